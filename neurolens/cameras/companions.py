@@ -56,11 +56,7 @@ class Shift(NamedTuple):
 
 
 def fit_shift(
-    lens: Graph,
-    samples: Mapping[str, Array],
-    margin: Array,
-    companion_nm: Array,
-    film_mm: tuple[float, float],
+    lens: Graph, samples: Mapping[str, Array], margin: Array, companion_nm: Array, film_mm: tuple[float, float]
 ) -> Shift | None:
     """Fit the shift of a lens; None if too few rays pass, or the error on held-out rays is too large.
 
@@ -75,14 +71,25 @@ def fit_shift(
         return None
     rays, values, companion_nm = (v[..., found.kept] for v in (samples["rays"], found.values, companion_nm))
     waves = (1000 / np.stack([rays[4], companion_nm])) ** 2
-    low, high = float(waves.min()), float(waves.max())
-    middle, spread = 0.5 * (low + high), 0.5 * (high - low)
+    middle, spread = 0.5 * float(waves.min() + waves.max()), 0.5 * float(np.ptp(waves))
     scale = np.repeat([np.abs(rays[:2]).max(), np.abs(rays[2:4]).max()], 2)
-    columns = np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread])
+    weights, tint, left = _terms(np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread]), values)
+    if left > max(_WORST_MM, _WORST * float(np.sqrt(np.mean(np.sum(values[:2] ** 2, axis=0))))):
+        return None
+    x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
+    graphs = _shift_graphs(weights, tint, scale, (middle, spread), (x, y), film_mm)
+    on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
+    lost = margin[found.kept][on_film & ~found.passed[found.kept]]
+    return Shift(*graphs, (x, y), max(_BEYOND * float(lost.max(initial=0)), float(np.quantile(margin, _SURELY))))
+
+
+def _terms(columns: Array, values: Array) -> tuple[Array, Array, float]:
+    """Fit the values [5, N] of `_Solved` by variables [6, N]: weights [5, M] of the monomials, coefficients of the
+    light by wavelength, and the RMS error of the film point on the half of the rays that were not fitted."""
     exponents, parity = _monomials()
     products = np.stack([np.prod(columns.T**powers, axis=1) for powers in exponents]) * (columns[5] - columns[4])
     tints = np.stack([columns[5] ** k - columns[4] ** k for k in range(1, _TINT + 1)])
-    train = np.arange(rays.shape[1]) % 2 == 0
+    train = np.arange(values.shape[1]) % 2 == 0
     weights, tint = np.zeros((5, len(exponents))), np.zeros(_TINT + 1)
     for row, kind in enumerate((0, 1, 0, 1, 2)):
         terms = parity == kind
@@ -90,31 +97,17 @@ def fit_shift(
         sizes = np.linalg.norm(part, axis=1)
         solved = np.linalg.lstsq((part / sizes[:, None]).T, values[row, train], rcond=1e-10)[0] / sizes
         weights[row, terms], tint[1:] = solved[: terms.sum()], solved[terms.sum() :] if kind == 2 else 0
-    left, size = (
-        float(np.sqrt(np.mean(np.sum(v[:2, ~train] ** 2, axis=0)))) for v in (values - weights @ products, values)
-    )
-    if left > max(_WORST_MM, _WORST * size):
-        return None
+    left = (values - weights @ products)[:2, ~train]
     along = np.linspace(-1, 1, 8 * _TINT)
-    light = np.polynomial.Polynomial.fit(along, np.exp(np.polynomial.polynomial.polyval(along, tint)), _TINT, [-1, 1])
-    x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
-    graphs = _shift_graphs((exponents, weights), light.coef, scale, (middle, spread), (x, y), film_mm)
-    on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
-    lost = margin[found.kept][on_film & ~found.passed[found.kept]]
-    return Shift(*graphs, (x, y), max(_BEYOND * float(lost.max(initial=0)), float(np.quantile(margin, _SURELY))))
+    light = np.exp(np.vander(along, _TINT + 1, increasing=True) @ tint)
+    return weights, np.polyfit(along, light, _TINT)[::-1], float(np.sqrt(np.mean(np.sum(left**2, axis=0))))
 
 
 def _shift_graphs(
-    terms: tuple[NDArray[np.int64], Array],
-    tint: Array,
-    scale: Array,
-    waves: tuple[float, float],
-    *limits_mm: tuple[float, float],
+    weights: Array, tint: Array, scale: Array, waves: tuple[float, float], *limits_mm: tuple[float, float]
 ) -> tuple[Graph, Graph]:
-    """The graphs of `Shift`, for exponents [M, 6] and weights [5, M] of variables so scaled, the coefficients of the
-    light by wavelength, the reach and the film."""
-    exponents, weights = terms
-    of_hero, g = Graph(), Graph()
+    """The graphs of `Shift`, for what `_terms` finds in variables so scaled, the reach and the film."""
+    exponents, of_hero, g = _monomials()[0], Graph(), Graph()
 
     def variable(g: Graph, name: str) -> Value:
         inverse = 1000.0 / g.input(name)

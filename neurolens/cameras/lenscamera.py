@@ -93,7 +93,7 @@ class LensFilm:
         return camera_rays(self.outputs(film_mm, square, wavelength_nm))
 
     def outputs(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> dict[str, NDArray[Any]]:
-        """The outputs of the camera's graph with `pupil_mm`, `area_mm2`, `transmittance`, for the inputs of `sample`."""
+        """The outputs of the camera's graph, `pupil_mm`, `area_mm2` and `transmittance`, for the inputs of `sample`."""
         pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
         lit = (area > 0) & is_light(wavelength_nm)
         some = np.flatnonzero(lit)  # a film point that nothing reaches is dark: no ray is traced
@@ -266,10 +266,10 @@ class LensCamera:
             assert self._shift is not None
             graph, numbers = companion_graph(lens, self._shift, mask_too), self._of_the_lens()
         else:
-            hero = kind == "hero" and self._shift is not None
-            also = ("pupil_mm", "area_mm2") if hero else ()
+            also = ("pupil_mm", "area_mm2") if kind == "hero" else ()
             graph, numbers = whole_camera(self.film, lens, also, mask_too)
-            if hero:
+            if kind == "hero":
+                assert self._shift is not None
                 area = graph.outputs.pop("area_mm2")
                 same = {k: graph.outputs[k] for k in ("pupil_mm", "weight")} | {"area_mm2": area}
                 graph.outputs |= graph.inline(lanes_graph(self._shift, companions), same)
@@ -322,7 +322,7 @@ class LensCamera:
         self.differentials_error = None if fitted is None else fitted.error
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
-    def _film_samples(self) -> tuple[dict[str, FloatArray], FloatArray]:
+    def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
         """Inputs of the lens's graph for rays all over film, pupil and wavelengths, and their `lanes_graph` margins."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
@@ -330,7 +330,7 @@ class LensCamera:
         wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
         pupil, area = outline.sample(film, square, wavelength)
-        margin = (1 - np.abs(2 * square - 1).max(axis=0)) * np.sqrt(area)
+        margin = ((1 - np.abs(2 * square - 1).max(axis=0)) * np.sqrt(area)).astype(np.float64)
         call = {k: np.array([[value]], np.float32) for k, value in self._of_the_lens().items()}
         return {"rays": np.stack([*film, *pupil, wavelength])} | call, margin
 

@@ -113,6 +113,11 @@ class Job:
         basis = self.spectral.rotated(self.spectral.basis)  # [lanes, 3, bins]
         table = np.stack([np.concatenate([t, self._luminance[:, None]], axis=1) for t in (self._response, basis)])
         self._bins = np.ascontiguousarray(table.transpose(3, 0, 1, 2), np.float32)  # as `spill.c` has them
+        tints = getattr(camera, "tints", None)
+        light = None if tints is None else self.spectral.rotated(tints(self.spectral.centres_nm))
+        self._tints: FloatArray | None = None
+        if light is not None:
+            self._tints = np.where(light[0] > 0, light / np.maximum(light[0], 1e-30), 0).astype(np.float32)
         self.sampler = Sampler(samples, seed)
         self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
         self.rows = rows or (0, grid.height)
@@ -219,14 +224,14 @@ class Job:
     def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> LensRays:
         """Rays of the hero wavelengths, with the weights of all lanes."""
         lanes = self.spectral.lanes
-        nm = np.stack([self._camera_wavelengths(_turned(hue, np.float32(k / lanes))) for k in range(lanes)])
+        used = lanes if self._tints is None or self.mode == "companions" else 1
+        nm = np.stack([self._camera_wavelengths(_turned(hue, np.float32(k / lanes))) for k in range(used)])
         if self.mode == "companions":
             return self._camera_rays(camera, film_mm, pupil, nm)
         hero = self._camera_rays(camera, film_mm, pupil, nm[:1])
         weight = np.repeat(hero.weight, lanes, axis=0)
-        if (tints := getattr(camera, "tints", None)) is not None:  # nothing else depends on the wavelength
-            light = tints(nm)
-            weight *= np.divide(light, light[0], out=np.zeros_like(light), where=light[0] > 0)
+        if self._tints is not None:  # nothing else depends on the wavelength
+            weight *= self._tints.take(self.spectral.bin_of(hue), axis=-1)
         elif camera.dispersive or not getattr(camera, "achromatic", False):
             for lane in range(1, lanes):
                 weight[lane] = self._camera_rays(camera, film_mm, pupil, nm[lane : lane + 1]).weight
