@@ -305,15 +305,6 @@ def test_film_beyond_the_model_is_dark(model: OnnxLens) -> None:
     assert rays.weight[1] > 0 and rays.status[1] == 0
 
 
-def test_worker_camera_gives_the_same_rays(model: OnnxLens) -> None:
-    camera = OnnxCamera(model, Shot((36.0, 24.0), 2.0, 4.0))
-    film, square, wavelength = (a.astype(np.float32) for a in some_rays(model, 500))
-    square = np.abs(square) % 1
-    a, b = (c.sample(film, square, wavelength) for c in (camera, camera.for_worker()))
-    assert np.array_equal(a.direction, b.direction) and np.array_equal(a.weight, b.weight)
-    assert json.loads(json.dumps(camera.settings, allow_nan=False))["f_number"] == pytest.approx(4.0)
-
-
 def test_models_need_no_torch_and_write_nothing(path: Path, tmp_path: Path) -> None:
     """Nothing in the home and cache folders either: onnxruntime records what it does unless told not to."""
     code = (

@@ -1,7 +1,6 @@
 """Equal time: bias and variance of known renders, errors in the film's space, laws of time."""
 
 import math
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -11,8 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from experiments import equal_time, equal_time_page
-from experiments.equal_time import CameraResult, Counts, Rendered, SceneResult, camera_result
 from experiments.equal_time_errors import (
     Estimate,
     FilmMap,
@@ -23,16 +20,13 @@ from experiments.equal_time_errors import (
     paired_bias,
     reference_variance,
     squared_error,
-    weights,
 )
-from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.scene import CameraSettings
 
 SHAPE = (12, 20, 3)
 Picture = NDArray[np.float64]
@@ -63,13 +57,6 @@ def test_bias_and_variance_of_known_pictures_with_a_noisy_reference(
     assert abs(variance.value - sigma**2) < 4 * variance.sd < 0.2 * sigma**2
 
 
-def test_the_jackknife_tells_how_far_estimates_spread() -> None:
-    sets = [bias_and_variance(0.2 + noise(8, 0.5, s), noise(2, 1e-9, 0), np.ones(SHAPE)) for s in range(40)]
-    for pick in (0, 1):
-        values, told = [s[pick].value for s in sets], [s[pick].sd for s in sets]
-        assert 0.7 < np.std(values) / np.mean(told) < 1.4
-
-
 def test_shared_random_numbers_resolve_a_bias_that_independent_passes_cannot() -> None:
     exact = truth() + noise(8, 1.0, 5)
     other = exact + 1e-3 + noise(8, 1e-3, 6)
@@ -78,16 +65,6 @@ def test_shared_random_numbers_resolve_a_bias_that_independent_passes_cannot() -
     assert not alone.resolved and paired.resolved
     assert abs(paired.value - 1e-6) < 4 * paired.sd
     assert paired_bias(exact, exact, np.ones(SHAPE)) == Estimate(0.0, 0.0)
-
-
-def test_errors_are_weighted_as_the_relative_mse_is() -> None:
-    halves = [np.full(SHAPE, 2.0), np.full(SHAPE, 2.0)]
-    weight = weights(halves[0], 0.01)
-    assert squared_error(halves[0] + 0.5, halves, weight) == pytest.approx(0.25 / 4.01)
-    assert paired_bias(noise(3, 0, 0) + 0.5, noise(3, 0, 0), weight).value == pytest.approx(0.25 / 4.01)
-    found, variance = bias_and_variance(np.full((3, *SHAPE), 2.5), halves, weight)
-    assert (found.value, variance.value) == (pytest.approx(0.25 / 4.01), pytest.approx(0, abs=1e-12))
-    assert squared_error(halves[0] + 0.5, halves, weights(halves[0], None)) == pytest.approx(0.25)
 
 
 def test_squared_error_is_free_of_the_references_noise_and_that_noise_is_known() -> None:
@@ -117,72 +94,7 @@ def test_both_errors_are_equal_where_the_exact_lens_gets_ahead() -> None:
     assert fast.at(0.5 * t) < EXACT.at(0.5 * t) and fast.at(2 * t) > EXACT.at(2 * t)
 
 
-def test_a_crossover_within_the_first_pass_is_found_on_the_measured_points() -> None:
-    biased = Law(6.0, 1.0, 0.5, ((0.1, 20.0), (0.2, 9.0)))
-    t = crossover_s(EXACT, biased)
-    assert 0.5 < t < 2.0
-    assert EXACT.at(t) == pytest.approx(biased.at(t), rel=0.02)
-
-
-def test_no_crossover() -> None:
-    assert crossover_s(EXACT, Law(0.0, 4.0, 1.0, ((0.25, 12.0),))) == math.inf  # as good and faster: for ever
-    assert crossover_s(EXACT, Law(1.0, 40.0, 3.0, ((1.0, 90.0),))) == 0.0  # worse at all times
-
-
 # Results of one scene
-
-COUNTS = Counts((SHAPE[1], SHAPE[0]), short=(1, 2), repeats=2, pass_samples=4, passes=4, reference=64)
-
-
-def rendered(bias: float, seconds_a_sample: float, sigma: float = 0.4) -> Rendered:
-    """Pictures of a camera whose variance is sigma^2 / samples; all cameras draw the same noise."""
-    own: list[Picture] = []
-    for k, (samples, _) in enumerate(COUNTS.jobs):
-        own.append(truth() + bias + noise(1, sigma / math.sqrt(samples), 50 + k)[0])
-    return Rendered(own, [seconds_a_sample * n for n, _ in COUNTS.jobs])
-
-
-def result(cameras: Sequence[tuple[str, float, float]]) -> SceneResult:
-    halves = list(truth() + noise(2, 0.01, 9))
-    by = {m: weights(truth(), eps) for m, eps in equal_time.MEASURES.items()}
-    film = FilmMap(np.full((4, 6), 2.0), 2.0, 3.0)
-    exact = rendered(0.0, cameras[0][2])
-    found: dict[str, CameraResult] = {
-        name: camera_result(name, rendered(bias, seconds), exact, halves, by, COUNTS, film)
-        for name, bias, seconds in cameras
-    }
-    noise2 = {m: reference_variance(halves, w) for m, w in by.items()}
-    shot = CameraSettings(position_m=(0, 0, 1), look_at_m=(0, 0, 0), focus_m=1.0)
-    return SceneResult("wall", shot, 1.8, COUNTS, 1, truth(), noise2, 0.01, found)
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneResult:
-    return result([("exact", 0.0, 0.02), ("mlp-16x2", 0.0, 0.01), ("thin lens", 0.2, 0.01)])
-
-
-def test_levels_hold_the_error_of_their_samples(scene: SceneResult) -> None:
-    exact = scene.cameras["exact"]
-    assert [level.samples for level in exact.levels] == [1, 2, 4, 8, 16]
-    for level in exact.levels:
-        assert level.mse == pytest.approx(0.16 / level.samples, rel=0.15)
-        assert level.seconds_min == pytest.approx(0.02 * level.samples)
-    assert [level.flip for level in exact.levels] == sorted((level.flip for level in exact.levels), reverse=True)
-
-
-def test_a_camera_that_gives_the_exact_pictures_has_neither_bias_nor_flip(scene: SceneResult) -> None:
-    found = scene.cameras["mlp-16x2"]
-    assert found.bias2["mse"] == Estimate(0.0, 0.0) and found.flip_same == 0.0
-    biased = scene.cameras["thin lens"]
-    assert biased.bias2["mse"].value == pytest.approx(0.04, rel=1e-6)  # the noise is the same and cancels
-    assert biased.flip_same > 0.05
-
-
-def test_the_exact_lens_is_ahead_when_its_law_says_so(scene: SceneResult) -> None:
-    """The law gives 0.16 (0.02 s - 0.01 s) / 0.2^2 = 40 ms for the absolute error."""
-    law, other = scene.cameras["exact"].law("mse"), scene.cameras["thin lens"].law("mse")
-    assert crossover_s(law, other) == pytest.approx(0.04, rel=0.5)
-    assert equal_time_page.equal_time_s(scene) == pytest.approx(0.16)
 
 
 # Errors in the film's space
@@ -241,12 +153,6 @@ def singlet() -> ExactCamera:
     return ExactCamera(lens, Shot((12.0, 6.0), 2.0, 4.0))
 
 
-def test_a_shift_behind_a_real_lens_is_found_through_its_aberrations(singlet: ExactCamera) -> None:
-    found = mapped(singlet, Shifted(singlet, 3.0, 4.0))
-    # The rays' own differentials hold aberrations; the pupil's outline moves with the film point, by little.
-    assert found.median_um == pytest.approx(np.full((4, 6), 5.0), rel=0.02)
-
-
 def test_another_pupil_outline_is_no_error_of_the_rays(singlet: ExactCamera) -> None:
     """The same lens whose pupil is a tenth narrower: pupil points differ, and so would the rays."""
     other: Any = copy(singlet)
@@ -258,19 +164,6 @@ def test_another_pupil_outline_is_no_error_of_the_rays(singlet: ExactCamera) -> 
     moved = other.sample(point, point, light).origin_m - singlet.sample(point, point, light).origin_m
     assert np.abs(moved).max() > 1e-5  # metres: it is another pupil
     assert mapped(singlet, other).p99_um == 0.0
-
-
-def test_dark_film_is_not_a_number() -> None:
-    thin = ThinLens(50.0, 2.0, 2.0, FILM)
-
-    class Dark(Shifted):
-        def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-            rays = self.camera.sample(film_mm, pupil, wavelength_nm)
-            lost = np.where(film_mm[1] > 0, st.blocked(0, st.RIM), rays.status).astype(np.int32)
-            return replace(rays, status=lost)
-
-    found = mapped(thin, Dark(thin, 0, 0)).median_um
-    assert np.isnan(found[2:]).all() and not found[:2].any()
 
 
 def test_cameras_that_do_not_take_the_same_picture_are_refused() -> None:

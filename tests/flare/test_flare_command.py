@@ -71,18 +71,6 @@ def seen_once() -> Iterator[None]:
         yield
 
 
-@pytest.mark.whole  # test_ghosts holds every ghost against photons
-def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
-    """The light of photons with two reflections at most is that of the ghosts, block by block, within its noise."""
-    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--bins", "2", "--quiet"]
-    blocks = []
-    for words in (["--cell", "2"], ["--photons", "200000", "--reflections", "2", "--kernel", "0"]):
-        out = tmp_path / "one.exr"
-        assert main(["flare", *common, *words, "-o", str(out)]) == 0
-        blocks.append(read_exr(out)[0][..., 1].reshape(2, 8, 3, 8).sum((1, 3)))
-    np.testing.assert_allclose(blocks[1], blocks[0], rtol=0.12)
-
-
 def test_starburst_is_a_layer(tmp_path: Path) -> None:
     """What the module makes, added to the ghosts under its gain."""
     out = tmp_path / "star.exr"

@@ -46,19 +46,6 @@ def test_another_order_is_the_same_program() -> None:
         assert all(a < k for a in step.arguments if isinstance(a, int))
 
 
-def test_what_is_divided_by_the_same_is_divided_once() -> None:
-    """But where the divisor is a number of each table: one over it could not be mixed."""
-    p = Program(tables=2)
-    x, y = p.input("x"), p.input("y") + 3.0
-    p.outputs = {"a": p.literal(2.0) / y, "b": x / y, "c": x / (y + 1.0), "d": x / p.literal([2.0, 4.0])}
-    p.outputs["e"] = y / p.literal([2.0, 4.0])
-    shared, given = p.with_shared_inverses(), {"x": X, "y": np.abs(Y)}
-    assert (p.count()["div"], shared.count()["div"]) == (5, 4)
-    for table in (0, 1):
-        found, wanted = (q.evaluate(given, table) for q in (shared, p))
-        assert all(np.allclose(found[name], value, rtol=3e-7) for name, value in wanted.items())
-
-
 def test_sums_in_parts_are_the_same_sums() -> None:
     p = Program()
     x, y = p.input("x"), p.input("y")

@@ -97,11 +97,6 @@ def test_a_mesh_may_be_sheared_mirrored_and_scaled_along_axes(given: dict[str, A
     assert towards == pytest.approx(np.ones(len(out)))
 
 
-def test_a_matrix_that_flattens_is_refused() -> None:
-    with pytest.raises(InputError, match="matrix.*flatten nothing"):
-        MeshSettings("m", file=Path("a.obj"), matrix=((1, 0, 0, 0), (0, 1, 0, 0), (1, 1, 0, 0)))
-
-
 def test_nothing_is_merged_or_mended(tmp_path: Path) -> None:
     # Two triangles in one place, one of them the other way round, and two vertices in one place.
     path = tmp_path / "a.obj"
@@ -191,24 +186,17 @@ def test_normals_of_the_file_are_used_and_turned(smooth: bool | None, tilted: bo
     [
         ("a.obj", b"", "at least one triangle"),
         ("a.obj", b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2.*v X Y Z"),
-        ("a.obj", b"v 0 0 nan\n", "line 1.*v X Y Z"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4.*f I J K"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "line 4.*counted from 1"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n", "line 4.*'-4'.*v from 1 to 3"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4.*'9'.*v from 1 to 3"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/2\n", "line 5.*'3/2'.*vt from 1 to 1"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n", "line 4.*vn from 1 to 0"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 2/1 3 4\n", "line 6.*corners of the same form"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1e400 0\nf 1 2 3\n", "v X Y Z"),
         ("a.obj", b"\xff\xfe\x00v", "text file"),
         ("a.ply", b"solid cube", "begins with ply"),
         ("a.ply", ply("binary_little_endian")[:-7], "ends before its last element"),
         ("a.ply", ply("ascii")[:-30], "ends before its last element"),
-        ("a.ply", ply("ascii").replace(b"1.25", b"nan"), "finite numbers"),
         ("a.ply", ply("ascii").replace(b"3 0 1 4", b"3 0 1 9"), "vertices from 0 to 4"),
         ("a.ply", ply("ascii").replace(b"element face 5", b"element face 0"), "at least one triangle"),
         ("a.ply", ply("binary_little_endian").replace(b"vertex 5", b"vertex 50000000"), "50000000 elements vertex in"),
-        ("a.stl", b"solid", r"\.obj or \.ply"),
     ],
 )
 def test_each_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:

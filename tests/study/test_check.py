@@ -4,7 +4,6 @@ import copy
 import math
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,13 +15,11 @@ from shipped import whole
 from vignetting_oracle import vignetting_errors
 
 from neurolens.cameras.model import load_model
-from neurolens.cli import main
 from neurolens.study import check
 from neurolens.study import measure as measured
 from neurolens.study.check import check_model, share_promise
-from neurolens.study.measure import STOPS, ZONED, fresh_rays, measure, measure_on, what_is_poor, with_more
+from neurolens.study.measure import STOPS, ZONED, fresh_rays, measure, measure_on, with_more
 from neurolens.study.rays import ZONES
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 RAYS = 6000
@@ -162,19 +159,6 @@ def test_one_trace_serves_every_stop(state: str) -> None:
         assert mine[key] == apart[key]
         if state in ZONED:
             assert {z: found.zones[state][z][key] for z in ZONES} == {z: apart["zones"][z][key] for z in ZONES}
-
-
-@pytest.mark.whole  # what is said of it
-def test_a_poor_fit_is_named_by_its_card_the_command_and_the_source_code(
-    errors: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert errors["poor"] == [] == what_is_poor({"false_pass": 0.01, "rms_px": 1.0, "false_block": None})
-    poor = {**errors, "poor": what_is_poor({**errors, "false_block": 0.042})}
-    path = export_onnx(model("invariants"), tmp_path / "model.onnx", poor)
-    assert main(["evaluate", str(path), "--rays", "1000", "--quiet"]) == 0
-    assert "Poor, as the card says: false block 4.2%." in capsys.readouterr().out
-    assert main(["export", str(path), "--to", "c", "-o", str(tmp_path / "model.h")]) == 0
-    assert "Poor: false block 4.2%." in (tmp_path / "model.h").read_text()
 
 
 def test_promises_of_another_shape_promise_nothing(errors: dict[str, Any]) -> None:

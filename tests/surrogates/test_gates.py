@@ -19,7 +19,7 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.domain import SPARSE, FilmRays, domain_of, lit_share, sample_domain, sample_lit
+from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits.boundaries import GateFit
@@ -88,13 +88,6 @@ def test_lost_rays_no_longer_pass(name: str, method: ModelSettings | str, most: 
     before = fit_model(replace(known, gates=rims), settings)
     assert false_passes(model, rays) < min(most, 0.6 * false_passes(before, rays))
     assert false_blocks(model, rays) < false_blocks(before, rays) + most
-
-
-@pytest.mark.whole  # as without zones
-@pytest.mark.slow
-def test_zones_have_the_gates_too() -> None:
-    model = fit_model(gated("singlet"), ModelSettings("ols", terms=16, degree=5, partitions=2, planes=False))
-    assert false_passes(model, fresh("singlet")) < 0.006
 
 
 def test_two_gates_for_one_reason_on_a_surface_are_refused(tmp_path: Path) -> None:
@@ -175,19 +168,6 @@ def fitted(lens: Lens, domain: Domain, terms: int = 40, rays: PairSettings = RAY
     return fit_model(prepare(make_pairs(lens, domain, rays)), ModelSettings("ols", terms=terms, planes=False))
 
 
-@pytest.mark.whole  # as a tiny rim far in front
-def test_where_little_passes_rays_are_drawn_where_it_does() -> None:
-    """The share that passes is known all the same, and no passing ray lies outside the boxes."""
-    lens, domain = narrow()
-    assert lit_share(domain) < SPARSE
-    drawn, stands_for = sample_lit(domain, 60_000, seed=3)
-    found = (trace_pairs(lens, drawn, domain.pupil_z_mm).status == st.PASSED).sum() / stands_for
-    everywhere = trace_pairs(lens, sample_domain(domain, 400_000, seed=4), domain.pupil_z_mm)
-    share = float((everywhere.status == st.PASSED).double().mean())
-    assert share < 0.012
-    assert float(found) == pytest.approx(share, rel=0.06)  # 4 sigma of some 4000 passing rays
-
-
 def test_rays_of_the_boxes_pass_uniformly() -> None:
     """The same distribution over film and pupil as that of the passing rays of the whole domain."""
     lens, domain = narrow()
@@ -200,15 +180,6 @@ def test_rays_of_the_boxes_pass_uniformly() -> None:
         points = torch.quantile(torch.cat([a, b]), torch.linspace(0.05, 0.95, 19, dtype=torch.float64))
         apart = max(abs(float((a < p).double().mean() - (b < p).double().mean())) for p in points)
         assert apart < 1.95 * math.sqrt(1 / len(a) + 1 / len(b))  # Kolmogorov and Smirnov, one in a thousand
-
-
-@pytest.mark.whole  # as a tiny rim far in front
-@pytest.mark.slow
-def test_a_lens_where_almost_no_ray_passes() -> None:
-    lens, domain = narrow()
-    found = vignetting_errors(lens, domain, fitted(lens, domain).predict, count=200_000)
-    assert found["passing_share"] < 0.012
-    assert found["false_pass"] < 0.005 and found["false_block"] < 0.005
 
 
 @pytest.mark.slow

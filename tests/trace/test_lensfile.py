@@ -1,7 +1,6 @@
 """Lens files: each mistake is one error that names file, surface and field; what is written reads back the same."""
 
 import math
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -279,21 +278,6 @@ def test_unknown_dispersion_is_a_warning(tmp_path: Path) -> None:
     with pytest.warns(NeurolensWarning, match=r"lens\.toml.*surface 4: .*constant") as seen:
         assert read_lens(path).surfaces[4].V_d is None
     assert len(seen) == 1
-
-
-def test_a_coating_that_no_surface_has_is_a_warning(tmp_path: Path) -> None:
-    coating = '\n[[coating]]\nname = "mine"\nlayers = [[1.38, 99.6]]\n'
-    with pytest.warns(NeurolensWarning, match='lens.toml: coating "mine": no surface has it'):
-        read_lens(write(tmp_path, GOOD + coating))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        read_lens(write(tmp_path, replaced("n_d = 1.6,", 'n_d = 1.6, coating = "mine",') + coating))
-
-
-def test_known_dispersion_is_no_warning(tmp_path: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert read_lens(write(tmp_path, GOOD)).dispersive
 
 
 # Round trip
