@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.cli import main
-from neurolens.cli import plan as command
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
 from neurolens.plan import candidates as tried
@@ -308,10 +306,6 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     assert choices["thick + ST map"].error_px == pytest.approx(blur, rel=0.02)  # in focus it is a point
     assert choices["pinhole"].error_px > 3 * blur
     assert choices["pinhole + ST map"].light_error < 0.0045 < choices["pinhole"].light_error / 8
-
-
-def test_targets_are_those_of_the_command() -> None:
-    assert get_args(get_type_hints(command.Plan)["target"]) == get_args(Target)
 
 
 @pytest.mark.usefixtures("no_plots")
