@@ -254,30 +254,6 @@ def test_brightness_is_the_integral_over_the_pupil(name: str, efl_mm: float, f_n
     assert axis == pytest.approx(1, abs=0.005)  # the exposure is a mean over wavelengths
 
 
-def test_the_dark_costs_nothing() -> None:
-    """No ray is traced for a film point that nothing reaches."""
-    camera = exact("muller_fisheye_100", 14.0, 8.0)
-    traced: list[int] = []
-    scene = camera.film.scene
-
-    def counting(film: np.ndarray, pupil: np.ndarray, wavelength_nm: np.ndarray) -> object:
-        traced.append(film.shape[1])
-        return scene(film, pupil, wavelength_nm)
-
-    rng = np.random.default_rng(0)
-    film = ((rng.random((2, 5000)) - 0.5) * 60).astype(np.float32)
-    square, wavelength = rng.random((2, 5000), np.float32), np.full(5000, 550, np.float32)
-    camera.film.scene = counting  # type: ignore[assignment]
-    try:
-        rays = camera.sample(film, square, wavelength)
-    finally:
-        camera.film.scene = scene
-    lit = camera.film.outline.sample(film, square, wavelength)[1] > 0
-    assert lit.sum() == pytest.approx((np.hypot(*film) <= camera.film.outline.film_radius_mm).sum(), abs=5)
-    assert 0.1 < lit.mean() < 0.6 and sum(traced) == lit.sum()
-    assert (rays.status[~lit] == st.OUTSIDE_DOMAIN).all() and (rays.weight[~lit] == 0).all()
-
-
 def test_blades_and_cylinders_are_held() -> None:
     """A bladed stop passes its share of the circle about it; a lens with cylinders passes what it does at any
     azimuth."""

@@ -8,7 +8,7 @@ from gallery_shots import ROOT, shipped, shot
 
 from experiments.__main__ import main
 from experiments.gallery.cameras import exact_camera, surrogate_camera
-from experiments.gallery.run import MOST_BYTES, check, fingerprint_of
+from experiments.gallery.run import MOST_BYTES, fingerprint_of
 from experiments.gallery.settings import read_effect
 from neurolens.base.errors import InputError
 
@@ -44,25 +44,6 @@ def written(folder: Path, old: str = "", new: str = "") -> Path:
     assert old in text
     path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
     return path
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "field"),
-    [
-        ("width = 24", "widht = 24", "panel[0].widht"),
-        ("samples = 2", "samples = 0", "panel[0].samples"),
-        ("f_number = 4", "widen = 9", "panel[0].widen"),
-        ('"two"', '"one"', "panel"),
-        ("9.0, 6.0]", "9.0, -6.0]", "panel[1].film_mm, window_mm"),
-        ('"edge_blur"', '"blur"', "measure"),
-        ('source = "Nobody."', 'source = ""\ncolumns = ["thick"]', "columns"),
-    ],
-)
-def test_a_mistake_in_a_file_is_one_error_that_names_its_field(tmp_path: Path, old: str, new: str, field: str) -> None:
-    path = written(tmp_path, old, new)
-    with pytest.raises(InputError) as caught:
-        check(read_effect(path))
-    assert (caught.value.file, caught.value.field) == (str(path), field)
 
 
 def test_exact_and_surrogate_put_the_film_in_the_same_place_however_it_is_focused() -> None:

@@ -13,7 +13,6 @@ from experiments.promises import read_index
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress
-from neurolens.base.settings import from_dict
 
 QUIET = Progress(quiet=True)
 
@@ -97,17 +96,3 @@ def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     made["broken"].clear()
     assert make_models.make_models(library, library.entry, tmp_path, QUIET) == []
     assert json.loads((tmp_path / "index.json").read_text())["left_out"] == {}
-
-
-@pytest.mark.parametrize(
-    "entry",
-    [
-        {"lens": {"file": "one.toml", "configuration": "../up"}},
-        {"lens": {"file": "one.toml"}, "models": [{"name": "a/b"}]},
-        {"lens": {"file": "one.toml"}, "models": [{"terms": 6}, {"terms": 6}]},
-        {"lens": {"file": "one.toml"}, "models": []},
-    ],
-)
-def test_names_that_are_no_file_names_are_refused(entry: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="entry"):
-        from_dict(Library, {"entry": [entry]}, "test")

@@ -22,18 +22,6 @@ from neurolens.surrogates.domain import sample_domain
 from neurolens.trace.tracegraph import exact_graph
 
 
-@pytest.mark.parametrize("name", ["inverse", "zoom", *whole("vignetting")])
-def test_results_of_another_kind_are_not_written_over(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)  # one makes a folder of models first
-    file = tmp_path / f"{name}.json"
-    for text in ("half a fi", "3", '[{"lens": "other"}]'):
-        file.write_text(text)
-        assert main([name, "--quiet", "--output", str(tmp_path)]) == 2
-        assert f"rows of experiments {name}" in capsys.readouterr().err and file.read_text() == text
-
-
 @pytest.mark.parametrize(
     ("command", "told"),
     [

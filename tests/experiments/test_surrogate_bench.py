@@ -2,17 +2,14 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command_line import failure
 from lens_models import LENSES
 
-from experiments import methods as surrogate_bench
 from experiments.__main__ import main
 from experiments.methods import Bench, BenchSettings, Row
 from experiments.surrogates import chosen_rows
-from neurolens.base.errors import InputError
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
@@ -35,29 +32,6 @@ ROWS = (
 
 def bench_of(folder: Path, file: Path = LENSES / f"{TRIPLET}.toml", settings: BenchSettings = SETTINGS) -> Bench:
     return Bench(LensChoice(file), settings, folder)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a command that ran twice."""
-    folder, real, patch = tmp_path_factory.mktemp("bench"), surrogate_bench.fit_any, pytest.MonkeyPatch()
-
-    def fit(prepared: Any, settings: ModelSettings, report: Any) -> Any:
-        if settings.method == "dense":
-            raise InputError("fit", "degree", 9, "less | fewer")
-        return real(prepared, settings, report)
-
-    command = ["surrogates", TRIPLET, "--quick", "--rays", "2000", "--rounds", "1", "--quiet"]
-    with patch.context() as patched:
-        patched.setattr(surrogate_bench, "fit_any", fit)
-        patched.setattr("experiments.surrogates.chosen_rows", lambda names, quick: ROWS)
-        assert main([*command, "--output", str(folder)]) == 0
-        files = [f for name in ("records", "models") for f in (folder / name).rglob("*") if f.is_file()]
-        before = {f: f.stat().st_mtime_ns for f in files}
-        assert main([*command, "--output", str(folder)]) == 0
-        # Nothing is made again, the refused one neither: its settings are the same.
-        assert len(before) == 7 and {f: f.stat().st_mtime_ns for f in files} == before
-    return folder
 
 
 def test_a_quick_run_has_a_row_of_every_method() -> None:
