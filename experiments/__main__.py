@@ -33,7 +33,7 @@ NAMES = {
     "plan-times": ("plan_times", "seconds that plans print beside those of renders to equal noise"),
     "shots": ("shots", "models fitted to one shot beside those that ship: error, operations, time"),
     "zoom": ("zoom", "models of whole zooms, of internal focus"),
-    "equal-time": ("equal_time_page", "error over render time of every camera"),
+    "equal-time": ("equal_time", "errors of pictures after equal time and equal samples, every camera"),
     "render": ("render_times", "render time by camera and scene"),
     "defocus": ("defocus", "the blur of a lens for sharp pictures, beside path-traced ones"),
     "dispersion": ("dispersion", "noise and time of lenses that disperse, beside a thin lens"),
