@@ -15,7 +15,6 @@ from neurolens import cli
 from neurolens.cli.arguments import Parser
 
 NAMES = {
-    "trace": ("trace_speed", "rays per second and memory of the exact tracer"),
     "extremes": ("extremes", "errors and statuses at the ends of what optics allows"),
     "pupils": ("pupils", "share of rays that pass a lens, by how its pupil is sampled"),
     "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),

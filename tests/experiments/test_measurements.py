@@ -16,7 +16,6 @@ from experiments.fused_speed import ray_candidate
 from experiments.promises import Outcome, hold_to_promises, read_index, report_outcome, times
 from experiments.pupils import CASES, Case, measure
 from experiments.render_times import FUSED_MODELS as MODELS
-from experiments.trace_speed import ASPHERIC_SURFACES, LENSES, MAIN, film_rays, launched, with_aspheres
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
@@ -27,7 +26,6 @@ from neurolens.study.speed import Race, fused_candidate, program_candidate, race
 from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.source import fused_program
-from neurolens.trace.rays import trace
 from neurolens.trace.tracegraph import exact_graph
 
 MODEL = MODELS[0]
@@ -61,7 +59,6 @@ def test_results_of_another_kind_are_not_written_over(
     ("command", "told"),
     [
         (["pupils", "--only", "nobody"], "--only"),
-        (["trace", "--quick", "--only", "zeiss"], "laikin"),
         (["vignetting", "--only", "nobody"], "--only"),
         (["equal-time", "--scene", "nowhere.toml"], "nowhere.toml"),
         (["models", "--list", "no.toml"], "no.toml"),
@@ -131,19 +128,6 @@ SAMPLES = 2**13
 def test_outlines_of_pupils_pass_most_and_lose_nothing(case: Case, goal: float) -> None:
     found = measure(case, SAMPLES, wider=1.3)
     assert found["passed"] >= goal and found["lost"] < 1e-4 and 0 <= found["dark"] < 0.3
-
-
-def test_two_aspheres_change_the_rays_and_little_else() -> None:
-    plain = lab.lens_of(LENSES[MAIN])
-    aspheric = with_aspheres(plain)
-    changed = [k for k, s in enumerate(aspheric.surfaces) if s.asphere]
-    assert changed == list(ASPHERIC_SURFACES)
-    assert [p for p, _ in aspheric.surfaces[changed[0]].asphere] == [4, 6, 8, 10]
-    rays = launched(plain, film_rays(plain, 4096), torch.float64)
-    a, b = trace(plain, *rays), trace(aspheric, *rays)
-    both = (a.status == 0) & (b.status == 0)
-    assert both.sum() > 0.7 * (a.status == 0).sum() > 100
-    assert 1e-2 < (a.rays.x - b.rays.x)[both].abs().max() < 3.0
 
 
 def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:
