@@ -13,8 +13,6 @@ import json
 import os
 import platform
 import resource
-import subprocess
-import sys
 import time
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
@@ -434,29 +432,8 @@ def cpu_ns(calls: Mapping[str, Callable[[], int]], rounds: int, report: Report |
     return times
 
 
-def most_load(rows: Iterable[Row]) -> float | None:
-    """The highest load average of races, whose rows have it as "load", before and after."""
-    return max((load for row in rows for load in row["load"] if load is not None), default=None)
-
-
 class Unmeasured(NeurolensError):
     """Something cannot be measured on this machine; the message says why."""
-
-
-def in_child(function: Callable[..., Row], *args: str | float) -> Row:
-    """The result of a function of a module of this folder, called with plain arguments in a new process.
-
-    Raises:
-        Unmeasured: the process failed.
-    """
-    module, name = function.__module__, function.__name__
-    code = f"import json, sys; from {module} import {name} as f; print(json.dumps(f(*json.loads(sys.argv[1]))))"
-    command = [sys.executable, "-W", "ignore", "-c", code, json.dumps(args)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    if done.returncode != 0:
-        raise Unmeasured(f"{name}{args} in a child process: {done.stderr.strip().splitlines()[-1:]}")
-    found: Row = json.loads(done.stdout)
-    return found
 
 
 def cpu_s() -> float:
@@ -469,11 +446,3 @@ def resident_kb(field: str) -> int:
     """Kilobytes of memory, from /proc: "VmRSS" is the resident memory now, "VmHWM" its highest, "VmData" the data."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(field)).split()[1])
-
-
-def memory_growth(work: Callable[[], T]) -> tuple[T, float]:
-    """The result of `work`, and the bytes by which the highest resident memory exceeds that before (Linux alone)."""
-    Path("/proc/self/clear_refs").write_text("5")  # the highest mark starts from here
-    before = resident_kb("VmRSS")
-    made = work()
-    return made, (resident_kb("VmHWM") - before) * 1024.0
