@@ -39,7 +39,7 @@ from neurolens.study.measure import (
 from neurolens.study.pages import write_report
 from neurolens.study.plots import illumination_plot, states_plot, trade_plot
 from neurolens.study.rays import Illumination, pixel_um, pupil_disc_share, relative_illumination
-from neurolens.study.scenes import Pictures, domain_facts, render_all, scene_gain
+from neurolens.study.scenes import Pictures, domain_facts, render_all
 from neurolens.study.speed import (
     EXACT,
     Race,
@@ -137,7 +137,6 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
             name: relative_illumination(lens, domain, onnx_predictor(load_model(file)), **options)
             for name, file in shown.items()
         }
-    gain = scene_gain(experiment, models, progress)
     drawn = Pictures()
     if experiment.render.scenes:
         with progress.stage("render") as report:
@@ -152,7 +151,6 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
         "cameras": [*({"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL if n in timed.ns), *drawn.cameras],
         "images": drawn.images,
         "image_settings": SETTINGS if drawn.images else None,
-        "domain_gain": gain,
         "figures": _draw(pairs, records, timed, light, pictures, use) + drawn.figures,
     }
 
@@ -163,7 +161,6 @@ def _plan(experiment: Experiment) -> dict[str, float]:
     for m in experiment.model:
         plan[f"fit {m.label}"] = 0.06 * m.steps * (m.units * m.layers / 32) ** 2.5 if m.method in NETWORKS else 3
     plan["race for speed"] = (45 if experiment.evaluation.compile_exact else 5) + 2 * len(experiment.model)
-    plan |= {"fit the scene's domain": 5} if experiment.scene_domain is not None else {}
     plan |= {"render": 40} if experiment.render.scenes else {}
     return plan
 
