@@ -89,7 +89,7 @@ def bench_models(args: argparse.Namespace) -> Outcome:
         lens = lens.with_stop_radius(domain.stop_radius_mm)
         made = [model_candidate(name, model, domain.stop_radius_mm) for name, model in models.items()]
         candidates = [*exact_candidates(lens, domain), *made]
-        timed = race(candidates, domain, threads=args.threads, rounds=args.rounds, report=report)
+        timed = race(candidates, domain, rounds=args.rounds, report=report)
         print(f"{_state(group)}\n{times(timed)}\n")
         hold_to_promises(rows, timed, outcome)
     return outcome
@@ -169,7 +169,6 @@ def report_outcome(outcome: Outcome) -> int:
 OPTIONS = (
     lab.option("--models", metavar="DIR", type=Path, default=lab.MODELS, help="with index.json (default: models)"),
     lab.option("--only", metavar="TEXT", default="", help="models whose names hold this, promised or not; no floors"),
-    lab.count("threads", 1, "that share out batches (default 1)"),
     lab.count("rounds", 20, "of each candidate (default 20)"),
     lab.QUIET,
 )

@@ -173,7 +173,7 @@ class TargetChoice:
 
 @dataclass(frozen=True)
 class EvaluationChoice:
-    """Rays for false passes and blocks; rounds (0: no race) and threads of the race for speed.
+    """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread.
 
     Attributes:
         compile_exact: whether the exact tracer compiled by torch runs, too: half a minute of compiling.
@@ -181,7 +181,6 @@ class EvaluationChoice:
 
     vignetting_rays: int = 200_000
     rounds: int = 15
-    threads: int = 1
     compile_exact: bool = True
 
 

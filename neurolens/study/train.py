@@ -168,18 +168,18 @@ def _plan(experiment: Experiment) -> dict[str, float]:
 def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measured], progress: Progress) -> Race:
     """Time the exact tracers and all models in one run, and add times, speed-ups and break-even to the records.
 
-    Models run in onnxruntime and, on one thread and with a compiler, as C; the exact lens eager, as C, and compiled by
+    Models run in onnxruntime and, with a compiler, as C; the exact lens eager, as C, and compiled by
     torch where that is asked for.
     """
     chosen, lens, domain = experiment.evaluation, prepared.pairs.lens, prepared.pairs.domain
     if not chosen.rounds:
-        return Race({}, {}, chosen.threads, 0)
+        return Race({}, {})
     with progress.stage("race for speed") as report:
         candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
-        candidates += [exact_c_candidate(lens, domain)] if chosen.threads == 1 else []
-        candidates += model_candidates({m.settings.label: m.file for m in measured}, domain, chosen.threads)
+        candidates += [exact_c_candidate(lens, domain)]
+        candidates += model_candidates({m.settings.label: m.file for m in measured}, domain)
         candidates += ideal_cameras(lens, domain)
-        timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds, report=report)
+        timed = race(candidates, domain, rounds=chosen.rounds, report=report)
     for m in measured:
         cost = m.record["fit_s"], m.record["load_s"]
         ns, speedup, _ = timed.gain(m.settings.label, EXACT[1], *cost)
