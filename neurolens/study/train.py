@@ -38,7 +38,7 @@ from neurolens.study.measure import (
 )
 from neurolens.study.pages import write_report
 from neurolens.study.plots import illumination_plot, states_plot, trade_plot
-from neurolens.study.rays import Illumination, pixel_um, pupil_disc_share, relative_illumination
+from neurolens.study.rays import Illumination, pixel_um, relative_illumination
 from neurolens.study.scenes import Pictures, domain_facts, render_all
 from neurolens.study.speed import (
     EXACT,
@@ -234,7 +234,6 @@ def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
         **domain_facts(lens, domain),
         "pupil_plane_z_mm": domain.pupil_z_mm,
         "pupil_radius_mm": domain.pupil_radius_mm,
-        "pupil_disc_holds": pupil_disc_share(lens, domain),
         "passing_share": len(pairs.train) / pairs.tested,
         "rays_train": len(pairs.train),
         "rays_held_out": MORE * len(pairs.held_out),
