@@ -94,11 +94,6 @@ AGAIN = option("--restart", old=("--again",), action="store_true", help="measure
 ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")
 
 
-def rounds_of(args: argparse.Namespace) -> int:
-    """The rounds of a race that --rounds and --quick ask for."""
-    return int(args.rounds or (5 if args.quick else 20))
-
-
 def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:
     """The items whose name holds the text of --only; `what` names the measurement.
 
@@ -295,23 +290,6 @@ def resume(
         done = ordered()
         write_results(args.out, name, page(done), {"machine": machine(), listed: done} if listed else done)
     print(page(ordered()))
-
-
-def write_figure(file: Path, figure: Any, dpi: int) -> None:
-    """Write a figure of matplotlib as PNG of 256 colours, or as JPEG, atomically, and close it."""
-    from matplotlib import pyplot as plt
-    from PIL import Image
-
-    file.parent.mkdir(parents=True, exist_ok=True)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=dpi, format="png")
-    plt.close(figure)
-    picture = Image.open(drawn).convert("RGB")
-    with atomic_path(file) as temporary:
-        if file.suffix == ".jpg":
-            picture.save(temporary, "JPEG", quality=90, subsampling=0)
-        else:
-            picture.quantize(256, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
 
 
 def write_small(file: Path, forms: Iterable[tuple[Any, dict[str, Any]]], most_bytes: int) -> None:
