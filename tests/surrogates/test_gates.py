@@ -73,9 +73,7 @@ def test_where_no_ray_is_lost_there_are_rims_alone() -> None:
     ("name", "method", "most"),
     [
         ("hemisphere", "ols", 0.005),
-        ("singlet", ModelSettings("dense", basis="raw", degree=4), 0.03),
         *whole(("singlet", ModelSettings("mlp", units=12, steps=15), 0.03)),
-        ("hemisphere", ModelSettings("dense", basis="raw", degree=4), 0.03),
         ("singlet", ModelSettings("thick"), 0.06),
         ("hemisphere", ModelSettings("thick"), 0.06),
     ],
@@ -88,13 +86,6 @@ def test_lost_rays_no_longer_pass(name: str, method: ModelSettings | str, most: 
     before = fit_model(replace(known, gates=rims), settings)
     assert false_passes(model, rays) < min(most, 0.6 * false_passes(before, rays))
     assert false_blocks(model, rays) < false_blocks(before, rays) + most
-
-
-@pytest.mark.whole  # as without zones
-@pytest.mark.slow
-def test_zones_have_the_gates_too() -> None:
-    model = fit_model(gated("singlet"), ModelSettings("ols", terms=16, degree=5, partitions=2, planes=False))
-    assert false_passes(model, fresh("singlet")) < 0.006
 
 
 def test_two_gates_for_one_reason_on_a_surface_are_refused(tmp_path: Path) -> None:
@@ -309,14 +300,13 @@ POOR = {
 }
 
 
-@pytest.mark.parametrize("method", ["ols", *whole("adaptive")])
 @pytest.mark.parametrize("kind", POOR)
-def test_poor_data_are_fitted_as_far_as_they_tell(kind: str, method: str) -> None:
+def test_poor_data_are_fitted_as_far_as_they_tell(kind: str) -> None:
     """Finite, sound in float32, and right on the rays that there were."""
     off_mm = []
     for train in POOR[kind]():
         pairs = replace(prepared().pairs, train=train)
-        settings = ModelSettings(method, terms=30, degree=4, growth=1)  # type: ignore[arg-type]
+        settings = ModelSettings(terms=30, degree=4, growth=1)
         core = fit_polynomial(replace(prepared(), pairs=pairs), settings)
         assert isinstance(core, InvariantPolynomial)
         assert np.isfinite(core.ab).all() and np.isfinite(core.scalars).all()

@@ -150,13 +150,9 @@ def test_a_lens_without_dispersion_ignores_the_wavelength():
     assert torch.rad2deg(error.square().mean().sqrt()) < 0.05
 
 
-@pytest.mark.parametrize("kind", ["network", "zones"])
-def test_no_clock_decides_a_fit_and_its_progress_grows_to_one(singlet, monkeypatch, kind):
+def test_no_clock_decides_a_fit_and_its_progress_grows_to_one(singlet, monkeypatch):
     monkeypatch.setattr(networks, "STARTS", 2)
-    settings = {
-        "network": ModelSettings("mlp", units=4, layers=1, steps=25),
-        "zones": ModelSettings("mlp", units=3, layers=1, steps=4, partitions=2),
-    }[kind]
+    settings = ModelSettings("mlp", units=4, layers=1, steps=25)
     found = []
     for each_look in (1e-3, 1e9):  # seconds that go by, as the fit sees it
         now = itertools.count(0.0, each_look)

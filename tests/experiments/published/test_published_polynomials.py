@@ -31,8 +31,8 @@ from neurolens.surrogates.targets import fit_encoding, scales_of
 from neurolens.trace.rays import Rays, trace
 
 FAST = {
-    "dense": PublishedSettings("hanika", basis="raw", degree=3),
-    "sparse": PublishedSettings("schrade", basis="raw", degree=5, terms=12),
+    "dense": PublishedSettings("hanika", degree=3),
+    "sparse": PublishedSettings("schrade", degree=5, terms=12),
 }
 
 
@@ -98,8 +98,8 @@ def test_more_terms_and_degrees_leave_less() -> None:
         model = fit_any(prepared, settings)
         return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).direction_rms_deg
 
-    dense = [rms_deg(PublishedSettings("hanika", basis="raw", degree=degree)) for degree in (1, 3, 5)]
-    sparse = [rms_deg(PublishedSettings("schrade", basis="raw", degree=5, terms=terms)) for terms in (4, 12, 32)]
+    dense = [rms_deg(PublishedSettings("hanika", degree=degree)) for degree in (1, 3, 5)]
+    sparse = [rms_deg(PublishedSettings("schrade", degree=5, terms=terms)) for terms in (4, 12, 32)]
     assert dense[0] > 2 * dense[1] > 4 * dense[2]
     assert sparse[0] > 2 * sparse[1] > 4 * sparse[2]
 

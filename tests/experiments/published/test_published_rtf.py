@@ -14,13 +14,12 @@ from torch import Tensor
 
 from experiments.published import PublishedSettings, fit_any
 from experiments.published.adaptive import Cells, fit_adaptive
-from experiments.published.data import RawData
+from experiments.published.data import RawData, RawPolynomial
 from experiments.published.neural import Averaged, Layers
 from experiments.published.rtf import least_ellipse, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.study.rays import ray_errors
-from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
@@ -29,7 +28,7 @@ from neurolens.surrogates.pairs import trace_pairs
 
 @cache
 def fitted() -> LensModel:
-    return fit_any(lens_models.prepared(), PublishedSettings("rtf", basis="raw", degree=6))
+    return fit_any(lens_models.prepared(), PublishedSettings("rtf", degree=6))
 
 
 def test_turning_is_a_rotation_onto_the_y_axis() -> None:
@@ -123,7 +122,7 @@ def test_half_the_step_leaves_a_quarter_of_the_error() -> None:
     assert 3 < errors[0] / errors[1] < 5
 
 
-NETWORKS = PublishedSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2)
+NETWORKS = PublishedSettings("neurolens2017", units=16, layers=2, steps=60, partitions=2)
 
 
 def rms_um(model: LensModel) -> float:
@@ -163,7 +162,7 @@ def test_cells_give_each_ray_the_polynomial_of_its_cell() -> None:
 @pytest.mark.whole
 def test_cells_and_terms_leave_less() -> None:
     few, more, cells = (
-        fit_any(lens_models.prepared(), PublishedSettings("zheng-adaptive", basis="raw", terms=terms, partitions=zones))
+        fit_any(lens_models.prepared(), PublishedSettings("zheng-adaptive", terms=terms, partitions=zones))
         for terms, zones in ((6, 1), (16, 1), (16, 2))
     )
     assert rms_um(few) > 2 * rms_um(more)
@@ -181,7 +180,7 @@ def test_growth_reaches_degrees_that_no_list_of_candidates_was_cut_at() -> None:
 
 @pytest.mark.parametrize("method", ("zheng-adaptive", "neurolens2017"))
 def test_more_cells_than_rays_allow_are_refused(method: str) -> None:
-    settings = PublishedSettings(method, basis="raw", terms=4, partitions=64)
+    settings = PublishedSettings(method, terms=4, partitions=64)
     with pytest.raises(InputError, match="partitions"):
         fit_any(lens_models.prepared(), settings)
 
