@@ -251,9 +251,11 @@ def best_focus_of_stops_mm(
     whole = best_focus_z_mm(widest, focus_m, wavelength_nm)
     if paraxial.is_pinhole(lens):
         return np.full(len(stops_mm), whole)
-    found = _least_spot_mm(widest, whole - 1000 * focus_m, wavelength_nm, stops_mm)
+    object_z = whole - 1000 * focus_m
+    found = _least_spot_mm(widest, object_z, wavelength_nm, stops_mm)
     # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
-    scale = 0.0 if math.isinf(focus_m) else float(paraxial.first_order(lens).efl_mm) / (1000 * focus_m)
+    data = paraxial.first_order(lens)
+    scale = float(data.efl_mm / (data.front_focal_z_mm - object_z))
     return np.asarray(found + (found - whole) * scale**2)
 
 
