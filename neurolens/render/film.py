@@ -85,13 +85,6 @@ class PixelGrid:
         points[1] = (down - 0.5) * self.film_mm[1]
         return points
 
-    def pixels_at(self, film_mm: FloatArray) -> NDArray[np.intp]:
-        """The pixels [...] that hold film points [..., 2, N] in mm; those at the edge for points beyond it."""
-        across = (0.5 - film_mm[..., 0, :] / np.float32(self.film_mm[0])) * np.float32(self.width)
-        down = (0.5 + film_mm[..., 1, :] / np.float32(self.film_mm[1])) * np.float32(self.height)
-        column, row = (np.clip(v, 0, n - 1).astype(np.intp) for v, n in ((across, self.width), (down, self.height)))
-        return row * self.width + column
-
 
 def check_memory(width: int, height: int, bytes_a_pixel: int = BYTES_A_PIXEL) -> None:
     """Refuse (InputError) a picture that alone would fill the machine, before memory is allocated."""

@@ -109,9 +109,10 @@ class Job:
             self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(white)))
         self._response = self.spectral.rotated(self.spectral.response)  # [lanes, 3, bins]
         self.luminance_row = SRGB.to_xyz[1] @ self.balance
-        self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
-        basis = self.spectral.rotated(self.spectral.basis)  # [lanes, 3, bins]
-        table = np.stack([np.concatenate([t, self._luminance[:, None]], axis=1) for t in (self._response, basis)])
+        tables = (self._response, self.spectral.rotated(self.spectral.basis))  # [lanes, 3, bins]
+        table = np.stack(
+            [np.concatenate([t, np.einsum("c,lcb->lb", self.luminance_row, t)[:, None]], 1) for t in tables]
+        )
         self._bins = np.ascontiguousarray(table.transpose(3, 0, 1, 2), np.float32)  # as `spill.c` has them
         tints = getattr(camera, "tints", None)
         light = None if tints is None else self.spectral.rotated(tints(self.spectral.centres_nm))
@@ -184,15 +185,15 @@ class Job:
         """
         if lens.places is not None:
             return self._spill(sums, value, bins, lens, tile)
-        response, factors = (t.take(bins, axis=-1, mode="clip") for t in (self._response, self._luminance))
-        dropped = ~(np.abs(np.einsum("ln,ln->n", factors, value)) <= _BRIGHTEST_SAMPLE)
+        light = np.einsum("lcn,ln->cn", self._response.take(bins, axis=-1, mode="clip"), value)
+        luminance = self.luminance_row.astype(np.float32) @ light
+        dropped = ~(np.abs(luminance) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
-            value = np.where(dropped, np.float32(0), value)
+            light[:, dropped] = luminance[dropped] = 0
         shape = (len(sums), len(bins) // len(sums))
         sums[:, columns.DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
-        luminance = np.einsum("ln,ln->n", factors, value).reshape(shape)
-        sums[:, columns.LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
-        sums[:, columns.RGB] = np.einsum("lcn,ln->cn", response, value).reshape(3, *shape).sum(axis=2).T
+        sums[:, columns.LUMINANCE2] = np.square(luminance, dtype=np.float64).reshape(shape).sum(axis=1)
+        sums[:, columns.RGB] = light.reshape(3, *shape).sum(axis=2).T
         return None
 
     def _spill(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, lens: LensRays, tile: slice) -> Spill:
