@@ -22,6 +22,8 @@ NAMES = {
     "vignetting": ("vignetting", "false passes and blocks, illumination"),
     "clipping": ("vignetting:clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),
     "outside": ("outside", "random inputs through exported models"),
+    "wild": ("wild", "wild numbers in every language: equal statuses, no NaN"),
+    "radiance": ("radiance", "a radiance field from photographs through a lens: pinhole, thin lens and lens"),
     "fused": ("fused_speed", "models as C against the exact lens as C"),
     "rays": ("rays", "an open benchmark of lens rays: error and time, ours beside other programs"),
     "tracer": ("tracer_race", "the exact lens as C beside a tracer written by hand"),

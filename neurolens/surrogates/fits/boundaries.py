@@ -35,6 +35,9 @@ from neurolens.surrogates.terms import (
 GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
+# Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
+# those errors, or by hardly more than with all terms. At a quarter as many rays were clipped wrongly as with all.
+NEEDED_SHARE, _NEARLY = 0.25, 1.1
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
@@ -79,27 +82,40 @@ def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
 
 
 def invariant_core(
-    data: Prepared, exponents: Exponents, columns: Sequence[int], coefficients: Tensor
+    data: Prepared, exponents: Exponents, columns: Sequence[int], coefficients: Tensor, *, sparse: bool = False
 ) -> InvariantPolynomial:
     """The polynomial on these monomials with all that is fitted on them after position and direction.
 
     Args:
         columns: places of the chosen ones among m p (first M) and m u (M more).
         coefficients: [2, C] of those, of position and direction.
+        sparse: whether the rest has only the terms that it needs.
     """
-    ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
+    ab, features = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64), features_of(exponents)
     ab[:STOP, list(columns)] = coefficients
-    ab[STOP] = fit_stop(data, features_of(exponents))
-    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
+    if not sparse:
+        ab[STOP] = fit_stop(data, features)
+        return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), solve_scalars(data, features).numpy())
+    stop, *gates = (fit.needed() for fit in _boundary_fits(data, _some(data), features(_some(data))))
+    crossing, weight = stop_crossing(data)
+    rows = vector_columns(features(data.boundary_field), data.boundary_field)[stop]
+    ab[STOP, stop] = solve(rows, crossing.reshape(1, -1), weight.repeat(2))[0]
+    rays = data.pairs.train
+    seen, wanted = features(data.encoding(rays.inputs)), rays.transmittance[None]
+    through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), TRANSMITTANCE_ERROR**-2 / len(rays), len(seen))
+    scalars = solve_scalars(data, features, [through.needed(), *gates])
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), scalars.numpy())
 
 
-def fit_scalars(data: Prepared, exponents: Exponents) -> Tensor:
-    """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
-    return solve_scalars(data, features_of(exponents))
+def _some(data: Prepared) -> LightField:
+    return LightField(*(c[..., :_RAYS] for c in data.boundary_field))
 
 
-def solve_scalars(data: Prepared, features: Features) -> Tensor:
-    """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
+def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] | None = None) -> Tensor:
+    """[1 + G, M]: transmittance on the passing rays, each gate on those that get as far, most on those that it decides.
+
+    Args:
+        kept: the features that the transmittance and each gate has; all without.
 
     Raises:
         InputError: no more rays near the boundaries than terms.
@@ -108,9 +124,12 @@ def solve_scalars(data: Prepared, features: Features) -> Tensor:
     train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
     if len(data.boundary) <= len(train):
         raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
-    fit = GateFit(near, gate_values(pairs.lens, data.gates, data.boundary), data.boundary_weights[0])
+    through, *gates = kept or [list(range(len(train)))] * (1 + len(data.gates))
+    fit = GateFit(near, gate_values(pairs.lens, data.gates, data.boundary), data.boundary_weights[0], gates)
     fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
-    return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
+    transmittance = torch.zeros((1, len(train)), dtype=torch.float64)
+    transmittance[:, through] = solve(train[through], pairs.train.transmittance[None])
+    return torch.cat([transmittance, fit.coefficients()])
 
 
 def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidden: Features | None = None) -> Exponents:
@@ -124,7 +143,7 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidde
         hidden: the features of a network's last hidden layer, which are held to a share of the errors.
     """
     added = further(invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive), exponents)
-    field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
+    field = _some(data)
     allowed, most, share = 1.0, MOST_BOUNDARY_TERMS, 1.0
     if hidden is not None:
         allowed, most = NETWORK_SHARE**2, MOST_NETWORK_TERMS
@@ -181,6 +200,13 @@ class _BoundaryFit:
             if self.sweep.scores("ols")[column] > 0:
                 self.sweep.add(column)
 
+    def needed(self) -> list[int]:
+        """The columns left when the cheapest are dropped one by one, as long as the error allows it."""
+        sweep, most = self.sweep, max(NEEDED_SHARE**2, _NEARLY * self.error)
+        while len(sweep.chosen) > 1 and self.error + float((costs := sweep.costs()).min()) * self.scale <= most:
+            sweep.drop(sweep.chosen[int(costs.argmin())])
+        return sorted(sweep.chosen)
+
     def scores(self) -> np.ndarray:
         return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
 
@@ -228,22 +254,24 @@ def _boundary_fits(
 
 
 class GateFit:
-    """Gates [G] on common features [M, N], each with weights of its own."""
+    """Gates [G] on features [M, N], each with weights, and features, of its own."""
 
-    def __init__(self, features: Tensor, values: Tensor, weights: Tensor) -> None:
-        """Fit values [G, N] with weights [G, N]."""
-        # In orthogonal columns, so that normal equations keep their digits; what depends on others is left out.
-        norms = features.norm(dim=1).clamp_min(1e-300)
-        _, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1], full_matrices=False)
-        kept = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
-        self._turn = (right[kept] / sizes[kept, None]).T / norms[:, None] * math.sqrt(features.shape[1])  # [M, K]
-        columns = features.T @ self._turn
-        self._grams, self._moments = [], []
-        for value, weight in zip(values, weights, strict=True):
-            rows = columns * weight[:, None]
+    def __init__(
+        self, features: Tensor, values: Tensor, weights: Tensor, kept: Sequence[list[int]] | None = None
+    ) -> None:
+        """Fit values [G, N] with weights [G, N]; `kept`: the features that each gate has, all without."""
+        self._kept, self._count = kept or [list(range(len(features)))] * len(values), len(features)
+        self._turns, self._grams, self._moments = list[Tensor](), list[Tensor](), list[Tensor]()
+        for gate, (value, weight) in enumerate(zip(values, weights, strict=True)):
+            same = gate > 0 and self._kept[gate] == self._kept[gate - 1]
+            self._turns.append(self._turns[-1] if same else _turn(features[self._kept[gate]]))
+            rows = self._columns(features, gate) * weight[:, None]
             self._grams.append(rows.T @ rows)
             self._moments.append(rows.T @ (value * weight))
         self._solutions = [self._solve(g) for g in range(len(values))]
+
+    def _columns(self, features: Tensor, gate: int) -> Tensor:
+        return features[self._kept[gate]].T @ self._turns[gate]
 
     def _solve(self, gate: int) -> Tensor:
         gram = self._grams[gate]
@@ -252,9 +280,10 @@ class GateFit:
 
     def coefficients(self) -> Tensor:
         """[G, M]."""
-        if not self._solutions:
-            return torch.empty((0, len(self._turn)), dtype=torch.float64)
-        return torch.stack(self._solutions) @ self._turn.T
+        found = torch.zeros((len(self._solutions), self._count), dtype=torch.float64)
+        for row, kept, turn, solution in zip(found, self._kept, self._turns, self._solutions, strict=True):
+            row[kept] = turn @ solution
+        return found
 
     def block(self, features: Tensor, values: Tensor, reached: Tensor) -> None:
         """Fit again until rays that do not pass are blocked by one gate at least.
@@ -267,8 +296,8 @@ class GateFit:
         blocks = (values > 0) | ~reached
         if not values.numel():
             return
-        columns = features.T @ self._turn
-        fitted = torch.stack([columns @ solution for solution in self._solutions])
+        columns = [self._columns(features, gate) for gate in range(len(values))]
+        fitted = torch.stack([c @ solution for c, solution in zip(columns, self._solutions, strict=True)])
         weight = torch.zeros_like(values)
         for _ in range(_ROUNDS):
             passing = (fitted <= 0).all(0) & blocks.any(0)
@@ -286,8 +315,17 @@ class GateFit:
                 more = torch.sqrt(heavier**2 - weight[g, at] ** 2)
                 weight[g, at] = heavier
                 target = torch.where(reached[g, at], values[g, at].clamp(_TARGET, _MOST_TARGET), _TARGET)
-                rows = columns[at] * more[:, None]
+                rows = columns[g][at] * more[:, None]
                 self._grams[g] = self._grams[g] + rows.T @ rows
                 self._moments[g] = self._moments[g] + rows.T @ (target * more)
                 self._solutions[g] = self._solve(g)
-                fitted[g] = columns @ self._solutions[g]
+                fitted[g] = columns[g] @ self._solutions[g]
+
+
+def _turn(features: Tensor) -> Tensor:
+    """[M, K] that makes columns of features [M, N] orthogonal, so that normal equations keep their digits; what depends
+    on others is left out."""
+    norms = features.norm(dim=1).clamp_min(1e-300)
+    _, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1], full_matrices=False)
+    kept = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
+    return (right[kept] / sizes[kept, None]).T / norms[:, None] * math.sqrt(features.shape[1])

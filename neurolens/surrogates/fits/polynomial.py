@@ -35,7 +35,6 @@ from neurolens.surrogates.cores import (
 from neurolens.surrogates.fits.boundaries import (
     boundary_terms,
     features_of,
-    fit_scalars,
     fit_stop,
     invariant_core,
     solve_scalars,
@@ -138,7 +137,7 @@ def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     exponents = np.concatenate([exponents, boundary_terms(data, exponents, first)])
     exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
     columns = [c if c < own else c - own + len(exponents) for c in columns]
-    return invariant_core(data, exponents, columns, coefficients)
+    return invariant_core(data, exponents, columns, coefficients, sparse=True)
 
 
 def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
@@ -262,7 +261,7 @@ def fit_paraxial(data: Prepared, method: ParaxialMethod) -> InvariantPolynomial:
     ab = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     ab[[POSITION, DIRECTION], :, 0] = ideal_map(data.pairs.lens, data.encoding, method)
     ab[STOP, :, 0] = fit_stop(data, features_of(exponents[:1]))
-    return InvariantPolynomial(exponents, ab.numpy(), fit_scalars(data, exponents).numpy())
+    return InvariantPolynomial(exponents, ab.numpy(), solve_scalars(data, features_of(exponents)).numpy())
 
 
 # ---- the planes of the light field ----
