@@ -173,7 +173,7 @@ def _spirv(glslang: str, code: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         text, binary = Path(folder) / "lens.hlsl", Path(folder) / "lens.spv"
         text.write_text(code)
-        command = [glslang, "-D", "-V", "-S", "comp", "-e", "run", text, "-o", binary]
+        command: list[Any] = [glslang, "-D", "-V", "-S", "comp", "-e", "run", text, "-o", binary]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout
         return binary.read_bytes()

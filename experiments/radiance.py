@@ -164,13 +164,13 @@ def measure(name: str, steps: int, folder: Path, report: Any) -> lab.Row:
     photos, where, held, views = photographs()
     lens = partial(LensCamera(lab.ROOT / MODEL, SHOT), wavelength_nm=NM)
     sharp = calibrated(lens, 0.0)
-    camera = {"lens": lens, "thin lens": calibrated(lens, 1.0), "pinhole": sharp}[name]
+    cameras: dict[str, Camera] = {"lens": lens, "thin lens": calibrated(lens, 1.0), "pinhole": sharp}
     start = time.process_time()
-    see = partial(field, train(camera, photos, where, steps, report))
+    see = partial(field, train(cameras[name], photos, where, steps, report))
     seconds = time.process_time() - start
     drawn, clear, wanted = (
         torch.stack([picture(c, of, pose, SHOWN_RAYS) for pose in views])
-        for c, of in ((camera, see), (sharp, see), (sharp, scene))
+        for c, of in ((cameras[name], see), (sharp, see), (sharp, scene))
     )
     four = torch.stack([p[0].reshape(SIZE[1], SIZE[0], 3) for p in (held, drawn, wanted, clear)]).transpose(0, 1)
     shown = (four.reshape(SIZE[1], -1, 3).clamp(0, 1) ** (1 / 2.2) * 255).byte().numpy()

@@ -40,7 +40,9 @@ from neurolens.surrogates.source import fused_program
 
 LENS, MODEL = "laikin_double_gauss_50", "laikin_double_gauss_50.ols-36.onnx"
 CHUNK = 1 << 17  # rays of one film plane and stop
-SPECIAL = np.float32([np.nan, np.inf, -np.inf, 3.4028235e38, -3.4028235e38, 1e-45, -1e-45, 1.2e-38, 1e20, 0.0, -0.0])
+SPECIAL = np.array(
+    [np.nan, np.inf, -np.inf, 3.4028235e38, -3.4028235e38, 1e-45, -1e-45, 1.2e-38, 1e20, 0.0, -0.0], np.float32
+)
 FLAGS = "-O1 -march=native -ffp-contract=off"
 TWICE = ("vex", "wgsl", "hlsl", "glsl")  # a b + c is rounded twice
 _NEAR, _ROUNDINGS = 4096, 3e-6  # rays tried around one whose status differs, and how far they are
@@ -112,7 +114,7 @@ def forms() -> dict[str, Form]:
         "exact lens": Form(exact, ends, at_call, others={"c": CompiledSource(exact).rays}),
         "whole camera": Form(
             whole[0], film | {"wavelength_nm": tuple(card["wavelength_nm"])},
-            tables={"outline": np.float32(camera.film.outline.table)},
+            tables={"outline": np.asarray(camera.film.outline.table, np.float32)},
             others={"c": CompiledSource(whole[1]).rays, "onnx": by_camera},
         ),
     }  # fmt: skip
@@ -127,7 +129,7 @@ def wild(form: Form, count: int, rng: np.random.Generator) -> dict[str, Any]:
         beyond = 0.0 if whole else 0.02 * spread
         own = rng.uniform(low - beyond, high + beyond, n).astype(np.float32)
         with np.errstate(over="ignore"):
-            kinds = [
+            kinds: Any = [
                 rng.integers(0, 2**32, n, dtype=np.uint32).view(np.float32), rng.choice(SPECIAL, n),
                 own * np.float32(10) ** rng.integers(-44, 38, n).astype(np.float32),
                 np.float32(low + spread * rng.uniform(-1, 2, n)),
@@ -166,7 +168,14 @@ def glsl(form: Form, rays: Mapping[str, Any]) -> Rows:
         shader, sent, out = (Path(folder) / name for name in ("lens.comp", "in.npy", "out.npy"))
         np.save(sent, given.rays)
         shader.write_text(text)
-        command = [sys.executable, str(Path(__file__).parent / "gl_compute.py"), shader, sent, out, str(len(names))]
+        command: list[Any] = [
+            sys.executable,
+            str(Path(__file__).parent / "gl_compute.py"),
+            shader,
+            sent,
+            out,
+            str(len(names)),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode == 3:
             raise Missing(done.stderr.strip())
