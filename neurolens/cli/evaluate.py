@@ -56,7 +56,6 @@ keeps its own; ./lenses; the project's."""
     seed: int | None = setting(
         None, "of the rays (default: one that differs from the fit's)", kind=whole(0), metavar="N"
     )
-    threads: int = setting(1, "for the timing (default: 1)", within=(1, 256))
 
     def run(self) -> int:
         """Measure, compare, time; 1 where a promise does not hold."""
@@ -75,7 +74,7 @@ keeps its own; ./lenses; the project's."""
             else:
                 figures, promises = check_model(model, lens, rays=self.rays, seed=self.seed)
         with progress.stage("time"):
-            timing = time_model(model, self.model.stem, rounds=10, threads=self.threads)
+            timing = time_model(model, self.model.stem, rounds=10)
         holds = all(p.holds for p in promises)
         data = {
             "model": str(self.model),

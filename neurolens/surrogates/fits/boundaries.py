@@ -36,7 +36,8 @@ GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
 # Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
-# those errors, or by hardly more than with all terms. At a quarter as many rays were clipped wrongly as with all.
+# those errors, or by hardly more than with all terms. At a quarter as many rays were clipped wrongly as with all;
+# networks clipped more, and keep all.
 NEEDED_SHARE, _NEARLY = 0.25, 1.1
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
@@ -93,18 +94,22 @@ def invariant_core(
     """
     ab, features = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64), features_of(exponents)
     ab[:STOP, list(columns)] = coefficients
-    if not sparse:
-        ab[STOP] = fit_stop(data, features)
-        return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), solve_scalars(data, features).numpy())
+    rest = fit_sparse(data, features) if sparse else (fit_stop(data, features), solve_scalars(data, features))
+    ab[STOP], scalars = rest
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), scalars.numpy())
+
+
+def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
+    """[2 M] and [1 + G, M] as `fit_stop` and `solve_scalars` give them, with the features that each needs."""
     stop, *gates = (fit.needed() for fit in _boundary_fits(data, _some(data), features(_some(data))))
     crossing, weight = stop_crossing(data)
-    rows = vector_columns(features(data.boundary_field), data.boundary_field)[stop]
-    ab[STOP, stop] = solve(rows, crossing.reshape(1, -1), weight.repeat(2))[0]
+    rows = vector_columns(features(data.boundary_field), data.boundary_field)
+    found = rows.new_zeros(len(rows))
+    found[stop] = solve(rows[stop], crossing.reshape(1, -1), weight.repeat(2))[0]
     rays = data.pairs.train
     seen, wanted = features(data.encoding(rays.inputs)), rays.transmittance[None]
     through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), TRANSMITTANCE_ERROR**-2 / len(rays), len(seen))
-    scalars = solve_scalars(data, features, [through.needed(), *gates])
-    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), scalars.numpy())
+    return found, solve_scalars(data, features, [through.needed(), *gates])
 
 
 def _some(data: Prepared) -> LightField:
@@ -124,8 +129,9 @@ def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] 
     train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
     if len(data.boundary) <= len(train):
         raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
-    through, *gates = kept or [list(range(len(train)))] * (1 + len(data.gates))
-    fit = GateFit(near, gate_values(pairs.lens, data.gates, data.boundary), data.boundary_weights[0], gates)
+    through, *gates = kept or [list(range(len(train)))]
+    values = gate_values(pairs.lens, data.gates, data.boundary)
+    fit = GateFit(near, values, data.boundary_weights[0], gates if kept else None)
     fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
     transmittance = torch.zeros((1, len(train)), dtype=torch.float64)
     transmittance[:, through] = solve(train[through], pairs.train.transmittance[None])
@@ -260,18 +266,15 @@ class GateFit:
         self, features: Tensor, values: Tensor, weights: Tensor, kept: Sequence[list[int]] | None = None
     ) -> None:
         """Fit values [G, N] with weights [G, N]; `kept`: the features that each gate has, all without."""
-        self._kept, self._count = kept or [list(range(len(features)))] * len(values), len(features)
-        self._turns, self._grams, self._moments = list[Tensor](), list[Tensor](), list[Tensor]()
-        for gate, (value, weight) in enumerate(zip(values, weights, strict=True)):
-            same = gate > 0 and self._kept[gate] == self._kept[gate - 1]
-            self._turns.append(self._turns[-1] if same else _turn(features[self._kept[gate]]))
-            rows = self._columns(features, gate) * weight[:, None]
+        self._terms = len(features)
+        all_of_them = [_turn(features, list(range(self._terms)))] * len(values) if kept is None else []
+        self._turns = all_of_them or [_turn(features, columns) for columns in kept or ()]
+        self._grams, self._moments = list[Tensor](), list[Tensor]()
+        for turn, value, weight in zip(self._turns, values, weights, strict=True):
+            rows = features.T @ turn * weight[:, None]
             self._grams.append(rows.T @ rows)
             self._moments.append(rows.T @ (value * weight))
         self._solutions = [self._solve(g) for g in range(len(values))]
-
-    def _columns(self, features: Tensor, gate: int) -> Tensor:
-        return features[self._kept[gate]].T @ self._turns[gate]
 
     def _solve(self, gate: int) -> Tensor:
         gram = self._grams[gate]
@@ -280,10 +283,8 @@ class GateFit:
 
     def coefficients(self) -> Tensor:
         """[G, M]."""
-        found = torch.zeros((len(self._solutions), self._count), dtype=torch.float64)
-        for row, kept, turn, solution in zip(found, self._kept, self._turns, self._solutions, strict=True):
-            row[kept] = turn @ solution
-        return found
+        found = [turn @ solution for turn, solution in zip(self._turns, self._solutions, strict=True)]
+        return torch.stack(found) if found else torch.empty((0, self._terms), dtype=torch.float64)
 
     def block(self, features: Tensor, values: Tensor, reached: Tensor) -> None:
         """Fit again until rays that do not pass are blocked by one gate at least.
@@ -296,7 +297,7 @@ class GateFit:
         blocks = (values > 0) | ~reached
         if not values.numel():
             return
-        columns = [self._columns(features, gate) for gate in range(len(values))]
+        columns = [features.T @ turn for turn in self._turns]
         fitted = torch.stack([c @ solution for c, solution in zip(columns, self._solutions, strict=True)])
         weight = torch.zeros_like(values)
         for _ in range(_ROUNDS):
@@ -322,10 +323,13 @@ class GateFit:
                 fitted[g] = columns[g] @ self._solutions[g]
 
 
-def _turn(features: Tensor) -> Tensor:
-    """[M, K] that makes columns of features [M, N] orthogonal, so that normal equations keep their digits; what depends
-    on others is left out."""
-    norms = features.norm(dim=1).clamp_min(1e-300)
-    _, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1], full_matrices=False)
-    kept = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
-    return (right[kept] / sizes[kept, None]).T / norms[:, None] * math.sqrt(features.shape[1])
+def _turn(features: Tensor, kept: list[int]) -> Tensor:
+    """[M, K] that makes orthogonal columns of some of the features [M, N], so that normal equations keep their digits;
+    what depends on others is left out."""
+    norms = features[kept].norm(dim=1).clamp_min(1e-300)
+    _, triangle = torch.linalg.qr((features[kept] / norms[:, None]).T)
+    _, sizes, right = torch.linalg.svd(triangle, full_matrices=False)
+    large = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
+    found = features.new_zeros((len(features), int(large.sum())))
+    found[kept] = (right[large] / sizes[large, None]).T / norms[:, None] * math.sqrt(features.shape[1])
+    return found
