@@ -101,7 +101,7 @@ def invariant_core(
 
 def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
     """[2 M] and [1 + G, M] as `fit_stop` and `solve_scalars` give them, with the features that each needs."""
-    stop, *gates = (fit.needed() for fit in _boundary_fits(data, _some(data), features(_some(data))))
+    stop, *gates = (fit.needed() for fit in _boundary_fits(data, features))
     crossing, weight = stop_crossing(data)
     rows = vector_columns(features(data.boundary_field), data.boundary_field)
     found = rows.new_zeros(len(rows))
@@ -110,10 +110,6 @@ def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
     seen, wanted = features(data.encoding(rays.inputs)), rays.transmittance[None]
     through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), TRANSMITTANCE_ERROR**-2 / len(rays), len(seen))
     return found, solve_scalars(data, features, [through.needed(), *gates])
-
-
-def _some(data: Prepared) -> LightField:
-    return LightField(*(c[..., :_RAYS] for c in data.boundary_field))
 
 
 def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] | None = None) -> Tensor:
@@ -149,20 +145,18 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidde
         hidden: the features of a network's last hidden layer, which are held to a share of the errors.
     """
     added = further(invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive), exponents)
-    field = _some(data)
     allowed, most, share = 1.0, MOST_BOUNDARY_TERMS, 1.0
     if hidden is not None:
         allowed, most = NETWORK_SHARE**2, MOST_NETWORK_TERMS
     if not np.array_equal(first, exponents[: len(first)]):
-        stop = _boundary_fits(data, field, features_of(first)(field), which=[0])[0]
+        stop = _boundary_fits(data, features_of(first), which=[0])[0]
         share = min(max(stop.error, STOP_KEPT), 1.0)
-    features = features_of(exponents, hidden)(field)
-    fits = _boundary_fits(data, field, features, stop_share=share)
+    fits = _boundary_fits(data, features_of(exponents, hidden), stop_share=share)
     bad = [k for k, fit in enumerate(fits) if fit.error > allowed]
     if not bad:
         return added[:0]
-    start, features = len(features), features_of(np.concatenate([exponents, added]), hidden)(field)
-    fits = _boundary_fits(data, field, features, start, bad, share)
+    start, features = fits[0].terms, features_of(np.concatenate([exponents, added]), hidden)
+    fits = _boundary_fits(data, features, start, bad, share)
     return added[[k - start for k in _selected(fits, min(most, len(added)), allowed)]]
 
 
@@ -233,12 +227,7 @@ def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: f
 
 
 def _boundary_fits(
-    data: Prepared,
-    field: LightField,
-    features: Tensor,
-    start: int | None = None,
-    which: list[int] | None = None,
-    stop_share: float = 1.0,
+    data: Prepared, features: Features, start: int | None = None, which: list[int] | None = None, stop_share: float = 1
 ) -> list[_BoundaryFit]:
     """The fits of the stop crossing and of every gate, or some `which` of them, with the first `start` terms in.
 
@@ -246,14 +235,16 @@ def _boundary_fits(
     """
     crossing, weight = stop_crossing(data)
     values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
-    rays, terms, fits = features.shape[1], len(features), []
+    field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
+    seen, fits = features(field), []
+    terms, rays = seen.shape
     for k in range(1 + len(values)) if which is None else which:
         w = (weights[k - 1] if k else weight)[:rays]
         if k:
-            sweep = Sweep.of_columns(features * w, (values[k - 1, :rays] * w)[None])
+            sweep = Sweep.of_columns(seen * w, (values[k - 1, :rays] * w)[None])
         else:
             weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
-            sweep = Sweep.of_vectors(features, weighed, (crossing[:, :rays] * w)[None])
+            sweep = Sweep.of_vectors(seen, weighed, (crossing[:, :rays] * w)[None])
         allowed = (GATE_ERROR**2 if k else STOP_ERROR**2 * stop_share) * max(float((w * w).sum()), 1e-300)
         fits.append(_BoundaryFit(sweep, terms, 1 / allowed, terms if start is None else start))
     return fits

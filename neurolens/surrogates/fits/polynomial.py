@@ -23,13 +23,7 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.surrogates.cores import (
-    DIRECTION,
-    POSITION,
-    STOP,
-    InvariantPolynomial,
-    MirrorPolynomial,
-)
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, MirrorPolynomial
 from neurolens.surrogates.fits.boundaries import (
     boundary_terms,
     features_of,
