@@ -22,7 +22,6 @@ from neurolens.cli import export_lens, main
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
-from neurolens.setting import focusing
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras
@@ -65,9 +64,8 @@ def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["laikin_double_gauss_50", *whole("phone_lens_6")])
-def test_the_film_of_a_focus_and_stop_is_that_of_best_focus(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_film_of_a_focus_and_stop_is_that_of_best_focus(name: str) -> None:
     """Of an exact lens, within the error that is told; it rises as objects come nearer, and stays beyond the ends."""
-    monkeypatch.setattr(focusing, "_RINGS", 96)  # rays of best focus, for the function as for what it is held to
     lens = set_lens(read_lens(LENS.with_name(f"{name}.toml")))
     near_m, widest = 12e-3 * float(first_order(lens).efl_mm), float(lens.stop_radius_mm)
 

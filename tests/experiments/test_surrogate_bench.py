@@ -26,7 +26,7 @@ ROWS = (
     Row("thick", "paraxial", ModelSettings("thick")),
     Row("ols-12", "ours", ModelSettings("ols", terms=12, degree=4)),
     Row("ols-24", "ours", ModelSettings("ols", terms=24, degree=5)),
-    Row("refused", "published", ModelSettings("dense", degree=9, basis="raw"), "a paper"),
+    Row("refused", "published", ModelSettings("dense", degree=9), "a paper"),
 )
 
 

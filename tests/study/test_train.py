@@ -52,9 +52,6 @@ scenes = ["ROOT/experiments/scenes/grid.toml"]
 width = 32
 height = 18
 samples = 4
-[scene_domain]
-scene = "ROOT/experiments/scenes/grid.toml"
-model = { method = "ols", terms = 24, planes = false }
 """
 
 
@@ -95,14 +92,6 @@ def test_errors_are_in_the_order_that_physics_gives_and_hold_when_stopped_down(r
     assert set(stopped["mlp-8x2"]) == {"2_stops", "4_stops"}
 
 
-def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
-    whole, shot, half = run[1]["domain_gain"]["rows"]
-    assert whole["nearest_m"] is None and 0.5 < shot["nearest_m"] < 10
-    assert shot["film_radius_mm"] < whole["film_radius_mm"]
-    assert shot["rms_um"] < whole["rms_um"]
-    assert half["coefficients_per_vector"] == shot["coefficients_per_vector"] / 2
-
-
 def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The final name comes when the errors are in the card."""
     there: list[list[Path]] = []
@@ -129,8 +118,7 @@ def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeyp
 def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:
     out = run[0] / "out"
     before = {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")}
-    quick = ["render.scenes=[]", "scene_domain=none"]
-    again = run_experiment(read_experiment(out / "config.toml", quick), out)
+    again = run_experiment(read_experiment(out / "config.toml", ["render.scenes=[]"]), out)
     assert {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")} == before
     assert [m["rms_um"] for m in again["models"]] == [m["rms_um"] for m in run[1]["models"]]
 
@@ -145,7 +133,6 @@ def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict
         ("nonsense=1", "nonsense"),
         ('model=[{name="../../evil"}]', "model"),
         ('model=[{name=".hidden"}]', "model"),
-        ('scene_domain.model.name="a/b"', "scene_domain"),
     ],
 )
 def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) -> None:
@@ -217,9 +204,6 @@ def test_states_that_cannot_be_asked_for(file: Path, overrides: list[str], field
         default_experiment(file, overrides).states()
 
 
-@pytest.mark.parametrize(
-    "settings", [ModelSettings("mlp"), ModelSettings("ols", basis="raw"), ModelSettings("ols", partitions=2)]
-)
-def test_models_that_know_no_states(settings: ModelSettings) -> None:
+def test_networks_know_no_states() -> None:
     with pytest.raises(InputError, match="many states"):
-        state_settings(settings, 1000, 1)
+        state_settings(ModelSettings("mlp"), 1000, 1)

@@ -196,7 +196,7 @@ def put(array: dict[str, Any], form: str, at: slice, raw: bytes) -> None:
 def nest(data: dict[str, Any]) -> None:
     node = data["nodes"][0]
     for _ in range(20):
-        node["core"] = {"kind": "partitioned", "edges": [], "parts": [node["core"]]}
+        node["core"] = {"kind": "residual", "parts": [node["core"]]}
 
 
 DAMAGE: dict[str, Callable[[dict[str, Any]], object]] = {

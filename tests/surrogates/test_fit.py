@@ -1,4 +1,4 @@
-"""Fits near grazing, of zones, and with a network on top; what each part of a fit is worth; bad settings."""
+"""Fits near grazing, and with a network on top; what each part of a fit is worth; bad settings."""
 
 import math
 from dataclasses import replace
@@ -19,13 +19,13 @@ from neurolens.lens.prescription import Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.surrogates import targets
 from neurolens.surrogates.assemble import refracted, tilt_series
-from neurolens.surrogates.cores import Partitioned, Refracted, Residual
+from neurolens.surrogates.cores import Refracted, Residual
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.targets import film_equivalent, targets_of
-from neurolens.surrogates.terms import invariant_exponents, raw_exponents
+from neurolens.surrogates.terms import invariant_exponents
 from neurolens.trace.shapes import sag_and_derivatives
 from neurolens.trace.surfaces import entered
 
@@ -35,7 +35,6 @@ from neurolens.trace.surfaces import entered
     [
         *(("degree", v) for v in (-1, 17, 10**9)),
         *(("terms", v) for v in (0, -3, 2001)),
-        *(("partitions", v) for v in (0, 65)),
         *(("units", v) for v in (0, 513)),
         *(("layers", v) for v in (0, 9)),
         *(("steps", v) for v in (0, 10**9)),
@@ -46,10 +45,7 @@ def test_numbers_without_bounds_are_refused(field: str, value: Any) -> None:
         ModelSettings(**{field: value})
 
 
-def test_raw_candidates_are_bounded_by_their_number() -> None:
-    with pytest.raises(InputError, match="degree"):
-        ModelSettings(basis="raw", degree=12)
-    assert len(raw_exponents(ModelSettings(basis="raw", degree=11).degree)) <= 5000
+def test_candidates_are_bounded_by_their_number() -> None:
     assert 2 * len(invariant_exponents(ModelSettings(degree=16).degree)) <= 5000
 
 
@@ -71,16 +67,6 @@ def test_transmittance_terms_follow_absorption() -> None:
         truth = _infinity(stem).pairs.held_out
         off.append(float((model.predict(truth.inputs).transmittance - truth.transmittance).square().mean().sqrt()))
     assert off[1] < 4e-4 < off[0]
-
-
-@pytest.fixture(scope="module")
-def zoned() -> LensModel:
-    return fit_model(prepared(), ModelSettings(method="adaptive", terms=16, partitions=3))
-
-
-def test_more_zones_than_rays_can_fill_are_refused() -> None:
-    with pytest.raises(InputError, match="partitions"):
-        fit_model(prepared(), ModelSettings(terms=16, partitions=10_000))
 
 
 SETTINGS = ModelSettings("ols+mlp", terms=12, degree=5, planes=False, units=8, layers=1, steps=60)
@@ -108,14 +94,6 @@ def test_it_is_the_sum_of_its_parts(model: LensModel) -> None:
     field = model.encoding(prepared().pairs.held_out.inputs.select(slice(0, 100)))
     for total, one, other in zip(model.core(field), *(part(field) for part in model.core.parts), strict=True):
         torch.testing.assert_close(total, one + other, rtol=0, atol=1e-13)
-
-
-def test_zones_and_what_is_refused() -> None:
-    zoned = fit_model(prepared(), replace(SETTINGS, units=3, steps=5, partitions=2))
-    assert isinstance(zoned.core, Partitioned)
-    assert all(isinstance(part, Residual) for part in zoned.core.parts)
-    with pytest.raises(InputError, match="basis"):
-        fit_model(prepared(), replace(SETTINGS, basis="raw", degree=3))
 
 
 # ---- rays that leave the front surface at grazing angles ----

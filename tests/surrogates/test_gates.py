@@ -73,9 +73,7 @@ def test_where_no_ray_is_lost_there_are_rims_alone() -> None:
     ("name", "method", "most"),
     [
         ("hemisphere", "ols", 0.005),
-        ("singlet", ModelSettings("dense", basis="raw", degree=4), 0.03),
         *whole(("singlet", ModelSettings("mlp", units=12, steps=15), 0.03)),
-        ("hemisphere", ModelSettings("dense", basis="raw", degree=4), 0.03),
         ("singlet", ModelSettings("thick"), 0.06),
         ("hemisphere", ModelSettings("thick"), 0.06),
     ],
@@ -249,14 +247,13 @@ POOR = {
 }
 
 
-@pytest.mark.parametrize("method", ["ols", *whole("adaptive")])
 @pytest.mark.parametrize("kind", POOR)
-def test_poor_data_are_fitted_as_far_as_they_tell(kind: str, method: str) -> None:
+def test_poor_data_are_fitted_as_far_as_they_tell(kind: str) -> None:
     """Finite, sound in float32, and right on the rays that there were."""
     off_mm = []
     for train in POOR[kind]():
         pairs = replace(prepared().pairs, train=train)
-        settings = ModelSettings(method, terms=30, degree=4, growth=1)  # type: ignore[arg-type]
+        settings = ModelSettings(terms=30, degree=4, growth=1)
         core = fit_polynomial(replace(prepared(), pairs=pairs), settings)
         assert isinstance(core, InvariantPolynomial)
         assert np.isfinite(core.ab).all() and np.isfinite(core.scalars).all()

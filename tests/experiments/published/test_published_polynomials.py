@@ -28,8 +28,8 @@ from neurolens.surrogates.targets import fit_encoding, scales_of
 from neurolens.trace.rays import Rays, trace
 
 FAST = {
-    "dense": PublishedSettings("hanika", basis="raw", degree=3),
-    "sparse": PublishedSettings("schrade", basis="raw", degree=5, terms=12),
+    "dense": PublishedSettings("hanika", degree=3),
+    "sparse": PublishedSettings("schrade", degree=5, terms=12),
 }
 
 

@@ -13,13 +13,12 @@ from torch import Tensor
 
 from experiments.published import PublishedSettings, fit_any
 from experiments.published.adaptive import Cells, fit_adaptive
-from experiments.published.data import RawData
+from experiments.published.data import RawData, RawPolynomial
 from experiments.published.neural import Layers
 from experiments.published.rtf import least_ellipse, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.study.rays import ray_errors
-from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
@@ -28,7 +27,7 @@ from neurolens.surrogates.pairs import trace_pairs
 
 @cache
 def fitted() -> LensModel:
-    return fit_any(lens_models.prepared(), PublishedSettings("rtf", basis="raw", degree=6))
+    return fit_any(lens_models.prepared(), PublishedSettings("rtf", degree=6))
 
 
 def test_turning_is_a_rotation_onto_the_y_axis() -> None:
@@ -142,7 +141,7 @@ def test_cells_give_each_ray_the_polynomial_of_its_cell() -> None:
 
 @pytest.mark.parametrize("method", ("zheng-adaptive", "neurolens2017"))
 def test_more_cells_than_rays_allow_are_refused(method: str) -> None:
-    settings = PublishedSettings(method, basis="raw", terms=4, partitions=64)
+    settings = PublishedSettings(method, terms=4, partitions=64)
     with pytest.raises(InputError, match="partitions"):
         fit_any(lens_models.prepared(), settings)
 
