@@ -47,7 +47,6 @@ POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no terms for transmittance": {"transmittance_terms": 0},
     "forward selection alone": {"planes": False, "growth": 0, "elimination": False, "replacement": False},
     "matching pursuit": {"method": "omp"},
-    "raw monomials": {"basis": "raw", "degree": 5},
 }
 # What each ablation changes in a network.
 NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {"20 steps of training": {"steps": 20}, "one layer": {"layers": 1}}

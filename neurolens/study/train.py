@@ -279,9 +279,9 @@ def state_settings(settings: ModelSettings, rays: int, seed: int) -> StateSettin
     """The settings of a model of one state as those of many states.
 
     Raises:
-        InputError: another method than "ols", zones, or the raw basis.
+        InputError: another method than "ols".
     """
-    if (settings.method, settings.basis, settings.partitions) != ("ols", "invariants", 1):
+    if settings.method != "ols":
         raise InputError("settings", "model", settings.label, 'method "ols" on the invariants, for many states')
     return StateSettings(settings.terms, settings.degree, rays, seed, settings.name or f"states-{settings.terms}")
 

@@ -5,12 +5,10 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from shipped import whole
-from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -306,42 +304,6 @@ def opening(
     return predict
 
 
-def stopped_down(lens: Lens, domain: Domain, predict: Any, count: int) -> list[dict[str, Any]]:
-    """At full aperture, and closed by two and by four stops."""
-    radii = [domain.stop_radius_mm / 2 ** (closed / 2) for closed in (0, 2, 4)]
-    return [vignetting_errors(lens, domain, predict, stop_radius_mm=r, count=count) for r in radii]
-
-
-@pytest.mark.parametrize(
-    ("factor", "wrong", "share"),
-    [
-        (1.0, "false_pass", 0.0),
-        # Too large, it passes the ring; too small, it blocks it.
-        (1.01, "false_pass", (1.01**2 - 1) / 1.01**2),
-        (0.99, "false_block", 1 - 0.99**2),
-    ],
-)
-def test_false_shares_of_a_hole(factor: float, wrong: str, share: float) -> None:
-    result = vignetting_errors(*hole(10.0), opening(factor), count=131072)
-    assert result[wrong] == pytest.approx(share, rel=0.02)
-    assert result["false_block" if wrong == "false_pass" else "false_pass"] == 0
-    assert result["passing_share"] == pytest.approx(1 / 1.05**2, rel=2e-3)
-
-
-def test_stopping_down_keeps_the_shares_of_a_hole() -> None:
-    lens, domain = hole(10.0)
-    results = stopped_down(lens, domain, opening(1.01), count=262144)
-    assert [result["stop_radius_mm"] for result in results] == pytest.approx([10, 5, 2.5])
-    for result in results:
-        assert result["false_pass"] == pytest.approx((1.01**2 - 1) / 1.01**2, rel=0.05)
-
-
-def test_zones_tell_where_on_the_film() -> None:
-    zones = vignetting_errors(*hole(10.0), opening(1.01, beyond_mm=FILM_RADIUS * 2 / 3), count=65536)["zones"]
-    assert zones["centre"]["false_pass"] == zones["mid"]["false_pass"] == 0
-    assert zones["edge"]["false_pass"] == pytest.approx((1.01**2 - 1) / 1.01**2, rel=0.05)
-
-
 def test_illumination_of_a_small_hole_is_cos4() -> None:
     result = relative_illumination(*hole(0.2), opening(1.0, 0.9), points=4096, rows=9)
     expected = [math.cos(math.atan2(r, FILM_Z)) ** 4 for r in result.film_radius_mm]
@@ -349,19 +311,3 @@ def test_illumination_of_a_small_hole_is_cos4() -> None:
     assert result.model == pytest.approx([0.9 * e for e in expected], rel=1e-4)
     assert result.max_difference == pytest.approx(0.1, rel=1e-4)
     assert result.film_radius_mm[-1] == FILM_RADIUS
-
-
-def test_a_real_lens_against_itself_stopped_down() -> None:
-    lens = set_lens(read_lens(LENSES / "laikin_double_gauss_50.toml"))
-    domain = domain_of(lens)
-
-    def exactly(rays: FilmRays, stop_radius_mm: float | None) -> SimpleNamespace:
-        assert stop_radius_mm is not None
-        traced = trace_pairs(lens.with_stop_radius(stop_radius_mm), rays, domain.pupil_z_mm)
-        return SimpleNamespace(status=traced.status, transmittance=traced.transmittance)
-
-    for result in stopped_down(lens, domain, exactly, count=32768):
-        assert result["false_pass"] == result["false_block"] == 0
-    light = relative_illumination(lens, domain, exactly, points=2048, rows=5)
-    assert light.max_difference < 1e-15  # where crossings are recorded, roots are rounded otherwise
-    assert light.exact[0] == 1 and light.exact[-1] < 0.5  # a fast double Gauss darkens by over a stop in the corner

@@ -74,18 +74,6 @@ def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
     assert result.timing("absent") is None and result.speedup("pinhole", "absent") is None
 
 
-@pytest.mark.whole
-@pytest.mark.slow
-def test_without_a_compiler_the_compiled_tracer_is_unavailable(domain: Domain) -> None:
-    import torch._inductor.config as inductor
-
-    # torch's own patch: monkeypatch leaves its settings unusable. A kernel compiled before would need no compiler.
-    with inductor.patch({"cpp.cxx": ("/nowhere/c++",), "fx_graph_cache": False}):
-        result = race(exact_candidates(LENS, domain), domain, rounds=1)
-    assert "exact eager" in result.ns
-    assert "compiler" in result.unavailable["exact compiled"].lower()
-
-
 def test_bad_settings_are_refused(domain: Domain) -> None:
     pinhole = camera_candidate(Pinhole(50.0), domain)
     for words, candidates, rounds in (("differ", [pinhole] * 2, 1), ("round", [pinhole], 0)):

