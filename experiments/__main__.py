@@ -16,7 +16,7 @@ from neurolens.cli.arguments import Parser
 
 NAMES = {
     "extremes": ("extremes", "errors and statuses at the ends of what optics allows"),
-    "pupils": ("pupils", "share of rays that pass a lens, by how its pupil is sampled"),
+    "pupils": ("pupils", "share of rays that pass a lens of those sent through its outlines"),
     "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),
     "vignetting": ("vignetting", "false passes and blocks, illumination"),
     "clipping": ("vignetting:clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),

@@ -60,7 +60,7 @@ def measure(case: Case, samples: int = SAMPLES, wider: float = 1.1) -> lab.Row:
     camera = ExactCamera(lens, Shot(FILM_MM, math.inf))
     outline = camera.film.outline
     draws = SobolEngine(5, scramble=True, seed=1).draw(samples).numpy().T
-    film = (draws[:2] - 0.5) * np.array(FILM_MM, np.float32)[:, None]
+    film: Any = (draws[:2] - 0.5) * np.array(FILM_MM, np.float32)[:, None]
     lit = np.hypot(*film) <= outline.film_radius_mm
     film, square, wavelength = film[:, lit], draws[2:4, lit], 400 + 300 * draws[4, lit]
 

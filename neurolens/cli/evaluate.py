@@ -64,7 +64,7 @@ keeps its own; ./lenses; the project's."""
         from neurolens.study.speed import time_model
         from neurolens.surrogates.card import transmittance_of
 
-        model = load_model(self.model)  # on one thread: the race distributes batches
+        model = load_model(self.model)
         space = space_of_card(model.card, model.axes, self.lens, self.model) if model.axes else None
         lens = space.lens if space else lens_of_card(model.card, self.lens, self.model)
         progress = self.progress({"measure": 10, "time": 2})
@@ -110,8 +110,7 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
         f"{data['model']}: {data['method']} of {lens['name']} ({lens['file']})\n"
         f"{data['rays']} fresh rays, seed {data['seed']}",
         table(header, rows),
-        f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
-        f"batches of {timing['batch']}",
+        f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}) on one thread, batches of {timing['batch']}",
     ]
     parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
     if data["transmittance"] == AVERAGED:
