@@ -63,7 +63,6 @@ keeps its own; ./lenses; the project's."""
         from neurolens.cameras.model import load_model
         from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
         from neurolens.study.speed import time_model
-        from neurolens.surrogates.card import transmittance_of
 
         model = load_model(self.model)  # on one thread: the race distributes batches
         space = space_of_card(model.card, model.axes, self.lens, self.model) if model.axes else None
@@ -81,7 +80,6 @@ keeps its own; ./lenses; the project's."""
             "model": str(self.model),
             "lens": {"id": model.card["lens"]["id"], "name": lens.name, "file": lens.path},
             "method": model.card["fit"]["method"],
-            "transmittance": transmittance_of(model.card),
             **figures,
             "ns_per_ray": timing,
             "promises": [{**asdict(p), "holds": p.holds} for p in promises],
@@ -92,8 +90,6 @@ keeps its own; ./lenses; the project's."""
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:
-    from neurolens.surrogates.card import AVERAGED
-
     header: tuple[str, ...] = ("figure", "promised", "measured", "allowed", "")
     rows: list[tuple[str, ...]] = [
         (p.key, number(p.promised), number(p.measured), number(p.allowed), "" if p.holds else "does not hold")
@@ -115,6 +111,4 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
         f"batches of {timing['batch']}",
     ]
     parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
-    if data["transmittance"] == AVERAGED:
-        parts.append("Transmittance: its fit averaged over polarisation at every surface, the lens here does not.")
     return "\n\n".join([*parts, verdict])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,17 +17,10 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.shaders.source import Focusing
 
+if TYPE_CHECKING:
+    from neurolens.shaders.pupil import PupilCircles, PupilDisc
+
 _PART = 1 << 15  # rays that are evaluated together
-
-
-class Pupil(Protocol):
-    """The sampler of a shader's rays: `graph` takes a film point and two random numbers to a pupil point."""
-
-    @property
-    def film_radius_mm(self) -> float: ...
-
-    @property
-    def graph(self) -> Graph: ...
 
 
 @dataclass(frozen=True)
@@ -109,7 +102,9 @@ Array = NDArray[np.float64]
 _SAMPLES, _TRIES = 20_000, 64  # film points; samples that decide whether one has light
 
 
-def passing_share(lens: ShaderLens, pupil: Pupil, stops: Sequence[float] = (1.0, 0.5, 0.25)) -> dict[float, float]:
+def passing_share(
+    lens: ShaderLens, pupil: PupilCircles | PupilDisc, stops: Sequence[float] = (1.0, 0.5, 0.25)
+) -> dict[float, float]:
     """The share of samples that pass, all over the film, by shares of the widest stop.
 
     Film points without light do not count: those whose ray is blocked count where any of 64 more rays passes.
@@ -133,7 +128,7 @@ def passing_share(lens: ShaderLens, pupil: Pupil, stops: Sequence[float] = (1.0,
 
 
 def _sampled(
-    lens: ShaderLens, pupil: Pupil, square: Array, film: Array, call: Array, share: float
+    lens: ShaderLens, pupil: PupilCircles | PupilDisc, square: Array, film: Array, call: Array, share: float
 ) -> NDArray[np.bool_]:
     """Test whether rays [N] of points of the unit square pass, at film positions and wavelengths `call` [2, N]."""
     (film_z, nanometres), stop = call, np.array([[share * lens.stop_radius_mm]])
