@@ -14,7 +14,7 @@ from lens_models import edited
 
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.model import load_model
-from neurolens.cameras.onnxmaps import load_inverse
+from neurolens.cameras.onnxlens import load_inverse
 from neurolens.cli import main
 from neurolens.cli.arguments import Parser
 from neurolens.render.pictures import read_exr, write_exr
