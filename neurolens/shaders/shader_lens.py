@@ -20,6 +20,7 @@ from neurolens.shaders.source import Focusing
 if TYPE_CHECKING:
     from neurolens.shaders.pupil import PupilCircles, PupilDisc
 
+Array = NDArray[np.float64]
 _PART = 1 << 15  # rays that are evaluated together
 
 
@@ -62,6 +63,12 @@ class ShaderLens:
                 radii.append(end_of_light(self.table, pass_test(passes, self.wavelength_nm)) or 0.0)
         return min(max(radii), self.film_radius_mm)
 
+    def drawn_in_boxes(self, radius: Array, rng: np.random.Generator) -> Array:
+        """Random pupil points [2, N] in the boxes of film points at radii [N] along +x."""
+        radii = np.linspace(0, self.film_radius_mm, self.table.rows.shape[1])
+        low, high, half = (np.interp(radius, radii, row) for row in self.table.rows)
+        return np.stack([low + (high - low) * rng.random(radius.size), half * rng.uniform(-1, 1, radius.size)])
+
     def _passes(
         self, film: FloatArray, pupil: FloatArray, nanometres: float, film_z: float, azimuth: float
     ) -> NDArray[np.bool_]:
@@ -98,7 +105,6 @@ def _row(value: ArrayLike) -> NDArray[np.float32]:
     return np.asarray(value, np.float32).reshape(1, -1)
 
 
-Array = NDArray[np.float64]
 _SAMPLES, _TRIES = 20_000, 64  # film points; samples that decide whether one has light
 
 
