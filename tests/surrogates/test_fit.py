@@ -11,7 +11,6 @@ import pytest
 import torch
 from lens_models import LENSES, prepared
 
-from experiments.methods import ablated
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -57,21 +56,6 @@ def test_candidates_are_bounded_by_their_number() -> None:
 def _infinity(stem: str) -> Prepared:
     lens = read_lens(LENSES / f"{stem}.toml")
     return prepare(make_pairs(lens, domain_of(lens), PairSettings(3000, 3000, 3000)))
-
-
-@cache
-def direction_rms(settings: ModelSettings) -> float:
-    model = fit_model(_infinity("angenieux_retrofocus_35"), settings)
-    targets = targets_of(model.lens, model.encoding, _infinity("angenieux_retrofocus_35").pairs.held_out)
-    return float((model.core(targets.field)[0][1] - targets.vectors[1]).square().sum(0).mean().sqrt())
-
-
-@pytest.mark.whole  # an ablation
-@pytest.mark.slow
-def test_every_part_of_the_fit_is_worth_something() -> None:
-    whole = direction_rms(ModelSettings(terms=24))
-    for name in ("planes not searched", "forward selection alone", "matching pursuit"):
-        assert whole < 0.8 * direction_rms(ablated(ModelSettings(terms=24), name)), name
 
 
 def test_transmittance_terms_follow_absorption() -> None:

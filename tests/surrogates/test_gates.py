@@ -19,15 +19,15 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.domain import SPARSE, FilmRays, domain_of, lit_share, sample_domain, sample_lit
+from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits.boundaries import GateFit
 from neurolens.surrogates.fits.polynomial import fit_polynomial
-from neurolens.surrogates.gates import boundary_rays, choose_gates, gate_reach, gate_values
+from neurolens.surrogates.gates import boundary_rays, gate_reach, gate_values
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Domain, Gate, LensModel
-from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, reached, trace_pairs
+from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
 from neurolens.surrogates.targets import targets_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -95,21 +95,6 @@ def test_two_gates_for_one_reason_on_a_surface_are_refused(tmp_path: Path) -> No
             export_onnx(replace(model, gates=twice), tmp_path / "m.onnx")
 
 
-@pytest.mark.parametrize("name", ["singlet", "hemisphere"])
-def test_edge_rays_are_lost_and_finite(name: str) -> None:
-    pairs = gated(name).pairs
-    edge = pairs.edge
-    assert 100 < len(edge) <= 5000
-    assert not ((edge.meets > 0) & (edge.refracts > 0)).all(0).any()
-    surfaces = torch.stack([edge.cross_x, edge.cross_y, edge.meets, edge.refracts])
-    assert torch.isfinite(surfaces).all()
-    assert (surfaces[:, ~reached(edge)] == 0).all()
-    # What it says of a ray that gets somewhere is what tracing says.
-    again = trace_pairs(pairs.lens, edge.inputs, pairs.domain.pupil_z_mm)
-    assert torch.equal(reached(edge), reached(again))
-    assert torch.equal(edge.refracts[reached(edge)], again.refracts[reached(edge)])
-
-
 def test_gate_values_say_what_stopped_each_ray() -> None:
     known, rays = gated("hemisphere"), fresh("hemisphere")
     values, arrives = gate_values(known.pairs.lens, known.gates, rays), gate_reach(known.gates, rays)
@@ -140,14 +125,6 @@ def test_a_rim_near_the_end_of_its_sphere_is_told_beyond_the_equator() -> None:
     torch.testing.assert_close(value[near & ~stopped], exact[near & ~stopped] / limit - 1, rtol=0, atol=1e-9)
 
 
-def test_only_rays_that_refract_all_the_way_choose_rims() -> None:
-    """A lost ray's crossings beyond the place where it ended are no crossings."""
-    pairs = gated("hemisphere").pairs
-    lost = pairs.edge.select(slice(0, 500))
-    wild = replace(lost, cross_x=lost.cross_x + 1e6 * ~reached(lost))
-    assert {g.reason for g in choose_gates(pairs.lens, wild)} <= {st.MISSED, st.TOTAL_REFLECTION}
-
-
 RAYS = PairSettings(train=4000, held_out=100, rim=4000)
 
 
@@ -166,19 +143,6 @@ def fitted(lens: Lens, domain: Domain, terms: int = 40, rays: PairSettings = RAY
     return fit_model(prepare(make_pairs(lens, domain, rays)), ModelSettings("ols", terms=terms, planes=False))
 
 
-@pytest.mark.whole  # as a tiny rim far in front
-def test_where_little_passes_rays_are_drawn_where_it_does() -> None:
-    """The share that passes is known all the same, and no passing ray lies outside the boxes."""
-    lens, domain = narrow()
-    assert lit_share(domain) < SPARSE
-    drawn, stands_for = sample_lit(domain, 60_000, seed=3)
-    found = (trace_pairs(lens, drawn, domain.pupil_z_mm).status == st.PASSED).sum() / stands_for
-    everywhere = trace_pairs(lens, sample_domain(domain, 400_000, seed=4), domain.pupil_z_mm)
-    share = float((everywhere.status == st.PASSED).double().mean())
-    assert share < 0.012
-    assert float(found) == pytest.approx(share, rel=0.06)  # 4 sigma of some 4000 passing rays
-
-
 def test_rays_of_the_boxes_pass_uniformly() -> None:
     """The same distribution over film and pupil as that of the passing rays of the whole domain."""
     lens, domain = narrow()
@@ -191,15 +155,6 @@ def test_rays_of_the_boxes_pass_uniformly() -> None:
         points = torch.quantile(torch.cat([a, b]), torch.linspace(0.05, 0.95, 19, dtype=torch.float64))
         apart = max(abs(float((a < p).double().mean() - (b < p).double().mean())) for p in points)
         assert apart < 1.95 * math.sqrt(1 / len(a) + 1 / len(b))  # Kolmogorov and Smirnov, one in a thousand
-
-
-@pytest.mark.whole  # as a tiny rim far in front
-@pytest.mark.slow
-def test_a_lens_where_almost_no_ray_passes() -> None:
-    lens, domain = narrow()
-    found = vignetting_errors(lens, domain, fitted(lens, domain).predict, count=200_000)
-    assert found["passing_share"] < 0.012
-    assert found["false_pass"] < 0.005 and found["false_block"] < 0.005
 
 
 @pytest.mark.slow
@@ -260,14 +215,6 @@ def test_gates_block_far_rays_of_which_no_value_is_known() -> None:
     known = GateFit(features, value[None], torch.ones((1, 400), dtype=torch.float64))
     known.block(beyond, nothing - 1, torch.ones((1, 50), dtype=torch.bool))
     assert (known.coefficients()[0] @ beyond < 0).all()
-
-
-def test_gates_of_dependent_features() -> None:
-    """Twice the same feature: finite, and as good as once."""
-    x = torch.linspace(-1, 1, 100, dtype=torch.float64)
-    features = torch.stack([torch.ones_like(x), x, x])
-    found = GateFit(features, (2 * x - 1)[None], torch.ones((1, 100), dtype=torch.float64)).coefficients()
-    assert torch.allclose(found @ features, (2 * x - 1)[None], atol=1e-9)
 
 
 # ---- rays that cannot tell all terms apart ----
