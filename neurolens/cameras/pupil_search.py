@@ -77,11 +77,11 @@ def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
     def passing(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
         film = np.zeros(points.shape, np.float32)
         film[0] = radius
-        film, pupil = film.reshape(2, -1), points.astype(np.float32).reshape(2, -1)
-        passed = np.zeros(film.shape[1], bool)
+        rays = np.concatenate([film, points]).reshape(4, -1).astype(np.float32)
+        passed = np.zeros(rays.shape[1], np.bool_)
         for wavelength in wavelength_nm:
             left = np.flatnonzero(~passed)
-            passed[left] = passes(film[:, left], pupil[:, left], wavelength)
+            passed[left] = passes(rays[:2, left], rays[2:, left], wavelength)
         return passed.reshape(points.shape[1:])
 
     return passing

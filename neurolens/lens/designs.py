@@ -156,7 +156,7 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     if n_before == n_after:
         raise InputError(file, where, name, f"a surface between two different media (both are {n_before:g})")
     try:
-        films = make(*sorted((n_before, n_after)), at_nm)
+        films = make(min(n_before, n_after), max(n_before, n_after), at_nm)
     except InputError as error:
         raise InputError(file, where, name, f"another design: {error}") from None
     return Coating(name, films if n_before < n_after else films[::-1])
