@@ -25,7 +25,7 @@ from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lenscamera import GraphRun, Kind, LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
-from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, PupilTable, outline_of
+from neurolens.cameras.pupil_search import COARSE, FINE, Detail, PupilTable, outline_of
 from neurolens.cameras.sampling import arrived, lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -79,7 +79,7 @@ class ExactCamera(LensCamera):
         film_z, tabled = self.lens.film_z_mm, at_infinity(self.lens)
         assert film_z is not None  # `set_lens` places the film
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
-        detail = FINE if not self.lens.anamorphic else COARSE if bounds is None else COARSE_TIGHT
+        detail = COARSE if self.lens.anamorphic else FINE
         self._film_z_mm, self._pupil_z_mm = film_z, pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
         read = [dtype, self._pupil_z_mm, self.film_mm, detail, bounds and asdict(bounds)]

@@ -62,7 +62,6 @@ keeps its own; ./lenses; the project's."""
         from neurolens.cameras.model import load_model
         from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
         from neurolens.study.speed import time_model
-        from neurolens.surrogates.card import transmittance_of
 
         model = load_model(self.model)
         space = space_of_card(model.card, model.axes, self.lens, self.model) if model.axes else None
@@ -80,7 +79,6 @@ keeps its own; ./lenses; the project's."""
             "model": str(self.model),
             "lens": {"id": model.card["lens"]["id"], "name": lens.name, "file": lens.path},
             "method": model.card["fit"]["method"],
-            "transmittance": transmittance_of(model.card),
             **figures,
             "ns_per_ray": timing,
             "promises": [{**asdict(p), "holds": p.holds} for p in promises],
@@ -91,8 +89,6 @@ keeps its own; ./lenses; the project's."""
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:
-    from neurolens.surrogates.card import AVERAGED
-
     header: tuple[str, ...] = ("figure", "promised", "measured", "allowed", "")
     rows: list[tuple[str, ...]] = [
         (p.key, number(p.promised), number(p.measured), number(p.allowed), "" if p.holds else "does not hold")
@@ -113,6 +109,4 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
         f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}) on one thread, batches of {timing['batch']}",
     ]
     parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
-    if data["transmittance"] == AVERAGED:
-        parts.append("Transmittance: its fit averaged over polarisation at every surface, the lens here does not.")
     return "\n\n".join([*parts, verdict])
