@@ -21,6 +21,7 @@ from neurolens.base import status as st
 from neurolens.base.files import fingerprint_of, kept_in_cache, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.cameragraph import D_FILM, METRES, LensGraph
+from neurolens.cameras.companions import lanes_graph, shifted
 from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lenscamera import GraphRun, Kind, LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
@@ -109,10 +110,11 @@ class ExactCamera(LensCamera):
         }
         self.start(runtime)
 
-    def _run(self, kind: Kind) -> GraphRun:
+    def _run(self, kind: Kind, companions: int = 0) -> GraphRun:
         if self.runtime != "trace":
-            return super()._run(kind)
-        return {"companion": self._companion, "differentials": self._moved}.get(kind, self._traced)
+            return super()._run(kind, companions)
+        own: dict[Kind, GraphRun] = {"hero": self._hero, "companion": self._companion, "differentials": self._moved}
+        return own.get(kind, self._traced)
 
     def _traced(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         return self.film.outputs(rays["film_mm"], rays["square"], rays["wavelength_nm"][0])
@@ -131,13 +133,17 @@ class ExactCamera(LensCamera):
     def _moves(self) -> Graph:
         return with_film_derivatives(self.lens_graph().graph)
 
+    def _hero(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+        assert self._shift is not None
+        found = self._traced(rays)
+        return found | evaluate(lanes_graph(self._shift, len(rays["companion_nm"])), rays | found)
+
     def _companion(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         assert self._shift is not None
-        shifted = evaluate(self._shift.graph, rays | evaluate(self._shift.of_hero, rays))
-        moved = shifted["companion"]
-        found = self._scene(moved[:2], moved[2:], rays["companion_nm"][0])
-        status = np.where(shifted["known"] > 0, found.status, st.OUTSIDE_DOMAIN)
-        return {"companion": moved, "transmittance": found.transmittance[None], "status": status}
+        g = Graph()
+        g.outputs["there"] = shifted(g, self._shift)
+        there = evaluate(g, rays)["there"]
+        return {"status": self._scene(there[:2], there[2:], rays["companion_nm"][0]).status[None]}
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""
