@@ -16,8 +16,10 @@ from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import Comparison, Curve, compare, heights_of, near_f8
+from neurolens.photographs.compare import Comparison, Curve, compare, near_f8
+from neurolens.photographs.figures import heights_of
 from neurolens.photographs.profiles import Match, Profile, matches, name_of, profile_named
+from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import at_infinity
 
 # Residuals of the shape of distortion (percent) and of light (stops, root mean square over heights) that half and nine
@@ -81,7 +83,7 @@ def _median(values: Iterable[float]) -> float:
 def names_of(lens: Lens) -> list[str]:
     """The names under which a lens is looked for: what it is believed to be, its own, and that of its file."""
     stem = Path(lens.path).stem.replace("_", " ")
-    return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}", stem) if name.strip()]
+    return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}".strip(), stem) if name]
 
 
 def found_for(
@@ -118,7 +120,8 @@ def found_for(
 
 def _by_film(profiles: Sequence[Profile], lens: Lens) -> list[Profile]:
     """Profiles in the order of use: of the largest film that the lens lights, then with light, then others."""
-    radius = 1.1 * (lens.image_radius_mm or math.inf)
+    several = len({p.crop for p in profiles}) > 1
+    radius = 1.1 * (image_radius_mm(at_infinity(lens))[0] if several else math.inf)
     return sorted(profiles, key=lambda p: (p.half_diagonal_mm > radius, p.crop, not p.light))
 
 
