@@ -31,7 +31,7 @@ from neurolens.setting.states import at_infinity, set_lens
 from neurolens.trace.aiming import without_rims
 from neurolens.trace.rays import trace
 
-_COARSE, _FINE = 16, 40  # points a side of the grids that find what is lit, and that measure it
+_COARSE, _FINE = 24, 32  # points a side of the grids that find what is lit, and that measure it
 _WIDER = 1.5  # cells by which what is lit may reach beyond the lit points of a grid
 _FLATTEST = 1e-3  # a slope over the steeper one, below which it makes no difference
 
