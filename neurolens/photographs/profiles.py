@@ -145,7 +145,7 @@ _SAME_WORD = {"asph": "aspherical", "mkii": "ii", "mkiii": "iii", "fuji": "fujif
               "nikkor": "nikon", "zuiko": "olympus", "takumar": "pentax", "rokkor": "minolta",
               "voigtlander": "cosina", "voigtländer": "cosina"}  # fmt: skip
 # Marks of which two names of one lens have the same: the version; and the mount, where both names have one.
-_VERSIONS = frozenset(("ii", "iii", "iv", "v", "vi", "new"))
+_VERSIONS = frozenset(("ii", "iii", "iv", "v", "vi", "new", "l"))
 _MOUNTS = frozenset(("ef", "rf", "fd", "z", "xf", "xc", "gf", "fe", "da", "fa", "dt", "af", "ai", "m", "tl", "sl"))
 _NO_WORD = frozenset(("mm", "lens", "f", "the", "and", "for", "of", "t", "zoom", "g1", "compatibles"))
 

@@ -179,7 +179,8 @@ def _said(found: Verified, fitted: bool) -> list[str]:
     if math.isnan(off):
         lines.append("distortion was not measured")
     else:
-        own = f" (two cameras differ by {slack:.2g}%)" if math.isfinite(slack) else ""
+        word = "contradict each other" if slack > DOUBTFUL_PERCENT else "differ"
+        own = f" (two cameras {word} by {slack:.2g}%)" if math.isfinite(slack) else ""
         sound = "agree" if off <= SOUND_PERCENT else "roughly agree" if off <= DOUBTFUL_PERCENT else "disagree"
         lines.append(f"the figures {sound} with the photographs: distortion within {off:.2g}% of the image height{own}")
     lines.append(_said_of_light(found, fitted))
