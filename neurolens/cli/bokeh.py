@@ -46,6 +46,8 @@ class Bokeh(PictureCommand):
 examples:
   neurolens bokeh lenses/laikin_double_gauss_50.toml --width 1920 --film 36x20.25 --focus 2 --f-number 2 \\
       --distance 0.8 --distance 5 --distance inf -o bokeh
+  neurolens bokeh lenses/leica_summilux_m_35mm_f1_4_asph_v1.toml --width 3840 --film 36x24 --focus 0.7 \\
+      --distance inf --grid 1x1 --ring-height 5 -o rings
   neurolens bokeh models/NAME.onnx --width 3840 --film 36x24 --focus 1 --distance inf --grid 1x1 -o kernel"""
 
     out: Path = output_path("OUT", "start of the files' names")
@@ -60,6 +62,11 @@ examples:
         None, "one wavelength for red, green and blue each (default: those that make each channel's light)",
         kind=channels_nm, metavar="NM",
     )  # fmt: skip
+    ring_height: float = setting(
+        0.0, "height of the grooves that grinding leaves on aspheres, which draw onion rings: 1 to 20 nm are plain "
+        "(default: 0)", within=(0, 1000), metavar="NM",
+    )  # fmt: skip
+    ring_spacing: float = setting(0.5, "from groove to groove (default: 0.5 mm)", within=(0.01, 100), metavar="MM")
 
     def run(self) -> int:
         """Find the kernels of all distances, then write an atlas for each."""
@@ -68,18 +75,23 @@ examples:
             self.refuse("--output", str(self.out), "the start of the files' names")
         from neurolens.defocus.atlas import as_picture, as_preview, kernels_over
         from neurolens.defocus.picture import check_field
+        from neurolens.defocus.rings import Grooves, aspheres
         from neurolens.render.pictures import write_channels, write_png
 
         progress = self.progress()
         camera, shot = self.make(self.state, progress, compiled=True)
         check_field(camera)
+        grooves = Grooves(self.ring_height, self.ring_spacing) if self.ring_height else None
+        if grooves:
+            aspheres(camera)
         with progress.stage("find the kernels") as report:
             found = kernels_over(
-                camera, self.picture, tuple(dict.fromkeys(self.distance)), self.grid, self.wavelengths, report
+                camera, self.picture, tuple(dict.fromkeys(self.distance)), self.grid, self.wavelengths, grooves, report
             )
         side = max(cell.width_px for cells in found for cell in cells)
         about: dict[str, Any] = {"version": __version__, "camera": camera.settings, "picture_px": list(self.picture)}
         about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m}
+        about |= {"grooves": vars(grooves)} if grooves else {}
         files, rows = [], []
         for cells in found:
             distance = "inf" if math.isinf(cells[0].distance_m) else f"{cells[0].distance_m:.10g}m"

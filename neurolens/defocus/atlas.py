@@ -11,8 +11,9 @@ import numpy as np
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
-from neurolens.defocus.kernels import GRID, Kernel, kernel_at
+from neurolens.defocus.kernels import Kernel, kernel_at
 from neurolens.defocus.plate import Eye, FloatArray
+from neurolens.defocus.rings import Grooves
 
 _LARGEST = 16384  # pixels a side of an atlas
 
@@ -50,14 +51,15 @@ def eye_of(camera: Camera, size: tuple[int, int]) -> Eye:
 
 def kernels_over(
     camera: Camera, size: tuple[int, int], distances_m: Sequence[float], fields: tuple[int, int],
-    wavelengths_nm: tuple[float, float, float] | None = None, report: Callable[[float], None] = lambda _: None,
+    wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
+    report: Callable[[float], None] = lambda _: None,
 ) -> list[list[Cell]]:  # fmt: skip
     """The kernels of each distance, row by row from the top of the picture.
 
     Args:
         size: of the picture in pixels. distances_m: from the film, along the axis; inf is far.
         fields: columns and rows of places, in the middles of equal parts of the picture.
-        wavelengths_nm: as for `kernel_at`.
+        wavelengths_nm, grooves: as for `kernel_at`.
 
     Raises:
         InputError: a distance within the lens; kernels too large for memory.
@@ -73,7 +75,9 @@ def kernels_over(
         for j in range(fields[1]):
             for i in range(fields[0]):
                 place = (i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1]
-                kernel = kernel_at(camera, eye, size, place, 1 / ahead, place, GRID, wavelengths_nm=wavelengths_nm)
+                kernel = kernel_at(
+                    camera, eye, size, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves
+                )
                 middle = place if kernel is None else kernel.middle_px
                 field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
                 cells.append(Cell(field, distance, middle, kernel))

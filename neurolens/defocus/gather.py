@@ -150,15 +150,23 @@ class RayTable:
 
     def at(self, place_px: NDArray[Any], pupil: FloatArray, nm: FloatArray) -> FloatArray:
         """Lines and weights [N, 5] of the rays of film places [2, N] by points of the pupil [2, N]."""
-        film = np.empty(place_px.shape, np.float32)
-        for k, sign in ((0, -1.0), (1, 1.0)):
-            film[k] = sign * (place_px[k] / self.size[k] - 0.5) * self.camera.film_mm[k]
-        return self._lines(film, pupil, nm)
+        return self._lines(self.film_mm(place_px), pupil, nm)
+
+    def film_mm(self, place_px: NDArray[Any]) -> FloatArray:
+        """Film points [2, N] of film places [2, N], which a picture shows upright."""
+        return ((place_px.T / self.size - 0.5) * self.camera.film_mm * (-1, 1)).T.astype(np.float32)
+
+    def moved_px(self, film_mm: NDArray[Any]) -> NDArray[Any]:
+        """Steps [2, N] on the film as steps of film places."""
+        return (film_mm.T * self.size / self.camera.film_mm * (-1, 1)).T
+
+    def unturned(self, film_mm: FloatArray, pupil: FloatArray) -> FloatArray:
+        """The samples that the camera takes for points of the pupil [2, N], seen from film points [2, N]."""
+        return turned(pupil, -np.arctan2(film_mm[1], film_mm[0])) if self.turns else pupil
 
     def _lines(self, film: FloatArray, pupil: FloatArray, nm: FloatArray) -> FloatArray:
         found = np.empty((len(nm), _NUMBERS), np.float32)
-        if self.turns:
-            pupil = turned(pupil, -np.arctan2(film[1], film[0]))
+        pupil = self.unturned(film, pupil)
         step = getattr(self.camera, "rays_a_call", RAYS_A_CALL)
         for first in range(0, len(nm), step):
             part = slice(first, first + step)

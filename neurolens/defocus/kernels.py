@@ -8,15 +8,16 @@ as the areas that they cover. So a kernel has no noise, and cat's eyes, coma and
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
-from neurolens.defocus.gather import LIGHT_NM, RayTable, channel_wavelengths
+from neurolens.defocus.gather import LIGHT_NM, RayTable, channel_wavelengths, turned
 from neurolens.defocus.plate import Eye, FloatArray
+from neurolens.defocus.rings import Grooves, moves, responses
 from neurolens.flare.areas import LOST, draw_edges, edges_of
 
 Array = NDArray[np.float64]
@@ -28,6 +29,7 @@ _FAR = 0.02  # of the kernel's width: what misses by more is left out
 LARGEST = 2048  # pixels a side of a kernel
 _RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
 _MARGIN = 2  # pixels around it
+_A_GROOVE, _FINEST = 8, 1536  # cells for each groove of an asphere, and the most along a side
 
 
 @dataclass(frozen=True)
@@ -78,19 +80,19 @@ class Kernel:
 def kernel_at(
     camera: Camera, eye: Eye, size: tuple[int, int], place_px: tuple[float, float], inverse_depth: float,
     guess_px: tuple[float, float], cells: int = GRID, colours: int = COLOURS,
-    wavelengths_nm: tuple[float, float, float] | None = None,
+    wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
 ) -> Kernel | None:  # fmt: skip
     """The kernel of a point at a place of the plate, in pixels of a film of `size`; None where no light arrives.
 
     Args:
         guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths a channel.
         wavelengths_nm: one wavelength for red, green and blue each, in place of those that make white light.
+        grooves: marks of grinding on the lens's aspheres, which make onion rings.
 
     Raises:
-        InputError: a kernel of over 2048 pixels a side.
+        InputError: a kernel of over 2048 pixels a side; grooves on a lens without aspheres, or too many.
     """
-    side = 0.5 + _RIM * (np.arange(cells + 1) / cells - 0.5)
-    pupil = np.stack(np.meshgrid(side, side), 0).reshape(2, -1).astype(np.float32)
+    pupil = _square(_RIM * _disk(np.linspace(-1, 1, cells + 1)))
     table = RayTable(camera, eye, size, pupil, np.zeros(pupil.shape[1], np.float32))
     if wavelengths_nm is not None:
         nm = np.array(wavelengths_nm, np.float32)[:, None]
@@ -101,11 +103,14 @@ def kernel_at(
     else:
         nm = table.nm[:, :1]
     aimed = _aimed(table, place_px, inverse_depth, guess_px, nm.reshape(-1))
-    aimed = aimed.widened(cells)
+    aimed = aimed.on_grid(nm.size, cells)
+    if grooves is not None:
+        aimed = aimed.with_rings(table, nm.reshape(-1), grooves)
     lit = aimed.weight > 0
     if not lit.any():
         return None
-    least, most = aimed.place[:, lit].min(axis=1), aimed.place[:, lit].max(axis=1)
+    places = aimed.place[:, lit]
+    least, most = places.min(axis=1), places.max(axis=1)
     corner = np.floor(least).astype(int) - _MARGIN
     width, height = (np.ceil(most).astype(int) + _MARGIN - corner).tolist()
     if max(width, height) > LARGEST:
@@ -113,16 +118,35 @@ def kernel_at(
     light = np.zeros((height, width, 3), np.float32)
     colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
     for k in range(nm.size):
-        aimed.draw(light, k, corner, cells, colour[[k // nm.shape[1]]] / (nm.shape[1] * cells**2))
+        aimed.draw(light, k, corner, colour[[k // nm.shape[1]]] / nm.shape[1])
     return Kernel(np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.turn, place_px, aimed.sweep(corner))
+
+
+def _disk(side: Array) -> Array:
+    """A grid [2, N, N] over the square of -1 to 1 on the disk: x sqrt(1 - y^2 / 2), and the same in y. It is smooth, as
+    the one of `Camera.sample`, which has corners along the diagonals, is not."""
+    x, y = np.meshgrid(side, side)
+    return np.stack([x * np.sqrt(1 - y**2 / 2), y * np.sqrt(1 - x**2 / 2)])
+
+
+def _square(disk: Array) -> FloatArray:
+    """Points [2, N] of the unit square that `Camera.sample` takes for points of the disk."""
+    (u, v), radius = disk.reshape(2, -1), np.hypot(*disk.reshape(2, -1))
+    return turned(np.stack([0.5 + 0.5 * radius, np.full_like(radius, 0.5)]), np.arctan2(v, u))
+
+
+def _between(values: Array, at: Array) -> Array:
+    """Values [..., cells + 1, cells + 1] at other columns and rows `at` of their grids, linear between points."""
+    share = np.maximum(1 - np.abs(at[:, None] - np.arange(values.shape[-1])), 0)
+    return np.asarray(share @ values @ share.T)
 
 
 @dataclass(frozen=True)
 class _Aimed:
     """Rays of a pupil's grid, of several wavelengths one after the other, that see a point.
 
-    Attributes:
-        place: [2, N] on the film in pixels. weight: [N]. slope: [2, N], b of their lines. turn: [2, 2] the mean
+    Attributes: of N rays, or after `on_grid` of rays [waves, cells + 1, cells + 1].
+        place: [2, ...] on the film in pixels. weight: [...]. slope: [2, ...], b of their lines. turn: [2, 2] the mean
             derivatives of places by the point's.
     """
 
@@ -131,32 +155,55 @@ class _Aimed:
     slope: Array
     turn: Array
 
-    def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], cells: int, colour: Array) -> None:
+    def on_grid(self, waves: int, cells: int) -> _Aimed:
+        """The rays as grids, their places taken from `_RIM` to the outline itself, along the radii of the pupil."""
+        place, weight, slope = (
+            v.reshape(*v.shape[:-1], waves, cells + 1, -1) for v in (self.place, self.weight, self.slope)
+        )
+        index, nearer = np.arange(cells + 1) - cells / 2, 1 - 2 / cells
+        far, near = (np.hypot(*_disk(2 / cells * k * index)) for k in (1, nearer))
+        within = _between(place, cells / 2 + nearer * index)
+        solid = (weight > 0) & (_between(weight > 0, cells / 2 + nearer * index) > 1 - 1e-9) & (far > 0)
+        more = (1 / _RIM - 1) * far / np.where(far > 0, far - near, 1) * (place - within)
+        return _Aimed(place + np.where(solid, more, 0), weight, slope, self.turn)
+
+    def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], colour: Array) -> None:
         """Add the light of a wavelength to a kernel's picture, each quarter of the pupil with its cells cut along the
-        disk's diagonal."""
+        grid's diagonal."""
         height, width = light.shape[:2]
-        own, half = slice(number * (cells + 1) ** 2, (number + 1) * (cells + 1) ** 2), cells // 2
-        here, weight = self.place[:, own] - corner[:, None], self.weight[own]
+        (x, y), weight = self.place[:, number] - corner[:, None, None], self.weight[number]
+        lit, cells = weight > 0, len(weight) - 1
+        half, square = cells // 2, 1 - np.linspace(-1, 1, cells + 1) ** 2 / 2
+        # The area of the disk that a cell has, over its whole.
+        share = (square[:, None] + square - 1) / np.sqrt(square[:, None] * square) * (4 / math.pi / cells**2)
         # `edges_of` turns film points in mm into pixels: one mm a pixel, from the middle.
-        rows = np.stack([width / 2 - here[0], here[1] - height / 2, weight, np.where(weight > 0, 0.0, LOST)])
-        rows[:2, weight <= 0] = 0
-        grid = rows.astype(np.float32).reshape(4, cells + 1, cells + 1)
+        rows = np.stack(
+            [np.where(lit, width / 2 - x, 0), np.where(lit, y - height / 2, 0), weight * share, np.where(lit, 0, LOST)]
+        )
         halves = slice(0, half + 1), slice(half, cells + 1)
         for across, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            part = grid[:, halves[down], halves[across]][..., :: 1 if across == down else -1]
-            edges = edges_of(np.ascontiguousarray(part.reshape(4, -1)), half, (width, height), 1.0)
+            part = rows[:, halves[down], halves[across]][..., :: 1 if across == down else -1]
+            edges = edges_of(np.ascontiguousarray(part.reshape(4, -1), np.float32), half, (width, height), 1.0)
             draw_edges(light, range(height), edges, np.array([len(edges)]), colour)
 
-    def widened(self, cells: int) -> _Aimed:
-        """The rays with their places taken from `_RIM` to the outline itself, along the radii of the pupil."""
-        grid = self.place.reshape(2, -1, cells + 1, cells + 1)
-        side = np.linspace(-1, 1, cells + 1)
-        down, across = np.gradient(grid, side, side, axis=(2, 3))
-        more = (1 / _RIM - 1) * (side[:, None] * down + side * across)
-        lit = np.pad((self.weight > 0).reshape(-1, cells + 1, cells + 1), ((0, 0), (1, 1), (1, 1)), mode="edge")
-        solid = np.all([lit[:, 1:-1, :-2], lit[:, 1:-1, 2:], lit[:, :-2, 1:-1], lit[:, 2:, 1:-1]], axis=0)
-        more *= solid & lit[:, 1:-1, 1:-1]
-        return replace(self, place=(grid + more).reshape(2, -1))
+    def with_rings(self, table: RayTable, nm: FloatArray, grooves: Grooves) -> _Aimed:
+        """The rays on a grid so fine that it shows grooves, with their places moved by them."""
+        cells, lit = self.weight.shape[1] - 1, self.weight > 0
+        pupil, film = (
+            np.tile(_square(_disk(np.linspace(-1, 1, cells + 1))), len(nm)),
+            table.film_mm(self.place.reshape(2, -1)),
+        )
+        response = responses(table.camera, film, table.unturned(film, pupil), np.repeat(nm, lit[0].size))
+        least = 2 * float(response[:, 0, lit.reshape(-1)].max(initial=0.0)) * _A_GROOVE / _FINEST
+        if grooves.spacing_mm < least:
+            raise InputError("kernel", "ring_spacing_mm", grooves.spacing_mm, f"at least {least:.2g} mm on this lens")
+        fine = cells * max(1, math.ceil(least * _FINEST / grooves.spacing_mm / cells))
+        place, weight, slope, lit, response = (
+            _between(v, np.arange(fine + 1) * cells / fine)
+            for v in (self.place, self.weight, self.slope, lit, response.reshape(-1, 5, *lit.shape))
+        )
+        moved = table.moved_px(moves(response.reshape(*response.shape[:2], -1), grooves)).reshape(place.shape)
+        return _Aimed(place + moved, np.where(lit > 1 - 1e-9, weight, 0), slope, self.turn)
 
     def sweep(self, corner: NDArray[np.int_]) -> Array:
         """See `Kernel.sweep`: a fit by least squares to the rays that pass."""
@@ -197,6 +244,7 @@ def _aimed(
     (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(ahead, behind, strict=True))
     stretch = np.abs(xx * yy - xy * yx)
     known = np.all([found[1] > 0 for found in (*ahead, *behind)], axis=0) & (stretch > 0)
+    known &= np.hypot(*(place - np.array(table.size)[:, None] / 2)) > 1  # on the axis the pupil's outline turns over
     area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(turn))))
     close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
     return _Aimed(place, np.where(close, weight, 0) * area, slope, turn)
