@@ -212,22 +212,16 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
     subtitle = f"{head}\n{'; '.join(found.verdict)}"
     with drawing(path, 13.5, 5.2, title, subtitle) as figure:
         left, middle, right = figure.subplots(1, 3)
-        for axes, label in (
-            (left, "distortion, % of the height, mean removed"),
-            (middle, "beside green, µm"),
-            (right, "light beside the axis, stops"),
-        ):
+        labels = "distortion, % of the height, mean removed", "beside green, µm", "light beside the axis, stops"
+        for axes, label in zip((left, middle, right), labels, strict=True):
             axes.grid(True)
             axes.set(xlabel="image height, mm", ylabel=label)
         bent = [(c.focal_mm, c.distortion_percent) for c in found.comparisons if c.distortion_percent is not None]
         for colour, (focal, curve) in zip(FIELD_COLOURS, _some_of(bent), strict=False):
             _both(left, curve, colour, f"{focal:g} mm")
         for name, colour in (("red", "#d55e00"), ("blue", "#0072b2")):
-            fringes = [
-                (c.focal_mm, getattr(c, f"{name}_um"))
-                for c in found.comparisons
-                if getattr(c, f"{name}_um") is not None
-            ]
+            curves = ((c.focal_mm, getattr(c, f"{name}_um")) for c in found.comparisons)
+            fringes = [(focal, curve) for focal, curve in curves if curve is not None]
             for focal, curve in fringes[:1]:
                 _both(middle, curve, colour, f"{name}, {focal:g} mm")
         lit = [c for c in found.comparisons if c.light_stops]
