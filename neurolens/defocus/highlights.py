@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ _LEAST_PX = 1.5  # radius of the blur: what is sharper has no noise
 _PLACES = 32  # kernels along the longer side of the film
 _FINE_PX, _FINE = 0.25, 0.03  # steps of the radius between kernels, absolute and relative
 _MOST_WORK = 4e9  # pixels of kernels
+_SAME = 0.01  # of inverse depth, within which two layers show the same thing
 _CELLS, _COLOURS = 24, 2
 
 
@@ -41,8 +42,13 @@ class Highlights:
     light: FloatArray
 
 
-def take_highlights(layer: Layer, eye: Eye, spread: NDArray[np.float64], size: tuple[int, int]) -> Highlights:
-    """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes."""
+def take_highlights(
+    layer: Layer, eye: Eye, spread: NDArray[np.float64], size: tuple[int, int], before: Sequence[Layer] = ()
+) -> Highlights:
+    """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes.
+
+    What the layers `before` show, too, at the same place and depth, is taken out and left to them.
+    """
     rgb, w = layer.texel[..., :3], layer.texel[..., 3]
     bright = rgb.max(axis=2)
     log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
@@ -66,7 +72,12 @@ def take_highlights(layer: Layer, eye: Eye, spread: NDArray[np.float64], size: t
         row, column, radius, side = row[kept], column[kept], radius[kept], side[kept]
     light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
     rgb[row, column] -= light
-    return Highlights(np.stack([column, row], axis=1) + np.float64(0.5), w[row, column], radius, side, light)
+    own = np.ones(len(row), bool)
+    for other in before:
+        own &= np.abs(other.texel[row, column, 3] - w[row, column]) > _SAME * w[row, column]
+    row, column = row[own], column[own]
+    place = np.stack([column, row], axis=1) + np.float64(0.5)
+    return Highlights(place, w[row, column], radius[own], side[own], light[own])
 
 
 def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -25,7 +25,8 @@ GRID = 48  # cells of the pupil along a side
 COLOURS = 5  # wavelengths of a channel
 _STEPS = 5  # of Newton's method
 _CLOSE = 0.01  # pixels by which a ray may miss the point
-_FAR = 0.02  # of the kernel's width: what misses by more is left out
+_FAR = 0.02  # of the kernel's width: the places of rays that miss by more are not used
+_SURE = 0.5  # share of the light whose rays meet the point, below which the places of all rays count
 LARGEST = 2048  # pixels a side of a kernel
 _RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
 _MARGIN = 2  # pixels around it
@@ -247,4 +248,7 @@ def _aimed(
     known &= np.hypot(*(place - np.array(table.size)[:, None] / 2)) > 1  # on the axis the pupil's outline turns over
     area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(turn))))
     close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
-    return _Aimed(place, np.where(close, weight, 0) * area, slope, turn)
+    light, kept = weight * area, np.where(close, weight, 0) * area
+    # The light of rays that Newton's method leaves beside the point goes where the others' goes.
+    share = kept.sum() / max(light.sum(), 1e-30)
+    return _Aimed(place, kept / share if share > _SURE else light, slope, turn)

@@ -57,7 +57,8 @@ def defocus(
     check_field(camera)
     spread, taken = spread_over(camera, plate.eye, plate.size), []
     if highlights:
-        taken = [take_highlights(layer, plate.eye, spread, plate.size) for layer in plate.layers]
+        for k, layer in enumerate(plate.layers):
+            taken.append(take_highlights(layer, plate.eye, spread, plate.size, plate.layers[:k]))
     with progress.stage(f"blur by {camera.name}") as report:
         found = gather(
             plate.layers, plate.eye, camera, plate.size, spread, 1 << (samples - 1).bit_length(), threads, report

@@ -37,6 +37,7 @@ _COMBINED = ("Combined.", "combined.")
 _SKY_M = 1e9  # and beyond it
 _MOST_LAYERS = 8  # of a deep file
 _LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
+_MOST_VALUES = 1 << 29  # of the later parts of a file
 _MOST_DEEP = 1 << 25  # pixels of a deep file, which is read whole
 _OPAQUE = 0.5  # opacity from which a deep sample hides what is behind it
 _SAME = 1e-3  # relative: shapes of plate and film
@@ -139,7 +140,7 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
     """Colours and depths of the layers of a file."""
     if header_of(path)["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
         return _deep(path)
-    planes, _ = decoded_channels(path, path, "file")
+    planes = _planes(path)
     found = list[tuple[str, str]]()
     for name in planes:
         prefix = name.removesuffix("R")
@@ -166,6 +167,23 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
             metres = np.where(solid, metres, np.float32(-np.inf))
         layers.append((rgb.astype(np.float32), metres))
     return layers
+
+
+def _planes(path: Path) -> dict[str, FloatArray]:
+    """The channels of all parts; of two with one name the later one has the name of its part before it."""
+    planes, _ = decoded_channels(path, path, "file")
+    with whole_file(path, "file", path), OpenEXR.File(str(path), header_only=True) as file:
+        kinds, count = {part.type() for part in file.parts}, sum(len(p.header["channels"]) for p in file.parts[1:])
+    if count and kinds <= {OpenEXR.scanlineimage, OpenEXR.tiledimage}:
+        shape = next(iter(planes.values())).shape
+        check_size(path, "file", f"{path}, {count} channels of later parts", (*shape, count), _LARGEST, _MOST_VALUES)
+        with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
+            for part in file.parts[1:]:
+                for name, channel in part.channels.items():
+                    if channel.pixels.shape == shape:
+                        known = f"{part.name()}.{name}" if name in planes else name
+                        planes[known] = np.asarray(channel.pixels, np.float32)
+    return planes
 
 
 def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:

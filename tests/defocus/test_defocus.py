@@ -297,6 +297,30 @@ def test_layers_of_a_file_are_found_by_their_names(tmp_path: Path) -> None:
     assert [layer.texel[0, 0, 3] for layer in plate.layers] == pytest.approx([0.4, 0.2, 0.2])
 
 
+def test_depth_may_be_in_another_part(tmp_path: Path) -> None:
+    """As compositing programs write it: colours in one part, depth in the next; a third repeats names."""
+    full = np.full(SIZE[::-1], 0.5, np.float32)
+    parts = [
+        OpenEXR.Part({}, {c: full * k for c in names}, name)
+        for name, names, k in (("rgb", "RGB", 1), ("depth", ["Z"], 8), ("far", "RGBZ", 20))
+    ]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    front, behind = read_plate(tmp_path / "parts.exr", FILM, frame_of(thin()), DepthSettings()).layers
+    assert front.texel[0, 0] == pytest.approx([0.5, 0.5, 0.5, 0.25])
+    assert behind.texel[0, 0] == pytest.approx([10, 10, 10, 0.1])
+
+
+def test_lights_that_two_layers_show_are_spread_once() -> None:
+    """A layer behind is a whole picture without the things in front: it shows the lights beside them, too."""
+    camera, size = thin(), SIZE
+    rgb, w = flat(0.0, 0.0)
+    rgb[108, 194] = 1e4
+    eye, spread = eye_of(camera), spread_over(camera, eye_of(camera), size)
+    layers = [Layer(rgb.astype(np.float32), w.astype(np.float32)) for _ in range(2)]
+    lights = [len(take_highlights(layer, eye, spread, size, layers[:k]).light) for k, layer in enumerate(layers)]
+    assert lights == [1, 0] and layers[1].texel[108, 194, 0] < 1e4
+
+
 def test_samples_of_a_deep_file_are_layers(tmp_path: Path) -> None:
     def samples(near: float, far: float) -> np.ndarray:
         cells = np.empty(SIZE[::-1], object)
