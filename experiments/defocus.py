@@ -25,10 +25,11 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.cli import main
-from neurolens.defocus.atlas import eye_of
+from neurolens.defocus.atlas import pinhole_of
+from neurolens.defocus.gather import Gathered
 from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.picture import Defocused, defocus
-from neurolens.defocus.plate import Eye, Layer
+from neurolens.defocus.picture import defocus
+from neurolens.defocus.plate import Layer, PlatePinhole
 from neurolens.defocus.read import DepthSettings, Plate, read_plate
 from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_exr, write_png
@@ -125,7 +126,7 @@ def camera_and_plate(scene: str, path: Path, *behind: Path) -> tuple[Camera, Pla
     return camera, read_plate(path, settings.film_mm, frame_of(camera), DepthSettings(), behind)
 
 
-def blurred(scene: str, path: Path, highlights: bool, *behind: Path) -> tuple[Defocused, float]:
+def blurred(scene: str, path: Path, highlights: bool, *behind: Path) -> tuple[Gathered, float]:
     """A scene's plate through the lens, and the seconds of a core."""
     camera, plate = camera_and_plate(scene, path, *behind)
     began = time.process_time()
@@ -180,14 +181,14 @@ def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> Poi
     camera = make_camera(f"fused:{lab.LENSES / LENS}.toml", shot)
     size = round(_STRIP_MM[0] * _PER_MM), round(_STRIP_MM[1] * _PER_MM)
     fine = size[0] * _FINER, size[1] * _FINER  # the kernel's pixels, so that the ball's outline is sharp
-    eye, ball = eye_of(camera, fine), _BALL_PX * _FINER
-    place, ahead = (fine[0] / 2, fine[1] / 2 - field_mm * _PER_MM * _FINER), distance_m - eye.before_film_mm / 1000
-    kernel = kernel_at(camera, eye, fine, place, 1 / ahead, place)
+    pinhole, ball = pinhole_of(camera, fine), _BALL_PX * _FINER
+    place, ahead = (fine[0] / 2, fine[1] / 2 - field_mm * _PER_MM * _FINER), distance_m - pinhole.before_film_mm / 1000
+    kernel = kernel_at(camera, pinhole, fine, place, 1 / ahead, place)
     assert kernel is not None
     scene = (
         "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 1\n[environment]\ncolour = [0, 0, 0]\n"
-        f"[[spheres]]\ncentre_m = [0, {(fine[1] / 2 - place[1]) / eye.reach_px[1] * ahead}, {-distance_m}]\n"
-        f"radius_m = {ball / eye.reach_px[0] * ahead}\nemission = [1, 1, 1]\n"
+        f"[[spheres]]\ncentre_m = [0, {(fine[1] / 2 - place[1]) / pinhole.reach_px[1] * ahead}, {-distance_m}]\n"
+        f"radius_m = {ball / pinhole.reach_px[0] * ahead}\nemission = [1, 1, 1]\n"
     )
     with tempfile.TemporaryDirectory() as folder:
         (path := Path(folder) / "point.toml").write_text(scene, encoding="utf-8")
@@ -199,7 +200,7 @@ def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> Poi
     ).rgb
     meant, side = np.zeros((fine[1], fine[0], 3)), range(-ball, ball + 1)
     inside = [(j, i) for j, i in itertools.product(side, side) if math.hypot(j, i) <= ball]
-    share = math.pi * ball**2 * math.hypot(1, (fine[1] / 2 - place[1]) / eye.reach_px[1]) / len(inside)
+    share = math.pi * ball**2 * math.hypot(1, (fine[1] / 2 - place[1]) / pinhole.reach_px[1]) / len(inside)
     for j, i in inside:  # off the axis a ball looks larger, by the cosine
         here = meant[kernel.corner_px[1] + j :, kernel.corner_px[0] + i :]
         here[: kernel.light.shape[0], : kernel.light.shape[1]] += share * kernel.light
@@ -217,10 +218,10 @@ def large_s(scene: str, folder: Path) -> tuple[float, int]:
     camera, small = camera_and_plate(scene, picture_of(scene, "pinhole", folder)[0])
     factor = _LARGE[0] // small.size[0]
     texel = small.layers[0].texel.repeat(factor, 0).repeat(factor, 1)
-    eye = small.eye
-    (x, y), (u, v) = eye.reach_px, eye.centre_px
-    eye = Eye((x * factor, y * factor), (u * factor, v * factor), eye.before_film_mm)
-    plate = Plate([Layer(texel[..., :3], texel[..., 3])], eye, (texel.shape[1], texel.shape[0]), small.space)
+    pinhole = small.pinhole
+    (x, y), (u, v) = pinhole.reach_px, pinhole.centre_px
+    pinhole = PlatePinhole((x * factor, y * factor), (u * factor, v * factor), pinhole.before_film_mm)
+    plate = Plate([Layer(texel[..., :3], texel[..., 3])], pinhole, (texel.shape[1], texel.shape[0]), small.space)
     began = time.process_time()
     found = defocus(plate, camera)
     return time.process_time() - began, found.highlights
@@ -270,7 +271,7 @@ squares). FLIP is over a strip about the disc, with twice the disc's mean as whi
 The scene lights: plates with overscan and a layer behind the figures, blurred, beside the lens path-traced with
 {samples} samples a pixel (goals: ten times, light within 1%). Noise and error are relative mean squares: noise by two
 seeds, error against the mean of both path-traced pictures, whose noise is taken out. Times to equal noise scale the
-path-traced noise by 1 / samples; to equal error, what one eye cannot know (mirrors, edges) counts, too."""
+path-traced noise by 1 / samples; to equal error, what one eye cannot see (mirrors, edges) counts, too."""
 OPTIONS = (
     lab.ONLY,
     lab.option("--pictures", type=Path, default=Path("runs/defocus"), metavar="FOLDER", help="where renders are kept"),

@@ -12,7 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.defocus.kernels import Kernel, kernel_at
-from neurolens.defocus.plate import Eye, FloatArray
+from neurolens.defocus.plate import FloatArray, PlatePinhole
 from neurolens.defocus.rings import Grooves
 
 _LARGEST = 16384  # pixels a side of an atlas
@@ -41,12 +41,12 @@ class Cell:
         return 2 * max(reach) + 1
 
 
-def eye_of(camera: Camera, size: tuple[int, int]) -> Eye:
+def pinhole_of(camera: Camera, size: tuple[int, int]) -> PlatePinhole:
     """The camera's own pinhole, whose picture has `size` pixels on its film: that of `neurolens stmap`."""
     frame = frame_of(camera)
     per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
     reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
-    return Eye(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1])
+    return PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1])
 
 
 def kernels_over(
@@ -64,19 +64,19 @@ def kernels_over(
     Raises:
         InputError: a distance within the lens; kernels too large for memory.
     """
-    eye, found = eye_of(camera, size), []
+    pinhole, found = pinhole_of(camera, size), []
     for number, distance in enumerate(distances_m):
-        ahead = distance - eye.before_film_mm / 1000
+        ahead = distance - pinhole.before_film_mm / 1000
         if not ahead > 0:
             raise InputError(
-                "kernels", "distance_m", distance, f"above {eye.before_film_mm / 1000:g}, the entrance pupil"
+                "kernels", "distance_m", distance, f"above {pinhole.before_film_mm / 1000:g}, the entrance pupil"
             )
         cells = []
         for j in range(fields[1]):
             for i in range(fields[0]):
                 place = (i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1]
                 kernel = kernel_at(
-                    camera, eye, size, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves
+                    camera, pinhole, size, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves
                 )
                 middle = place if kernel is None else kernel.middle_px
                 field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import Camera
 from neurolens.defocus.gather import compiled, radius_px
 from neurolens.defocus.kernels import LARGEST, kernel_at
-from neurolens.defocus.plate import Eye, FloatArray, Layer, as_structs
+from neurolens.defocus.plate import FloatArray, Layer, PlatePinhole, as_structs
 
 _WINDOW = 33  # pixels about which surroundings are meant
 _BRIGHTER, _ABOVE = 8.0, 3.0  # than the geometric mean of the surroundings, and than their mean
@@ -43,7 +43,11 @@ class Highlights:
 
 
 def take_highlights(
-    layer: Layer, eye: Eye, spread: NDArray[np.float64], size: tuple[int, int], before: Sequence[Layer] = ()
+    layer: Layer,
+    pinhole: PlatePinhole,
+    spread: NDArray[np.float64],
+    size: tuple[int, int],
+    before: Sequence[Layer] = (),
 ) -> Highlights:
     """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes.
 
@@ -58,7 +62,9 @@ def take_highlights(
     row, column = np.nonzero((bright > cap) & (w >= 0))
     nodes = [
         np.clip(((v + 0.5 - border) / n * (k - 1)).round().astype(int), 0, k - 1)
-        for v, border, n, k in zip((row, column), eye.border_px(size)[::-1], size[::-1], spread.shape[:2], strict=True)
+        for v, border, n, k in zip(
+            (row, column), pinhole.border_px(size)[::-1], size[::-1], spread.shape[:2], strict=True
+        )
     ]
     radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
     _, ab, b = np.moveaxis(spread[nodes[0], nodes[1]], -1, 0)
@@ -92,12 +98,12 @@ def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def spread_highlights(
-    picture: FloatArray, found: Highlights, layers: list[Layer], eye: Eye, camera: Camera,
+    picture: FloatArray, found: Highlights, layers: list[Layer], pinhole: PlatePinhole, camera: Camera,
     report: Callable[[float], None] = lambda _: None,
 ) -> None:  # fmt: skip
     """Add the light of highlights to a picture [H, W, 3]."""
     height, width = picture.shape[:2]
-    border = np.array(eye.border_px((width, height)))
+    border = np.array(pinhole.border_px((width, height)))
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
     near = 4.0 * _FINE_PX / _FINE
@@ -116,12 +122,12 @@ def spread_highlights(
     for number, rows in enumerate(groups.values()):
         place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
         kernel = kernel_at(
-            camera, eye, (width, height), (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS
+            camera, pinhole, (width, height), (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS
         )
         if kernel is not None:
             points = np.empty((len(rows), 8), np.float32)
             points[:, :2], points[:, 2] = found.place_px[rows], found.inverse_depth[rows]
-            points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.turn.T
+            points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.film_by_plate.T
             points[:, 5:] = found.light[rows]
             sweep, light = np.ascontiguousarray(kernel.sweep, np.float32), np.ascontiguousarray(kernel.light)
             compiled().splat(

@@ -22,7 +22,7 @@ _MIXED = 4.0  # steps of the surfaces beside an edge, below which the pixel betw
 
 
 @dataclass(frozen=True)
-class Eye:
+class PlatePinhole:
     """The pinhole that a plate was rendered through.
 
     Attributes:
@@ -52,8 +52,8 @@ class Layer:
     """One layer of a plate.
 
     Args:
-        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the eye, 0 for the sky, below 0 where the layer
-            has nothing.
+        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the pinhole, 0 for the sky, below 0 where the
+            layer has nothing.
     """
 
     def __init__(self, rgb: FloatArray, inverse_depth: FloatArray) -> None:

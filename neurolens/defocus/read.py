@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
 from neurolens.cameras.field import Frame
-from neurolens.defocus.plate import Eye, FloatArray, Layer
+from neurolens.defocus.plate import FloatArray, Layer, PlatePinhole
 from neurolens.render.colour import SRGB, ColourSpace, conversion, converted
 from neurolens.render.pictures import (
     COLOURS,
@@ -62,10 +62,10 @@ class DepthSettings:
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate: its layers, the front first, its eye, the size of the picture in pixels, and its colour space."""
+    """A plate: its layers, the front first, its pinhole, the size of the picture in pixels, and its colour space."""
 
     layers: list[Layer]
-    eye: Eye
+    pinhole: PlatePinhole
     size: tuple[int, int]
     space: ColourSpace
 
@@ -104,7 +104,7 @@ def read_plate(
         check_size(path, "displayWindow", f"({pixels[0]} x {pixels[1]} pixels)", pixels, _LARGEST, _MOST_PIXELS)
     start = [int(v) for v in header["dataWindow"][0]]
     centre = size[0] / 2 + int(left) - start[0], size[1] / 2 + int(top) - start[1]
-    eye = Eye((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
+    pinhole = PlatePinhole((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
     space = read_colour_space(path) or SRGB
     layers = list[Layer]()
     for file in (path, *behind):
@@ -114,16 +114,16 @@ def read_plate(
             for a, b in zip(own["dataWindow"], header["dataWindow"], strict=True)
         ):
             raise InputError(file, "dataWindow", f"({own['dataWindow']})".replace("\n", " "), "that of the plate")
-        pinhole, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
-        from_film = pinhole is not None if depth.from_film is None else depth.from_film
+        settings, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
+        from_film = settings is not None if depth.from_film is None else depth.from_film
         for rgb, metres in _layers(file, depth, several=file == path):
-            w, cosine = _inverse_depth(file, metres, depth, eye, 1e-3 * before if from_film else 0.0)
+            w, cosine = _inverse_depth(file, metres, depth, pinhole, 1e-3 * before if from_film else 0.0)
             light = np.maximum(_finite(file, rgb), 0)
             light = light if colours is SRGB else converted(light, conversion(colours, SRGB)).astype(np.float32)
-            if pinhole is not None and pinhole.get("vignetting", "both") in ("both", "natural"):
+            if settings is not None and settings.get("vignetting", "both") in ("both", "natural"):
                 light /= (cosine**4)[..., None]
             layers.append(Layer(light, w))
-    return Plate(layers, eye, film_px, space)
+    return Plate(layers, pinhole, film_px, space)
 
 
 def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -233,16 +233,16 @@ def _finite(path: Path, rgb: FloatArray) -> FloatArray:
 
 
 def _inverse_depth(
-    path: Path, metres: FloatArray, depth: DepthSettings, eye: Eye, eye_m: float
+    path: Path, metres: FloatArray, depth: DepthSettings, pinhole: PlatePinhole, pinhole_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Inverse depth from the eye, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
+    """Inverse depth from the pinhole, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
 
-    `eye_m`: the eye's distance before the place from which depth counts.
+    `pinhole_m`: the pinhole's distance before the place from which depth counts.
     """
     height, width = metres.shape
     x, y = (
         (np.arange(n, dtype=np.float32) + 0.5 - c) / r
-        for n, c, r in zip((width, height), eye.centre_px, eye.reach_px, strict=True)
+        for n, c, r in zip((width, height), pinhole.centre_px, pinhole.reach_px, strict=True)
     )
     cosine = (1 / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)).astype(np.float32)
     nothing = np.isneginf(metres)
@@ -258,7 +258,7 @@ def _inverse_depth(
         if most <= 1 and depth.scale_m is None and not nothing.any():
             expected = "depth in metres; this looks like inverse or normalised depth (--depth-scale 1: it is none)"
             raise InputError(path, "depth", f"({least:g} to {most:g} m)", expected)
-    z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(eye_m)
+    z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(pinhole_m)
     if (close := solid & (z <= 1e-3)).any():
         raise InputError(path, "depth", f"({float(z[close].min()):g} m)", "more than 0 m before the pinhole")
     w = np.divide(1, z, out=np.zeros_like(z), where=solid)
