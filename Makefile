@@ -9,7 +9,7 @@
 #                 `neurolens view` draws, scripts in every text; its models in onnxruntime-web where npm is
 #   make test-shading  shading languages by their compilers: Slang's, naga with Vulkan in software (Debian: mesa-vulkan-drivers),
 #                 HLSL by glslang (glslang-tools), CUDA by nvcc where it is (5 CPU minutes)
-#   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
+#   make bench    models against the exact tracer, and the speed of tracer and renderer; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
 #   make docs     the documentation in build/docs; its links, commands, how-tos and, where there is a Chromium, its search
@@ -88,7 +88,6 @@ docs: $(INSTALLED) $(VENV)/.docs
 	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
-	$(BIN)/python -m experiments trace
 	$(BIN)/python -m experiments promises
 
 models: $(INSTALLED)

@@ -15,7 +15,6 @@ from neurolens import cli
 from neurolens.cli.arguments import Parser
 
 NAMES = {
-    "trace": ("trace_speed", "rays per second and memory of the exact tracer"),
     "extremes": ("extremes", "errors and statuses at the ends of what optics allows"),
     "pupils": ("pupils", "share of rays that pass a lens, by how its pupil is sampled"),
     "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),
@@ -33,7 +32,7 @@ NAMES = {
     "plan-times": ("plan_times", "seconds that plans print beside those of renders to equal noise"),
     "shots": ("shots", "models fitted to one shot beside those that ship: error, operations, time"),
     "zoom": ("zoom", "models of whole zooms, of internal focus"),
-    "equal-time": ("equal_time_page", "error over render time of every camera"),
+    "equal-time": ("equal_time", "errors of pictures after equal time and equal samples, every camera"),
     "render": ("render_times", "render time by camera and scene"),
     "defocus": ("defocus", "the blur of a lens for sharp pictures, beside path-traced ones"),
     "dispersion": ("dispersion", "noise and time of lenses that disperse, beside a thin lens"),
@@ -47,8 +46,8 @@ NAMES = {
     "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),
     "survive": ("survive", "commands killed at random moments, on full disks, two at once"),
     "photons": ("photons", "flare by photons, as in Keshmirian 2008"),
-    "glare": ("glare", "contrast that veiling glare takes; ways to sample light that turns round"),
-    "starburst": ("starburst", "stars by diffraction: shapes, checks, Keller's cones beside"),
+    "glare": ("glare", "contrast that veiling glare takes"),
+    "starburst": ("starburst", "stars by diffraction: checks against closed forms, seconds"),
     "flare": ("flare_speed", "ghosts: nanoseconds a ray, compiled and path by path"),
     "flare-gallery": ("flare_gallery", "pictures of flare: suns, headlights, coatings, stops, an animation"),
     "ghosts": ("ghosts", "ghosts drawn in several ways: error and time a picture"),

@@ -45,7 +45,7 @@ OPTIONS = [
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, simulate, write dask.md, dask.json and dask.png."""
+    """Measure, simulate, write dask.md and dask.json."""
     warnings.simplefilter("ignore")
     file = args.out / "dask.json"
     kept = json.loads(file.read_text())["rows"] if args.only and file.exists() else []
@@ -56,7 +56,6 @@ def run(args: argparse.Namespace) -> None:
         rows += [overhead(kind, count) for kind, counts in _COUNTS.items() for count in counts]
     simulated = list(simulations(rows))
     lab.write_results(args.out, "dask", _page(rows, simulated), {"rows": rows, "simulated": simulated})
-    _draw(args.out / "dask.png", rows, simulated)
     print((args.out / "dask.md").read_text())
 
 
@@ -196,7 +195,7 @@ def _page(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
         ("CPU s of the driver", "driver_s", ".0f"),
     )  # fmt: skip
     return lab.page(
-        "# Dask: speed-up and overhead", " ".join((__doc__ or "").split()), lab.machine_line(), "![dask](dask.png)",
+        "# Dask: speed-up and overhead", " ".join((__doc__ or "").split()), lab.machine_line(),
         "## Speed-up (measured)", lab.table(columns, fast, missing="not taken"),
         "## Tasks that do nothing (measured)", lab.table(small, [r for r in rows if r["part"] == "overhead"]),
         "## Many tasks and workers (simulated)", lab.table(large, simulated), _words(rows, simulated),
@@ -217,26 +216,3 @@ def _words(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
         "cluster is sent no more tasks than it has workers, so that neither holds more. Workers wait for the driver "
         f"only beyond some {busy:,.0f} of them. A survey keeps some tens of kB a lens, a render the names of tiles."
     )
-
-
-def _draw(file: Path, rows: Sequence[Row], simulated: Sequence[Row]) -> None:
-    from neurolens.analysis.plots import FAINT, FIELD_COLOURS, drawing, plain_log_ticks
-
-    with drawing(file, 9.0, 3.8, "A Dask cluster", "left: measured, tasks that do nothing; right: simulated") as figure:
-        left, right = figure.subplots(1, 2)
-        for k, kind in enumerate(_COUNTS):
-            payloads = [r for r in rows if r.get("what") == kind]
-            for key, look in (("wall_ms", "o-"), ("cpu_ms", "s--")):
-                x, y, name = [r["count"] for r in payloads], [r[key] for r in payloads], f"{kind}, {key[:-3]}"
-                left.plot(x, y, look, color=FIELD_COLOURS[k], label=name)
-        left.set(xscale="log", yscale="log", xlabel="tasks", ylabel="ms a task")
-        for k, what in enumerate(dict.fromkeys(r["what"] for r in simulated)):
-            found = [r for r in simulated if r["what"] == what]
-            right.plot([r["workers"] for r in found], [r["speed_up"] for r in found], "o-", color=FIELD_COLOURS[k],
-                       label=what)  # fmt: skip
-        right.plot(_WORKERS, _WORKERS, "--", color=FAINT, lw=0.8)
-        right.set(xscale="log", yscale="log", xlabel="workers", ylabel="speed-up")
-        for axis in (left, right):
-            plain_log_ticks(axis.xaxis, axis.yaxis)
-            axis.grid(True)
-            axis.legend()

@@ -1,127 +1,44 @@
-"""Equal time and equal samples: error of each camera's picture after given seconds, against the exact lens."""
+"""Equal time and equal samples: errors of pictures through a lens, its models and a thin lens in three scenes.
+
+The reference is a converged picture through the exact lens with other seeds, in two halves. A progressive render adds
+passes with seeds of their own, so that its squared error, mean over the pixels, is bias^2 + V / K after K passes. With
+pictures I_i of the passes and the halves R_1, R_2, the products <I_i - R_1, I_j - R_2> have the mean bias^2 for i != j,
+and bias^2 + V for i = j: the bias alone, free of the reference's own noise. With the exact lens's passes J_i of the
+same random numbers, <I_i - J_i, I_j - J_j> for i != j has the mean bias^2 between the two, and most noise cancels
+first: the paired bias. Needs the extra "train" (torch, flip-evaluator) and a C compiler. Writes equal_time.md and
+equal_time.json after each scene (some ten minutes); scenes that these have are kept.
+"""
 
 from __future__ import annotations
 
+import argparse
 import math
-import zipfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-import neurolens
 from experiments import lab
-from experiments.equal_time_errors import (
-    Estimate,
-    FilmMap,
-    Floats,
-    Law,
-    bias_and_variance,
-    film_map,
-    paired_bias,
-    reference_variance,
-    squared_error,
-    weights,
-)
-from neurolens.base.files import atomic_path, fingerprint_of, sha256_of
-from neurolens.base.records import plain
+from experiments.lab import Row
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
-from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene
-from neurolens.render.settings import FilmSettings
+from neurolens.render.scene import CameraSettings, load_scene
 from neurolens.study import scenes
-from neurolens.study.image import EPS, flip, flip_map
+from neurolens.study.image import EPS, flip
 from neurolens.surrogates.model import Domain
 
-EXACT, THIN = "exact", "thin lens"
-LENS = "laikin_double_gauss_50"
-# Name in the tables to the file in models/.
-MODELS = {"ols-28": f"{LENS}.ols-28.onnx", "mlp-16x2": f"{LENS}.mlp-16x2.onnx"}
-FUSED_EXACT = "fused exact"
-EXACTS = (EXACT, FUSED_EXACT)
+Floats = NDArray[np.float64]
+Passes = tuple[list[Floats], list[float]]  # pictures [H, W, 3] and seconds, in the order of `Counts.jobs`
 
-
-def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
-    """The cameras of a scene by name, the exact one first, and the exact one in float64 for film-space errors.
-
-    All cameras of the lens have the pupil bounds of the models' domain: the same random numbers are the same rays.
-    """
-    lens = read_lens(lab.LENSES / f"{LENS}.toml")
-    files = {name: lab.MODELS / file for name, file in MODELS.items()}
-    domain = Domain.from_dict(load_model(files["ols-28"]).card["domain"])
-    plain = scenes.scene_cameras(lens, domain, files, shot)
-    fused = scenes.scene_cameras(lens, domain, {"mlp-16x2": files["mlp-16x2"]}, shot, fused=True)
-    cameras = {EXACT: plain[EXACT], **{name: plain[name] for name in files}}
-    cameras |= {"fused mlp-16x2": fused["mlp-16x2"], FUSED_EXACT: fused[EXACT], THIN: plain[THIN]}
-    focus_m, f_number = (plain[EXACT].settings[name] for name in ("focus_m", "f_number"))
-    real = Shot(plain[EXACT].film_mm, focus_m, f_number, wavelength_nm=shot.wavelength_nm)
-    truth = ExactCamera(lens, real, dtype="float64", bounds=domain.bounds)
-    return cameras, truth
-
-
-# Folders that a picture depends on.
-_SOURCES = ("base", "graph", "lens", "trace", "setting", "readers", "surrogates", "cameras", "render")
-
-
-class Shelf:
-    """The renders of one scene through one camera, in a folder whose name has the hash of all that they depend on."""
-
-    def __init__(
-        self, run: Path, file: Path, scene: Scene, name: str, camera: Camera, film: FilmSettings, size: tuple[int, int]
-    ) -> None:
-        package, model = Path(neurolens.__file__).parent, camera.settings.get("model")
-        read = [f for part in _SOURCES for f in sorted((package / part).rglob("*.py"))]
-        read += [file, *(file.parent / named for named in files_named(scene.settings)), *([model] if model else [])]
-        about = [[sha256_of(f) for f in read], plain(camera.settings), plain(film.__dict__), size]
-        digest = fingerprint_of([neurolens.__version__, *about])
-        self.folder = run / scene.name / f"{name.replace(' ', '-')}-{digest[:16]}"
-        self.size = size
-        self.render = partial(render, scene, camera, width=size[0], height=size[1], film=film)
-
-    def file(self, samples: int, seed: int, threads: int) -> Path:
-        return self.folder / f"{samples}-{seed}-{threads}.npz"
-
-    def take(self, samples: int, seed: int, threads: int) -> tuple[NDArray[np.float32], float]:
-        """The picture [H, W, 3] and the seconds that it took, rendered or as an earlier run left it.
-
-        A file that is broken is made again. Raises what `render` does.
-        """
-        file = self.file(samples, seed, threads)
-        kept = _read(file, (*self.size[::-1], 3))
-        if kept is not None:
-            return kept
-        made = self.render(samples=samples, seed=seed, threads=threads)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_path(file) as temporary:
-            np.savez(temporary, rgb=made.rgb, seconds=np.float64(made.stats["seconds"]))
-        return made.rgb, float(made.stats["seconds"])
-
-    def warm_up(self) -> None:
-        """An untimed sample per pixel: the first render of a camera loads code and fills caches."""
-        self.render(samples=1, threads=1)
-
-
-def _read(file: Path, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], float] | None:
-    try:
-        with np.load(file, allow_pickle=False) as kept:
-            rgb, seconds = kept["rgb"], float(kept["seconds"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-    good = rgb.shape == shape and rgb.dtype == np.float32 and np.isfinite(rgb).all() and seconds > 0
-    return (rgb, seconds) if good else None
-
-
+EXACT, FUSED_EXACT, LENS = "exact", "fused exact", "laikin_double_gauss_50"
+MODELS = {name: lab.MODELS / f"{LENS}.{name}.onnx" for name in ("ols-28", "mlp-16x2")}
 SCENES = ("grid", "lights", "room")
-# Weight of a squared error: that of the RMSE, and of the relative MSE.
-MEASURES: dict[str, float | None] = {"mse": None, "rel_mse": EPS}
 _PASS_SEED, _SHORT_SEED, _REFERENCE_SEED = 100, 1000, 1_000_000
 
 
@@ -132,7 +49,7 @@ class Counts:
     Attributes:
         size: width and height in pixels.
         short: samples of the renders shorter than a pass, each `repeats` times. pass_samples, passes: of a pass, and
-            how many. reference: samples of each half of the reference, rendered in `parts` with a seed each.
+            how many. reference: samples of each half of the reference.
     """
 
     size: tuple[int, int] = (160, 90)
@@ -141,7 +58,6 @@ class Counts:
     pass_samples: int = 64
     passes: int = 8
     reference: int = 2048
-    parts: int = 2
 
     @property
     def jobs(self) -> list[tuple[int, int]]:
@@ -150,182 +66,292 @@ class Counts:
         return short + [(self.pass_samples, _PASS_SEED + k) for k in range(self.passes)]
 
 
-QUICK = Counts((64, 36), (1, 2, 4, 8), 2, 16, 4, 256, 1)
+QUICK = Counts((64, 36), (1, 2, 4, 8), 2, 16, 4, 256)
+
+
+# ---- Estimates. ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Level:
-    """Renders of one sample count: seconds best and median, mean squared errors and FLIP against the reference."""
+class Estimate:
+    """A value and its standard deviation, by the jackknife over the passes."""
 
-    samples: int
-    seconds_min: float
-    seconds_median: float
-    mse: float
-    rel_mse: float
-    flip: float
+    value: float
+    sd: float
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the value is more than two deviations above 0."""
+        return self.value > 2 * self.sd
 
 
-@dataclass(frozen=True)
-class CameraResult:
-    """One camera in one scene.
+def weights(reference: ArrayLike) -> Floats:
+    """Weight of each value's squared error in the relative MSE: 1 / (R^2 + eps)."""
+    return np.asarray(1 / (np.asarray(reference, np.float64) ** 2 + EPS))
 
-    Attributes:
-        levels: by samples. pass_s: best and median seconds of a pass.
-        bias2: by measure, against the exact camera with the same random numbers; the exact camera's is 0.
-        extrapolated2: by measure, bias^2 from the camera's own passes and the reference.
-        variance: by measure, of a pass. flip_same: FLIP of the mean picture against the exact camera's, same numbers.
-        picture: [H, W, 3] mean of the passes. flip_map: [H, W] of it against the reference.
-        film: where its rays land on the film.
+
+def squared_error(image: ArrayLike, halves: Sequence[ArrayLike], weight: ArrayLike) -> float:
+    """Weighted mean of (I - R_1)(I - R_2): the squared error of `image`, without the reference's own noise.
+
+    It may come out below 0 where the error is smaller than that noise.
     """
-
-    name: str
-    levels: tuple[Level, ...]
-    pass_s: tuple[float, float]
-    bias2: dict[str, Estimate]
-    extrapolated2: dict[str, Estimate]
-    variance: dict[str, Estimate]
-    flip_same: float
-    picture: Floats
-    flip_map: Floats
-    film: FilmMap
-
-    def law(self, measure: str, bias2: float | None = None) -> Law:
-        """Error over time of a measure; `bias2` stands in for the estimate, which is taken as 0 where negative."""
-        known = max(self.bias2[measure].value, 0.0) if bias2 is None else bias2
-        points = [(level.seconds_min, getattr(level, measure)) for level in self.levels]
-        first = tuple(sorted((t, e) for t, e in points if t < self.pass_s[0] and e > 0))
-        return Law(known, self.variance[measure].value, self.pass_s[0], first)
+    one, two = (np.asarray(image, np.float64) - np.asarray(half, np.float64) for half in halves)
+    return float(np.mean(np.asarray(weight) * one * two))
 
 
-@dataclass(frozen=True)
-class SceneResult:
-    """All cameras in one scene; `noise2` is the reference's own variance by measure, `flip_halves` its halves' FLIP."""
-
-    name: str
-    settings: CameraSettings
-    f_number: float
-    counts: Counts
-    threads: int
-    reference: Floats
-    noise2: dict[str, float]
-    flip_halves: float
-    cameras: dict[str, CameraResult]
+def reference_variance(halves: Sequence[ArrayLike], weight: ArrayLike) -> float:
+    """Variance of the mean of two independent halves: a quarter of their mean squared difference."""
+    difference = np.asarray(halves[0], np.float64) - np.asarray(halves[1], np.float64)
+    return float(np.mean(np.asarray(weight) * difference**2)) / 4
 
 
-def measure_scene(file: Path, run: Path, counts: Counts, threads: int, report: lab.Report) -> SceneResult:
-    """Render and measure one scene; what an earlier run left in `run` is not rendered again."""
+def bias_and_variance(passes: ArrayLike, halves: Sequence[ArrayLike], weight: ArrayLike) -> tuple[Estimate, Estimate]:
+    """bias^2 and the variance of one pass, from passes [K, ...] with seeds of their own; see the module.
+
+    Raises:
+        InputError: fewer than three passes, which leave no deviation.
+    """
+    rows = _rows(passes)
+    root = np.sqrt(np.asarray(weight, np.float64)).ravel()
+    one, two = ((rows - np.asarray(half, np.float64).ravel()) * root for half in halves)
+    gram = one @ two.T / rows.shape[1]
+    return _jackknife(gram, _apart), _jackknife(gram, lambda g: float(np.trace(g)) / len(g) - _apart(g))
+
+
+def paired_bias(passes: ArrayLike, others: ArrayLike, weight: ArrayLike) -> Estimate:
+    """bias^2 between two cameras whose passes [K, ...] share their random numbers, pass by pass.
+
+    Raises:
+        InputError: passes that do not pair, or fewer than three.
+    """
+    rows, against = _rows(passes), _rows(others)
+    if rows.shape != against.shape:
+        raise InputError("paired bias", "passes", f"({rows.shape})", f"those of the other camera, {against.shape}")
+    difference = (rows - against) * np.sqrt(np.asarray(weight, np.float64)).ravel()
+    return _jackknife(difference @ difference.T / rows.shape[1], _apart)
+
+
+def _rows(passes: ArrayLike) -> Floats:
+    values = np.asarray(passes, np.float64)
+    if values.ndim < 2 or len(values) < 3:
+        raise InputError("bias and variance", "passes", f"({len(np.atleast_1d(values))})", "at least three pictures")
+    return values.reshape(len(values), -1)
+
+
+def _apart(gram: Floats) -> float:
+    """Mean of the products of different passes."""
+    count = len(gram)
+    return float(gram.sum() - np.trace(gram)) / (count * (count - 1))
+
+
+def _jackknife(gram: Floats, statistic: Callable[[Floats], float]) -> Estimate:
+    """A statistic of the products of passes, and its deviation from leaving out one pass after the other (Tukey)."""
+    count = len(gram)
+    without = np.array([statistic(np.delete(np.delete(gram, k, 0), k, 1)) for k in range(count)])
+    return Estimate(statistic(gram), float(np.sqrt((count - 1) * np.mean((without - without.mean()) ** 2))))
+
+
+# ---- One scene. ------------------------------------------------------------------------------------------------------
+
+
+def scene_cameras(shot: CameraSettings) -> dict[str, Camera]:
+    """The cameras of a scene by name, the exact one first.
+
+    All cameras of the lens have the pupil bounds of the models' domain: the same random numbers are the same rays.
+    """
+    lens = read_lens(lab.LENSES / f"{LENS}.toml")
+    domain = Domain.from_dict(load_model(MODELS["ols-28"]).card["domain"])
+    plain = scenes.scene_cameras(lens, domain, MODELS, shot)
+    fused = scenes.scene_cameras(lens, domain, {"mlp-16x2": MODELS["mlp-16x2"]}, shot, fused=True)
+    cameras = {name: plain[name] for name in (EXACT, *MODELS)}
+    cameras |= {"fused mlp-16x2": fused["mlp-16x2"], FUSED_EXACT: fused[EXACT]}
+    return cameras | {"thin lens": plain["thin lens"]}
+
+
+def measure_scene(file: Path, counts: Counts, threads: int, report: lab.Report) -> Row:
+    """Render one scene through every camera in turn, so that load affects all equally, and measure the pictures."""
     torch.set_num_threads(1)  # in this process; workers do so themselves
     scene = load_scene(file)
-    shot = scene.settings.camera
-    cameras, truth = scene_cameras(shot)
-    film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
-    shelves = {name: Shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
-    halves, rendered = _render(shelves, counts, threads, report)
-    maps = {name: film_map(truth, c, wavelengths_nm=shot.wavelength_nm) for name, c in cameras.items()}
-    reference = (halves[0] + halves[1]) / 2
-    by = {measure: weights(reference, eps) for measure, eps in MEASURES.items()}
-    found = {
-        name: camera_result(name, pictures, rendered[EXACT], halves, by, counts, maps[name])
-        for name, pictures in rendered.items()
+    shot, film = scene.settings.camera, replace(scene.settings.film, wavelengths="one")  # shared random numbers
+    cameras, (width, height) = scene_cameras(shot), counts.size
+    done, total = 0, 2 * counts.reference + len(cameras) * sum(n for n, _ in counts.jobs)
+
+    def drawn(camera: Camera, samples: int, seed: int, workers: int) -> tuple[Floats, float]:
+        nonlocal done
+        made = render(
+            scene, camera, width=width, height=height, film=film, samples=samples, seed=seed, threads=workers
+        )  # fmt: skip
+        done += samples
+        report(done / total)
+        return made.rgb.astype(np.float64), float(made.stats["seconds"])
+
+    halves = [drawn(cameras[EXACT], counts.reference, _REFERENCE_SEED + k, 2)[0] for k in range(2)]
+    for camera in cameras.values():  # the first render of a camera loads code and fills caches
+        render(scene, camera, width=width, height=height, samples=1, threads=1)
+    rendered: dict[str, Passes] = {name: ([], []) for name in cameras}
+    for samples, seed in counts.jobs:
+        for name, camera in cameras.items():
+            picture, seconds = drawn(camera, samples, seed, threads)
+            rendered[name][0].append(picture)
+            rendered[name][1].append(seconds)
+    weight = weights((halves[0] + halves[1]) / 2)
+    return {
+        "scene": scene.name,
+        "f_number": float(cameras[EXACT].settings["f_number"]),
+        "focus_m": shot.focus_m,
+        "counts": asdict(counts),
+        "threads": threads,
+        "reference_variance": reference_variance(halves, weight),
+        "reference_flip": flip(halves[0], halves[1]),
+        "cameras": [camera_row(name, own, rendered[EXACT], halves, counts) for name, own in rendered.items()],
     }
-    noise2 = {measure: reference_variance(halves, weight) for measure, weight in by.items()}
-    f_number = float(cameras[EXACT].settings["f_number"])
-    apart = flip(halves[0], halves[1])
-    return SceneResult(scene.name, shot, f_number, counts, threads, reference, noise2, apart, found)
 
 
-@dataclass(frozen=True)
-class Rendered:
-    """Pictures [H, W, 3] and seconds of one camera, in the order of `Counts.jobs`."""
+def camera_row(name: str, own: Passes, exact: Passes, halves: Sequence[Floats], counts: Counts) -> Row:
+    """The errors of one camera's renders.
 
-    pictures: list[Floats]
-    seconds: list[float]
+    Returns: levels, by samples; pass_s, best and median seconds of a pass; bias2, against the exact camera with the
+        same random numbers; alone2, bias^2 from the camera's own passes and the reference; variance of a pass;
+        flip_paired, FLIP of the mean picture against the exact camera's with the same random numbers.
+    """
+    reference = (halves[0] + halves[1]) / 2
+    weight, order = weights(reference), [n for n, _ in counts.jobs]
+    (pictures, seconds), others = own, np.stack(exact[0][-counts.passes :])
+    passes, times = pictures[-counts.passes :], seconds[-counts.passes :]
+
+    def level(samples: int, some: Sequence[Floats], took: Sequence[float]) -> Row:
+        error = float(np.mean([squared_error(p, halves, weight) for p in some]))
+        row = {"samples": samples, "seconds_min": min(took), "seconds_median": float(np.median(took))}
+        return row | {"rel_mse": error, "flip": float(np.mean([flip(p, reference) for p in some]))}
+
+    levels = []
+    for samples in counts.short:
+        mine = [k for k, n in enumerate(order) if n == samples]
+        levels.append(level(samples, [pictures[k] for k in mine], [seconds[k] for k in mine]))
+    for together in (2**k for k in range(int(math.log2(counts.passes)) + 1)):  # passes in groups that share none
+        groups = [passes[k : k + together] for k in range(0, counts.passes - together + 1, together)]
+        means = [np.mean(group, axis=0) for group in groups]
+        levels.append(level(together * counts.pass_samples, means, [together * t for t in times]))
+    alone, variance = bias_and_variance(np.stack(passes), halves, weight)
+    return {
+        "name": name,
+        "levels": levels,
+        "pass_s": [min(times), float(np.median(times))],
+        "bias2": asdict(paired_bias(np.stack(passes), others, weight)),
+        "alone2": asdict(alone),
+        "variance": asdict(variance),
+        "flip_paired": flip(np.mean(passes, axis=0), others.mean(axis=0)),
+    }
 
 
-def _render(
-    shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: lab.Report
-) -> tuple[list[Floats], dict[str, Rendered]]:
-    """The reference's halves, and every camera's renders; the cameras take turns, so that load affects all equally."""
-    jobs = counts.jobs
-    total = 2 * counts.reference + len(shelves) * sum(n for n, _ in jobs)
-    done, halves = 0, []
-    for half in range(2):
-        pictures, part = [], counts.reference // counts.parts
-        for k in range(counts.parts):
-            seed = _REFERENCE_SEED + half * counts.parts + k
-            pictures.append(shelves[EXACT].take(part, seed, threads=2)[0].astype(np.float64))
-            done += part
-            report(done / total)
-        halves.append(np.mean(pictures, axis=0))
-    rendered = {name: Rendered([], []) for name in shelves}
-    for kept in shelves.values():
-        if not all(kept.file(n, seed, threads).exists() for n, seed in jobs):
-            kept.warm_up()
-    for samples, seed in jobs:
-        for name, kept in shelves.items():
-            rgb, seconds = kept.take(samples, seed, threads)
-            rendered[name].pictures.append(rgb.astype(np.float64))
-            rendered[name].seconds.append(seconds)
-            done += samples
-            report(done / total)
-    return halves, rendered
+# ---- The page. -------------------------------------------------------------------------------------------------------
+
+_INTRO = """\
+# Equal time and equal samples
+
+`python -m experiments equal-time`: {lens} exact in torch, through surrogates in onnxruntime, both as compiled
+C (fused), and as a thin lens of its focal length and f-number. Against the exact lens with other seeds and {reference}
+samples per pixel, in two halves. Every camera draws the same random numbers, one wavelength per path. Times are the
+render's own seconds (best; median in brackets), threads: {threads}, {width} x {height} pixels; making a camera, its fit
+and the scene's tables are not in them.
+
+- *Error*: relative RMSE, the root of the mean of (a - b)^2 / (b^2 + 0.01) on linear radiance, in percent; mean FLIP.
+  The reference's own noise is taken out of the first (products of the differences from its two halves), not of FLIP.
+- *Bias*: what more samples do not lower. A render adds passes of {pass_samples} samples with seeds of their own, so
+  that error^2 = bias^2 + V / passes exactly. *Alone* takes this law to infinity from the camera's own {passes} passes
+  and the reference; *paired* compares its passes with the exact lens's of the same random numbers, where most noise
+  cancels. Deviations by the jackknife over passes; where a square is below two of them, "<" gives the bound of two.
+- *Variance*: V times the samples of a pass, relative. *Efficiency*: 1 / (V x seconds of a pass).
+- *FLIP paired*: between the camera's mean picture and the exact lens's of the same random numbers.
+"""
 
 
-def camera_result(
-    name: str,
-    own: Rendered,
-    exact: Rendered,
-    halves: list[Floats],
-    by: Mapping[str, Floats],
-    counts: Counts,
-    film: FilmMap,
-) -> CameraResult:
-    """The errors of a camera's renders against the exact lens's and the reference's halves; weights `by` measure."""
-    passes, others = np.stack(own.pictures[-counts.passes :]), np.stack(exact.pictures[-counts.passes :])
-    times = own.seconds[-counts.passes :]
-    both = {measure: bias_and_variance(passes, halves, weight) for measure, weight in by.items()}
-    picture, reference = passes.mean(axis=0), (halves[0] + halves[1]) / 2
-    return CameraResult(
-        name,
-        tuple(_levels(own, halves, by, counts)),
-        (min(times), float(np.median(times))),
-        {measure: paired_bias(passes, others, weight) for measure, weight in by.items()},
-        {measure: b for measure, (b, _) in both.items()},
-        {measure: v for measure, (_, v) in both.items()},
-        flip(picture, others.mean(axis=0)),
-        picture,
-        flip_map(picture, reference),
-        film,
+def page(rows: Sequence[Row]) -> str:
+    """The tables of scenes in Markdown."""
+    counts, about = rows[0]["counts"], lab.machine()
+    (width, height), samples = counts["size"], {k: counts[k] for k in ("pass_samples", "passes")}
+    told = {"lens": LENS, "reference": 2 * counts["reference"], "threads": rows[0]["threads"]}
+    parts = [_INTRO.format(width=width, height=height, **told, **samples)]
+    for row in rows:
+        noise = 100 * math.sqrt(row["reference_variance"])
+        parts += [
+            f"## {row['scene']}",
+            f"Focused at {row['focus_m']:g} m, f/{row['f_number']:.3g}. "
+            f"The reference's own noise: {noise:.3g}%; FLIP between its halves {row['reference_flip']:.3g}.",
+            lab.table(_law_columns(row), row["cameras"]),
+            lab.table(_equal_columns(row), row["cameras"]),
+        ]
+    machine = f"{about['processor']}, {about['cores']} cores, Python {about['python']}, numpy {about['numpy']}."
+    return lab.page(*parts, machine)
+
+
+def error_after(camera: Mapping[str, object], seconds: float) -> float:
+    """The squared error after at least one pass, by the law of the module; a bias below 0 counts as none."""
+    bias2, variance, (pass_s, _) = (camera[key] for key in ("bias2", "variance", "pass_s"))  # type: ignore[misc]
+    return float(max(bias2["value"], 0.0) + variance["value"] * pass_s / seconds)  # type: ignore[index]
+
+
+def _law_columns(row: Row) -> Sequence[lab.Column]:
+    samples = row["counts"]["pass_samples"]
+    return lab.columns(
+        ("camera", "name"),
+        ("bias paired %", lambda c: "0" if c["name"] == EXACT else _root(Estimate(**c["bias2"]))),
+        ("bias alone %", lambda c: _root(Estimate(**c["alone2"]))),
+        ("variance a sample", "variance.value", ".3g", samples),
+        ("ms a sample", lambda c: "{:.3g} ({:.3g})".format(*(1000 * s / samples for s in c["pass_s"]))),
+        ("efficiency 1/s", lambda c: 1 / (c["variance"]["value"] * c["pass_s"][0]), ".3g"),
     )
 
 
-def _levels(own: Rendered, halves: list[Floats], by: Mapping[str, Floats], counts: Counts) -> Iterator[Level]:
-    """Errors by sample count: of the short renders, then of as many passes as fit, in groups that share none."""
-    reference = (halves[0] + halves[1]) / 2
+def _equal_columns(row: Row) -> Sequence[lab.Column]:
+    """Columns at the most samples, and at the longest time for which every camera was rendered."""
+    most = row["cameras"][0]["levels"][-1]["samples"]
+    seconds = min(c["levels"][-1]["seconds_min"] for c in row["cameras"])
 
-    def level(samples: int, pictures: list[Floats], seconds: list[float]) -> Level:
-        errors = {m: float(np.mean([squared_error(p, halves, w) for p in pictures])) for m, w in by.items()}
-        seen = float(np.mean([flip(p, reference) for p in pictures]))
-        return Level(samples, min(seconds), float(np.median(seconds)), errors["mse"], errors["rel_mse"], seen)
+    def flip_then(camera: Row) -> float:
+        points = np.log(sorted((level["seconds_min"], level["flip"]) for level in camera["levels"]))
+        return float(np.exp(np.interp(math.log(seconds), points[:, 0], points[:, 1])))
 
-    order = [n for n, _ in counts.jobs]
-    for samples in counts.short:
-        mine = [k for k, n in enumerate(order) if n == samples]
-        yield level(samples, [own.pictures[k] for k in mine], [own.seconds[k] for k in mine])
-    passes, times = own.pictures[-counts.passes :], own.seconds[-counts.passes :]
-    for together in (2**k for k in range(int(math.log2(counts.passes)) + 1)):
-        groups = [passes[k : k + together] for k in range(0, counts.passes - together + 1, together)]
-        pictures = [np.mean(group, axis=0) for group in groups]
-        yield level(together * counts.pass_samples, pictures, [together * t for t in times])
+    return lab.columns(
+        ("camera", "name"),
+        (f"{most} samples: error %", lambda c: _percent(c["levels"][-1]["rel_mse"])),
+        ("FLIP", lambda c: c["levels"][-1]["flip"], ".3g"),
+        (f"{seconds:.3g} s: samples", lambda c: seconds * row["counts"]["pass_samples"] / c["pass_s"][0], ".0f"),
+        ("error %", lambda c: _percent(error_after(c, seconds))),
+        ("FLIP", flip_then, ".3g"),
+        ("FLIP paired", lambda c: "0" if c["name"] == EXACT else f"{c['flip_paired']:.2g}"),
+    )
 
 
-def scene_file(name: str) -> Path:
-    """The file of a scene of the project by name, or of any by its path; read, so that mistakes are found before the
-    work.
+def _percent(square: float) -> str:
+    return f"{100 * math.sqrt(square):.3g}" if square > 0 else "~0"
 
-    Raises:
-        InputError: as `load_scene`.
-    """
-    file = lab.SCENES / f"{name}.toml" if name in SCENES else Path(name)
-    load_scene(file)
-    return file
+
+def _root(square: Estimate) -> str:
+    """An error in percent from its square, with its deviation, or the bound where it is not resolved."""
+    if not square.resolved:
+        return f"< {100 * math.sqrt(max(square.value, 0.0) + 2 * square.sd):.2g}"
+    root = math.sqrt(square.value)
+    return f"{100 * root:.3g} ± {100 * square.sd / (2 * root):.1g}"
+
+
+OPTIONS = (
+    lab.option("--scene", metavar="SCENE", action="append", help="grid, lights, room or a file (default: all)"),
+    lab.option("--quick", action="store_true", help="tiny pictures (a minute)"),
+    lab.count("threads", 1, "of the timed renders (default 1)", 1, 256),
+    lab.AGAIN, lab.out(),
+)  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure scene by scene; the page is written after each."""
+    counts, files = QUICK if args.quick else Counts(), dict[str, Path]()
+    for name in args.scene or SCENES:
+        file = lab.SCENES / f"{name}.toml" if name in SCENES else Path(name)
+        files[load_scene(file).name] = file  # read now, so that mistakes are found before the work
+    lab.resume(
+        args, "equal_time", files,
+        lambda file, report: measure_scene(file, counts, args.threads, report),
+        lambda row: row["scene"], page, listed="scenes", again=args.restart, maker="experiments equal-time",
+        seconds=200.0,
+    )  # fmt: skip

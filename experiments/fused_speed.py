@@ -158,11 +158,10 @@ def measure(case: Case, *, rounds: int, torch_compiled: bool, report: Report) ->
             add(name, "whole", model_candidate(name, load_model(file), domain.stop_radius_mm), rms_um=error)
             add(name, "ray", ray_candidate(name, file), rms_um=error)
         timed = race(field, domain, rounds=rounds, report=lambda s: report(0.3 + 0.7 * s))
-    loads = [v for v in (timed.load_before, timed.load_after) if v is not None]
     for key, row in rows.items():
         timing = timed.timing(key)
         row.ns, row.reason = None if timing is None else dict(timing), timed.unavailable.get(key)
-        row.load = max(loads, default=None)
+        row.load = timed.load
         ratios = {exact: timed.speedup(key, f"{exact}, {row.work}") for exact in EXACTS}
         row.speedup = {exact: ratio["min"] for exact, ratio in ratios.items() if ratio is not None}
     return list(rows.values())
@@ -312,7 +311,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure lens by lens; the table is written after each."""
     lab.quiet_glasses()
     find_compiler()
-    rounds = lab.rounds_of(args)
+    rounds = args.rounds or (5 if args.quick else 20)
     cases = lab.chosen(CASES, lambda c: c.file, args.only, "fused")
     rows, text = earlier(args.out, [Path(c.file).stem for c in cases]), ""
     for case, report in lab.stages(cases, lambda c: c.file, args.quiet):

@@ -1,14 +1,14 @@
 """Ghosts drawn in several ways: error against the converged picture, and milliseconds a picture.
 
 All draw the same light through a double Gauss, 960 x 540 pixels, by the areas of the cells of a pupil grid. Exact: rays
-traced through all surfaces, compiled, on grids as fine as each ghost is large and bright, or on one sparse grid for all
-(after Hullin et al. 2011); the same rays path by path in torch, whose picture is that of the compiled ones. Fitted: a
-polynomial a ghost; and of first order, two matrices a ghost (after Lee and Eisemann 2013), here with all the rims of
-the polynomial and a constant power. RMS on the film is of rays that both let through, of the ghosts that carry 99% of
-the light, weighted by light. Times are without compiling, fitting and the exposure of the lens: of one thread its CPU
-time, of two threads what the clock says, the least and the median of the rounds. A ray is one place of the pupil, one
-ghost, one wavelength; exact and fitted rays are the same places. Exact ghosts have the same grids, as many wavelengths
-as their colours part, and the same edges drawn. Writes ghosts.md, ghosts.json and ghosts.png.
+traced through all surfaces, compiled, on grids as fine as each ghost is large and bright; the same rays path by path in
+torch, whose picture is that of the compiled ones. Fitted: a polynomial a ghost; and of first order, two matrices a
+ghost (after Lee and Eisemann 2013), here with all the rims of the polynomial and a constant power. RMS on the film is
+of rays that both let through, of the ghosts that carry 99% of the light, weighted by light. Times are without
+compiling, fitting and the exposure of the lens: of one thread its CPU time, of two threads what the clock says, the
+least and the median of the rounds. A ray is one place of the pupil, one ghost, one wavelength; exact and fitted rays
+are the same places. Exact ghosts have the same grids, as many wavelengths as their colours part, and the same edges
+drawn. Writes ghosts.md and ghosts.json.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -34,13 +33,13 @@ from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays, rays_across
 from neurolens.lens.prescription import Lens
-from neurolens.study.image import flip, flip_map
+from neurolens.study.image import flip
 from neurolens.trace.rays import Rays
 from neurolens.trace.sequence import follow, ghost
 
 LENS, LIGHT = "laikin_double_gauss_50", Light(15.0, 8.0)
 RASTER = Raster((36.0, 20.25), 960, 540)
-WAVELENGTHS, _SPARSE, _NM = 15, 32, 550.0
+WAVELENGTHS, _NM = 15, 550.0
 _CELLS = (8.0, 32.0, 40.0)
 _CELL = 40.0  # the coarsest whose FLIP and light keep the goals: the one that they are held against
 GOAL_UM, GOAL_ENERGY, GOAL_FLIP, GOAL_TORCH, GOAL_C, GOAL_MS = 20.0, 0.01, 0.03, 15.0, 4.0, 100.0
@@ -67,7 +66,7 @@ class Row:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, draw, write."""
+    """Measure, write."""
     lab.quiet_glasses()
     torch.set_num_threads(1)
     lens = lab.lens_of(LENS, focus_m=math.inf)
@@ -77,23 +76,20 @@ def run(args: argparse.Namespace) -> int:
         linear = first_order_ghosts(fitted)
     with progress.stage("converged"):
         reference = _drawn(tracer, 3.0, wavelengths=45)
-    rows, shown = [], {"exact, converged": reference}
+    rows = []
     ways: list[tuple[str, Any, float, int]] = [
         *(("exact, compiled", tracer, cell, WAVELENGTHS) for cell in _CELLS),
-        ("exact, one sparse grid", tracer, 0.0, WAVELENGTHS),
         *(("polynomials", fitted, cell, WAVELENGTHS) for cell in _CELLS),
         ("polynomials", fitted, _CELL, 8),
         ("first order", linear, _CELL, WAVELENGTHS),
     ]
     for name, model, cell, count in ways:
-        with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
-            found = _drawn(model, cell or 8.0, 1, count)
-            shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
-            times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
+        with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"):
+            found = _drawn(model, cell, 1, count)
+            times = [_timed(model, cell, threads, count, args.rounds) for threads in (1, 2)]
         rms = None if model is tracer else _rms(tracer, model)
         energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
         rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
-    _draw(args.out, shown, reference)
     exact = next(r for r in rows if r.cell_px == _CELL)
     more = _torch_ms(lens, tracer, _CELL)
     slow = exact.cpu_ms[0] + more, exact.cpu_ms[1] + more
@@ -156,18 +152,6 @@ def _goals(rows: list[Row], ray_ns: tuple[float, float]) -> list[lab.Goal]:
         lab.Goal("time over that of exact as C, as good", 1 / GOAL_C, mine.cpu_ms[0] / exact.cpu_ms[0]),
         lab.Goal("ms a picture, two cores", GOAL_MS, mine.wall_ms[0]),
     ]
-
-
-@contextmanager
-def _grid(cell: float) -> Iterator[None]:
-    """Grids of one size for all ghosts where no cell is given."""
-    kept = grids.FEWEST, grids.MOST
-    if not cell:
-        grids.FEWEST, grids.MOST = 10**9, _SPARSE
-    try:
-        yield
-    finally:
-        grids.FEWEST, grids.MOST = kept
 
 
 def _drawn(model: Any, cell: float, threads: int = 1, wavelengths: int = WAVELENGTHS) -> Any:
@@ -245,21 +229,6 @@ def _shown(found: Any, reference: Any) -> tuple[Any, Any]:
     return np.clip(found / white, 0, 1), np.clip(reference / white, 0, 1)
 
 
-def _draw(out: Any, shown: dict[str, Any], reference: Any) -> None:
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, len(shown), figsize=(2.9 * len(shown), 3.9), layout="constrained", squeeze=False)
-    for (name, found), (top, below) in zip(shown.items(), axes.T, strict=True):
-        pair = _shown(found, reference)
-        top.imshow(pair[0] ** (1 / 2.2))
-        top.set_title(name, fontsize=7)
-        below.imshow(flip_map(*pair), cmap="magma", vmin=0, vmax=0.2)
-        below.set_title(f"FLIP {flip(*pair):.3f}", fontsize=7)
-        for axis in (top, below):
-            axis.set_axis_off()
-    lab.write_figure(out / "ghosts.png", figure, 90)
-
-
 def _both(times: tuple[float, float] | None) -> str:
     """The least and the median."""
     return "-" if times is None else f"{times[0]:.0f}, {times[1]:.0f}"
@@ -267,7 +236,7 @@ def _both(times: tuple[float, float] | None) -> str:
 
 _COLUMNS = lab.columns(
     ("way", "way"),
-    ("cells, px", lambda r: r.cell_px or f"{_SPARSE} a side"),
+    ("cells, px", "cell_px"),
     ("wavelengths", "wavelengths"),
     ("RMS um", "rms_um", ".1f"),
     ("energy", "energy", "+.2%"),

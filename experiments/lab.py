@@ -13,8 +13,6 @@ import json
 import os
 import platform
 import resource
-import subprocess
-import sys
 import time
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
@@ -94,11 +92,6 @@ QUIET = option("--quiet", action="store_true", help=QUIET_HELP)
 ONLY = option("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
 AGAIN = option("--restart", old=("--again",), action="store_true", help="measure what is chosen again")
 ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")
-
-
-def rounds_of(args: argparse.Namespace) -> int:
-    """The rounds of a race that --rounds and --quick ask for."""
-    return int(args.rounds or (5 if args.quick else 20))
 
 
 def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:
@@ -299,23 +292,6 @@ def resume(
     print(page(ordered()))
 
 
-def write_figure(file: Path, figure: Any, dpi: int) -> None:
-    """Write a figure of matplotlib as PNG of 256 colours, or as JPEG, atomically, and close it."""
-    from matplotlib import pyplot as plt
-    from PIL import Image
-
-    file.parent.mkdir(parents=True, exist_ok=True)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=dpi, format="png")
-    plt.close(figure)
-    picture = Image.open(drawn).convert("RGB")
-    with atomic_path(file) as temporary:
-        if file.suffix == ".jpg":
-            picture.save(temporary, "JPEG", quality=90, subsampling=0)
-        else:
-            picture.quantize(256, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
-
-
 def write_small(file: Path, forms: Iterable[tuple[Any, dict[str, Any]]], most_bytes: int) -> None:
     """Write the first form, a picture of Pillow and the settings of its file, that is small enough for the repository.
 
@@ -434,29 +410,8 @@ def cpu_ns(calls: Mapping[str, Callable[[], int]], rounds: int, report: Report |
     return times
 
 
-def most_load(rows: Iterable[Row]) -> float | None:
-    """The highest load average of races, whose rows have it as "load", before and after."""
-    return max((load for row in rows for load in row["load"] if load is not None), default=None)
-
-
 class Unmeasured(NeurolensError):
     """Something cannot be measured on this machine; the message says why."""
-
-
-def in_child(function: Callable[..., Row], *args: str | float) -> Row:
-    """The result of a function of a module of this folder, called with plain arguments in a new process.
-
-    Raises:
-        Unmeasured: the process failed.
-    """
-    module, name = function.__module__, function.__name__
-    code = f"import json, sys; from {module} import {name} as f; print(json.dumps(f(*json.loads(sys.argv[1]))))"
-    command = [sys.executable, "-W", "ignore", "-c", code, json.dumps(args)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    if done.returncode != 0:
-        raise Unmeasured(f"{name}{args} in a child process: {done.stderr.strip().splitlines()[-1:]}")
-    found: Row = json.loads(done.stdout)
-    return found
 
 
 def cpu_s() -> float:
@@ -469,11 +424,3 @@ def resident_kb(field: str) -> int:
     """Kilobytes of memory, from /proc: "VmRSS" is the resident memory now, "VmHWM" its highest, "VmData" the data."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(field)).split()[1])
-
-
-def memory_growth(work: Callable[[], T]) -> tuple[T, float]:
-    """The result of `work`, and the bytes by which the highest resident memory exceeds that before (Linux alone)."""
-    Path("/proc/self/clear_refs").write_text("5")  # the highest mark starts from here
-    before = resident_kb("VmRSS")
-    made = work()
-    return made, (resident_kb("VmHWM") - before) * 1024.0

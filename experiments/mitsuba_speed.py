@@ -1,30 +1,26 @@
 """Paths per second of the renderer beside the scalar and LLVM variants of Mitsuba 3, on Mitsuba's own Cornell box.
 
 With its pinhole and through a lens model: the same picture, samples, depth and roulette, in one run. Each renderer
-makes a picture in turn, so that a busy machine slows all alike; compiling is not counted. Then our scenes, where their
-time goes, and the memory that a render takes by picture size. Without the extra "mitsuba", our side alone.
+makes a picture in turn, so that a busy machine slows all alike; compiling is not counted. Without the extra "mitsuba"
+nothing is measured, and the page says so.
 Writes render_speed.md and render_speed.json.
 """
 
 from __future__ import annotations
 
 import argparse
-import cProfile
 import math
-import pstats
 import statistics
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import neurolens
 from experiments import lab
 from experiments.lab import Report
 from experiments.mitsuba_scenes import our_scene, with_our_spectra
@@ -32,12 +28,11 @@ from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.library import libraries
 from neurolens.render.renderer import render
-from neurolens.render.scene import Scene, load_scene
+from neurolens.render.scene import Scene
 from neurolens.render.settings import FilmSettings
 
 FOCAL_MM = 50.0
@@ -202,111 +197,13 @@ def _noise(row: Row) -> float | None:
     return float(np.mean(grey.var(axis=0, ddof=1)) / np.mean(grey**2)) if len(grey) > 1 else None
 
 
-STAGES = ("camera", "intersection", "lights", "shading", "random numbers", "integrator", "film, set-up")
-_ROOT = str(Path(neurolens.__file__).parent)
-# Stages of the renderer's modules; some functions have a stage of their own.
-_STAGE = {
-    **dict.fromkeys(("primitives", "mesh"), "intersection"),
-    **dict.fromkeys(("lights", "environment"), "lights"),
-    **dict.fromkeys(("materials", "directions", "textures", "world"), "shading"),
-    **{"sampler": "random numbers", "integrator": "integrator"},
-}
-_FUNCTIONS = {
-    "world": dict.fromkeys(("nearest", "visible", "surfaces"), "intersection"),
-    "integrator": {
-        "aim_at_lights": "lights",
-        **dict.fromkeys(("lit", "deposit", "scatter", "_scatter_rough", "_scatter_glass"), "shading"),
-        **dict.fromkeys(("__init__", "_lobes", "_absorb", "start", "evaluate", "index"), "shading"),  # of a vertex
-    },
-    "spectrum": dict.fromkeys(("colour", "reflectance", "absorption", "light", "look_up", "_row", "freeze"), "shading"),
-}
-_HELPERS = {"dot", "take", "cut"}  # which count as part of those who call them
-
-Function = tuple[str, int, str]
-
-
-def profile(scene: Scene, camera: Camera, **size: int) -> dict[str, float]:
-    """Share of the time of each of `STAGES` in a render by one worker, adding up to 1."""
-    profiler = cProfile.Profile()
-    profiler.enable()
-    render(scene, camera, **size, threads=1)  # type: ignore[arg-type]
-    profiler.disable()
-    return shares(pstats.Stats(profiler))
-
-
-def shares(stats: pstats.Stats) -> dict[str, float]:
-    """Own time of every function by stage; that of numpy and of helpers belongs to those who called them."""
-    table: dict[Function, Any] = stats.stats  # type: ignore[attr-defined]
-    path: set[Function] = set()
-
-    @cache
-    def split(function: Function) -> tuple[float, ...]:
-        own = _stage_of(function)
-        if own is not None:
-            return tuple(float(stage == own) for stage in STAGES)
-        callers = {k: v[2] + 1e-12 for k, v in table[function][4].items() if k not in path and k != function}
-        total = sum(callers.values())
-        if not total:
-            return tuple(float(stage == STAGES[-1]) for stage in STAGES)
-        path.add(function)
-        parts = [(seconds / total, split(caller)) for caller, seconds in callers.items()]
-        path.discard(function)
-        return tuple(sum(share * part[k] for share, part in parts) for k in range(len(STAGES)))
-
-    spent = dict.fromkeys(STAGES, 0.0)
-    for function, (_, _, own_s, _, _) in table.items():
-        for stage, share in zip(STAGES, split(function), strict=True):
-            spent[stage] += own_s * share
-    total = sum(spent.values())
-    return {stage: seconds / total for stage, seconds in spent.items()}
-
-
-def _stage_of(function: Function) -> str | None:
-    """Stage of a function of ours; None for helpers and for all others."""
-    file, _, name = function
-    if not file.startswith(_ROOT) or name in _HELPERS:
-        return None
-    part, module = Path(file).parent.name, Path(file).stem
-    if part == "cameras" or name in ("_hero_rays", "_camera_rays"):
-        return "camera"
-    if part != "render":
-        return STAGES[-1]
-    return _FUNCTIONS.get(module, {}).get(name) or _STAGE.get(module, STAGES[-1])
-
-
-def thin_camera(scene: Scene) -> ThinLens:
-    """A 50 mm thin lens with the scene's focus and stop."""
-    settings = scene.settings.camera
-    film_mm = settings.film_mm
-    return ThinLens(50.0, settings.f_number or 2.8, settings.focus_m, film_mm)
-
-
-def mpaths_per_s(scene: Scene, repeats: int = 5, **options: Any) -> list[float]:
-    """Millions of paths a second of each of some renders through a thin lens; options as of `render`."""
-    camera = thin_camera(scene)
-    return [float(render(scene, camera, seed=k, **options).stats["mpaths_per_s"]) for k in range(repeats)]
-
-
-def memory_of(scene_file: str, width: int, samples: int) -> lab.Row:
-    """Render a scene in a fresh process: its size, and the MB by which the highest resident memory grows."""
-    scene = load_scene(scene_file)
-    camera = thin_camera(scene)
-    height = round(width * camera.film_mm[1] / camera.film_mm[0])
-    render(scene, camera, width=64, height=36, samples=1, threads=1)  # what numpy sets up once
-    size: dict[str, Any] = {"width": width, "height": height, "samples": samples}
-    grown = lab.memory_growth(lambda: render(scene, camera, **size, threads=1))[1]
-    return {**size, "growth_mb": grown / 1e6}
-
-
 @dataclass
 class Results:
-    """The results: rows of `record`, of scenes and of memory; `missing` says what was not measured, and why."""
+    """The results: rows of `record`; `missing` says what was not measured, and why."""
 
     settings: Settings
     versions: dict[str, str]
     rows: list[dict[str, Any]] = field(default_factory=list)
-    scenes: list[dict[str, Any]] = field(default_factory=list)
-    memory: list[dict[str, Any]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
 
@@ -331,17 +228,6 @@ _SPEEDS = lab.columns(
     ("time to equal noise", "equal_noise", ".2f"),
     ("first picture s", "first_s", ".2g"),
 )
-_WHERE = """\
-Paths per second through a thin lens, four wavelengths per path, the scene's own depth; beside it the share of the \
-time by what the code is for (profile of one worker)."""
-_SCENES = lab.columns(
-    ("scene", "scene"),
-    ("surfaces a path", "max_depth"),
-    ("Mpath/s, fastest", "mpaths_per_s", ".3g"),
-    ("median", "mpaths_per_s_median", ".3g"),
-    *((f"{stage} %", f"shares.{stage}", ".0f", 100) for stage in STAGES),
-)
-_MEMORY = lab.columns(("picture", "{width} x {height}".format_map), ("samples", "samples"), ("MB", "growth_mb", ".0f"))
 
 
 def page(results: Results) -> str:
@@ -351,29 +237,10 @@ def page(results: Results) -> str:
     parts = [f"One run of `python -m experiments mitsuba` ({versions}); {s.threads} threads."]
     if results.rows:
         parts += ["## Beside Mitsuba 3", _BESIDE.format(**vars(s)), lab.table(_SPEEDS, results.rows, "–")]
-    if results.scenes:
-        parts += ["## Scenes, and where the time goes", _WHERE, lab.table(_SCENES, results.scenes)]
-    if results.memory:
-        parts += ["## Memory", _memory_text(results.memory), lab.table(_MEMORY, results.memory)]
     return lab.page("# Speed of the renderer", *parts, *(f"Not measured: {reason}" for reason in results.missing))
 
 
-def _memory_text(rows: list[lab.Row]) -> str:
-    """The memory that grows with the picture, from the two largest at equal samples, and the rest."""
-    sizes = sorted((r["width"] * r["height"], r["growth_mb"]) for r in rows if r["samples"] == rows[0]["samples"])
-    (small, small_mb), (large, large_mb) = sizes[-2:]
-    each = (large_mb - small_mb) * 1e6 / (large - small)
-    rest = large_mb - each * large * 1e-6
-    text = f"It grows by {each:.0f} bytes per pixel, the film; the paths under way take {rest:.0f} MB whatever the"
-    return (
-        f"Highest resident memory of one worker while it renders, less that before. {text} picture's size and samples."
-    )
-
-
-SCENES = ("cornell", "room", "lights", "grid")
 MODEL = "laikin_double_gauss_50.ols-60.onnx"
-SCENE_SAMPLES, SCENE_WIDTH = 16, 240
-WIDTHS, MANY_SAMPLES = (256, 512, 1024, 2048), 64
 OPTIONS = (
     lab.count("size", 256, "side in pixels (default: 256)", 16, 2048),
     lab.count("samples", 16, "a pixel (default: 16)", 1, 4096),
@@ -384,19 +251,14 @@ OPTIONS = (
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, writing the page after each part."""
+    """Measure, and write the page."""
     results = Results(Settings(args.size, args.samples, args.threads, args.repeats), _versions())
-    parts = {"beside Mitsuba": _beside, "scenes": _scenes, "memory": _memory}
-    progress = Progress(dict(zip(parts, (120.0, 60.0, 40.0), strict=True)), quiet=args.quiet)
-    text = ""
-    for name, part in parts.items():
-        with progress.stage(name) as report:
-            try:
-                part(results, report)
-            except NeurolensError as error:
-                results.missing.append(f"{name} ({error})")
-        text = lab.write_results(args.out, "render_speed", page(results), vars(results))
-    print(text)
+    with Progress({"beside Mitsuba": 120.0}, quiet=args.quiet).stage("beside Mitsuba") as report:
+        try:
+            _beside(results, report)
+        except NeurolensError as error:
+            results.missing.append(f"beside Mitsuba ({error})")
+    print(lab.write_results(args.out, "render_speed", page(results), vars(results)))
 
 
 def _versions() -> dict[str, str]:
@@ -418,25 +280,3 @@ def _beside(results: Results, report: Report) -> None:
         made[k % len(made)].run(seed=k // len(made))
         report((k + 1) / total)
     results.rows = [record(row, results.settings, made[0]) for row in made]
-
-
-def _scenes(results: Results, report: Report) -> None:
-    """Each scene: timed with all threads, then profiled with one."""
-    threads, repeats = results.settings.threads, min(results.settings.repeats, 5)
-    for k, name in enumerate(SCENES):
-        scene = load_scene(lab.SCENES / f"{name}.toml")
-        camera = thin_camera(scene)
-        height = round(SCENE_WIDTH * camera.film_mm[1] / camera.film_mm[0])
-        size: dict[str, Any] = {"width": SCENE_WIDTH, "height": height, "samples": SCENE_SAMPLES}
-        speeds = mpaths_per_s(scene, repeats=repeats, threads=threads, **size)
-        row = {"scene": name, "max_depth": scene.settings.camera.max_depth, "mpaths_per_s": max(speeds)}
-        row |= {"mpaths_per_s_median": sorted(speeds)[len(speeds) // 2], "shares": profile(scene, camera, **size)}
-        results.scenes.append(row)
-        report((k + 1) / len(SCENES))
-
-
-def _memory(results: Results, report: Report) -> None:
-    cases = [*((width, 1) for width in WIDTHS), (WIDTHS[0], MANY_SAMPLES)]
-    for k, (width, samples) in enumerate(cases):
-        results.memory.append(lab.in_child(memory_of, str(lab.SCENES / "room.toml"), width, samples))
-        report((k + 1) / len(cases))

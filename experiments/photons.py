@@ -4,8 +4,7 @@ Ten million photons of 550 nm for each place of the light, with 10 reflections a
 twenty million for three places. His photons left the light in a cone tuned by hand and 30 to 32% of them reached the
 sensor, in 7867 to 9017 s, and twenty million in 12 to 15 hours (2008); ours are aimed at the sphere about the front
 surface, so that their share is another: both are told. Compiling is not counted; processor seconds are those of all
-threads. Writes photons.md, photons.json and photons.jpg (the flare alone, 9 wavelengths of 16 million photons each, for
-a smooth picture; beside it all pairs of reflections without chance).
+threads. Writes photons.md and photons.json.
 """
 
 from __future__ import annotations
@@ -20,11 +19,8 @@ import numpy as np
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.flare.canvas import Raster
-from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import ghost_picture, photon_picture
 
 LENS, ZOOM, DISTANCE_MM = "nikon_zoom_80_200", "80", 3600.0
 # x, y of the light in mm, most reflections, and his time where he states it.
@@ -39,7 +35,6 @@ CASES = (
 )
 TWICE = ((-400, 66), (450, 200), (300, 300))  # with twice the photons, in 12 to 15 h
 FILM_MM, _AT_ONCE, _NM = (36.0, 24.0), 1 << 18, 550.0
-_SHOWN = 1 << 24  # photons of a wavelength of a picture
 GOAL_S = 10.0
 
 OPTIONS = [
@@ -78,7 +73,6 @@ def run(args: argparse.Namespace) -> int:
     for x, y, most, his, count in cases:
         with progress.stage(f"{x}, {y}, {most} reflections"):
             rows.append(_row(tracer, x, y, most, his, count, args.threads))
-    _draw(tracer, args)
     slowest = max(r.seconds for r in rows if r.photons == args.photons)
     goal = lab.Goal(f"seconds for {args.photons:,} photons, {args.threads} threads", GOAL_S, slowest)
     text = lab.page("# Photons", __doc__ or "", lab.table(_COLUMNS, rows), lab.goal_table("Goal", [goal]))
@@ -114,29 +108,6 @@ def _row(tracer: PhotonTracer, x: int, y: int, most: int, his: str, count: int, 
     return Row(
         x, y, most, count, seconds, worked, his, by.sum(), by[1:].sum(), by[2], by[4], by[5:].sum(), *books[12:]
     )  # fmt: skip
-
-
-def _draw(tracer: PhotonTracer, args: argparse.Namespace) -> None:
-    import matplotlib.pyplot as plt
-
-    raster, panels = Raster(FILM_MM, 480, 320), []
-    for x, y, most, _ in CASES:
-        photons = photon_picture(
-            tracer, [light_at(x, y)], raster, photons=_SHOWN, wavelengths=9, kernel_px=12.0,
-            most_reflections=most, threads=args.threads,
-        )  # fmt: skip
-        panels.append((f"light at {x}, {y} mm, {most} reflections", photons))
-    x, y = CASES[-1][:2]
-    exact = ghost_picture(GhostTracer(tracer.lens), [light_at(x, y)], raster, threads=args.threads)[0]
-    panels.append((f"light at {x}, {y} mm, all pairs, not by chance", exact))
-    figure, axes = plt.subplots(2, 4, figsize=(16, 6), layout="constrained")
-    for axis, (title, picture) in zip(axes.flat, panels, strict=True):
-        shown = (picture / max(float(np.quantile(picture, 0.99)), 1e-30)).clip(0, 1) ** (1 / 2.2)
-        axis.imshow(shown, extent=(-18, 18, -12, 12))
-        axis.set_title(title, fontsize=8)
-        axis.set_xlabel("mm", fontsize=7)
-        axis.tick_params(labelsize=7)
-    lab.write_figure(args.out / "photons.jpg", figure, 100)
 
 
 _COLUMNS = lab.columns(

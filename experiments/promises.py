@@ -18,9 +18,10 @@ from typing import Any
 
 from experiments import lab
 from experiments.lab import Row
-from experiments.mitsuba_speed import mpaths_per_s
 from neurolens.base.errors import InputError
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import load_model
+from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 from neurolens.study.speed import Race, exact_candidates, model_candidate, race
 from neurolens.surrogates.domain import domain_of
@@ -88,7 +89,7 @@ def bench_models(args: argparse.Namespace) -> Outcome:
         lens = lens.with_stop_radius(domain.stop_radius_mm)
         made = [model_candidate(name, model, domain.stop_radius_mm) for name, model in models.items()]
         candidates = [*exact_candidates(lens, domain), *made]
-        timed = race(candidates, domain, threads=args.threads, rounds=args.rounds, report=report)
+        timed = race(candidates, domain, rounds=args.rounds, report=report)
         print(f"{_state(group)}\n{times(timed)}\n")
         hold_to_promises(rows, timed, outcome)
     return outcome
@@ -141,7 +142,11 @@ def check_floors(rounds: int) -> list[lab.Goal]:
         speed, reason = (1000 / timing["min"], "") if timing else (None, timed.unavailable.get(f"trace {kind}", ""))
         text = f"exact tracer, {kind}, one core, float32, Mray/s"
         floors.append(lab.Goal(text, floor, speed, at_least=True, worst=reason))
-    speed = max(mpaths_per_s(load_scene(SCENE), threads=2, max_depth=3, samples=16))
+    scene = load_scene(SCENE)
+    shot = scene.settings.camera
+    camera = ThinLens(50.0, shot.f_number or 2.8, shot.focus_m, shot.film_mm)
+    drawn = [render(scene, camera, seed=k, threads=2, max_depth=3, samples=16) for k in range(5)]
+    speed = max(float(picture.stats["mpaths_per_s"]) for picture in drawn)
     return [*floors, lab.Goal("render of the room, two cores, depth 3, Mpath/s", RENDER_MPATH_S, speed, at_least=True)]
 
 
@@ -164,7 +169,6 @@ def report_outcome(outcome: Outcome) -> int:
 OPTIONS = (
     lab.option("--models", metavar="DIR", type=Path, default=lab.MODELS, help="with index.json (default: models)"),
     lab.option("--only", metavar="TEXT", default="", help="models whose names hold this, promised or not; no floors"),
-    lab.count("threads", 1, "that share out batches (default 1)"),
     lab.count("rounds", 20, "of each candidate (default 20)"),
     lab.QUIET,
 )

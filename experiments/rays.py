@@ -44,6 +44,7 @@ import torch
 from experiments import lab
 from experiments.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Prepared, Task, table_of
 from experiments.tracer_race import has_avx512
+from neurolens.analysis.plots import drawing, plain_log_ticks
 from neurolens.cameras.model import load_model
 from neurolens.graph.compiler import FLAGS, find_compiler, has_compiler
 from neurolens.graph.ir import pruned
@@ -362,31 +363,29 @@ def description(name: str) -> dict[str, str]:
 
 def draw(rows: Sequence[Row], known: Mapping[str, Any], file: Path) -> None:
     """Error on the film against time, a panel a lens."""
-    from matplotlib import pyplot as plt
-
     names = list(dict.fromkeys(r.lens for r in rows))
-    figure, panels = plt.subplots(1, len(names), figsize=(5.6 * len(names), 6.4), squeeze=False)
     floor = 1e-11  # um; the trace that all are compared with has no error, and a logarithm none
-    for name, panel in zip(names, panels[0], strict=True):
-        timed = [(row.ns["min"], row) for row in rows if row.lens == name and row.ns]
-        for k, (x, row) in enumerate(sorted(timed, key=lambda pair: pair[0])):
-            assert row.errors
-            y, colour = max(row.errors["film_um"], floor), FAMILIES[row.family]
-            panel.plot(x, y, "s" if row.precision == "float64" else "o", color=colour, markersize=4)
-            panel.annotate(f"{k + 1}", (x, y), (2, 4 if k % 2 else -9), textcoords="offset points", color=colour)
-            place = 0.03, 0.02 + 0.028 * (len(timed) - 1 - k)
-            panel.text(*place, f"{k + 1}  {row.name}", transform=panel.transAxes, fontsize=7, color=colour)
-        panel.set(xscale="log", yscale="log", xlabel="ns a ray, one thread", title=known["lenses"][name]["title"])
-        panel.title.set_fontsize(8)
-        panel.grid(alpha=0.3)
-        panel.margins(0.2)
-    panels[0][0].set_ylabel("RMS error on the film, um (1e-11: the reference itself)")
-    for family, colour in FAMILIES.items():
-        panels[0][0].plot([], [], "o", color=colour, label=family)
-    panels[0][0].plot([], [], "s", color="grey", label="float64 (others float32)")
-    panels[0][0].legend(fontsize=7, loc="upper right")
-    figure.tight_layout()
-    lab.write_figure(file, figure, 110)
+    with drawing(file, 5.6 * len(names), 6.4) as figure:
+        panels = figure.subplots(1, len(names), squeeze=False)[0]
+        for name, panel in zip(names, panels, strict=True):
+            timed = [(row.ns["min"], row) for row in rows if row.lens == name and row.ns]
+            for k, (x, row) in enumerate(sorted(timed, key=lambda pair: pair[0])):
+                assert row.errors
+                y, colour = max(row.errors["film_um"], floor), FAMILIES[row.family]
+                panel.plot(x, y, "s" if row.precision == "float64" else "o", color=colour, markersize=4)
+                panel.annotate(f"{k + 1}", (x, y), (2, 4 if k % 2 else -9), textcoords="offset points", color=colour)
+                place = 0.03, 0.02 + 0.028 * (len(timed) - 1 - k)
+                panel.text(*place, f"{k + 1}  {row.name}", transform=panel.transAxes, fontsize=7, color=colour)
+            panel.set(xscale="log", yscale="log", xlabel="ns a ray, one thread", title=known["lenses"][name]["title"])
+            plain_log_ticks(panel.xaxis, panel.yaxis)
+            panel.title.set_fontsize(8)
+            panel.grid(alpha=0.3)
+            panel.margins(0.2)
+        panels[0].set_ylabel("RMS error on the film, um (1e-11: the reference itself)")
+        for family, colour in FAMILIES.items():
+            panels[0].plot([], [], "o", color=colour, label=family)
+        panels[0].plot([], [], "s", color="grey", label="float64 (others float32)")
+        panels[0].legend(fontsize=7, loc="upper right")
 
 
 OPTIONS = (

@@ -3,7 +3,7 @@
 The lenses, of 2 to 40 refractions, are traced exactly (torch, and compiled as C), through their polynomials and
 networks in onnxruntime and compiled (12 minutes of one core; --quick: one). Needs the extra "train" (torch) and a C
 compiler; what this machine cannot make is left out, and the page says so. The tables are those of Willi 2021
-(multi-lens cameras in appleseed), 6.2 and 6.3. Writes README.md, render_times.csv and render_times.png.
+(multi-lens cameras in appleseed), 6.2 and 6.3. Writes README.md.
 """
 
 from __future__ import annotations
@@ -22,15 +22,12 @@ import torch
 
 from experiments import lab
 from experiments.lab import Report
-from neurolens.analysis.plots import INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import FUSED, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.shot import Shot, StopShape
-from neurolens.render.images import make_aperture
+from neurolens.lens.shot import Shot
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
 from neurolens.render.settings import FilmSettings
@@ -57,7 +54,6 @@ LENSES = (
     (40, "zoom 70-200 (Nikon)", "nikon_zoom_70_200", 71.5),
 )
 _QUICK = (2, 14, 40)
-_MASKS = lab.ROOT / "experiments" / "gallery" / "scenes"
 _FILM = (0.36, 0.2025)  # of the focal length
 _FOCUS_M, _F_NUMBER = 5.0, 4.0
 _ALONE_ROUNDS, _SLOW_S = 15, 0.1
@@ -137,10 +133,10 @@ def make_subjects(quick: bool, report: Report) -> list[Subject]:
     return [subject for subject, _, _ in specs]
 
 
-def shot(efl: float, spec: str, aperture: Aperture | None = None) -> Shot:
+def shot(efl: float, spec: str) -> Shot:
     """The settings of every camera."""
     f_number = None if spec == "pinhole" else _F_NUMBER
-    return Shot((_FILM[0] * efl, _FILM[1] * efl), _FOCUS_M, f_number, aperture=aperture)
+    return Shot((_FILM[0] * efl, _FILM[1] * efl), _FOCUS_M, f_number)
 
 
 def _differentials(camera: Camera, count: int) -> Callable[[], object] | None:
@@ -228,46 +224,6 @@ class _WithDifferentials:
         return _WithDifferentials(opener() if opener else self._camera)
 
 
-@dataclass
-class Shape:
-    """A shape of the biconvex lens's stop: the share of rays that pass, seconds of every round."""
-
-    name: str
-    aperture: Aperture | None
-    passed: float = 0.0
-    seconds: list[float] = field(default_factory=list)
-
-    @property
-    def area(self) -> float:
-        """Its area over that of the round stop."""
-        return 1.0 if self.aperture is None else self.aperture.area_share
-
-
-def shapes() -> list[Shape]:
-    """The round stop, 5 and 50 straight edges, a star and a heart."""
-    made = {f"{n} edges": Aperture(blades=n) for n in (5, 50)}
-    masks = {name: make_aperture(StopShape(aperture_mask=_MASKS / f"{name}.png")) for name in ("star", "heart")}
-    return [Shape("round", None), *(Shape(name, aperture) for name, aperture in (made | masks).items())]
-
-
-def time_shapes(scene: Scene, size: Size, report: Report) -> list[Shape]:
-    """The biconvex lens, compiled, with every shape of its stop."""
-    _, _, stem, efl = LENSES[0]
-    spec = f"{FUSED}{lab.LENSES / stem}.toml"
-    made = shapes()
-    try:
-        cameras = [make_camera(spec, shot(efl, spec, shape.aperture)) for shape in made]
-    except InputError:
-        return []
-    for k in range(size.rounds):
-        for shape, camera in zip(made, cameras, strict=True):
-            stats = one_render(scene, camera, size)
-            shape.seconds.append(stats["seconds"])
-            shape.passed = stats["passed_fraction"]
-        report((k + 1) / size.rounds)
-    return made
-
-
 # ---- The page. -------------------------------------------------------------------------------------------------------
 
 ABOVE_THIN, MOVES, PER_REFRACTION = 0.05, 0.30, 0.10  # the goals, as shares
@@ -291,7 +247,6 @@ class Results:
     size: Size
     subjects: list[Subject] = field(default_factory=list)
     rows: list[Timed] = field(default_factory=list)
-    shapes: list[Shape] = field(default_factory=list)
 
     def row(self, subject: Subject | str, scene: str, differentials: bool = False) -> Timed | None:
         """The times of a camera (of an ideal one by its kind) in a scene, if there are any."""
@@ -344,11 +299,10 @@ def goals(results: Results) -> list[lab.Goal]:
 
 
 def write(results: Results, out: Path) -> str:
-    """Write README.md and render_times.csv; returns the page."""
+    """Write README.md; returns the page."""
     out.mkdir(parents=True, exist_ok=True)
     text = page(results)
     atomic_write_text(out / "README.md", text)
-    atomic_write_text(out / "render_times.csv", lab.csv_text(_CSV, [r for r in results.rows if r.seconds]))
     return text
 
 
@@ -363,16 +317,13 @@ _GOALS = lab.columns(
 _LEGEND = """\
 Seconds (median); overhead over the pinhole per refraction; share of the camera. Ideal cameras stand in the
 first column."""
-_SHAPES_NOTE = "Biconvex lens, C, cheap scene. Passage and time over the round stop's, area over the disc's."
 
 
 def page(results: Results) -> str:
     """All tables."""
     timed = {r.scene for r in results.rows if r.seconds}
-    parts = [] if not timed else ["![Seconds over refractions](render_times.png)"]
-    parts += [f"## Seconds, {s}\n\n{_LEGEND}\n\n{_scene_table(results, s)}" for s in SCENES if s in timed]
+    parts = [f"## Seconds, {s}\n\n{_LEGEND}\n\n{_scene_table(results, s)}" for s in SCENES if s in timed]
     missing = [f"{s.name}: {s.reason}." for s in results.subjects if s.reason]
-    by_shape = lab.table(_shape_columns(results.shapes[0]), results.shapes) if results.shapes else ""
     return lab.page(
         "# Render time by camera",
         "`python -m experiments render`",
@@ -384,7 +335,6 @@ def page(results: Results) -> str:
         "## Cameras by themselves",
         lab.table(_camera_columns(results), results.subjects, "–"),
         *missing,
-        f"## Shapes of the stop\n\n{_SHAPES_NOTE}\n\n{by_shape}" if by_shape else "",
     )
 
 
@@ -422,58 +372,6 @@ def _camera_columns(results: Results) -> tuple[lab.Column, ...]:
     )
 
 
-def _shape_columns(first: Shape) -> tuple[lab.Column, ...]:
-    return lab.columns(
-        ("stop", "name"), ("area", lambda s: _percent(s.area)),
-        ("rays that pass", lambda s: _percent(s.passed / first.passed)),
-        ("time", lambda s: _percent(min(s.seconds) / min(first.seconds))),
-    )  # fmt: skip
-
-
-_CSV = lab.columns(
-    ("scene", "scene"), ("lens", "subject.lens"), ("refractions", "subject.refractions"), ("camera", "subject.kind"),
-    ("differentials", lambda r: int(r.differentials)), ("seconds_min", lambda r: min(r.seconds), ".5f"),
-    ("seconds_median", lambda r: median(r.seconds), ".5f"), ("camera_seconds_min", lambda r: min(r.camera_s), ".5f"),
-    ("passed", "passed", ".5f"), ("paths", "paths"), ("threads", lambda r: 1), ("rounds", lambda r: len(r.seconds)),
-    ("camera_alone_ns", lambda r: r.subject.ns_moves if r.differentials else r.subject.ns, ".2f"),
-)  # fmt: skip
-# Okabe and Ito's colours; what runs compiled is filled.
-_LOOK = {
-    TORCH: (INK, "s", "white"),
-    EXACT_C: (INK, "s", INK),
-    GRAPHS[0]: ("#0072b2", "o", "white"),
-    FUSED_MODELS[0]: ("#0072b2", "o", "#0072b2"),
-    GRAPHS[1]: ("#d55e00", "^", "white"),
-    FUSED_MODELS[1]: ("#d55e00", "^", "#d55e00"),
-}
-_LINES = {THIN: ("#009e73", "--"), PINHOLE: ("#7f7f7f", ":")}
-
-
-def draw(results: Results, path: Path) -> None:
-    """Draw one panel for every scene that was rendered; nothing where none was."""
-    scenes = [s for s in SCENES if results.row(PINHOLE, s)]
-    if not scenes:
-        return
-    with drawing(path, 4.4 * len(scenes) + 2.6, 4.6) as figure:
-        for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
-            for kind, (colour, marker, fill) in _LOOK.items():
-                timed = [(s.refractions, results.row(s, scene)) for s in results.subjects if s.kind == kind]
-                points = [(count, min(row.seconds)) for count, row in timed if row is not None]
-                if points:
-                    look = {"color": colour, "mfc": fill, "mec": colour, "ms": 5, "lw": 1.1}
-                    axes.plot(*zip(*points, strict=True), marker=marker, label=kind, **look)
-            for kind, (colour, dash) in _LINES.items():
-                row = results.row(kind, scene)
-                if row is not None:
-                    axes.axhline(min(row.seconds), color=colour, ls=dash, lw=1.2, label=kind)
-            axes.set(xlabel="refractions of the lens", ylabel="seconds a render", title=scene)
-            axes.set(xlim=(0, None), ylim=(0, None))
-            axes.grid(True)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.suptitle("Render time over refractions", x=0.01, ha="left", fontweight="bold")
-        figure.legend(handles, labels, loc="outside right upper")
-
-
 OPTIONS = (
     lab.option("--quick", action="store_true", help="three lenses in the cheap scene, one small round"),
     lab.out(lab.RESULTS / "render_times"),
@@ -487,7 +385,7 @@ def run(args: argparse.Namespace) -> None:
     results = Results(Size(64, 36, 16, 1) if args.quick else Size())
     chosen = list(SCENES.items())[: 1 if args.quick else 3]
     scenes = {cost: load_scene(lab.SCENES / f"{name}.toml") for cost, name in chosen}
-    progress = Progress({"cameras": 25, "cameras alone": 5, "renders": 65, "stop shapes": 5}, quiet=args.quiet)
+    progress = Progress({"cameras": 25, "cameras alone": 5, "renders": 65}, quiet=args.quiet)
     with progress.stage("cameras") as report:
         results.subjects = make_subjects(args.quick, report)
     with progress.stage("cameras alone") as report:
@@ -496,7 +394,4 @@ def run(args: argparse.Namespace) -> None:
     with progress.stage("renders") as report:
         results.rows = time_renders(results.subjects, scenes, results.size, report)
     write(results, args.out)
-    with progress.stage("stop shapes") as report:
-        results.shapes = time_shapes(scenes[CHEAP], results.size, report)
-    draw(results, args.out / "render_times.png")
     print(write(results, args.out))

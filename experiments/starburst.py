@@ -1,10 +1,7 @@
-"""Stars about lights: their shapes by stop, blades and field, checks of the diffraction against closed forms, and the
-sampled Keller cones of Steinert's thesis (2009) beside it.
+"""Stars about lights: checks of the diffraction against closed forms, and the seconds that stars take.
 
-The lens is a double Gauss 50 mm f/1.8 on 36 x 24 mm; a light on the axis and one 15 degrees off. Keller's cones: edge
-points drawn by chance, from each a ray across its edge whose light falls as the square of the angle, added without
-phase (the constant is that of the geometrical theory of diffraction for small angles). Seconds are told with those of a
-core, for others work on the machine. Writes starburst.md, starburst.json and starburst.png.
+The lens is a double Gauss 50 mm f/1.8 on 36 x 24 mm. Seconds are told with those of a core, for others work on the
+machine. Writes starburst.md and starburst.json.
 """
 
 from __future__ import annotations
@@ -29,12 +26,9 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 
 LENS, NM, FILM_MM = "laikin_double_gauss_50", 550.0, (36.0, 24.0)
-STOPS, BLADES, CURVATURES, FIELDS = (4.0, 8.0, 16.0), (6, 7, 9), (0.0, 0.7), (0.0, 15.0)
-LARGE, SMALL, DECADES = (960, 640), (216, 144), 5.0
-_RAYS, _MOST_BYTES = 1 << 20, 350_000
+STOPS, LARGE = (1.8, 4.0, 8.0, 16.0, 45.0), (960, 640)
 
 OPTIONS = [
-    lab.count("wavelengths", 5, "of the pictures drawn (default: 5)"),
     lab.count("threads", 2, "default: 2"),
     lab.out(),
 ]
@@ -54,15 +48,12 @@ class Check:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, draw, write; 1 where a check is off by more than its goal."""
+    """Check, time, write; 1 where a check is off by more than its goal."""
     progress = Progress(quiet=args.quiet)
     with progress.stage("checks"):
         rings, streaks, light = _rings(), _streaks(), _light()
-        keller = _keller_rows()
     with progress.stage("seconds"):
-        seconds = [_seconds(f_number, args) for f_number in (1.8, *STOPS, 45.0)]
-    with progress.stage("pictures") as report:
-        _draw(args, report)
+        seconds = [_seconds(f_number, args) for f_number in STOPS]
     goals = [
         lab.Goal("dark ring, relative error", 0.005, max(c.off for c in rings)),
         lab.Goal("number of streaks, relative error", 0.0, max(c.off for c in streaks)),
@@ -71,11 +62,10 @@ def run(args: argparse.Namespace) -> int:
     ]
     text = lab.page(
         "# Stars", __doc__ or "", lab.table(_CHECKS, [*rings, *streaks, *light]), lab.table(_SECONDS, seconds),
-        "Keller's cones, sampled, beside the far field, f/16:", lab.table(_KELLER, keller),
-        lab.goal_table("Goal", goals), f"{_PICTURE} {lab.machine_line()}",
+        lab.goal_table("Goal", goals), lab.machine_line(),
     )  # fmt: skip
     checks = [*rings, *streaks, *light]
-    data = {"machine": lab.machine(), "checks": checks, "seconds": seconds, "keller": keller}
+    data = {"machine": lab.machine(), "checks": checks, "seconds": seconds}
     print(lab.write_results(args.out, "starburst", text, data))
     return int(any(goal.verdict == "missed" for goal in goals))
 
@@ -164,115 +154,6 @@ def _seconds(f_number: float, args: argparse.Namespace) -> dict[str, Any]:
     return {"stop": f"f/{f_number:g}", "seconds": spent[0], "core": spent[1], "aside": aside}
 
 
-def _edges(pupil: ExitPupil, lines: list[Array]) -> tuple[Array, Array]:
-    """Parts of an edge: their ways [2, N] in cosines, and e dl [N]."""
-    ends = [np.append(line, line[:, :1], 1) * pupil.half[:, None] for line in lines]
-    way = np.concatenate([np.diff(e) for e in ends], 1)
-    middle = np.concatenate([(e[:, 1:] + e[:, :-1]) / 2 for e in ends], 1)
-    return way, np.hypot(*way) * np.abs(pupil.field(middle / pupil.half[:, None])) ** 2
-
-
-def _edge_light(pupil: ExitPupil, lines: list[Array]) -> float:
-    """Light that cones send farther than u, times u."""
-    return 2 * NM * 1e-6 * float(_edges(pupil, lines)[1].sum()) / (4 * math.pi**2)
-
-
-def keller(pupil: ExitPupil, lines: list[Array], pixel: float, reach: int, rays: int = _RAYS) -> Array:
-    """A star by sampled cones, [2 reach + 1] pixels a side: rays across edges, from half a pixel to beyond the frame.
-
-    An element dl of the edge sends lambda e dl / (4 pi^2 u^2) to each side, per mm at the distance u.
-    """
-    way, weight = _edges(pupil, lines)
-    chance = np.random.default_rng(0)
-    which = chance.choice(len(weight), rays, p=weight / weight.sum())
-    near, far = 0.5 * pixel, 2 * reach * pixel
-    u = 1 / (1 / far + chance.random(rays) * (1 / near - 1 / far)) * chance.choice([-1, 1], rays)
-    at = u * np.stack([way[1], -way[0]])[:, which] / np.hypot(*way[:, which])
-    edges = (np.arange(2 * reach + 2) - reach - 0.5) * pixel
-    count = np.histogram2d(at[1], at[0], bins=(edges, edges))[0]
-    return count * (_edge_light(pupil, lines) * (1 / near - 1 / far) / rays / pixel**2)
-
-
-def _keller_rows() -> list[dict[str, Any]]:
-    rows, pixel, reach = [], 0.0375, 100
-    for name, aperture in (("round", None), ("7 blades", Aperture(blades=7))):
-        pupil, lines = _pupil(16.0, aperture)
-        exact, cones = _star(pupil, lines, pixel, reach), keller(pupil, lines, pixel, reach)
-        away = np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1])
-        ring = (away > 20) & (away < 80)
-        peak = [exact[np.abs(away - k) < 1].max() for k in range(101)]
-        dim = ring & (exact < 0.01 * np.interp(away, np.arange(101), peak))
-        even = np.interp(away, np.arange(101), [cones[np.abs(away - k) < 1].mean() for k in range(101)])
-        # Where Airy's first ring is dark and the next bright, cones say the same.
-        fringe = NM * 1e-6 * 16 * np.array([1.22, 1.635])
-        first, second = (far_field(pupil, lines, np.array([r]), np.zeros(1))[0, 0] for r in fringe)
-        row = {"stop": name, "light": float(cones[ring].sum() / exact[ring].sum())}
-        row["dim"] = float(cones[dim].sum() / exact[dim].sum()) if dim.any() else None
-        row["noise"] = float(np.std(cones[ring] / even[ring] - 1)) if aperture is None else None
-        row["contrast"] = float((second - first) / (second + first)) if aperture is None else None
-        row["too_much"] = _edge_light(pupil, lines) / light_of(pupil, lines) / (NM * 1e-6 * 16)
-        rows.append(row)
-    return rows
-
-
-def _shown(picture: Array, white: float) -> Array:
-    """A picture [H, W, 3] with brightness by its logarithm, `DECADES` below white; hues stay."""
-    bright = np.maximum(picture.max(-1, keepdims=True), 1e-30)
-    scale = np.clip(1 + np.log10(bright / white) / DECADES, 0, 1)
-    return np.clip(picture / bright, 0, 1) * scale
-
-
-def _draw(args: argparse.Namespace, report: Any) -> None:
-    from PIL import Image, ImageDraw
-
-    columns = [(n, c) for n in STOPS for c in CURVATURES]
-    rows = [(b, f) for b in BLADES for f in FIELDS]
-    width, height, edge = *SMALL, 14
-    size = (len(columns) * (width + 2), (len(rows) + 2) * (height + edge))
-    sheet, done = Image.new("RGB", size, (24, 24, 24)), 0
-    write = ImageDraw.Draw(sheet)
-
-    def put(row: int, column: int, picture: Array, white: float, title: str) -> None:
-        at = column * (width + 2), row * (height + edge)
-        made = Image.fromarray((255 * _shown(picture, white)).astype(np.uint8))
-        sheet.paste(made, (at[0], at[1] + edge))
-        write.text((at[0] + 2, at[1] + 1), title, (220, 220, 220))
-
-    for row, (blades, field) in enumerate(rows):
-        for column, (f_number, curvature) in enumerate(columns):
-            lens = lens_at(f_number, Aperture(blades=blades, curvature=curvature, rotation_deg=7.0))
-            light, raster = Light(field, 0.0), Raster(FILM_MM, *SMALL)
-            film = starburst_picture(lens, [light], raster, wavelengths=args.wavelengths, threads=args.threads)
-            title = f"f/{f_number:g} {blades} {'round' if curvature else 'straight'} {field:g} deg"
-            put(row, column, film, float(np.quantile(film.max(-1), 0.9999)), title)
-            done += 1
-            report(done / len(rows) / len(columns))
-    half = min(SMALL) // 2 - 1
-    for row, aperture in enumerate((None, Aperture(blades=7, rotation_deg=7.0))):
-        pupil, lines = _pupil(16.0, aperture)
-        exact = _star(pupil, lines, 0.0375, half)
-        some, many = (keller(pupil, lines, 0.0375, half, rays) for rays in (1 << 14, 1 << 20))
-        fine = 0.05 / half
-        x = np.arange(-half, half + 1) * fine
-        near, cones = far_field(pupil, lines, x, x), keller(pupil, lines, fine, half)
-        panels = (
-            (exact, "far field"), (some, "cones, 16384 rays"), (many, "cones, 2^20 rays"),
-            (near, "far field, 0.1 mm"), (cones, "cones, 0.1 mm"),
-        )  # fmt: skip
-        for column, (film, title) in enumerate(panels):
-            white = float((exact if column < 3 else near).max())
-            put(len(rows) + row, column, np.repeat(film[..., None], 3, 2), white, f"f/16 550 nm {title}")
-    args.out.mkdir(parents=True, exist_ok=True)
-    colours = (sheet.quantize(n) for n in (256, 64, 32))
-    forms = ((picture, {"optimize": True}) for picture in (sheet, *colours))
-    lab.write_small(args.out / "starburst.png", forms, _MOST_BYTES)
-
-
-_PICTURE = (
-    "![Stars](starburst.png) Rows: 6, 7 and 9 blades, on the axis and 15 degrees off; columns: f/4, f/8, f/16, blades "
-    "straight and rounded; brightness by its logarithm, five decades. Below: one wavelength, round and 7 blades, "
-    "beside Keller's cones."
-)
 _CHECKS = lab.columns(
     ("", "what"), ("measured", "found", ".4f"), ("right", "right", ".4f"), ("off", "off", ".3%")
 )  # fmt: skip
@@ -281,12 +162,4 @@ _SECONDS = lab.columns(
     ("seconds", "seconds", ".1f"),
     ("of a core", "core", ".1f"),
     ("light that leaves the image, 550 nm", "aside", ".2%"),
-)
-_KELLER = lab.columns(
-    ("stop", "stop"),
-    ("its light from 0.75 to 3 mm over ours", "light", ".3f"),
-    ("the same between streaks", "dim", ".3f"),
-    ("noise of a pixel, a million rays", "noise", ".0%"),
-    ("contrast of the first rings (its: 0)", "contrast", ".2f"),
-    ("distance in lambda N within which it has more than all light", "too_much", ".2f"),
 )

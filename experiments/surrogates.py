@@ -55,7 +55,6 @@ OPTIONS = (
     lab.option("--rays", metavar="N", type=whole(1000, 10**6), help="rays of fits and errors (default 30000)"),
     lab.option("--seed", metavar="N", type=whole(0), default=1, help="seed of the rays (default 1)"),
     lab.option("--rounds", metavar="N", type=whole(0), help="rounds of the race, 0 for none (default 10)"),
-    lab.option("--threads", metavar="N", type=whole(1, 256), default=1, help="threads of the race (default 1)"),
     lab.option("--restart", action="store_true", help="make the records of the chosen rows again"),
     lab.out(lab.ROOT / "runs" / "surrogates", "folder"),
     lambda parser: add_options(parser, Glasses),
@@ -103,7 +102,7 @@ def _settings(args: argparse.Namespace) -> BenchSettings:
     rounds = args.rounds if args.rounds is not None else (3 if args.quick else 10)
     # The goals are stated for 400-700 nm.
     domain = DomainChoice(focus_m=None if args.near else (math.inf, math.inf), wavelength_nm=(400.0, 700.0))
-    evaluation = EvaluationChoice(50_000 if args.quick else 200_000, rounds, args.threads, not args.quick)
+    evaluation = EvaluationChoice(50_000 if args.quick else 200_000, rounds, not args.quick)
     return BenchSettings(domain, PairSettings(rays, rays, rays, args.seed), evaluation)
 
 
@@ -115,7 +114,7 @@ def _conditions(args: argparse.Namespace, settings: BenchSettings) -> str:
     return (
         f"Full aperture and lit film, 400-700 nm (one wavelength where no dispersion is known), {focus}; {pairs.train} "
         f"rays to fit, {pairs.held_out} to measure, {e.vignetting_rays} for the vignetting, seed {pairs.seed}; "
-        f"{e.threads} thread{'s' * (e.threads > 1)}, {e.rounds} rounds.{quick}"
+        f"1 thread, {e.rounds} rounds.{quick}"
     )
 
 

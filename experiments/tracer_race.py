@@ -182,14 +182,15 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
             run()
             other[name] = int((out[-1] != ours).sum())
     timed = race(field, domain, rounds=rounds, report=report)
-    load = max((v for v in (timed.load_before, timed.load_after) if v is not None), default=None)
     rows = []
     for name in (c.name for c in field):
         timing, ratio = timed.timing(name), timed.speedup(name, "exact C")
         count = sum(programs[name].count().values()) if name in programs else None
         known = None if timing is None else dict(timing), timed.unavailable.get(name), other.get(name)
         rows.append(
-            Row(case.file, lens.name, lens.refractions, name, count, *known, ratio["min"] if ratio else None, load)
+            Row(
+                case.file, lens.name, lens.refractions, name, count, *known, ratio["min"] if ratio else None, timed.load
+            )
         )
     return rows
 

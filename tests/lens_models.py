@@ -33,22 +33,20 @@ from neurolens.surrogates.source import at_wavelength
 
 LENSES = Path(__file__).parents[1] / "lenses"
 GAUSS, FISHEYE, COLOURLESS = "laikin_double_gauss_50", "horimoto_fisheye_16", "muller_fisheye_100"
-KINDS = ("invariants", "raw", "network", "thick", "fisheye")
+KINDS = ("invariants", "network", "thick", "fisheye")
 GATED = ("singlet", "hemisphere")  # lenses whose rays are lost at surfaces, too
 PUBLISHED = ("hanika", "schrade", "rtf", "taylor", "cells", "neurolens2017", "ray-lut")
 _FITS = {
     "invariants": ModelSettings("dense", degree=4),
-    "raw": ModelSettings("dense", basis="raw", degree=3),
     "thick": ModelSettings("thick"),
-    "zones": ModelSettings("ols", terms=16, partitions=2, planes=False),
     "residual": ModelSettings("ols+mlp", terms=12, degree=5, planes=False, units=8, layers=1, steps=60),
-    "hanika": PublishedSettings("hanika", basis="raw", degree=3),
-    "schrade": PublishedSettings("schrade", basis="raw", degree=5, terms=12),
-    "rtf": PublishedSettings("rtf", basis="raw", degree=4),
-    "taylor": PublishedSettings("taylor", basis="raw", degree=3),
-    "ray-lut": PublishedSettings("ray-lut", basis="raw", units=6),
-    "cells": PublishedSettings("zheng-adaptive", basis="raw", terms=6, partitions=2),
-    "neurolens2017": PublishedSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2),
+    "hanika": PublishedSettings("hanika", degree=3),
+    "schrade": PublishedSettings("schrade", degree=5, terms=12),
+    "rtf": PublishedSettings("rtf", degree=4),
+    "taylor": PublishedSettings("taylor", degree=3),
+    "ray-lut": PublishedSettings("ray-lut", units=6),
+    "cells": PublishedSettings("zheng-adaptive", terms=6, partitions=2),
+    "neurolens2017": PublishedSettings("neurolens2017", units=16, layers=2, steps=60, partitions=2),
 }
 
 
@@ -115,8 +113,8 @@ def model(kind: str) -> LensModel:
     """A model of each kind.
 
     `KINDS` (each kind of core, first order, a fisheye whose rays graze its front), `GATED`, `PUBLISHED` (after which
-    " fisheye" takes that lens), or "zones" of the film, "residual" network, "laser" (one wavelength), "colourless" (a
-    fisheye without known dispersion), "cylinders", "cylinders network".
+    " fisheye" takes that lens), or "residual" network, "laser" (one wavelength), "colourless" (a fisheye
+    without known dispersion), "cylinders", "cylinders network".
     """
     if kind in ("fisheye", "colourless"):
         return fit_model(prepared(FISHEYE if kind == "fisheye" else COLOURLESS), _FITS["invariants"])

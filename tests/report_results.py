@@ -63,7 +63,6 @@ def full_results(name: str = "Tessar 50 mm") -> dict[str, Any]:
             "paired_share": 0.05, "pairs": 4, "caption": name,
         }],
         "image_settings": {"exposure": 1.0, "pixels_per_degree": 67.0},
-        "domain_gain": {"scene": "room", "text": name, "rows": [{"domain": "scene", "name": "ols 40", "rms_um": 0.61}]},
         "figures": [{"file": "pareto.png", "title": name, "caption": name, "wide": True}],
         "versions": {"torch": "2.13.0", name: name},
         "seed": 7,

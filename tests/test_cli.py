@@ -17,7 +17,7 @@ from command_line import described, failure, run_json
 from lens_models import edited
 from shipped import whole
 
-from neurolens.cli import build_parser, library, main
+from neurolens.cli import build_parser, main
 from neurolens.render.pictures import read_exr
 from neurolens.surrogates.card import read_card
 
@@ -311,21 +311,6 @@ def test_lens_state_is_applied(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_json(capsys, "lens", GAUSS, "--efl", "35")["efl_mm"] == pytest.approx(35)
 
 
-@pytest.mark.whole  # trace/test_states.py has its figures
-def test_lens_zooms_between_states_focuses_inside_and_shows_its_breathing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lens = ROOT / "lenses/nikon_zoom_70_200.toml"
-    state = ("--zoom", "100", "--focus", "1.5", "--focusing", "internal", "--blades", "9")
-    data = run_json(capsys, "lens", lens, *state, "--breathing", tmp_path / "breathing.png")
-    assert (tmp_path / "breathing.png").stat().st_size > 10_000
-    assert "100 mm" in data["derived"] and data["aperture"]["blades"] == 9
-    inside = data["breathing"]["groups move"]
-    assert inside[0]["efl_mm"] == pytest.approx(100, rel=1e-6) and inside[1]["efl_mm"] < 95
-    seen = run_json(capsys, "lens", GAUSS, "--field", "40")
-    assert seen["image_radius_mm"] == 21.6 and seen["half_field_reached_deg"] == pytest.approx(20, abs=0.5)
-
-
 # render
 
 
@@ -544,50 +529,3 @@ def test_render_through_a_model_needs_no_torch_and_keeps_its_card(
     ):
         line = failure(capsys, "render", scene, "--camera", MODEL, "-o", out, "--quiet", *args)
         assert all(word in line for word in words), line
-
-
-@pytest.mark.whole  # a page
-def test_the_demo_is_a_page_of_pictures_with_their_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["demo", "--width", "32", "--samples", "1"]) == 0
-    page = (tmp_path / "neurolens-demo" / "index.html").read_text(encoding="utf-8")
-    pictures = re.findall(r'img src="./([a-z]+\.png)"', page)
-    assert pictures == ["model.png", "exact.png", "thin.png", "pinhole.png", "fisheye.png"]
-    assert all((tmp_path / "neurolens-demo" / name).stat().st_size > 100 for name in pictures)
-    assert page.count("neurolens render") == 5 and "missing" not in page
-
-
-@pytest.mark.whole  # a page
-@pytest.mark.slow
-def test_the_library_is_pages_of_lenses_and_an_index_that_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drawings = library._drawings  # the others are those of `neurolens analyse`
-    monkeypatch.setattr(
-        library, "_drawings", lambda lens: [d for d in drawings(lens) if d[0] in ("layout", "bokeh", "breathing")]
-    )
-    command = ["library", "-o", tmp_path / "pages", "thorlabs_lb1471_biconvex_50", "--quiet", "--json"]
-    assert main([str(word) for word in command]) == 0
-    found = json.loads(capsys.readouterr().out)
-    folder = tmp_path / "pages" / "thorlabs_lb1471_biconvex_50"
-    page = (folder / "index.html").read_text(encoding="utf-8")
-    for name in re.findall(r'img src="./([a-z-]+\.png)"', page):
-        assert (folder / name).read_bytes()[:4] == b"\x89PNG"
-    assert page.count("<img") == 3 and "mlp-16x2" in page and "Picture missing" not in page
-    assert found["bytes"] < 1e6 and found["lenses"][0]["efl_mm"] == pytest.approx(50, rel=0.02)
-    index = (tmp_path / "pages" / "index.html").read_text(encoding="utf-8")
-    assert (
-        "thorlabs_lb1471_biconvex_50/index.html" in index
-        and "data:image/svg+xml,%3Csvg" in index
-        and not re.search("(src|href)=.http", index)
-    )
-    assert 'src="./thorlabs_lb1471_biconvex_50/discs.png"' in index and ">cat&#39;s eye<" in index
-    assert (folder / "discs.png").stat().st_size < 2048 and found["lenses"][0]["character"]["bubble"] < 0.9
-    before = (folder / "layout.png").stat().st_mtime_ns
-    assert main([str(word) for word in command]) == 0 and (folder / "layout.png").stat().st_mtime_ns == before
-    (tmp_path / "bad.toml").write_text("schema = 1\n")
-    capsys.readouterr()
-    assert main(["library", "-o", str(tmp_path / "pages"), str(tmp_path / "bad.toml"), "--quiet"]) == 1
-    assert "bad.toml" in capsys.readouterr().out

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,6 @@ from command_line import failure, run_json
 from PIL import Image
 from shipped import whole
 
-from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.ideal import ThinLens
 from neurolens.cli import main
 from neurolens.cli.keys import frames_of
 from neurolens.render.pictures import read_exr, read_layers, write_exr
@@ -110,24 +107,6 @@ def test_a_signal_in_mid_render_loses_nothing(
     assert all(np.array_equal(one[name], other[name]) for name in one)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux")
-def test_workers_end_with_a_killed_command_whatever_they_do(scene: Path, tmp_path: Path) -> None:
-    """A killed parent can ask nobody to stop, and these workers never come to the end of a tile."""
-    code = (
-        "import sys, time\n"
-        "from neurolens.cli import main\n"
-        "from neurolens.render.job import Job\n"
-        "Job.render_tile = lambda *_: time.sleep(600)\n"
-        "main(['render', sys.argv[1], '--camera', 'thin', '-o', 'a.exr', '--quiet'])\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code, str(scene)], cwd=tmp_path, start_new_session=True)
-    wait(lambda: len(children(process)) == 2 or process.poll() is not None)
-    workers = children(process)
-    process.kill()
-    process.wait()
-    wait(lambda: not any(map(alive, workers)))
-
-
 def test_layers_are_chosen_and_explained(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a.exr"
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", out)
@@ -136,25 +115,6 @@ def test_layers_are_chosen_and_explained(scene: Path, tmp_path: Path, capsys: py
     run_json(capsys, *common, "--half")
     assert sorted(read_exr(out)[1]["layers"]) == sorted(read_layers(out))
     assert np.all(read_layers(out)["samples"] == 16)
-
-
-def test_samples_that_are_not_finite_are_one_warning(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usual = ThinLens.sample
-
-    def sample(self: ThinLens, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
-        rays = usual(self, film_mm, pupil, wavelength_nm)
-        return replace(rays, weight=np.where(film_mm[0] > 0, rays.weight, np.float32(np.inf)))
-
-    monkeypatch.setattr(ThinLens, "sample", sample)
-    out = tmp_path / "a.exr"
-    assert main(["render", str(scene), "--camera", "thin", "-o", str(out)]) == 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-    half = 64 * 36 * 16 // 2
-    assert lines == [f"neurolens: warning: {half} of {2 * half} samples were not finite and count as black"]
-    picture, told = read_exr(out)
-    assert np.all(np.isfinite(picture)) and told["render"]["dropped_samples"] == half
 
 
 def test_a_full_disk_keeps_what_it_can_and_says_what_is_lost(

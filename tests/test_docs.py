@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
+from shipped import WHOLE
 
 from neurolens.readers import lensfile
 from neurolens.render.scene import SceneSettings
@@ -33,6 +34,12 @@ EXAMPLES = [
 ]
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```', re.MULTILINE | re.DOTALL)
 NODE = "onnxruntime-node@1.30"
+# What takes long in how-tos and is run by the first hour or by tests of the command: a block's commands
+# from the first of these on run with NEUROLENS_WHOLE=1.
+LONG = re.compile(
+    r"^neurolens (?:analyse|train|plan|handover|rims|verify [^\n]*--check|export [^\n]*--to osl)\b.*",
+    re.MULTILINE | re.DOTALL,
+)
 
 
 def name_of(page: Path) -> str:
@@ -146,6 +153,8 @@ def test_examples_run(page: Path, tmp_path: Path) -> None:
             continue
         if title:
             (tmp_path / title).write_text(code, encoding="utf-8")
+        if page in HOW_TO and not WHOLE and language == "sh":
+            code = LONG.sub("", code)
         command = {"sh": ["sh", "-ec", code], "python": [sys.executable, "-c", code]}.get(language)
         if language == "js":
             npm = f"command -v npm >/dev/null && npm install --silent --no-fund --ignore-scripts {NODE} || exit 77; "

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import failure, run_json
+from command_line import failure
 
 from neurolens.blender.pack import Form
 from neurolens.cameras.onnxlens import load_model
@@ -105,33 +105,3 @@ def test_a_refused_lens_is_text_in_the_librarys_index(capsys: pytest.CaptureFixt
     text = Path("new/index.html").read_text()
     assert "schema: got" in capsys.readouterr().out and "schema: got" in text
     assert "<img" not in text and "<script>document.documentElement" not in text
-
-
-@pytest.mark.whole  # a page
-def test_lenses_of_one_stem_have_pages_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    from neurolens.cli import library
-
-    monkeypatch.setattr(library, "_drawings", lambda lens: ())  # pictures take ten seconds a lens
-    for folder, lens in (("a", "cooke_triplet_50"), ("b", "petzval_portrait_100")):
-        Path(folder).mkdir()
-        shutil.copyfile(ROOT / "lenses" / f"{lens}.toml", f"{folder}/x.toml")
-    assert main(["library", "-o", "pages", "a/x.toml", "b/x.toml", "--quiet"]) == 0
-    titles = [Path("pages", name, "index.html").read_text() for name in ("x", "x-2")]
-    assert "Cooke triplet" in titles[0] and "Petzval" in titles[1]
-    index = Path("pages/index.html").read_text()
-    assert "./x/index.html" in index and "./x-2/index.html" in index
-
-
-@pytest.mark.whole  # flare/test_flare_extremes.py, in a process of its own
-@pytest.mark.slow
-def test_nested_rings_end_within_the_memory_of_one_picture(capsys: pytest.CaptureFixture[str]) -> None:
-    """A thousand regions, each around the next, took 1.7 GB more than their picture of 48 MB."""
-    import tracemalloc
-
-    tracemalloc.start()
-    try:
-        words = (*FLARE, "--image", "rings.exr", "--film", "24x24", "--most", "2")
-        run_json(capsys, *words)
-        assert tracemalloc.get_traced_memory()[1] < 700e6
-    finally:
-        tracemalloc.stop()

@@ -4,28 +4,21 @@ import gc
 import io
 import json
 import os
-import re
-import runpy
 import socket
 import subprocess
 import sys
-import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from command_line import failure
 from some_tasks import count
 
-from neurolens import __version__
-from neurolens.base import cluster as cluster_module
-from neurolens.base import tasks as tasks_module
 from neurolens.base.cluster import Dask, packed, unpack, with_paths
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import noted_files, read_bytes
@@ -37,7 +30,6 @@ from neurolens.render.pictures import read_channels
 
 Client = pytest.importorskip("distributed", reason="needs the extra dask").Client
 
-ROOT = Path(__file__).parents[1]
 CLUSTER = """
 import logging, multiprocessing, sys
 from distributed import LocalCluster
@@ -129,33 +121,6 @@ def test_processes_end_with_an_iteration_that_is_left() -> None:
         time.sleep(0.01)
     with pytest.raises(RuntimeError, match="shutdown"):
         executor.submit(count, Shared(b""), (1, ""))
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_process_ends_once_nobody_waits_for_it() -> None:
-    read, write = os.pipe()
-    child = os.fork()
-    if not child:
-        os.close(read)
-        tasks_module._end_unread(write)
-        os._exit(0)
-    time.sleep(0.05)
-    assert os.waitpid(child, os.WNOHANG) == (0, 0)
-    os.close(read)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
-    os.close(write)
-
-
-def test_a_worker_of_a_cluster_ends_after_a_task_that_never_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It answers first; a task in time leaves it alone."""
-    ended: list[float] = []
-    stuck, timer = threading.Event(), SimpleNamespace(start=lambda: None)
-    monkeypatch.setattr(cluster_module.threading, "Timer", lambda after, *_: (ended.append(after), timer)[1])
-    assert cluster_module._answer(bytes, __version__, 9.0, [b"a"], {}) == b"a" and not ended
-    answer = cluster_module._answer(stuck.wait, __version__, 0.01, [], {})
-    stuck.set()
-    assert answer == Failed("took longer than 0.01 s") and len(ended) == 1
-    assert "not 0" in cluster_module._answer(bytes, "0", 9.0, [], {}).reason
 
 
 def try_in(task: str) -> bytes:
@@ -307,83 +272,3 @@ def test_a_lost_scheduler_leaves_what_is_done(
     seen.clear()
     assert framed("a.exr", "--dask", cluster) == framed("here.exr")
     assert 1 <= len(seen) < 8 and not (tmp_path / "a.exr.tiles").exists()
-
-
-@pytest.fixture
-def lenses(tmp_path: Path) -> list[Path]:
-    """Two lenses that are soon fitted, one beside the other."""
-    found = [tmp_path / "lenses" / name for name in ("one.toml", "two.toml")]
-    found[0].parent.mkdir()
-    for path, lens in zip(found, ("cooke_triplet_50", "thorlabs_lb1471_biconvex_50"), strict=True):
-        path.write_text((ROOT / "lenses" / f"{lens}.toml").read_text())
-    return found
-
-
-SMALL = ("pairs.train=1500", "pairs.held_out=1000", "evaluation.vignetting_rays=1000",
-         "render.scenes=[]", 'model=[{method="ols", terms=12}]')  # fmt: skip
-
-
-@pytest.mark.whole  # as surveys go on
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_plots")
-def test_a_lens_that_fails_is_a_line_and_the_others_are_trained(
-    lenses: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    small = [word for each in SMALL for word in ("--set", each)]
-    Path("no.toml").write_text("name = 5")
-    named = ("--lens", "no.toml", str(lenses[0]))
-    assert main(["train", "--output", "runs", "--rounds", "0", "--quiet", *small, *named]) == 2
-    err = capsys.readouterr().err
-    assert "neurolens: no: no.toml: schema: got (missing)" in err and err.count("\n") == 1
-    assert Path("runs/one/models/ols-12.onnx").is_file()
-
-
-@pytest.mark.whole  # as frames are
-def test_records_of_a_survey_are_those_of_one_machine(
-    cluster: str, lenses: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("neurolens.cli.train.Processes", lambda *_: Here())
-    found = []
-    for place, more in (("here", ()), ("there", ("--dask", cluster))):
-        out = tmp_path / place
-        assert main(["survey", str(lenses[0].parent), "--no-fit", "--quiet", "--output", str(out), *more]) == 0
-        found.append({path.name: path.read_bytes() for path in (out / "records").iterdir()})
-    assert found[0] == found[1] and len(found[0]) == 2
-
-
-LAMP = """
-points = [{ position_m = [-0.3, 1.3, 0.0], intensity = [2.0, 1.0, 0.5] }]
-[camera]
-position_m = [0.0, 1.0, 2.0]
-look_at_m = [0.0, 1.0, 0.0]
-focus_m = 2.0
-film_height_mm = 24.0
-[flare]
-bins = 3
-brightest = 1
-cell_px = 64.0
-"""
-
-
-@pytest.mark.whole  # make docs runs it too; frames and tiles by themselves below and in test_tiles
-@pytest.mark.slow
-def test_the_documented_script_renders_one_picture_in_three_ways(
-    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A frame rendered at once, in tiles that are merged, and on Dask has the same channels, its flare's among them."""
-    (script,) = re.findall(
-        r'```python title="farm.py"\n(.*?)```', (ROOT / "docs/pages/how-to/farm.md").read_text(), re.S
-    )
-    monkeypatch.chdir(tmp_path)
-    Path("lights.toml").write_text(LAMP)
-    # A cluster that runs already instead of one that the script starts, whose worker would import all of it again.
-    script = script.replace("experiments/scenes/", "").replace('"local:2"', f'"{cluster}"')
-    Path("farm.py").write_text(script)
-    runpy.run_path("farm.py", run_name="__main__")
-    one, *others = (read_channels(Path(f"{name}.exr"))[0] for name in ("one", "tiled", "farm"))
-    assert one["ghosts.G"].any() and {"R", "Z", "rest.B"} <= one.keys()
-    for other in others:
-        assert other.keys() == one.keys()
-        assert all(np.array_equal(other[name], one[name]) for name in one)
-    assert len(list(tmp_path.glob("pull.*.exr"))) == 2 and not list(tmp_path.glob("*.tiles"))

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 from experiments.published.adaptive import fit_adaptive
-from experiments.published.data import RawData, outer_pupil
+from experiments.published.data import PublishedSettings, RawData, outer_pupil
 from experiments.published.neural import fit_averaged
 from experiments.published.polynomials import fit_dense, fit_sparse
 from experiments.published.raylut import fit_table
@@ -28,12 +28,7 @@ from neurolens.surrogates.model import Gate, LensModel
 from neurolens.surrogates.targets import ModelSettings, Prepared
 from neurolens.surrogates.terms import pinned_threads
 
-
-@dataclass(frozen=True)
-class PublishedSettings(ModelSettings):
-    """The settings of a published method, whose names are those of `PUBLISHED`."""
-
-    method: str = ""  # type: ignore[assignment]
+__all__ = ["PUBLISHED", "PublishedMethod", "PublishedSettings", "fit_any", "fit_published"]
 
 
 class PublishedMethod(NamedTuple):
@@ -47,46 +42,40 @@ PUBLISHED: dict[str, PublishedMethod] = {
     "taylor": PublishedMethod(
         'Hullin, Hanika, Heidrich 2012, "Polynomial Optics: A Construction Kit for Efficient Ray-Tracing of Lens '
         'Systems", Computer Graphics Forum 31(4)',
-        tuple(PublishedSettings("taylor", f"taylor-d{degree}", "raw", degree=degree) for degree in (5, 3, 7)),
+        tuple(PublishedSettings("taylor", f"taylor-d{degree}", degree=degree) for degree in (5, 3, 7)),
     ),
     "hanika": PublishedMethod(
         'Hanika and Dachsbacher 2014, "Efficient Monte Carlo Rendering with Realistic Lenses", Computer Graphics '
         "Forum 33(2)",
-        tuple(PublishedSettings("hanika", f"hanika-d{degree}", "raw", degree=degree) for degree in (5, 4, 3)),
+        tuple(PublishedSettings("hanika", f"hanika-d{degree}", degree=degree) for degree in (5, 4, 3)),
     ),
     "schrade": PublishedMethod(
         'Schrade, Hanika, Dachsbacher 2016, "Sparse high-degree polynomials for wide-angle lenses", Computer Graphics '
         "Forum 35(4)",
-        tuple(
-            PublishedSettings("schrade", f"schrade-{terms}", "raw", terms=terms, degree=11) for terms in (28, 16, 40)
-        ),
+        tuple(PublishedSettings("schrade", f"schrade-{terms}", terms=terms, degree=11) for terms in (28, 16, 40)),
     ),
     "zheng-adaptive": PublishedMethod(
         'Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation", The Visual '
         "Computer 33(6-8)",
         tuple(
-            PublishedSettings("zheng-adaptive", f"zheng-adaptive-{terms}x{zones}", "raw", terms=terms, partitions=zones)
+            PublishedSettings("zheng-adaptive", f"zheng-adaptive-{terms}x{zones}", terms=terms, partitions=zones)
             for terms, zones in ((36, 4), (36, 1))
         ),
     ),
     "neurolens2017": PublishedMethod(
         'Zheng and Zheng 2017, "NeuroLens: Data-Driven Camera Lens Simulation Using Neural Networks", Computer '
         "Graphics Forum 36(8); here 24,000 steps of 128 rays a network",
-        (
-            PublishedSettings(
-                "neurolens2017", "neurolens2017-128x3", "raw", partitions=2, units=128, layers=3, steps=24_000
-            ),
-        ),
+        (PublishedSettings("neurolens2017", "neurolens2017-128x3", partitions=2, units=128, layers=3, steps=24_000),),
     ),
     "rtf": PublishedMethod(
         'Goossens et al. 2022, "Ray-transfer functions for camera simulation of 3D scenes with hidden lens design", '
         "Optics Express 30(13)",
-        tuple(PublishedSettings("rtf", f"rtf-d{degree}", "raw", degree=degree) for degree in (6, 4, 8)),
+        tuple(PublishedSettings("rtf", f"rtf-d{degree}", degree=degree) for degree in (6, 4, 8)),
     ),
     "ray-lut": PublishedMethod(
         'Honsbrok, Mostafawy, Herder, Huldtgren 2025, "Ray-LUT: A Lookup-Based Method for Camera Lens Simulation in '
         'Real-Time Using Ray Tracing", GRAPP',
-        tuple(PublishedSettings("ray-lut", f"ray-lut-{nodes}", "raw", units=nodes) for nodes in (8, 16, 32)),
+        tuple(PublishedSettings("ray-lut", f"ray-lut-{nodes}", units=nodes) for nodes in (8, 16, 32)),
     ),
 }
 

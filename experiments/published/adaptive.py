@@ -1,6 +1,6 @@
 """Adaptive sparse polynomials with a partition of the light field (Zheng and Zheng 2017, The Visual Computer).
 
-Every scalar output has terms of its own, grown from the lowest (`surrogates.terms.grow`): each chosen term brings its
+Every scalar output has terms of its own, grown from the lowest (`grow`): each chosen term brings its
 products with the variables into the candidates, so that no degree limits them. Where the error stays high the light
 field is divided: the cell with the largest summed error is cut in two halves of its rays, along whichever of its
 coordinates leaves least, and each half is fitted anew, until the number of cells asked for is reached.
@@ -16,22 +16,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.published.data import Outputs, RawData, outer_pupil, solve_outputs
+from experiments.published.data import Outputs, RawData, RawPolynomial, outer_pupil, solve_outputs
 from experiments.published.polynomials import fit_dense
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
-from neurolens.surrogates.cores import Composite, CoreValues, Field, RawPolynomial, Units, stored_as
+from neurolens.surrogates.cores import Composite, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.lightfield import ROUND
 from neurolens.surrogates.pairs import PairSet
-from neurolens.surrogates.targets import squared_error
-from neurolens.surrogates.terms import Exponents, grow
+from neurolens.surrogates.targets import film_equivalent, targets_of
+from neurolens.surrogates.terms import Exponents, Sweep, forward, further, monomials, replace_terms
 
 # A cell's fit sees this share of its rays' range beyond a cut, so that neighbours meet.
 MARGIN = 0.03
 _FEWEST_RAYS = 400
+# Rays that decide the choice of terms; the coefficients are fitted on all of them afterwards.
+SELECTION_RAYS = 6000
 _COORDINATES = (0, 2, 1)  # rho, tau, sigma: of equal errors the first is cut
 
 
@@ -52,7 +55,10 @@ class Cells(Composite):
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         low, high = (half.build(g, field, units) for half in self.parts)
-        return low.chosen(field.products(ROUND[self.variable : self.variable + 1], w=False) <= self.threshold, high)
+        first = g.quadratic(field.planes, ROUND[self.variable : self.variable + 1]) <= self.threshold
+        vectors = [g.select(first, a, b) for a, b in zip(low.vectors, high.vectors, strict=True)]
+        gates = None if low.gates is None or high.gates is None else g.select(first, low.gates, high.gates)
+        return CoreValues(tuple(vectors), g.select(first, low.transmittance, high.transmittance), gates)  # type: ignore[arg-type]
 
 
 @dataclass
@@ -107,12 +113,43 @@ def fit_grown(data: RawData, terms: int) -> RawPolynomial:
 def _support(output: Outputs, terms: int, dispersive: bool) -> Exponents:
     known = slice(None) if output.weights is None else output.weights > 0
     variables, values = output.variables[:, known], output.values[:, known]
-    exponents, chosen = grow(variables, None, values[:, None], min(terms, values.shape[1] // 2), dispersive=dispersive)
+    return grow(variables, values, min(terms, values.shape[1] // 2), dispersive=dispersive)
+
+
+def grow(variables: Tensor, outputs: Tensor, terms: int, *, dispersive: bool) -> Exponents:
+    """Choose `terms` terms by growth, which knows no limit of degree: each brings its products into the candidates.
+
+    Args:
+        variables: [5, N] raw coordinates. outputs: [R, N].
+        dispersive: False leaves the last variable (the wavelength) out.
+
+    Returns the exponents [K, 5].
+    """
+    step = max(1, variables.shape[1] // SELECTION_RAYS)
+    rays, target = variables[:, ::step], outputs[:, ::step]
+    unit = np.eye(5, dtype=np.int64)[: None if dispersive else -1]
+    # A component of a vector is odd in the four coordinates: a single factor leads to terms that never help.
+    factors = [unit[a] + unit[b] for a in range(4) for b in range(a, 4)] + list(unit[4:])
+    exponents, chosen = np.concatenate([np.zeros_like(unit[:1]), unit]), list[int]()
+    while len(chosen) < terms:
+        sweep = Sweep.of_columns(monomials(rays, exponents), target)
+        sweep.restart(chosen)
+        forward(sweep, min(terms, len(sweep.chosen) + max(1, terms // 16)))
+        if len(sweep.chosen) == len(chosen):
+            break
+        replace_terms(sweep, passes=2)
+        chosen = list(sweep.chosen)
+        products = np.array([exponents[k] + factor for k in chosen for factor in factors])
+        exponents = np.concatenate([exponents, further(products, exponents)])
     return exponents[chosen]
 
 
 def _squared_error(data: RawData, polynomial: RawPolynomial, rays: PairSet) -> float:
-    return squared_error(data.pairs, data.encoding, outer_pupil(data, polynomial)[0], rays)
+    """Summed squared film-equivalent error (um^2)."""
+    lens, domain, core = data.pairs.lens, data.pairs.domain, outer_pupil(data, polynomial)[0]
+    targets = targets_of(lens, data.encoding, rays)
+    fitted, wanted = (film_equivalent(lens, domain, v) for v in (core(targets.field)[0], targets.vectors))
+    return float(((fitted - wanted) ** 2).sum())
 
 
 def _halves(

@@ -13,17 +13,66 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cores import DIRECTION, POSITION, Core, CoreValues, Field, RawPolynomial, Units, stored_as
+from neurolens.surrogates.cores import DIRECTION, POSITION, Array, Core, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.gates import gate_reach
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.targets import Prepared, scales_of
+from neurolens.surrogates.targets import ModelSettings, Prepared, scales_of
 from neurolens.surrogates.terms import Exponents, monomials, raw_exponents, raw_variables, united
 
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
 OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")
 PARITY = ((1, 0), (0, 1), (1, 0), (0, 1), (1, 0), (0, 1), (0, 0))
+
+
+@dataclass(frozen=True)
+class PublishedSettings(ModelSettings):
+    """The settings of a published method, whose names are those of `PUBLISHED`."""
+
+    method: str = ""  # type: ignore[assignment]
+    partitions: int = 1  # zones or cells with a fit of their own
+
+
+def raw_rows(field: Field) -> Value:
+    """p, u and, where it varies, w."""
+    return field.planes.graph.concat(field.planes[0:4], field.colour()) if field.dispersive else field.planes
+
+
+@stored_as("raw")
+@dataclass(frozen=True, eq=False)
+class RawPolynomial(Core):
+    """Every component of every vector, and every scalar, is a polynomial in p_x, p_y, u_x, u_y, w: the published form.
+
+    Attributes:
+        exponents: [M, 5] int64.
+        components: [3, 2, M].
+        scalars: [S, M].
+    """
+
+    exponents: Exponents
+    components: Array
+    scalars: Array
+    basis = "raw"
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        components = self.components * np.array(units.vectors)[:, None, None]
+        scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
+        weight = np.concatenate([components.reshape(6, -1), scalars])
+        x = raw_rows(field)
+        used = np.ones(len(self.exponents), bool) if field.dispersive else self.exponents[:, -1] == 0
+        rows = g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
+        *vectors, transmittance, gates = g.split(rows, [2, 2, 2, 1, len(scalars) - 1])
+        return CoreValues(tuple(vectors), transmittance, gates if len(scalars) > 1 else None)  # type: ignore[arg-type]
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        """Coefficients of both components of a vector, the larger of position and direction."""
+        return int((self.components[:2] != 0).sum((1, 2)).max())
+
+    @property
+    def coefficients(self) -> int:
+        return int((self.components != 0).sum() + (self.scalars != 0).sum())
 
 
 @stored_as("outer-pupil")

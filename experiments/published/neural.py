@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from experiments.published.data import RawData
+from experiments.published.data import PublishedSettings, RawData, raw_rows
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
@@ -34,7 +34,7 @@ from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.lightfield import ROUND
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, trace_pairs
-from neurolens.surrogates.targets import ModelSettings, scales_of
+from neurolens.surrogates.targets import scales_of
 
 NETWORKS = 3  # whose mean is taken
 BATCH = 128
@@ -62,7 +62,7 @@ class Averaged(Core):
     basis = "raw"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        inputs, rho = field.raw(), field.products(ROUND[:1], w=False)
+        inputs, rho = raw_rows(field), g.quadratic(field.planes, ROUND[:1])
         out = _ring(inputs, self.networks[0])
         for edge, ring in zip(self.edges, self.networks[1:], strict=True):
             out = g.select(rho <= edge, out, _ring(inputs, ring))
@@ -91,7 +91,7 @@ def _ring(inputs: Value, networks: tuple[Layers, ...]) -> Value:
 
 
 def fit_averaged(
-    data: RawData, settings: ModelSettings, progress: Callable[[float], object] = lambda share: None
+    data: RawData, settings: PublishedSettings, progress: Callable[[float], object] = lambda share: None
 ) -> tuple[Averaged, tuple[Gate, ...]]:
     """Train every network; the same seed gives the same weights.
 
@@ -149,7 +149,7 @@ def _training_rays(data: RawData) -> tuple[Tensor, Tensor]:
     return inputs.float(), outputs.float()
 
 
-def _train(inputs: Tensor, values: Tensor, settings: ModelSettings, seed: int) -> Layers:
+def _train(inputs: Tensor, values: Tensor, settings: PublishedSettings, seed: int) -> Layers:
     generator = torch.Generator().manual_seed(seed)
     widths = [5, *[settings.units] * settings.layers, 7]
     weights: list[Tensor] = []

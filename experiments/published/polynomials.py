@@ -17,8 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.published.data import PARITY, Outputs, RawData, parity_exponents, solve_outputs
-from neurolens.surrogates.cores import RawPolynomial
+from experiments.published.data import PARITY, Outputs, RawData, RawPolynomial, parity_exponents, solve_outputs
 from neurolens.surrogates.terms import monomials
 
 # Rays that decide the choice of terms; the coefficients are fitted on all of them afterwards.

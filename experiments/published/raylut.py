@@ -65,7 +65,7 @@ class RayTable(Core):
         waves = g.constant(1.0)
         if self.table.shape[1] > _COLUMNS:  # the parabola through three nodes
             lagrange = np.array([[0, -0.5, 0.5], [1, 0, -1], [0, 0.5, 0.5]])
-            w = field.raw()[4] if field.dispersive else g.constant(0.0)
+            w = field.colour() if field.dispersive else g.constant(0.0)
             waves = g.polynomial(np.arange(3)[:, None], lagrange, w)
         corners = list(itertools.product((0, 1), repeat=3))
         weights = []

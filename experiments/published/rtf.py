@@ -75,7 +75,7 @@ class Meridian(Core):
         x = g.concat(radius, g.concat(*turn(slope, y)) * along)
         exponents, weight = self.exponents, self.outputs * np.array([unit, unit, 1, 1, 1, 1])[:, None]
         if field.dispersive:
-            x = g.concat(x, field.raw()[4])
+            x = g.concat(x, field.colour())
         else:
             used = exponents[:, 3] == 0
             exponents, weight = exponents[used][:, :3], weight[:, used]

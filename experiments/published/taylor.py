@@ -25,11 +25,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from experiments.published.data import raw_polynomial
+from experiments.published.data import RawPolynomial, raw_polynomial
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.targets import scales_of
 from neurolens.surrogates.terms import ordered

@@ -63,8 +63,6 @@ class Results:
         images: name, scene, camera, file_png and file_exr relative to the run folder, samples; except of the exact
             lens, `image.ImageErrors`.
         image_settings: `image.SETTINGS`.
-        domain_gain: what a domain taken from the scene gains: scene, text, and rows, for the whole lens and for the
-            scene: such models with domain (its name) and `scenes.domain_facts`.
         figures: file, relative to the run folder, title, caption; wide where it goes across the page.
         started: ISO 8601.
     """
@@ -80,7 +78,6 @@ class Results:
     cameras: Sequence[dict[str, Any]] = ()
     images: Sequence[dict[str, Any]] = ()
     image_settings: dict[str, Any] | None = None
-    domain_gain: dict[str, Any] | None = None
     figures: Sequence[dict[str, Any]] = ()
     versions: dict[str, str] = field(default_factory=dict)
     seed: int = 0

@@ -272,10 +272,12 @@ class _Spot(NamedTuple):
 def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> _Spot:
     domain = scene.model.card["domain"]
     colours, weights = film_plane.colours(wavelength_nm)
-    shape = len(colours), _RINGS, _SPOKES
-    pupil = np.tile(_axial_pupil(domain, scene.stop_radius_mm), len(colours))
-    nanometres = np.repeat(colours, _RINGS * _SPOKES).astype(np.float32)
     reach = float(domain["film_radius_mm"])
+    round_ = scene.aperture is None and squeeze_of(scene, _SQUEEZED * reach, wavelength_nm) == 1.0
+    spokes = 1 if round_ else _SPOKES  # of a round lens one stands for all
+    shape = len(colours), _RINGS, spokes
+    pupil = np.tile(_axial_pupil(domain, scene.stop_radius_mm, spokes), len(colours))
+    nanometres = np.repeat(colours, _RINGS * spokes).astype(np.float32)
     film, best, shift = np.zeros_like(pupil), scene.film_z_mm, _SHIFT * reach
 
     def miss(film: FloatArray, object_z_mm: float) -> tuple[FloatArray, FloatArray, NDArray[np.int32]]:
@@ -300,6 +302,8 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
             # Equal areas of the entrance pupil count alike: a cell's area there.
             cell = seen.reshape(2, *shape)
             out, turn = np.gradient(cell, axis=2), np.roll(cell, -1, 3) - np.roll(cell, 1, 3)
+            if round_:  # its neighbours are the spoke turned
+                turn = cell[::-1] * np.array([-1.0, 1.0])[:, None, None, None]
             weight = weights[:, None, None] * np.abs(out[0] * turn[1] - out[1] * turn[0])
             moments = weight.reshape(-1) * np.stack([(film * slope).sum(0), (slope**2).sum(0)])
         passed = (status == st.PASSED) & np.isfinite(moments).all(0)
@@ -340,9 +344,9 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
     )
 
 
-def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float) -> FloatArray:
+def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float, spokes: int) -> FloatArray:
     """Pupil points [2, rings * spokes] about all that pass from the film's centre through a stop."""
-    ring, spoke = (np.arange(_RINGS) + 0.5) / _RINGS, 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
+    ring, spoke = (np.arange(_RINGS) + 0.5) / _RINGS, 2 * np.pi * (np.arange(spokes) + 0.5) / spokes
     low, high, half = (abs(domain["bounds"][name][0]) for name in ("low_mm", "high_mm", "half_mm"))
     reach = _WIDER * max(low, high, half) * min(1.0, stop_radius_mm / domain["stop_radius_mm"])
     return (reach * ring[:, None] * np.stack([np.cos(spoke), np.sin(spoke)])[:, None]).reshape(2, -1)

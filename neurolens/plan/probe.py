@@ -36,7 +36,7 @@ from neurolens.render.world import shared_worlds
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import set_lens
 from neurolens.study.scenes import seen_depths_m
-from neurolens.surrogates.domain import domain_from_camera, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.model import Domain
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
@@ -224,11 +224,10 @@ def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
     move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, 1/mm
     vergence = 1e-3 / shot.focus_m
     ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
+    options: dict[str, Any] = {"film_radius_mm": radius, "wavelength_nm": shot.wavelength_nm}
     with suppress(InputError):
-        return domain_of(stopped, film_radius_mm=radius, focus_m=ends, wavelength_nm=shot.wavelength_nm)
-    return domain_from_camera(
-        plain, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelength_nm
-    )[1]
+        return domain_of(stopped, focus_m=ends, **options)
+    return domain_of(stopped, focus_m=(shot.focus_m, shot.focus_m), **options)
 
 
 def _edges(scene: Scene, exact: Any, small: Overview, pixel_mm: float) -> tuple[float, float | None]:

@@ -218,24 +218,45 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
     film_z = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return film_z
+    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
+        film_z = float(_least_spot_mm(lens, film_z - 1000 * focus_m, wavelength_nm)[0])
+    return film_z
+
+
+def _least_spot_mm(
+    lens: Lens, object_z_mm: float, wavelength_nm: tuple[float, float] | None, stops_mm: Sequence[float] | None = None
+) -> NDArray[np.float64]:
+    """Film planes of least spot for an axial point, behind the stop as it is or behind round ones of some radii."""
     # Without dispersion all light is of one colour.
     one = (lens.reference_nm, lens.reference_nm)
     wavelengths, weights = film_plane.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
-    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
-        along, across = _moments(lens, film_z - 1000 * focus_m, wavelengths)
-        w = torch.from_numpy(weights)[:, None, None]
-        if not float(across.sum()) > 0:
-            raise InputError(lens.path, "focus_mode", "best", "a lens that axial light passes and bends")
-        film_z = -float((w * along).sum() / (w * across).sum())
-    return film_z
+    along, across, at_stop = _moments(lens, object_z_mm, wavelengths)
+    share = torch.from_numpy(weights)[:, None, None].expand_as(along)[None]
+    if stops_mm is not None:  # rays at the edge count in part
+        square = torch.tensor(stops_mm, dtype=torch.float64)[:, None, None, None] ** 2
+        ring = (_WIDER * lens.stop_radius_mm) ** 2 / along.shape[1]
+        share = share * ((square - at_stop**2) / ring + 0.5).clamp(0, 1)
+    along, across = ((share * m).sum((1, 2, 3)) for m in (along, across))
+    if not bool((across > 0).all()):
+        raise InputError(lens.path, "focus_mode", "best", "a lens that axial light passes and bends")
+    return np.asarray((-along / across).numpy())
 
 
 def best_focus_of_stops_mm(
     lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] | None = None
 ) -> NDArray[np.float64]:
-    """`best_focus_z_mm` at some stop radii; errors as there."""
-    each = (lens.with_stop_radius(float(radius)) for radius in stops_mm)
-    return np.array([best_focus_z_mm(one, focus_m, wavelength_nm) for one in each])
+    """`best_focus_z_mm` at some radii of a round stop, of one set of rays: those that each lets through. Errors as
+    there."""
+    widest = replace(lens, aperture=None).with_stop_radius(float(max(stops_mm)))
+    whole = best_focus_z_mm(widest, focus_m, wavelength_nm)
+    if paraxial.is_pinhole(lens):
+        return np.full(len(stops_mm), whole)
+    object_z = whole - 1000 * focus_m
+    found = _least_spot_mm(widest, object_z, wavelength_nm, stops_mm)
+    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    data = paraxial.first_order(lens)
+    scale = float(data.efl_mm / (data.front_focal_z_mm - object_z))
+    return np.asarray(found + (found - whole) * scale**2)
 
 
 def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
@@ -298,7 +319,7 @@ def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]
     low = high = image
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
         # The rays within each ring are those that a smaller stop lets through.
-        along, across = (m.cumsum(1) for m in _moments(lens, (low + high) / 2 - 1000 * focus_m, colours))
+        along, across = (m.cumsum(1) for m in _moments(lens, (low + high) / 2 - 1000 * focus_m, colours)[:2])
         found = [image, *(-along / across)[across > 0].tolist()]
         low, high = min(found), max(found)
     spare, last = _SPARE * (high - low), float(lens.vertices_mm[len(lens.surfaces) - 1])
@@ -333,8 +354,9 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
 
 
-def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
-    """x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes]; 0 of one that is blocked.
+def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64]) -> tuple[Tensor, Tensor, Tensor]:
+    """x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes], 0 of one that is blocked; and how far from
+    the axis it meets the stop.
 
     (x0, y0) is where it meets the plane z = 0 and (tx, ty) its slopes: the sum of (x0 + z tx)^2 + (y0 + z ty)^2 is
     least where the sum of the first makes up for z times that of the second.
@@ -343,9 +365,11 @@ def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64])
     count, colours = len(rays.x), len(wavelength_nm)
     with torch.no_grad():
         many = Rays(*(c.repeat(colours) for c in rays))
-        out = trace(lens, many, torch.from_numpy(wavelength_nm).repeat_interleave(count), towards="film")
+        waves, stop = torch.from_numpy(wavelength_nm).repeat_interleave(count), lens.stop_index
+        out = trace(lens, many, waves, towards="film", record=[stop])
     r, passed = out.rays, out.status == 0
     tx, ty = r.dx / r.dz, r.dy / r.dz
     along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
     shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
-    return along.where(passed, 0.0).reshape(shape), across.where(passed, 0.0).reshape(shape)
+    at_stop = torch.hypot(out.crossings[stop].x, out.crossings[stop].y)
+    return along.where(passed, 0.0).reshape(shape), across.where(passed, 0.0).reshape(shape), at_stop.reshape(shape)

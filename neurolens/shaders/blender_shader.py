@@ -185,7 +185,7 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
         infinity, close = film_z_mm(lens, math.inf), film_z_mm(lens, near)
         spare = _SPARE * abs(close - infinity)
         places = min(infinity, close) - spare, max(infinity, close) + spare
-    bounds = pupil_bounds(lens, radius, places, LIGHT_NM, rows=17, points=96, pupil_z_mm=plane_mm)
+    bounds = pupil_bounds(lens, radius, places, LIGHT_NM, rows=9, points=48, pupil_z_mm=plane_mm)
     stop = float(lens.stop_radius_mm)
 
     def paraxial(focus_m: float) -> float:

@@ -21,6 +21,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,11 @@ class OslCamera:
     def pupil_z_mm(self) -> float:
         """z of the plane of pupil points."""
         return self.lens.table.pupil_z_mm
+
+    @cached_property
+    def per_exposure(self) -> Array:
+        """See `_per_exposure`."""
+        return _per_exposure(self)
 
 
 @dataclass(frozen=True)
@@ -283,7 +289,7 @@ class _Call:
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
         middle, half = _film_position(camera)
-        per_share = _in_turn(g, _per_exposure(camera), self.share, (self.film_z - middle) * (1 / half))
+        per_share = _in_turn(g, camera.per_exposure, self.share, (self.film_z - middle) * (1 / half))
         per_lens, nominal = per_share * (1.0 / (self.share * self.share)), 4 * camera.lens.f_number**2 / math.pi
         per_exposure = g.select(self.number("as_lens") <= 0.5, per_lens, nominal)
         return {"per_distance": per_distance, "scale": per_distance * per_distance * per_exposure}

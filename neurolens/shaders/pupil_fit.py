@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from neurolens.shaders.stop_image import StopImage, draw_rays, fit_stop_images
 
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]
-_RAYS, _FIRST = 12_000, 60_000  # random rays of a zone; those of all to which circles are fitted first
+_RAYS, _FIRST = 6_000, 15_000  # random rays of a zone; those of all to which circles are fitted first
 _STOPS = (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.0, 1.0)  # of the widest stop
 _AROUND = 1.1  # stop radii, within which rays are drawn
 _BESIDE, _FOLDED = 0.25, 0.01  # of the pupil's size, and the share of rays that may lie so far from the image
@@ -117,24 +118,23 @@ def _widened(
 ) -> tuple[list[PupilCircles], float]:
     """Circles as much wider as new random rays need, and the share that they lose of others."""
     states = [*zip(np.eye(len(pupils)), lenses, strict=True), *between]
-    lost = 1.0
+    lost = np.ones(len(states))
     for seed, allowed in enumerate((*_ALLOWED, 0.0)):
-        lost_of = []
-        for weights, lens in states:
+        for k in np.flatnonzero(lost > LOST):
+            weights, lens = states[k]
             mixed = pupils[0].mixed(pupils[1:], weights)
             rays = _drawn(lens, mixed, 1 + seed)
             within = evaluate(mixed.checked, rays.inputs)["within"]
-            lost_of.append(_lost(rays, within))
-            if allowed and (seed == 0 or lost_of[-1] > LOST):
+            lost[k] = _lost(rays, within) if seed else 1.0
+            if allowed and lost[k] > LOST:
                 needs = [[n for _, n in _needs(rays, margin, allowed / len(within))] for margin in within[1:]]
                 more = np.array([max([0.0, *need]) for need in needs])
                 near = weights > _NEIGHBOUR * weights.max()  # the nodes on both sides of a state between them
                 more /= weights[near].sum()
                 pupils = [_wider(p, more) if w else p for p, w in zip(pupils, near, strict=True)]
-        lost = max(lost_of)
-        if seed and lost <= LOST:
-            break
-    return pupils, lost
+                for other, (mix, _) in enumerate(states):  # a state loses by what widens a node that it subtracts
+                    lost[other] = 1.0 if (mix[near] < 0).any() else lost[other]
+    return pupils, float(lost.max())
 
 
 def _wider(pupil: PupilCircles, more: Array) -> PupilCircles:
@@ -244,12 +244,14 @@ def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float]:
     return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER))
 
 
-def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[Truths, float]]:
+def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[NDArray[np.intp], float]]:
     """The rays that pass in each zone, and by how much their margins lack, so that this share at most is lost."""
+    passed = np.flatnonzero(rays.passed)
+    zones = rays.zone[passed]
+    ends = np.searchsorted(zones, np.arange(_ALL + 1), sorter=(order := np.argsort(zones, kind="stable")))
     needs = []
-    for zone in np.unique(rays.zone):
-        rows = rays.passed & (rays.zone == zone)
-        margin, spare = within[rows], round(share * max(rows.sum(), _FEW))
+    for rows in (passed[order[low:high]] for low, high in pairwise(ends)):
+        margin, spare = within[rows], round(share * max(rows.size, _FEW))
         if margin.size > spare:
             needs.append((rows, -float(np.partition(margin, spare)[spare])))
     return needs

@@ -24,7 +24,7 @@ from neurolens.shaders.shader_lens import ShaderLens
 
 Array = NDArray[np.float64]
 HAIR = 1e-18  # mm; keeps the direction of a film point on the axis finite
-_RAYS, _FEWEST = 8_000, 1_000  # rays of a fit, and how many have to pass
+_RAYS, _FEWEST = 4_000, 1_000  # rays of a fit at most, and how many have to pass
 _TERMS = ((12, 24, 72), (16, 32, 72))  # most terms of each fit; rays of the next are drawn through the last
 _ENOUGH = 0.0012  # RMS error, in units of the stop's radius, at which a fit needs no more terms
 _SIZES, _REACH = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.0), 1.06  # stops whose edges count most; how far beyond rays lie
@@ -279,6 +279,6 @@ def draw_rays(lens: ShaderLens, image: StopImage | None, seed: int) -> StopRays:
     rays = np.concatenate([film, pupil, nm[None]])
     with np.errstate(all="ignore"):
         out = evaluate(lens.graph, {"rays": rays, "film_z_mm": z[None], "stop_radius_mm": np.array([[stop]])})
-    passed = np.broadcast_to(out["status"][0] == st.PASSED, radius.shape)
+    passed = np.flatnonzero(np.broadcast_to(out["status"][0] == st.PASSED, radius.shape))[:_RAYS]
     point = out["stop_xy_mm"].astype(np.float64)
     return StopRays(film[:, passed], z[passed], nm[passed], pupil[:, passed].astype(np.float64), point[:, passed])

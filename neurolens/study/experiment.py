@@ -173,7 +173,7 @@ class TargetChoice:
 
 @dataclass(frozen=True)
 class EvaluationChoice:
-    """Rays for false passes and blocks; rounds (0: no race) and threads of the race for speed.
+    """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread.
 
     Attributes:
         compile_exact: whether the exact tracer compiled by torch runs, too: half a minute of compiling.
@@ -181,7 +181,6 @@ class EvaluationChoice:
 
     vignetting_rays: int = 200_000
     rounds: int = 15
-    threads: int = 1
     compile_exact: bool = True
 
 
@@ -213,14 +212,6 @@ class RenderChoice:
 
 
 @dataclass(frozen=True)
-class SceneDomainChoice:
-    """A scene for whose camera settings alone a model is fitted, to measure the gain; the settings of that model."""
-
-    scene: Path
-    model: ModelSettings = field(default_factory=ModelSettings)
-
-
-@dataclass(frozen=True)
 class Experiment:
     """One resolved run: lens, domain, ray pairs, models, measurements and renders.
 
@@ -235,7 +226,6 @@ class Experiment:
     pairs: PairSettings = field(default_factory=PairSettings)
     evaluation: EvaluationChoice = field(default_factory=EvaluationChoice)
     render: RenderChoice = field(default_factory=RenderChoice)
-    scene_domain: SceneDomainChoice | None = None
     target: TargetChoice | None = None
     save_pairs: bool = False
     camera: str | None = None
@@ -243,8 +233,6 @@ class Experiment:
     def __post_init__(self) -> None:
         labels = [m.label for m in self.model]
         check_names("model", labels)
-        if self.scene_domain is not None:
-            check_names("scene_domain.model", [self.scene_domain.model.label])
         twice = sorted({n for n in labels if labels.count(n) > 1})
         if not labels or twice:
             raise InputError("settings", "model", labels, "at least one [[model]], and names that differ")
@@ -286,12 +274,10 @@ def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experime
 
 
 def _with_files(experiment: Experiment, moved: Callable[[Path], Path]) -> Experiment:
-    gain = experiment.scene_domain
     return replace(
         experiment,
         lens=replace(experiment.lens, file=moved(experiment.lens.file)),
         render=replace(experiment.render, scenes=tuple(moved(s) for s in experiment.render.scenes)),
-        scene_domain=None if gain is None else replace(gain, scene=moved(gain.scene)),
     )
 
 

@@ -287,7 +287,7 @@ def fit_and_measure(
     model = fit_model(prepared, settings, report, checkpoint=training)
     on = rays() if rays else shared_rays(prepared, vignetting_rays)
     facts = {
-        "name": settings.label, "family": settings.family, "variables": settings.basis, "file": f"models/{file.name}",
+        "name": settings.label, "family": settings.family, "variables": model.core.basis, "file": f"models/{file.name}",
         "coefficients_per_vector": None if settings.method in NETWORKS else model.core.coefficients_per_vector,
         "parameters": model.core.coefficients, "fit_s": model.fit_s,
     }  # fmt: skip

@@ -189,7 +189,6 @@ _IMAGE_COLUMNS = (
     Column("noise floor of it", "noise_floor_rel_mse", about="the same of two exact renders"),
     Column("pairs", "pairs", about="of renders compared"),
 )
-_GAIN_COLUMNS = (Column("film radius (mm)", "film_radius_mm"), Column("f-number", "f_number"))
 
 
 def write_report(run_dir: str | Path, results: Results) -> Path:
@@ -202,8 +201,6 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
     if not folder.is_dir():
         raise InputError(folder, "run folder", "(missing)", "a folder that exists")
     wall = None if results.wall_s is None else f"{results.wall_s:.0f} s in all"
-    gain = results.domain_gain or {}
-    rows: Sequence[Record] = gain.get("rows", ())
     page = html(
         "report.html",
         title=str(results.title or results.lens.get("name") or "neurolens run"),
@@ -213,8 +210,6 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
         exact=table([_exact_name(r) for r in results.exact], results.exact, _EXACT_COLUMNS),
         trade=figures_of(folder, results.figures),
         cameras=table(_names(results.cameras, "name"), results.cameras, _CAMERA_COLUMNS),
-        gain_text=": ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key)),
-        gains=table(_names(rows, "name", "domain"), rows, _GAIN_COLUMNS + _MODEL_COLUMNS),
         about=_about(results),
         settings=flat(results.settings or {}),
         **_models(results.models),
@@ -224,9 +219,9 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
     return folder / "report.html"
 
 
-def _names(records: Sequence[Record], last: str, first: str = "scene") -> list[str]:
-    """The scene or the domain of each record, then its camera or model."""
-    return [" · ".join(str(r[key]) for key in (first, last) if r.get(key)) for r in records]
+def _names(records: Sequence[Record], last: str) -> list[str]:
+    """The scene of each record, then its camera."""
+    return [" · ".join(str(r[key]) for key in ("scene", last) if r.get(key)) for r in records]
 
 
 def _exact_name(record: Record) -> str:

@@ -26,7 +26,6 @@ FAMILIES: Kinds = {
     "dense": ("dense", "#56b4e9", "s"),
     "omp": ("OMP", "#e69f00", "s"),
     "ols": ("orthogonal LS", "#0072b2", "o"),
-    "adaptive": ("adaptive", "#009e73", "s"),
     "mlp": ("MLP", "#d55e00", "^"),
 }
 _OTHER = ("other", "#cc79a7", "v")

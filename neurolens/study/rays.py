@@ -178,36 +178,6 @@ def _cross_length(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
     return torch.sqrt(x * x + y * y + z * z)
 
 
-def pupil_disc_share(lens: Lens, domain: Domain, count: int = 400_000, seed: int = 7) -> float:
-    """Share of the passing rays that the domain's pupil disc contains; the definition of the errors requires 0.9999.
-
-    Rays uniform over the film disc, wavelengths and film positions, and over a disc on the pupil plane that holds the
-    whole rear surface seen from the film point, independent of the domain's bounds.
-
-    Raises:
-        InputError: no ray passes.
-    """
-    rays = sample_domain(domain, count, seed)
-    scaled = [c / domain.pupil_radius_mm for c in (rays.pupil_x, rays.pupil_y)]  # uniform in the unit disc
-    rear = lens.surfaces[-1]
-    vertex, c, size = float(lens.vertices_mm[len(lens.surfaces) - 1]), float(rear.curvature), rear.semi_diameter_mm
-    edge = vertex + c * size**2 / (1 + math.sqrt(max(0.0, 1 - (c * size) ** 2)))
-    # The rear surface lies between the planes of its vertex and of its edge: a disc round both projections.
-    stretch = torch.stack([(rays.film_z - domain.pupil_z_mm) / (rays.film_z - z) for z in (vertex, edge)])
-    along = (1 - stretch).mean(0)
-    reach = size * stretch.abs().max(0).values
-    reach = reach + torch.hypot(rays.film_x, rays.film_y) * (stretch[0] - stretch[1]).abs() / 2
-    pupil_x, pupil_y = rays.film_x * along + reach * scaled[0], rays.film_y * along + reach * scaled[1]
-    start = camera_rays(rays.film_x, rays.film_y, rays.film_z, pupil_x, pupil_y, domain.pupil_z_mm)
-    with torch.no_grad():
-        traced = trace(lens, start, rays.wavelength_nm)
-    weight = torch.where(traced.status == st.PASSED, reach * reach, 0.0)  # the discs differ in size
-    if not float(weight.sum()) > 0:
-        raise InputError(lens.path, "domain", "(no ray passes)", "a domain that the lens can reach")
-    held = torch.hypot(pupil_x, pupil_y) <= domain.pupil_radius_mm
-    return min(1.0, float(weight[held].sum() / weight.sum()))
-
-
 # Central differences over this share of the film radius: truncation and float64 rounding both stay below 1e-6.
 _STEP = 1e-4
 # Lower bound of the Jacobian, as a share of the paraxial one.

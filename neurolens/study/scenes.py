@@ -1,6 +1,4 @@
-"""Scenes of an experiment: renders through every camera, compared with the exact lens's, and the gain of a domain
-restricted to one shot.
-"""
+"""Scenes of an experiment: renders through every camera, compared with the exact lens's."""
 
 from __future__ import annotations
 
@@ -12,12 +10,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.progress import Progress, Report
+from neurolens.base.progress import Report
 from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
@@ -29,15 +26,10 @@ from neurolens.render.primitives import Rays
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.render.world import world_of
-from neurolens.study.experiment import Experiment, RenderChoice
+from neurolens.study.experiment import RenderChoice
 from neurolens.study.image import compare, flip_map
-from neurolens.study.measure import fit_and_measure
 from neurolens.study.plots import side_by_side
-from neurolens.study.speed import Candidate, model_candidate, race
-from neurolens.surrogates.domain import domain_from_camera
-from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import make_pairs
 
 EXACT = "exact"
 
@@ -131,70 +123,6 @@ def _compare_scene(
     caption += "from the exact lens's with the same random numbers; below the exact lens that of two seeds."
     title = f"{scene.name}: every camera"
     records.figures.append({"file": f"{folder.name}/{file.name}", "title": title, "caption": caption, "wide": True})
-
-
-def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any] | None:
-    """One model for the whole lens, the same for one shot, and for the shot half of it: error, size and time.
-
-    Returns `records.Results.domain_gain`, None where the experiment names no scene.
-    """
-    choice = experiment.scene_domain
-    if choice is None:
-        return None
-    scene, lens = load_scene(choice.scene), experiment.lens.read()
-    shot, data = scene.settings.camera, first_order(lens)
-    shot_lens, shot_domain = domain_from_camera(
-        lens,
-        film_mm=shot.film_mm,
-        focus_m=shot.focus_m,
-        f_number=max(shot.f_number or data.f_number, data.f_number),
-        wavelength_nm=shot.wavelength_nm,
-        nearest_m=nearest_depth_m(scene, abs(data.efl_mm)),
-    )
-    half = replace(choice.model, name="", terms=max(choice.model.terms // 2, 2), units=max(choice.model.units // 2, 2))
-    states = (
-        ("whole lens", lens, experiment.domain.of(lens), (choice.model,)),
-        (scene.name, shot_lens, shot_domain, (choice.model, half)),
-    )
-    rows: list[dict[str, Any]] = []
-    candidates: list[Candidate] = []
-    with progress.stage("fit the scene's domain") as report:
-        for name, state, domain, models in states:
-            prepared = prepare(make_pairs(state, domain, experiment.pairs))
-            place = folder / f"for-{name.replace(' ', '-')}"
-            place.mkdir(parents=True, exist_ok=True)
-            for settings in models:
-                m = fit_and_measure(prepared, settings, place, experiment.evaluation.vignetting_rays, report)
-                row = {**m.record, "domain": name, **domain_facts(state, domain)}
-                rows.append(row | {"file": f"models/{place.name}/{m.file.name}"})
-                candidate = model_candidate(f"{name}: {settings.label}", load_model(m.file), domain.stop_radius_mm)
-                candidates.append(replace(candidate, domain=domain))
-        # One race, so that the times can be set against each other.
-        if (chosen := experiment.evaluation).rounds:
-            timed = race(candidates, shot_domain, threads=chosen.threads, rounds=chosen.rounds)
-            for row, candidate in zip(rows, candidates, strict=True):
-                row["ns_per_ray"] = timed.timing(candidate.name)
-    whole, same, half_row = rows
-    text = ""
-    if all(row.get("rms_um") for row in rows):
-        text = (
-            f"{whole['name']} has {whole['rms_um']:.3g} um RMS over the whole lens, {same['rms_um']:.3g} um over this "
-        )
-        text += f"shot; {half_row['name']} has {half_row['rms_um']:.3g} um over the shot."
-    return {"scene": scene.name, "text": text, "rows": rows}
-
-
-def nearest_depth_m(scene: Scene, efl_mm: float, across: int = 96) -> float | None:
-    """Depth of the nearest visible surface, in m from the film plane along the axis; None if nothing is visible.
-
-    Rays of a pinhole of the lens's focal length through a grid of `across` x `across` points of the film; surfaces
-    smaller than a step of the grid may be missed.
-    """
-    film = scene.settings.camera.film_mm
-    steps = np.linspace(-0.5, 0.5, across)
-    points = np.stack(np.meshgrid(steps * film[0], steps * film[1])).reshape(2, -1)
-    nearest = float(seen_depths_m(scene, Pinhole(efl_mm, film), points).min())
-    return nearest if np.isfinite(nearest) else None
 
 
 def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Speed in nanoseconds per ray, measured in races so that ratios are meaningful, and what may run in them.
 
-Candidates run in turn, round after round, in one process with the same number of threads, so that a machine that
-slows down slows all of them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film
+Candidates run in turn, round after round, on one thread of one process, so that a machine that slows down slows all of
+them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film
 and over the pupil disc of the domain, those that are blocked included, because a render traces them too, and all from
 one film plane, as in a picture. Each candidate uses its fastest batch size.
 """
@@ -13,13 +13,10 @@ import math
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
-from threading import get_ident
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,13 +69,11 @@ class Candidate:
         prepare: takes the rays of one batch (float64, one film plane) and gives the call to be timed; conversions
             belong here, off the clock. Raises `Unavailable` where it cannot run.
         batches: batch sizes to choose from.
-        domain: whose rays it does, where candidates of several domains run in one race; None takes the race's.
     """
 
     name: str
     prepare: Callable[[FilmRays], Call]
     batches: tuple[int, ...] = BATCHES
-    domain: Domain | None = None
 
 
 class Gain(NamedTuple):
@@ -99,25 +94,21 @@ class Race:
     Attributes:
         ns: nanoseconds per ray of each round (the best of a few short samples), by candidate.
         batch: rays per call, the best of those tried.
-        threads, rounds: of all.
         unavailable: reason, by candidate that could not run.
-        load_before, load_after: load average of the machine, if known; above `threads` it was shared.
+        load: the higher load average of the machine before and after, if known; above 1 it was shared.
     """
 
     ns: dict[str, list[float]]
     batch: dict[str, int]
-    threads: int
-    rounds: int
     unavailable: dict[str, str] = field(default_factory=dict)
-    load_before: float | None = None
-    load_after: float | None = None
+    load: float | None = None
 
     def timing(self, name: str) -> Timing | None:
         """Best and median of the rounds; None where the candidate could not run."""
         if name not in self.ns:
             return None
         ns = self.ns[name]
-        timing: Timing = {"min": min(ns), "median": statistics.median(ns), "threads": self.threads}
+        timing: Timing = {"min": min(ns), "median": statistics.median(ns), "threads": 1}
         return {**timing, "batch": self.batch[name], "repeats": len(ns)}
 
     def speedup(self, name: str, over: str) -> dict[str, float] | None:
@@ -141,21 +132,16 @@ class Race:
 
 
 def race(
-    candidates: Sequence[Candidate], domain: Domain | FilmRays, *, threads: int = 1, rounds: int = 20,
-    fresh: bool = True, report: Callable[[float], None] = lambda share: None,
-) -> Race:  # fmt: skip
-    """Time candidates in turn on the same rays of a domain, or each on its own.
-
-    Args:
-        domain: of the rays of candidates without their own domain; or those rays, `POOL` of them.
-        fresh: forget what torch compiled before; False keeps what an earlier race of the same candidates compiled.
-        report: called with the fraction done.
-
-    Each call runs on one thread; with more threads, that many workers share out the batches, as a renderer does
-    (torch and onnxruntime gain nothing from threads within an operator at batches that fit the caches).
+    candidates: Sequence[Candidate],
+    domain: Domain,
+    *,
+    rounds: int = 20,
+    report: Callable[[float], None] = lambda share: None,
+) -> Race:
+    """Time candidates in turn on the same rays of a domain; `report` is called with the fraction done.
 
     Raises:
-        InputError: no rounds, fewer than one thread, or two candidates of one name.
+        InputError: no rounds, or two candidates of one name.
     """
     names = [c.name for c in candidates]
     if rounds < 1 or len(set(names)) < len(names):
@@ -163,12 +149,12 @@ def race(
     unavailable: dict[str, str] = {}
     passes: dict[str, _Pass] = {}
     before = _load()
-    with _workers(threads) as team, pinned_threads(), torch.no_grad():
-        if fresh:
-            torch._dynamo.reset()  # torch limits the number of recompilations of a function
+    pool = _pool(domain)
+    with pinned_threads(), torch.no_grad():
+        torch._dynamo.reset()  # torch limits the number of recompilations of a function
         for i, c in enumerate(candidates):
             try:
-                passes[c.name] = _best_batch(c, _pool(c.domain or domain), team)
+                passes[c.name] = _best_batch(c, pool)
             except Unavailable as reason:
                 unavailable[c.name] = str(reason)
             report(_PREPARING * (i + 1) / len(candidates))
@@ -180,66 +166,38 @@ def race(
                 passes[name].sample_ns(1)  # warms the caches for this candidate
                 ns[name].append(min(passes[name].sample_ns(inner[name]) for _ in range(_SAMPLES)) / POOL)
             report(_PREPARING + (1 - _PREPARING) * (i + 1) / rounds)
-    return Race(ns, {n: p.batch for n, p in passes.items()}, threads, rounds, unavailable, before, _load())
+    load = max((v for v in (before, _load()) if v is not None), default=None)
+    return Race(ns, {n: p.batch for n, p in passes.items()}, unavailable, load)
 
 
-def _pool(domain: Domain | FilmRays) -> FilmRays:
+def _pool(domain: Domain) -> FilmRays:
     """The rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
-    if isinstance(domain, FilmRays):
-        return domain
     rays = sample_domain(domain, POOL, seed=3)
     return replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
 
 
 @dataclass(frozen=True)
 class _Pass:
-    """The calls of one candidate that together do every ray of the pool once, shared out among workers."""
+    """The calls of one candidate that together do every ray of the pool once."""
 
     batch: int
     calls: tuple[Call, ...]
-    workers: ThreadPoolExecutor | None
-    threads: int
 
     def sample_ns(self, inner: int) -> float:
         """Nanoseconds of one pass, mean of `inner` in a row."""
         start = time.perf_counter_ns()
-        if self.workers is None:
-            _repeat(self.calls, inner)
-        else:
-            # A worker repeats its own share, so that distribution is not timed with every pass.
-            shares = [self.calls[i :: self.threads] for i in range(self.threads)]
-            for done in [self.workers.submit(_repeat, share, inner) for share in shares]:
-                done.result()
+        for _ in range(inner):
+            for call in self.calls:
+                call()
         return max(time.perf_counter_ns() - start, 1) / inner
 
 
-def _repeat(calls: Sequence[Call], times: int) -> None:
-    with torch.no_grad():  # gradients are a setting of each thread
-        for _ in range(times):
-            for call in calls:
-                call()
-
-
-@contextmanager
-def _workers(threads: int) -> Iterator[ThreadPoolExecutor | None]:
-    """Threads that share out batches; None for a single one."""
-    if threads < 1:
-        raise InputError("race", "threads", threads, "at least 1")
-    if threads == 1:
-        yield None
-        return
-    # The number of threads within an operator is a setting of each thread, too.
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as workers:
-        yield workers
-
-
-def _best_batch(candidate: Candidate, pool: FilmRays, workers: ThreadPoolExecutor | None) -> _Pass:
+def _best_batch(candidate: Candidate, pool: FilmRays) -> _Pass:
     """One pass over the pool in the fastest of the candidate's batch sizes."""
-    threads = 1 if workers is None else workers._max_workers
     passes = []
     for batch in candidate.batches:
         calls = tuple(candidate.prepare(pool.select(slice(i, i + batch))) for i in range(0, len(pool), batch))
-        passes.append(_Pass(batch, calls, workers, threads))
+        passes.append(_Pass(batch, calls))
         passes[-1].sample_ns(1)
     if len(passes) == 1:
         return passes[0]
@@ -339,7 +297,7 @@ def ideal_cameras(lens: Lens, domain: Domain) -> list[Candidate]:
 
 
 def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candidate:
-    """An exported model, loaded with one thread: the race shares out batches."""
+    """An exported model, in onnxruntime on one thread."""
 
     def prepare(rays: FilmRays) -> Call:
         film_x, film_y, _, pupil_x, pupil_y, wavelength = map(_float32, rays.columns())
@@ -349,21 +307,21 @@ def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candid
     return Candidate(name, prepare)
 
 
-def model_candidates(files: Mapping[str, Path], domain: Domain, threads: int = 1) -> list[Candidate]:
-    """Exported models by name, in onnxruntime; and on one thread "NAME fused", as C, where that is possible."""
+def model_candidates(files: Mapping[str, Path], domain: Domain) -> list[Candidate]:
+    """Exported models by name, in onnxruntime; and "NAME fused", as C, where that is possible."""
     candidates = []
     for name, file in files.items():
         candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
-        fused = fused_candidate(f"{name} fused", file, domain) if threads == 1 else None
+        fused = fused_candidate(f"{name} fused", file, domain)
         candidates += [fused] if fused else []
     return candidates
 
 
-def time_model(model: OnnxLens, name: str, *, rounds: int, threads: int = 1) -> Timing | None:
+def time_model(model: OnnxLens, name: str, *, rounds: int) -> Timing | None:
     """Nanoseconds per ray of an exported model over its domain."""
     domain = Domain.from_dict(model.card["domain"])
     candidate = model_candidate(name, model, domain.stop_radius_mm)
-    return race([candidate], domain, threads=threads, rounds=rounds).timing(name)
+    return race([candidate], domain, rounds=rounds).timing(name)
 
 
 class CompiledSource:
@@ -441,8 +399,8 @@ def program_candidate(
     compiled = cache(lambda: CompiledSource(program, flags))
 
     @cache
-    def room(thread: int, count: int) -> dict[str, NDArray[Any]]:
-        """The output memory of a thread, which it uses again, as tracers and onnxruntime do."""
+    def room(count: int) -> dict[str, NDArray[Any]]:
+        """Output memory, which is used again, as tracers and onnxruntime do."""
         return compiled().outputs(count)
 
     def prepare(rays: FilmRays) -> Call:
@@ -450,16 +408,7 @@ def program_candidate(
         columns: dict[str, Any] = {n: c.numpy().astype(np.float32) for n, c in zip(names, rays.columns(), strict=False)}
         columns["film_z_mm"] = columns["film_z_mm"][0]
         columns["stop_radius_mm"] = np.float32(domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm)
-        source = compiled()
-        calls: dict[int, Call] = {}
-
-        def call() -> None:
-            thread = get_ident()
-            if thread not in calls:
-                calls[thread] = source.prepared(columns, room(thread, len(rays)))
-            calls[thread]()
-
-        return call
+        return compiled().prepared(columns, room(len(rays)))
 
     return Candidate(name, prepare, FUSED_BATCHES)
 

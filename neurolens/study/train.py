@@ -38,8 +38,8 @@ from neurolens.study.measure import (
 )
 from neurolens.study.pages import write_report
 from neurolens.study.plots import illumination_plot, states_plot, trade_plot
-from neurolens.study.rays import Illumination, pixel_um, pupil_disc_share, relative_illumination
-from neurolens.study.scenes import Pictures, domain_facts, render_all, scene_gain
+from neurolens.study.rays import Illumination, pixel_um, relative_illumination
+from neurolens.study.scenes import Pictures, domain_facts, render_all
 from neurolens.study.speed import (
     EXACT,
     Race,
@@ -137,7 +137,6 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
             name: relative_illumination(lens, domain, onnx_predictor(load_model(file)), **options)
             for name, file in shown.items()
         }
-    gain = scene_gain(experiment, models, progress)
     drawn = Pictures()
     if experiment.render.scenes:
         with progress.stage("render") as report:
@@ -152,7 +151,6 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
         "cameras": [*({"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL if n in timed.ns), *drawn.cameras],
         "images": drawn.images,
         "image_settings": SETTINGS if drawn.images else None,
-        "domain_gain": gain,
         "figures": _draw(pairs, records, timed, light, pictures, use) + drawn.figures,
     }
 
@@ -163,7 +161,6 @@ def _plan(experiment: Experiment) -> dict[str, float]:
     for m in experiment.model:
         plan[f"fit {m.label}"] = 0.06 * m.steps * (m.units * m.layers / 32) ** 2.5 if m.method in NETWORKS else 3
     plan["race for speed"] = (45 if experiment.evaluation.compile_exact else 5) + 2 * len(experiment.model)
-    plan |= {"fit the scene's domain": 5} if experiment.scene_domain is not None else {}
     plan |= {"render": 40} if experiment.render.scenes else {}
     return plan
 
@@ -171,18 +168,18 @@ def _plan(experiment: Experiment) -> dict[str, float]:
 def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measured], progress: Progress) -> Race:
     """Time the exact tracers and all models in one run, and add times, speed-ups and break-even to the records.
 
-    Models run in onnxruntime and, on one thread and with a compiler, as C; the exact lens eager, as C, and compiled by
+    Models run in onnxruntime and, with a compiler, as C; the exact lens eager, as C, and compiled by
     torch where that is asked for.
     """
     chosen, lens, domain = experiment.evaluation, prepared.pairs.lens, prepared.pairs.domain
     if not chosen.rounds:
-        return Race({}, {}, chosen.threads, 0)
+        return Race({}, {})
     with progress.stage("race for speed") as report:
         candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
-        candidates += [exact_c_candidate(lens, domain)] if chosen.threads == 1 else []
-        candidates += model_candidates({m.settings.label: m.file for m in measured}, domain, chosen.threads)
+        candidates += [exact_c_candidate(lens, domain)]
+        candidates += model_candidates({m.settings.label: m.file for m in measured}, domain)
         candidates += ideal_cameras(lens, domain)
-        timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds, report=report)
+        timed = race(candidates, domain, rounds=chosen.rounds, report=report)
     for m in measured:
         cost = m.record["fit_s"], m.record["load_s"]
         ns, speedup, _ = timed.gain(m.settings.label, EXACT[1], *cost)
@@ -237,7 +234,6 @@ def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
         **domain_facts(lens, domain),
         "pupil_plane_z_mm": domain.pupil_z_mm,
         "pupil_radius_mm": domain.pupil_radius_mm,
-        "pupil_disc_holds": pupil_disc_share(lens, domain),
         "passing_share": len(pairs.train) / pairs.tested,
         "rays_train": len(pairs.train),
         "rays_held_out": MORE * len(pairs.held_out),
@@ -283,9 +279,9 @@ def state_settings(settings: ModelSettings, rays: int, seed: int) -> StateSettin
     """The settings of a model of one state as those of many states.
 
     Raises:
-        InputError: another method than "ols", zones, or the raw basis.
+        InputError: another method than "ols".
     """
-    if (settings.method, settings.basis, settings.partitions) != ("ols", "invariants", 1):
+    if settings.method != "ols":
         raise InputError("settings", "model", settings.label, 'method "ols" on the invariants, for many states')
     return StateSettings(settings.terms, settings.degree, rays, seed, settings.name or f"states-{settings.terms}")
 

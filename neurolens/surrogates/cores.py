@@ -1,4 +1,4 @@
-"""The cores of surrogates: polynomials in the invariants or the raw coordinates, small networks, and sums and zones.
+"""The cores of surrogates: polynomials in the invariants, small networks, and sums of both.
 
 A core maps a light field to vectors (position, direction, stop crossing) and scalars (transmittance, gates). It is
 plain data with one method that writes it into a graph (`neurolens.graph`); every evaluator and writer reads that. A new
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-Basis = Literal["invariants", "raw"]
 # Order of the vectors of every core.
 POSITION, DIRECTION, STOP = 0, 1, 2
 
@@ -55,22 +54,18 @@ class Field:
     def dispersive(self) -> bool:
         return self.w is not None or self.planes.rows == 5
 
-    def products(self, forms: Sequence[Form], w: bool = True) -> Value:
-        """Sums of products of the rows p, u; below them w, where it varies and is wanted."""
+    def products(self, forms: Sequence[Form]) -> Value:
+        """Sums of products of the rows p, u; below them w, where it varies."""
         g = self.planes.graph
-        if self.w is not None and w:
+        if self.w is not None:
             return g.concat(g.quadratic(self.planes, forms), self.w)
-        if self.planes.rows == 5 and w:
+        if self.planes.rows == 5:
             return g.quadratic(self.planes, [*forms, ((4, 4),)], [*np.zeros(len(forms)), self.w_bias])
         return g.quadratic(self.planes, forms)
 
     def colour(self) -> Value:
         """w, where it varies."""
         return self.w if self.w is not None else self.planes.graph.quadratic(self.planes, [((4, 4),)], [self.w_bias])
-
-    def raw(self) -> Value:
-        """p, u and, where it varies, w."""
-        return self.planes.graph.concat(self.planes[0:4], self.colour()) if self.dispersive else self.planes
 
 
 @dataclass(frozen=True)
@@ -98,14 +93,6 @@ class CoreValues:
     gates: Value | None
     unit: Value | None = None
     index: Value | None = None
-
-    def chosen(self, truth: Value, other: CoreValues) -> CoreValues:
-        """These values where `truth`, those of `other` elsewhere."""
-        g = truth.graph
-        a, b = self.vectors, other.vectors
-        vectors = tuple(g.select(truth, x, y) for x, y in zip(a, b, strict=True))
-        gates = None if self.gates is None or other.gates is None else g.select(truth, self.gates, other.gates)
-        return CoreValues(vectors, g.select(truth, self.transmittance, other.transmittance), gates)  # type: ignore[arg-type]
 
 
 _CoreType = TypeVar("_CoreType", bound=type)
@@ -181,12 +168,16 @@ def symmetric(rows: Value, field: Field, scalars: int) -> CoreValues:
     return CoreValues(vectors, transmittance, gates if scalars > 1 else None)  # type: ignore[arg-type]
 
 
-class _Polynomial(Core):
-    """Base of the three polynomials: exponents, whose last column is that of w, and tables over the terms."""
+class _Symmetric(Core):
+    """A p + B u, with A, B and the scalars polynomials in invariants: `ab` [3, 2, .., M] and `scalars` [S, M].
+
+    The last column of the exponents is that of w.
+    """
 
     exponents: Exponents
+    ab: Array
     scalars: Array
-    _vectors: ClassVar[str]  # name of the field that holds the vectors' coefficients
+    _forms: ClassVar[tuple[Form, ...]]
 
     def fixed(self, w: float) -> Self:
         rest = self.exponents.copy()
@@ -194,41 +185,23 @@ class _Polynomial(Core):
         unique, place = np.unique(rest, axis=0, return_inverse=True)
         merge = np.zeros((len(rest), len(unique)))
         merge[np.arange(len(rest)), place.reshape(-1)] = w ** self.exponents[:, -1].astype(float)
-        tables = {self._vectors: getattr(self, self._vectors) @ merge, "scalars": self.scalars @ merge}
-        return replace(self, exponents=unique, **tables)  # type: ignore[type-var]
+        return replace(self, exponents=unique, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
 
     def keep(self, scalars: Sequence[int]) -> Self:
         return replace(self, scalars=self.scalars[list(scalars)])  # type: ignore[type-var]
 
     @cached_property
     def coefficients(self) -> int:
-        return int((getattr(self, self._vectors) != 0).sum() + (self.scalars != 0).sum())
-
-    def _tables(self, units: Units) -> tuple[Array, Array]:
-        """Vectors' coefficients and scalars in units."""
-        vectors = getattr(self, self._vectors)
-        factors = np.array(units.vectors).reshape(3, *[1] * (vectors.ndim - 1))
-        return vectors * factors, self.scalars * units.scalars(len(self.scalars))[:, None]
-
-    def _terms(self, g: Graph, field: Field, weight: Array, forms: Sequence[Form] | None) -> Value:
-        """weight [R, M] times the terms; those in w are left out where it is 0."""
-        x = field.raw() if forms is None else field.products(forms)
-        used = np.ones(len(self.exponents), bool) if field.dispersive else self.exponents[:, -1] == 0
-        return g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
-
-
-class _Symmetric(_Polynomial):
-    """A p + B u, with A, B and the scalars polynomials in invariants: `ab` [3, 2, .., M] and `scalars` [S, M]."""
-
-    ab: Array
-    _vectors = "ab"
-    _forms: ClassVar[tuple[Form, ...]]
+        return int((self.ab != 0).sum() + (self.scalars != 0).sum())
 
     def rows(self, g: Graph, field: Field, units: Units) -> Value:
-        """Rows A of the three vectors, B of them, scalars."""
-        ab, scalars = self._tables(units)
+        """Rows A of the three vectors, B of them, scalars; terms in w are left out where it is 0."""
+        ab = self.ab * np.array(units.vectors).reshape(3, *[1] * (self.ab.ndim - 1))
+        scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
         a, b = (ab[:, k].reshape(-1, len(self.exponents)) for k in (0, 1))
-        return self._terms(g, field, np.concatenate([a, b, scalars]), self._forms)
+        x, weight = field.products(self._forms), np.concatenate([a, b, scalars])
+        used = np.ones(len(self.exponents), bool) if field.dispersive else self.exponents[:, -1] == 0
+        return g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         return symmetric(self.rows(g, field, units), field, len(self.scalars))
@@ -289,35 +262,6 @@ class MirrorPolynomial(_Symmetric):
     def coefficients_per_vector(self) -> int:
         """The coefficients of a vector's two components together, the larger of position and direction."""
         return int((self.ab[:2] != 0).sum((1, 2, 3)).max())
-
-
-@stored_as("raw")
-@dataclass(frozen=True, eq=False)
-class RawPolynomial(_Polynomial):
-    """Every component of every vector, and every scalar, is a polynomial in p_x, p_y, u_x, u_y, w: the published form.
-
-    Attributes:
-        exponents: [M, 5] int64.
-        components: [3, 2, M].
-        scalars: [S, M].
-    """
-
-    exponents: Exponents
-    components: Array
-    scalars: Array
-    basis = "raw"
-    _vectors = "components"
-
-    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        components, scalars = self._tables(units)
-        rows = self._terms(g, field, np.concatenate([components.reshape(6, -1), scalars]), None)
-        *vectors, transmittance, gates = g.split(rows, [2, 2, 2, 1, len(scalars) - 1])
-        return CoreValues(tuple(vectors), transmittance, gates if len(scalars) > 1 else None)  # type: ignore[arg-type]
-
-    @cached_property
-    def coefficients_per_vector(self) -> int:
-        """Coefficients of both components of a vector, the larger of position and direction."""
-        return int((self.components[:2] != 0).sum((1, 2)).max())
 
 
 @stored_as("network")
@@ -421,29 +365,6 @@ class Residual(Composite):
         whole = polynomial.plus(bias[:6].reshape(3, 2), bias[6:])
         network = replace(network, output=(weight, np.zeros_like(bias)))
         return symmetric(network.rows(g, field, units, whole.rows(g, field, units)), field, len(bias) - 6)
-
-
-@stored_as("partitioned")
-@dataclass(frozen=True, eq=False)
-class Partitioned(Composite):
-    """Cores of zones of the light field, split by rho (the squared film radius): the published light-field partition.
-
-    Every zone's core is evaluated for every ray, and one is chosen.
-
-    Attributes:
-        edges: rising values of rho between zones.
-        parts: one core a zone, one more than edges.
-    """
-
-    edges: tuple[float, ...]
-    parts: tuple[InvariantPolynomial | RawPolynomial | Network | Residual, ...]
-
-    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        values = [part.build(g, field, units) for part in self.parts]
-        rho, chosen = field.products(ROUND[:1], w=False), values[0]
-        for edge, outer in zip(self.edges, values[1:], strict=True):
-            chosen = chosen.chosen(rho <= edge, outer)
-        return chosen
 
 
 @stored_as("refracted")

@@ -16,7 +16,6 @@ from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.focusing import film_range_mm
 from neurolens.setting.pupils import image_radius_mm, pupil_bounds
-from neurolens.setting.states import set_lens
 from neurolens.surrogates.model import Domain
 
 _PUPIL_MARGIN = 1.05  # of the disc on the pupil plane beyond that of all passing rays
@@ -142,28 +141,6 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
     count = math.ceil(math.log(max(end / start, 1.0)) / math.log(_STEP)) + 1
     best = min((start * _STEP**k for k in range(count)), key=spread)
     return film_z_mm - best if spread(here) > math.sqrt(_BETTER) * spread(best) else bounds.pupil_z_mm
-
-
-def domain_from_camera(
-    lens: Lens,
-    *,
-    film_mm: tuple[float, float],
-    focus_m: float,
-    f_number: float | None = None,
-    wavelength_nm: tuple[float, float] | None = None,
-    nearest_m: float | None = None,
-) -> tuple[Lens, Domain]:
-    """The stopped lens and the domain of one shot alone: its film crop, stop, focus and wavelengths.
-
-    The lit film may be smaller than the crop (fisheyes); the smaller radius rules. `nearest_m` is the distance from the
-    film of the nearest object in view, so that fits count errors of position for objects before the plane in focus.
-    """
-    stopped = set_lens(lens, f_number=f_number, focus_m=focus_m)
-    radius = min(math.hypot(*film_mm) / 2, image_radius_mm(lens)[0])
-    focus = (focus_m, focus_m)
-    return stopped, domain_of(
-        stopped, film_radius_mm=radius, focus_m=focus, wavelength_nm=wavelength_nm, nearest_m=nearest_m
-    )
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:

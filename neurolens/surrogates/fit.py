@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.surrogates.cores import (
-    Core,
-    InvariantPolynomial,
-    Network,
-    Partitioned,
-    RawPolynomial,
-    Refracted,
-    Residual,
-)
+from neurolens.surrogates.cores import Core, Refracted, Residual
 from neurolens.surrogates.domain import FilmRays, draw_everywhere
-from neurolens.surrogates.fits.network import fit_network, of_zone, training_s, with_boundary_terms
+from neurolens.surrogates.fits.network import fit_network, training_s, with_boundary_terms
 from neurolens.surrogates.fits.polynomial import fit_mirror, fit_paraxial, fit_planes, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.model import LensModel
@@ -41,18 +28,12 @@ from neurolens.surrogates.targets import (
     index_series,
     inside_front,
     scales_of,
-    squared_error,
 )  # fmt: skip
 from neurolens.surrogates.terms import pinned_threads
 from neurolens.trace.rays import CHUNK
 
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
 _GATE_RAYS = 200_000
-ZoneCore = InvariantPolynomial | RawPolynomial | Network | Residual
-# A zone's fit sees this share of rho beyond its edges, so that neighbours meet.
-OVERLAP = 0.03
-_FEWEST_RAYS = 200
-_FITTED = ("train", "rim", "edge", "far")  # the splits that fits see
 
 
 def prepare(pairs: RayPairs) -> Prepared:
@@ -104,10 +85,10 @@ def fit_model(
     start = time.perf_counter()
     pairs, encoding = prepared.pairs, prepared.encoding
     with pinned_threads():
-        shown, refracts = pairs, settings.method in POLYNOMIALS and settings.basis == "invariants" and grazes(pairs)
+        shown, refracts = pairs, settings.method in POLYNOMIALS and grazes(pairs)
         if refracts:
             shown = replace(pairs, train=inside_front(pairs.lens, pairs.train))
-        if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:
+        if settings.planes and settings.method in PLANES_SEARCHED:
             encoding = fit_planes(shown, encoding, settings.terms, settings.position_weight)
         core = _fit_core(replace(prepared, pairs=shown, encoding=encoding), settings, progress, checkpoint)
         if refracts:
@@ -146,60 +127,11 @@ def _fit_core(
         raise InputError("fit", "method", settings.method, f"one of {', '.join(methods)}")
     if mirror and settings.method != "mlp":
         return fit_mirror(prepared, settings.method, settings.terms, settings.degree)
-    zones, fits = itertools.count(), 2 * settings.partitions - 1
-
-    def fit(data: Prepared) -> ZoneCore:
-        base = None
-        if settings.method != "mlp":
-            base = fit_polynomial(data, replace(settings, method="ols") if settings.method == "ols+mlp" else settings)
-        if settings.method not in NETWORKS:
-            assert base is not None
-            return base
-        if isinstance(base, RawPolynomial):
-            raise InputError("fit", "basis", settings.basis, "invariants, with a network beside the polynomial")
-        zone = next(zones)
-        file, share = of_zone(checkpoint, zone), lambda part: progress((zone + part) / fits)
-        network = fit_network(data, settings, base=base, checkpoint=file, progress=share)
-        return with_boundary_terms(data, network) if base is None else Residual((base, network))
-
-    return fit_partitioned(prepared, settings.partitions, fit)
-
-
-def fit_partitioned(prepared: Prepared, zones: int, fit: Callable[[Prepared], ZoneCore]) -> Partitioned | ZoneCore:
-    """Split the zone with the largest summed squared error in two halves of its rays, until there are `zones`.
-
-    After Zheng and Zheng 2017 (adaptive sparse polynomials) and NeuroLens 2017 (networks), which both split the space
-    of rays. Zones are rings of the film, so that the rotational symmetry of the invariants survives.
-
-    Raises:
-        InputError: fewer than one zone, or several with fewer than 200 training rays each.
-    """
-    pairs, encoding = prepared.pairs, prepared.encoding
-    if zones < 1 or (zones > 1 and len(pairs.train) < zones * _FEWEST_RAYS):
-        most = max(1, len(pairs.train) // _FEWEST_RAYS)
-        raise InputError("fit", "partitions", zones, f"1 to {most} zones for {len(pairs.train)} training rays")
-    rhos = {name: encoding(getattr(pairs, name).inputs).invariants()[0] for name in _FITTED}
-    rho = rhos["train"]
-    bounds = [(-torch.inf, torch.inf)]
-    cores = [fit(prepared)]
-    while len(cores) < zones:
-        inside = [(rho > low) & (rho <= high) for low, high in bounds]
-        each = zip(cores, inside, strict=True)
-        errors = [squared_error(pairs, encoding, core, pairs.train.select(at)) for core, at in each]
-        worst = errors.index(max(errors))
-        low, high = bounds[worst]
-        middle = float(rho[inside[worst]].median())
-        halves = [(low, middle), (middle, high)]
-        bounds[worst : worst + 1] = halves
-        cores[worst : worst + 1] = [fit(_zone(prepared, rhos, *half)) for half in halves]
-    if zones == 1:
-        return cores[0]
-    return Partitioned(tuple(high for _, high in bounds[:-1]), tuple(cores))
-
-
-def _zone(prepared: Prepared, rhos: dict[str, Tensor], low: float, high: float) -> Prepared:
-    zone: dict[str, Any] = {
-        name: getattr(prepared.pairs, name).select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
-        for name, rho in rhos.items()
-    }
-    return replace(prepared, pairs=replace(prepared.pairs, **zone))
+    base = None
+    if settings.method != "mlp":
+        base = fit_polynomial(prepared, replace(settings, method="ols") if settings.method == "ols+mlp" else settings)
+    if settings.method not in NETWORKS:
+        assert base is not None
+        return base
+    network = fit_network(prepared, settings, base=base, checkpoint=checkpoint, progress=progress)
+    return with_boundary_terms(prepared, network) if base is None else Residual((base, network))

@@ -22,19 +22,19 @@ from neurolens.lens.glass import index_of, inverse_square_um
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.surrogates.assemble import tilt_series
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Array, Basis, Core
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Array
 from neurolens.surrogates.gates import boundary_rays, boundary_weights
 from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
 from neurolens.surrogates.model import Domain, Gate, Scales
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.trace.surfaces import entered
 
-Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", "ols+mlp"]
-POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
+Method = Literal["thin", "thick", "dense", "omp", "ols", "mlp", "ols+mlp"]
+POLYNOMIALS = ("dense", "omp", "ols")
 NETWORKS = ("mlp", "ols+mlp")
-PLANES_SEARCHED = ("ols", "adaptive", "ols+mlp")
+PLANES_SEARCHED = ("ols", "ols+mlp")
 # About 5000 candidate columns, whose Gram matrix takes 200 MB.
-_MOST_DEGREE = {"invariants": 16, "raw": 11}
+_MOST_DEGREE = 16
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,12 @@ class ModelSettings:
         InputError: numbers that ask for more than a fit can hold, or for less than one.
     """
 
-    # First order; polynomials: all terms up to `degree`, matching pursuit, orthogonal least squares with replacement,
-    # terms of any degree grown from chosen terms; a network; a polynomial, and a network on what it leaves.
+    # First order; polynomials: all terms up to `degree`, matching pursuit, orthogonal least squares with replacement;
+    # a network; a polynomial, and a network on what it leaves.
     method: Method = setting("ols", "of the fit")
     name: str = setting("", "of the file and of the table's row; empty: made from the other settings")
-    basis: Basis = setting("invariants", "of polynomials; raw: p_x, p_y, u_x, u_y, w, without the lens's symmetry")
     terms: int = setting(40, "coefficients per vector output; dense ignores it", within=(1, 2000))
-    degree: int = setting(7, "largest total degree of the first candidates; adaptive ignores it")
+    degree: int = setting(7, "largest total degree of the first candidates", within=(0, _MOST_DEGREE))
     replacement: bool = setting(True, "whether ols exchanges terms afterwards")
     elimination: bool = setting(True, "whether ols first chooses half as many terms again, and drops the cheapest")
     # From 2 on a few more rounds follow where directions still err.
@@ -60,7 +59,6 @@ class ModelSettings:
     transmittance_terms: int = setting(16, "most further terms where the transmittance needs them", within=(0, 200))
     idle_gates: float = setting(0.0, "rims that alone block at most this share of the domain's rays are left out")
     planes: bool = setting(True, "whether methods of `PLANES_SEARCHED` search the planes of the light field")
-    partitions: int = setting(1, "zones of the film with a fit of their own", within=(1, 64))
     units: int = setting(16, "units of each layer of a network", within=(1, 512))
     layers: int = setting(2, "layers of a network", within=(1, 8))
     # Never a time, so that the load of a machine changes no byte. On n times the fewest rays a step counts n.
@@ -69,9 +67,7 @@ class ModelSettings:
 
     def __post_init__(self) -> None:
         check_bounds(self, "settings")
-        most_degree = _MOST_DEGREE.get(self.basis, min(_MOST_DEGREE.values()))
         for name, good, expected in (
-            ("degree", 0 <= self.degree <= most_degree, f"an integer from 0 to {most_degree}"),
             ("idle_gates", 0 <= self.idle_gates < 1, "a share from 0 to below 1"),
             ("position_weight", 0 < self.position_weight < math.inf, "a number above 0"),
         ):
@@ -80,17 +76,15 @@ class ModelSettings:
 
     @property
     def label(self) -> str:
-        """The name, or one made from the settings: "ols-40", "raw-omp-80", "dense-d4", "mlp-16x2"."""
+        """The name, or one made from the settings: "ols-40", "dense-d4", "mlp-16x2"."""
         if self.name:
             return self.name
-        zones = f"-{self.partitions}zones" if self.partitions > 1 else ""
         if self.method in NETWORKS:
             before = f"ols-{self.terms}-" if self.method == "ols+mlp" else ""
-            return f"{before}mlp-{self.units}x{self.layers}{zones}"
+            return f"{before}mlp-{self.units}x{self.layers}"
         if self.method in ("thin", "thick"):
             return self.method
-        size = f"-d{self.degree}" if self.method == "dense" else f"-{self.terms}"
-        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}{size}{zones}"
+        return f"{self.method}-d{self.degree}" if self.method == "dense" else f"{self.method}-{self.terms}"
 
     @property
     def family(self) -> str:
@@ -178,13 +172,6 @@ def film_equivalent(lens: Lens, domain: Domain, vectors: Tensor) -> Tensor:
     position, direction = film_equivalent_weights(lens, domain)
     at_infinity = direction * vectors[DIRECTION]
     return torch.stack([at_infinity + position * vectors[POSITION], at_infinity])
-
-
-def squared_error(pairs: RayPairs, encoding: Encoding, core: Core, rays: PairSet) -> float:
-    """Summed squared film-equivalent error (um^2) of a core over rays of a lens and domain."""
-    targets = targets_of(pairs.lens, encoding, rays)
-    fitted, wanted = (film_equivalent(pairs.lens, pairs.domain, v) for v in (core(targets.field)[0], targets.vectors))
-    return float(((fitted - wanted) ** 2).sum())
 
 
 def weighed_apart(lens: Lens, domain: Domain, vectors: Tensor, position_weight: float) -> Tensor:

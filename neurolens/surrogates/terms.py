@@ -1,7 +1,7 @@
 """Terms of polynomials: candidates, their columns, least squares, and which terms to keep.
 
-Terms are monomials of the invariants (times p or u), or of the raw coordinates. They are chosen by orthogonal matching
-pursuit, orthogonal least squares, elimination, replacement or growth. All of these work on the Gram matrix of the
+Terms are monomials of the invariants (times p or u). They are chosen by orthogonal matching pursuit, orthogonal least
+squares, elimination or replacement. All of these work on the Gram matrix of the
 candidate columns, so that their cost does not grow with the number of rays. The sweep operator (Goodnight 1979, "A
 Tutorial on the SWEEP Operator") moves a column into or out of the fit in one rank-one update; afterwards the diagonal
 holds what every candidate has left after orthogonalisation, and the right-hand side its correlation with the residual.
@@ -33,8 +33,6 @@ DEPENDENT = 1e-11
 SPANNED = 1e-12
 # A share of this size is rounding of the Gram matrix, about fifty units in the last place.
 _NOTHING = 1e-14
-# Rays that decide the choice of terms; the coefficients are fitted on all of them afterwards.
-SELECTION_RAYS = 6000
 ROUNDING = 2.0**-24  # of float32
 
 
@@ -326,43 +324,3 @@ def replace_terms(sweep: Sweep, passes: int = 10) -> int:
         if exchanged == before:
             break
     return exchanged
-
-
-def grow(
-    variables: Tensor, field: LightField | None, outputs: Tensor, terms: int, *, dispersive: bool
-) -> tuple[Exponents, list[int]]:
-    """Choose `terms` terms by growth, which knows no limit of degree: each brings its products into the candidates.
-
-    Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation".
-
-    Args:
-        variables: [V, N]: the invariants with `field`, or the raw coordinates without.
-        field: where given, every monomial offers two columns, times p and times u, and outputs are vectors.
-        outputs: [R, 2, N] with a field, [R, 1, N] without.
-        dispersive: False leaves the last variable (the wavelength) out.
-
-    Returns:
-        Exponents [M, V] of all monomials offered, and the chosen columns as in `vector_columns` (k, or M + k for u).
-    """
-    step = max(1, variables.shape[1] // SELECTION_RAYS)
-    rays, target = variables[:, ::step], outputs[..., ::step].flatten(1)
-    vectors = None if field is None else LightField(*(c[..., ::step] for c in field))
-    unit = np.eye(variables.shape[0], dtype=np.int64)[: None if dispersive else -1]
-    factors = list(unit)
-    if field is None:
-        # A component of a vector is odd in the four coordinates: a single factor leads to terms that never help.
-        factors = [unit[a] + unit[b] for a in range(4) for b in range(a, 4)] + list(unit[4:])
-    exponents = np.concatenate([np.zeros_like(unit[:1]), unit])
-    chosen: list[tuple[int, int]] = []  # number of the monomial, and 1 for a column times u
-    while len(chosen) < terms:
-        count, features = len(exponents), monomials(rays, exponents)
-        sweep = Sweep.of_columns(features if vectors is None else vector_columns(features, vectors), target)
-        sweep.restart([k + side * count for k, side in chosen])
-        forward(sweep, min(terms, len(sweep.chosen) + max(1, terms // 16)))
-        if len(sweep.chosen) == len(chosen):
-            break
-        replace_terms(sweep, passes=2)
-        chosen = [(k % count, k // count) for k in sweep.chosen]
-        products = np.array([exponents[k] + factor for k, _ in chosen for factor in factors])
-        exponents = np.concatenate([exponents, further(products, exponents)])
-    return exponents, [k + side * len(exponents) for k, side in chosen]

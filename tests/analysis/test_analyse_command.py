@@ -4,7 +4,6 @@ And lenses or wishes at their limits: no light, no glass, doubtful tables, far w
 """
 
 import math
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -138,17 +137,6 @@ def test_no_light_is_one_error_or_a_gap(tmp_path: Path, capsys: pytest.CaptureFi
     assert "expected at most 2" in failure(capsys, "analyse", GAUSS, "mtf", "--field-points", 80)
 
 
-def test_a_stop_beyond_all_glass_warns_of_no_division(capsys: pytest.CaptureFixture[str]) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        lens = LENSES / "muller_fisheye_100.toml"
-        options = ("--f-number", 0.3, "--field-points", 0, 40)
-        data = run_json(capsys, "analyse", lens, "vignetting", "spots", *options)
-    assert data["vignetting"]["relative"][0] in (None, 1.0)
-    assert data["spots"]["working_f_number"] == pytest.approx(4, rel=0.02)
-    assert any("V_d is not given" in w for w in data["warnings"])
-
-
 def test_a_pinhole_has_no_focus(pinhole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = run_json(capsys, "analyse", pinhole)
     assert data["spots"]["working_f_number"] == pytest.approx(50 / 0.4)
@@ -158,33 +146,6 @@ def test_a_pinhole_has_no_focus(pinhole: Path, capsys: pytest.CaptureFixture[str
     assert not {"colour", "curvature", "psf", "seidel"} & set(data) and len(data["notes"]) == 4
     for what in ("colour", "curvature", "psf"):
         assert "a pinhole" in failure(capsys, "analyse", pinhole, what)
-
-
-def test_doubtful_tables_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fisheye = run_json(capsys, "analyse", LENSES / "shimizu_fisheye_220.toml", "distortion")["warnings"]
-    assert any("negative thickness" in w for w in fisheye) and any("estimated" in w for w in fisheye)
-    assert run_json(capsys, "analyse", GAUSS, "seidel")["warnings"] == []
-    zoom = run_json(capsys, "analyse", LENSES / "nikon_zoom_70_200.toml", "distortion", "--zoom", 100)
-    assert any("interpolated" in n for n in zoom["notes"])
-    wrong = tmp_path / "wrong.toml"
-    text = (LENSES / "thorlabs_lb1471_biconvex_50.toml").read_text(encoding="utf-8")
-    wrong.write_text(text.replace('material = "N-BK7"', 'glass = "N-SF11"'), encoding="utf-8")
-    assert main(["analyse", str(wrong), "distortion"]) == 0
-    assert "Warning: surface 1, n_d = 1.5168" in capsys.readouterr().out
-
-
-def test_the_chart_of_lens_makers_has_the_frequencies_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
-    options = ("--frequencies", 80, 10, "--wavelengths", 550)
-    data = run_json(capsys, "analyse", TESSAR, "mtf-height", *options)["mtf-height"]
-    assert data["frequency_per_mm"] == [10, 80] and data["wavelength_nm"] == [550]
-    assert data["height_mm"][0] == 0 and data["height_mm"][-1] == pytest.approx(43.1, abs=0.1)
-    assert np.shape(data["tangential"]) == np.shape(data["sagittal"]) == np.shape(data["spread"]["sagittal"]) == (21, 2)
-    assert data["tangential"][0] == pytest.approx(data["sagittal"][0], abs=1e-3)
-
-
-def test_options_may_stand_before_what(capsys: pytest.CaptureFixture[str]) -> None:
-    data = run_json(capsys, "analyse", GAUSS, "--f-number", 8, "seidel", "--axis", "x", "distortion")
-    assert "seidel" in data and "distortion" in data and "spots" not in data
 
 
 def test_far_wavelengths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

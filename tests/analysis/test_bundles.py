@@ -177,18 +177,6 @@ def test_distortion_names_the_projection_of_a_fisheye() -> None:
     json.dumps(found.to_dict())
 
 
-@pytest.mark.whole  # test_converged has dense sampling
-def test_spots_agree_with_their_own_points_through_focus() -> None:
-    given = library("brendel_tessar_100")
-    found = spots(given, [15.0], shift_mm=[-0.2, 0.0, 0.3])
-    for k, shift in enumerate((-0.2, 0.0, 0.3)):
-        again = spots(moved(given, shift), [15.0], shift_mm=[0.0])
-        assert found.through_focus_um[:, k] == pytest.approx(again.rms_um, rel=1e-6)
-    best = spots(moved(given, float(found.best_shift_mm[0])), [15.0], shift_mm=[0.0])
-    assert best.rms_um[0] == pytest.approx(found.best_rms_um[0], rel=1e-6)
-    assert best.rms_um[0] < min(spots(moved(given, s), [15.0], shift_mm=[0.0]).rms_um[0] for s in (-0.5, 0.5))
-
-
 def test_a_defocused_perfect_spot_is_a_disc() -> None:
     """RMS radius of an even disc is its radius over the square root of two."""
     given = moved(cartesian(stop_mm=2.0), 0.5)

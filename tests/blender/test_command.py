@@ -14,15 +14,12 @@ import pytest
 
 pytest.importorskip("onnxruntime", reason="neurolens is not installed in Blender's environment")
 
-from neurolens.base import files  # noqa: E402
-from neurolens.base.errors import InputError, NeurolensError  # noqa: E402
+from neurolens.base.errors import InputError  # noqa: E402
 from neurolens.cli import (
     blender_lenses,  # noqa: E402
     main,  # noqa: E402
 )
-from neurolens.cli.blender_lenses import thumbnail  # noqa: E402
 from neurolens.lens.paraxial import first_order  # noqa: E402
-from neurolens.readers.lensfile import read_lens  # noqa: E402
 from neurolens.shaders.blender_shader import Shader  # noqa: E402
 
 LENS = "laikin_double_gauss_50"
@@ -100,28 +97,6 @@ def test_zip_holds_the_best_of_each_kind_and_takes_more(place: Path, capsys: pyt
     assert picture.startswith(b"\x89PNG") and picture[16:24] == bytes([0, 0, 1, 0] * 2)
 
 
-@pytest.mark.whole  # it installs the package
-def test_an_installed_package_builds_in_any_folder(
-    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A wheel brings every lens file and a few models: a lens without a model is packed as its file is, traced."""
-    shutil.copy("lenses/brendel_tessar_100.toml", place / "lenses")
-    (place / "share").mkdir()
-    (place / "share" / "neurolens").symlink_to(place)
-    (place / "empty").mkdir()
-    monkeypatch.chdir(place / "empty")
-    monkeypatch.setattr(files, "__file__", str(place / "lib" / "site-packages" / "neurolens" / "base" / "files.py"))
-    monkeypatch.setattr(files.sys, "prefix", str(place))
-    for options, packed in (
-        ([], {LENS: ["ols-60", "mlp-10x1", "exact"], "brendel_tessar_100": ["exact"]}),
-        (["--lens", "brendel_tessar_100"], {"brendel_tessar_100": ["exact"]}),
-        (["--no-exact"], {LENS: ["ols-60", "mlp-10x1"]}),
-    ):
-        assert main(["blender", "build", "-o", "n.zip", "--jobs", "1", "--json", *options]) == 0
-        assert json.loads(capsys.readouterr().out)["lenses"] == packed
-    assert "got 'nothing', expected one of" in failed(capsys, "build", "-o", "n.zip", "--lens", "nothing")
-
-
 def test_lenses_that_cannot_be_shaders_are_left_out_and_said(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copy(place / "models" / f"{LENS}.ols-36.onnx", place / "models" / "huge.ols-36.onnx")
     for form in ("lenses/huge.toml",):
@@ -161,52 +136,6 @@ def test_bad_input_is_one_line(
     assert not out.exists() and not (place / "user").exists()
 
 
-@pytest.mark.whole  # a second build
-def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = ["blender", "build", "--models", str(place / "models"), "--jobs", "1", "--quiet", "-o"]
-    stand_in, field_table, asked, fields = blender_lenses.shader_of, blender_lenses.field_table, [], []
-    monkeypatch.setattr(blender_lenses, "field_table", lambda *given: fields.append(1) or field_table(*given))
-
-    def counted(file: Path, **options: Any) -> Shader:
-        asked.append(file.suffix)
-        if stops and file.suffix == ".toml":
-            raise KeyboardInterrupt
-        return stand_in(file, **options)
-
-    monkeypatch.setattr(blender_lenses, "shader_of", counted)
-    stops = True
-    assert main([*given, str(place / "a.zip")]) == 130 and not (place / "a.zip").exists()
-    stops = False
-    for name in ("a.zip", "b.zip"):
-        assert main([*given, str(place / name)]) == 0
-    assert asked == [".toml", ".toml", ".onnx", ".onnx"] and len(fields) == 1
-    assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
-    with (place / "lenses" / f"{LENS}.toml").open("a", encoding="utf-8") as lens_file:
-        lens_file.write("# another file\n")
-    assert main([*given, str(place / "c.zip")]) == 0 and asked[4:] == [".toml"]
-    for kept in (place / "cache" / "neurolens").glob("*.form"):
-        kept.write_bytes(kept.read_bytes()[:-40])
-    assert main([*given, str(place / "d.zip")]) == 0 and asked[5:] == [".toml", ".onnx", ".onnx"]
-
-
-def test_two_jobs_make_the_zip_of_one_and_a_killed_job_fails_the_command(
-    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Stand-ins reach threads, not processes, which tests/test_tasks.py tests."""
-    monkeypatch.setattr(blender_lenses, "Processes", ThreadPoolExecutor)
-    given = ["blender", "build", "--models", str(place / "models"), "--quiet", "-o"]
-    for name, jobs in (("a.zip", "2"), ("b.zip", "1")):
-        assert main([*given, str(place / name), "--jobs", jobs]) == 0
-    assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
-
-    def killed(task: tuple[Path, str | None]) -> None:
-        raise NeurolensError("its process was killed by signal 9: did the memory run out?")
-
-    monkeypatch.setattr(blender_lenses, "_form_or_why", killed)
-    assert main([*given, str(place / "c.zip"), "--jobs", "2"]) == 2 and not (place / "c.zip").exists()
-    assert "killed by signal 9" in (said := capsys.readouterr().err) and "try --jobs 1" in said
-
-
 def test_a_squeezed_picture_is_said_of_its_lens(place: Path) -> None:
     name = "cooke_anamorphic_42"  # focal lengths of 42.47 and 21.47 mm
     for file in (f"models/{name}.mlp-16x2.onnx", f"lenses/{name}.toml"):
@@ -227,8 +156,3 @@ def test_models_of_one_state_have_the_section_of_that_state_and_ranges_their_nam
         packed = blender_lenses.packed_of([file], [])
         assert packed.name.endswith(", any zoom") == ("range" in model)
     assert blender_lenses.stated_lens(file, Path("models")) is None
-
-
-def test_thumbnails_show_the_lens() -> None:
-    first, second = (thumbnail(read_lens(f"lenses/{n}.toml")) for n in (LENS, "horimoto_fisheye_16"))
-    assert first is not None and second is not None and first != second

@@ -356,17 +356,6 @@ def test_stereo_that_leaves_the_image_circle_is_told_by_what_cycles_shifts(
     assert "stereo" not in " ".join(panel(scene))
 
 
-def test_what_a_lens_does_to_passes_is_in_the_panel(scene: Any) -> None:
-    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
-    words = ("Alpha where nothing is", "Cryptomatte's coverage", "Vector pass")
-    assert not any(word in " ".join(panel(scene)) for word in words)
-    layer = scene.view_layers[0]
-    layer.use_pass_cryptomatte_material = layer.use_pass_vector = scene.render.film_transparent = True
-    assert all(word in " ".join(panel(scene)) for word in (*words, "Vignetting off"))
-    scene.camera.data.cycles_custom["vignetting"] = False
-    assert "Vignetting off" not in " ".join(panel(scene))
-
-
 def test_what_cannot_be_is_one_sentence_and_changes_nothing(scene: Any) -> None:
     gauss = {"lens": "gauss", "kind": "polynomial"}
     camera, before = scene.camera, everything(scene)
@@ -445,43 +434,6 @@ def panel(scene: Any) -> list[str]:
         setattr(drawn, name, getattr(shown, name).__get__(drawn))
     shown.draw(drawn, SimpleNamespace(scene=scene, camera=scene.camera.data, object=scene.camera))
     return paper.lines
-
-
-def test_menus_sorted_by_character_show_bokeh(monkeypatch: pytest.MonkeyPatch, scene: Any) -> None:
-    library = sys.modules[f"{MODULE}.panel"].Library
-    monkeypatch.setattr(library, "_icon", lambda self, name, picture: {"gauss": 3, "bokeh of gauss": 7}.get(name, 1))
-    read = library()
-    read.load()
-    icons = {order: {lens_id: icon for lens_id, _, _, icon, _ in rows} for order, rows in read.items.items()}
-    read.close()
-    assert icons["speed"]["gauss"] == icons["year"]["gauss"] == 3
-    assert icons["swirl"]["gauss"] == icons["bubble"]["gauss"] == 7
-
-
-def test_panel_shows_lens_settings_error_and_what_leaves_the_domain(
-    scene: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene.camera.data.neurolens.lens = "gauss"
-    monkeypatch.setitem(sys.modules[f"{MODULE}.panel"].LIBRARY.bokeh, "gauss", 1)  # 0 without a screen
-    lines = panel(scene)
-    assert {"<order>", "[bokeh]", "Swirl 0.4, soap bubbles 1.2", "Angenieux, 49.6 mm f/1.8, 1955"} <= set(lines)
-    assert {"[picture]", "<kind:polynomial>", "<kind:exact>", "(neurolens.apply)"} <= set(lines)
-    bpy.ops.neurolens.apply()
-    camera = scene.camera.data
-    camera.cycles_custom["f_number"] = 1.0
-    camera.dof.focus_distance = 0.3
-    text = "\n".join(panel(scene))
-    assert "(neurolens.take_back)" in text and '<["blades"]>' in text and "<focus_distance>" in text
-    assert "Error: 0.00015 pixels (RMS)" in text  # 0.17 um of pixels of 36 mm / 32
-    assert "The lens opens to f/1.81: f/1 renders as that" in text
-    assert "The focus distance is 0.3 m away, nearer than the lens" in text
-    camera.neurolens.lens = "phone"  # is put on at once, or says why not
-    lines = panel(scene)
-    assert "\n".join(lines).count("larger than the lens's picture") == 1 and "(neurolens.apply)" in lines
-    assert camera.neurolens.on == "gauss/polynomial"
-    assert bpy.ops.neurolens.apply(fit_sensor=True) == {"FINISHED"} and camera.neurolens.on == "phone/network"
-    text = "\n".join(panel(scene))
-    assert "larger" not in text and "nearer" not in text
 
 
 def test_lenses_of_the_user_folder_join_the_menu(scene: Any) -> None:

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.base.lensname import year_of
 from neurolens.blender.pack import (
     Form,
     PackedLens,
@@ -176,26 +175,6 @@ def test_no_text_of_a_card_leads_out_of_the_folder(method: str, tmp_path: Path) 
     assert ".." not in name.split("/") and len(name) < 120 and name.isascii()
 
 
-def test_refusals_and_notes_are_sentences() -> None:
-    assert library.refusals(variant(), setting()) == [] == library.notes(variant(), setting())
-    assert library.refusals(variant(), setting(focus_m=0.6999)) == []
-    [near] = library.refusals(variant(), setting(focus_m=0.3, focus_object="nose"))
-    assert near == "The focus object 'nose' is 0.3 m away, nearer than the lens focuses: 0.7 m"
-    [large] = library.refusals(variant(film_radius_mm=10.0), setting())
-    assert "36 x 24 mm" in large and "at most 16.64 mm wide" in large
-    fitted = library.fitting_width_mm(variant(film_radius_mm=10.0), setting())
-    assert not library.refusals(variant(film_radius_mm=10.0), setting(sensor_mm=(fitted, fitted * 2 / 3)))
-    said = library.notes(
-        variant(rms_um=25.0, poor=("pixels",), notes=("no coatings",)),
-        setting(f_number=1.2, focus_m=None, unit_m=0.01, on_gpu=True, passes=("vector",)),
-    )
-    assert len(said) == 8 and said[0] == "The lens opens to f/1.8: f/1.2 renders as that" and said[-1] == "no coatings"
-    assert "is 0.01 m by its unit scale; the lens takes it for 1 m" in said[2]
-    assert "2.5 pixels" in said[4] and "Vector pass is wrong" in said[6]
-    assert library.refusals(variant(nearest_m=None), setting(focus_m=0.01)) == []
-    assert library.refusals(variant(), setting(focus_m=math.inf)) == []
-
-
 def test_shift_is_told_where_it_counts_another_side_or_leaves_the_picture() -> None:
     """As Cycles has it; `test_optics` holds that it does."""
     small = {"sensor_mm": (24.0, 12.0)}
@@ -220,22 +199,10 @@ def test_the_eye_whose_picture_leaves_the_image_circle_is_told() -> None:
     assert library.outside(variant(), setting(**film, shift=(0.2, 0.0), stereo=(-0.18, -0.2))) == []
 
 
-def test_error_in_pixels_of_the_render() -> None:
-    assert library.error_px(variant(rms_um=5.0), setting()) == pytest.approx(0.5)
-    assert library.error_px(variant(rms_um=None), setting()) is None
-
-
 def test_blenders_that_cannot_run_lenses() -> None:
     assert library.refused((4, 4, 3)).startswith("This is Blender 4.4.3: cameras written in OSL need 4.5")
     assert library.refused((4, 5, 0)) is None and library.refused((5, 1, 0, "alpha")) is None
     assert "Open Shading Language" in library.refused((5, 0, 0), False)
-
-
-def test_years_of_sources() -> None:
-    assert year_of("US 2,854,889 (Brendel, 1958); table as in Smith, Modern Lens Design (1992)") == 1958
-    assert year_of("US 2,019,982") is None and year_of("DE 485,798 (1927)") == 1927
-    assert year_of("Japanese patent S.53-131852; table in Smith, 2nd ed. (2005)") == 1978
-    assert year_of("US 2014/0300973 A1, tables 1 and 2") == 2014 and year_of("a textbook") is None
 
 
 def test_user_folder_is_where_blender_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

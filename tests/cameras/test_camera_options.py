@@ -107,30 +107,9 @@ def test_the_thin_lens_s_share_is_that_of_the_shape() -> None:
         assert (status == 0).mean() == pytest.approx(shape.area_share, abs=0.01)
 
 
-def test_models_keep_their_shape_in_a_worker_and_say_so() -> None:
-    first = shaped("invariants", "five")
-    other = first.for_worker()  # type: ignore[attr-defined]
-    assert (sample(first, (5.0, 3.0))[0] == sample(other, (5.0, 3.0))[0]).all()
-    assert first.settings["aperture"] == {"blades": 5, "rotation_deg": 15.0, "curvature": 0.0}
-    assert shaped("invariants", None).settings["aperture"] is None
-
-
 def test_a_shot_shapes_every_camera_but_a_point() -> None:
     shot = Shot(FILM, 2.0, f_number=5.6, aperture=Aperture(6))
     for spec in (lens_models.LENSES / "laikin_double_gauss_50.toml", lens_models.exported("invariants"), "thin"):
         assert make_camera(spec, shot).settings["aperture"]["blades"] == 6
     with pytest.raises(InputError, match="aperture"):
         make_camera("pinhole", shot)
-
-
-@pytest.mark.whole  # trace/test_states.py has the lenses, test_state_surrogates the cameras
-def test_a_shot_zooms_and_focuses_inside() -> None:
-    zoom = lens_models.LENSES / "nikon_zoom_70_200.toml"
-    near = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0, focus_mode="internal"))
-    far = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0))
-    assert near.settings["film_z_mm"] < far.settings["film_z_mm"]
-    assert near.settings["efl_mm"] < far.settings["efl_mm"] == pytest.approx(100, rel=1e-9)
-    for field, shot in (("zoom", Shot(FILM, 2.0, zoom="x")), ("focus", Shot(FILM, 2.0, focus_mode="internal"))):
-        for spec in ("thin", "pinhole", lens_models.exported("invariants")):
-            with pytest.raises(InputError, match=field):
-                make_camera(spec, shot)

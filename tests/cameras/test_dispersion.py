@@ -18,9 +18,6 @@ from neurolens.cameras.sampling import stratified
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.film import PixelGrid
-from neurolens.render.job import LANES, Job
-from neurolens.render.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
@@ -171,35 +168,6 @@ def test_cameras_without_colours_and_empty_or_dark_batches() -> None:
         np.zeros((2, 2), np.float32), np.full((2, 2), 0.5, np.float32), np.array([np.nan, 550], np.float32)
     )
     assert dark.weight[0] == 0 < dark.weight[1] and dark.status[0] != 0
-
-
-def test_a_path_asks_for_one_ray_where_only_the_tint_depends_on_the_wavelength() -> None:
-    class Asked:
-        """A camera that counts its rays, and may hide that it knows its tints."""
-
-        def __init__(self, camera: Any, hides: bool) -> None:
-            self.camera, self.hides, self.rays = camera, hides, 0
-
-        def __getattr__(self, name: str) -> Any:
-            if self.hides and name == "tints":
-                raise AttributeError(name)
-            return getattr(self.camera, name)
-
-        def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
-            self.rays += film_mm.shape[1]
-            return self.camera.sample(film_mm, pupil, wavelength_nm)
-
-    scene = load_scene(ROOT / "experiments" / "scenes" / "lights.toml")
-    camera = cameras("laikin_double_gauss_50")["off"]
-    knows, hides = Asked(camera, False), Asked(camera, True)
-    grid = PixelGrid(12, 8, FILM)
-    pictures = []
-    for asked in (knows, hides):
-        job = Job(scene, asked, grid, 4, 0, 2, scene.settings.film)  # type: ignore[arg-type]
-        asked.rays = 0
-        pictures.append(job.render_tile(asked, 0, 0)[0])  # type: ignore[arg-type]
-    assert job.mode == "hero" and hides.rays == LANES * knows.rays > 0
-    np.testing.assert_allclose(*pictures, rtol=1e-5, atol=1e-7)
 
 
 def test_another_word_is_refused() -> None:

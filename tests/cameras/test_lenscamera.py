@@ -1,8 +1,6 @@
 """Fused cameras against the cameras that they stand for: same random numbers, same rays."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -29,11 +27,8 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.renderer import render
-from neurolens.render.scene import load_scene
 from neurolens.surrogates.export import export_onnx
 
-ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
 BAND = np.abs(np.add.outer(np.arange(64), -np.arange(64))) < 16  # about half of the stop
 Numbers = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -251,27 +246,3 @@ def test_cameras_that_cannot_be_compiled() -> None:
     for spec in ("fused:thin", "fused:", "fused:nothing.onnx", twice):
         with pytest.raises(InputError):
             make_camera(spec, Shot(FILM, 2.0))
-
-
-def test_workers_share_one_library() -> None:
-    _, fused = pair()
-    scene = load_scene(ROOT / "experiments" / "scenes" / "grid.toml")
-    one, two = (render(scene, fused, width=24, height=16, samples=4, threads=t) for t in (1, 2))
-    assert np.array_equal(one.rgb, two.rgb) and one.rgb.max() > 0
-
-
-def test_no_torch_no_onnx(tmp_path: Path) -> None:
-    pair()
-    code = (
-        "import sys\n"
-        "sys.modules.update(dict.fromkeys(['torch', 'onnx', 'sklearn', 'matplotlib']))\n"
-        "from neurolens.graph import compiler\n"
-        f"compiler.FLAGS = {compiler.FLAGS!r}\n"
-        "from neurolens.cameras.build import make_camera\nfrom neurolens.lens.shot import Shot\n"
-        f"camera = make_camera('fused:{model_file()}', Shot((36.0, 24.0), 2.0))\n"
-        "import numpy as np\n"
-        "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"
-        "assert (rays.status == 0).all() and (rays.direction[2] < -.9).all()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert done.returncode == 0, done.stderr

@@ -174,20 +174,6 @@ def test_zoom_is_an_input() -> None:
         assert np.mean(found["throughput_0"]) == pytest.approx(rays.weight.mean(dtype=np.float64), rel=0.02)
 
 
-@pytest.mark.whole  # test_zoom_is_an_input is of another zoom
-@pytest.mark.slow
-def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides() -> None:
-    """One set of operations serves its states, and hardly any ray that passes is lost, between nodes either."""
-    nodes, between = zoom("nikon_zoom_70_200-range.states-64", Axis("zoom", "mm", (90.0, 110.0), 1))
-    assert len({lens.stop_radius_mm for lens in nodes}) == 2
-    pupils = fit_pupil(nodes, lambda share: None, between)
-    for weight, shown in [(np.array([0.0, 1.0]), nodes[1]), *between]:
-        pupil = pupils[0].mixed(pupils[1:], weight)  # type: ignore[arg-type]
-        assert isinstance(pupil, PupilCircles) and len(pupil.numbers) >= 2
-        counts, missed = missed_by_zone(shown, pupil, 0.8 * reach_of(shown))
-        assert missed.sum() <= 1e-3 * counts.sum()
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_rays")
 def test_groups_of_a_lens_file_move_where_the_camera_is_focused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,15 +75,6 @@ def test_whatever_the_search_reads_is_in_the_key() -> None:
     assert len(set(keys)) == len(keys) and key(lens) == keys[0]
 
 
-def test_two_runs_that_search_at_once_agree(folder: Path) -> None:
-    def beaten() -> PupilOutline:
-        kept_outline(KEY, outline)  # another run is faster
-        return outline()
-
-    assert parts(kept_outline(KEY, beaten)) == parts(kept_outline(KEY, never)) == parts(outline())
-    assert [f.suffix for f in folder.iterdir()] == [".outline"]
-
-
 @pytest.mark.parametrize("harm", ["cut", "flipped", "empty"])
 def test_damaged_files_are_made_again(folder: Path, harm: str) -> None:
     kept_outline(KEY, outline)
@@ -93,13 +84,3 @@ def test_damaged_files_are_made_again(folder: Path, harm: str) -> None:
     file.write_bytes({"cut": data[:-40], "flipped": data, "empty": b""}[harm])
     assert parts(kept_outline(KEY, lambda: outline(2.0))) == parts(outline(2.0))
     assert parts(kept_outline(KEY, never)) == parts(outline(2.0))
-
-
-def test_a_disk_that_takes_nothing_costs_the_cache_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.base.files.atomic_path", full)
-    assert parts(kept_outline(KEY, outline)) == parts(outline())
-    assert kept_outline(KEY, lambda: None) is None
-
-
-def full(path: Path) -> object:
-    raise OSError(28, "No space left on device", str(path))

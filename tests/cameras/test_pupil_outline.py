@@ -12,7 +12,7 @@ from shipped import whole
 
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import Passes, PupilTable, outline_of
 from neurolens.lens.apertures import Aperture
@@ -193,10 +193,6 @@ LENSES = [
     ("mizuguchi_fisheye_10", 10.5, 8.0, 0.97),
     *whole(("muller_fisheye_100", 14.0, 4.0, 0.99)),
 ]
-MODELS = [
-    "muller_fisheye_100-14mm.ols-40",
-    *whole("laikin_double_gauss_50.ols-28", "thorlabs_lb1471_biconvex_50.ols-64"),
-]
 
 
 @cache
@@ -235,16 +231,6 @@ def test_nearly_all_rays_of_lit_film_points_pass(
     assert lost_share(camera, 40_000) <= 2e-4
 
 
-@pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("f_number", [None, 8.0])
-def test_models_that_ship_find_their_outlines_when_a_camera_is_made(name: str, f_number: float | None) -> None:
-    model = load_model(ROOT / "models" / f"{name}.onnx")
-    camera = OnnxCamera(model, Shot(FILM, math.inf, f_number))
-    rays = camera.sample(*film_rays(camera, 40_000))
-    assert (rays.status == st.PASSED).mean() >= 0.99
-    assert lost_share(camera, 40_000) <= 2e-4
-
-
 @pytest.mark.parametrize(
     ("name", "efl_mm", "f_number"), [("laikin_double_gauss_50", 50.0, None), *whole(("muller_fisheye_100", 14.0, 4.0))]
 )
@@ -266,30 +252,6 @@ def test_brightness_is_the_integral_over_the_pupil(name: str, efl_mm: float, f_n
             axis = mean
         assert mean / axis == pytest.approx(light.relative[i], abs=0.002)
     assert axis == pytest.approx(1, abs=0.005)  # the exposure is a mean over wavelengths
-
-
-def test_the_dark_costs_nothing() -> None:
-    """No ray is traced for a film point that nothing reaches."""
-    camera = exact("muller_fisheye_100", 14.0, 8.0)
-    traced: list[int] = []
-    scene = camera.film.scene
-
-    def counting(film: np.ndarray, pupil: np.ndarray, wavelength_nm: np.ndarray) -> object:
-        traced.append(film.shape[1])
-        return scene(film, pupil, wavelength_nm)
-
-    rng = np.random.default_rng(0)
-    film = ((rng.random((2, 5000)) - 0.5) * 60).astype(np.float32)
-    square, wavelength = rng.random((2, 5000), np.float32), np.full(5000, 550, np.float32)
-    camera.film.scene = counting  # type: ignore[assignment]
-    try:
-        rays = camera.sample(film, square, wavelength)
-    finally:
-        camera.film.scene = scene
-    lit = camera.film.outline.sample(film, square, wavelength)[1] > 0
-    assert lit.sum() == pytest.approx((np.hypot(*film) <= camera.film.outline.film_radius_mm).sum(), abs=5)
-    assert 0.1 < lit.mean() < 0.6 and sum(traced) == lit.sum()
-    assert (rays.status[~lit] == st.OUTSIDE_DOMAIN).all() and (rays.weight[~lit] == 0).all()
 
 
 def test_blades_and_cylinders_are_held() -> None:

@@ -13,14 +13,13 @@ from camera_helpers import FILM, FISHEYES, KINDS, RADII, camera, film_rays, film
 from shipped import disc_irradiance
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pinhole import PROJECTIONS, Pinhole
-from neurolens.cameras.vignetting import VIGNETTINGS, Vignetted
+from neurolens.cameras.vignetting import Vignetted
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.shot import Shot
 from neurolens.setting.states import set_lens
@@ -184,20 +183,3 @@ def test_cameras_that_are_not_round() -> None:
         cos4 = (1 + (math.hypot(*point) / 50) ** 2) ** -2
         assert film_value(none, point, 4) == pytest.approx(1, abs=5e-3)
         assert film_value(natural, point, 4) == pytest.approx(cos4, abs=5e-3)
-
-
-def test_points_that_are_none_are_dark() -> None:
-    film = np.array([[math.nan, math.inf, 0.0], [0.0, 0.0, 0.0]], np.float32)
-    for kind in ("thin", "fisheye-orthographic"):
-        rays = without(kind, "none").sample(film, np.full((2, 3), 0.3, np.float32), np.full(3, 550, np.float32))
-        assert rays.weight.tolist()[:2] == [0, 0] and rays.weight[2] > 0 and rays.weight.dtype == np.float32
-        assert rays.status.tolist() == [st.OUTSIDE_DOMAIN, st.OUTSIDE_DOMAIN, st.PASSED]
-
-
-def test_made_from_a_shot() -> None:
-    made = make_camera("thin", Shot(FILM, 2.0, vignetting="natural"))
-    assert isinstance(made, Vignetted) and made.settings["vignetting"] == "natural"
-    assert not isinstance(make_camera("thin", Shot(FILM, 2.0)), Vignetted)
-    assert set(VIGNETTINGS) == {"both", "natural", "optical", "none"}
-    with pytest.raises(InputError, match="vignetting"):
-        make_camera("thin", Shot(FILM, 2.0, vignetting="cos4"))

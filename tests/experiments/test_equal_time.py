@@ -1,38 +1,25 @@
-"""Equal time: bias and variance of known renders, errors in the film's space, laws of time."""
+"""Equal time: bias and variance of known renders, and the error that follows after some seconds."""
 
 import math
 from collections.abc import Sequence
-from copy import copy
-from dataclasses import replace
-from typing import Any
 
-import lens_models
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from experiments import equal_time, equal_time_page
-from experiments.equal_time import CameraResult, Counts, Rendered, SceneResult, camera_result
-from experiments.equal_time_errors import (
+from experiments.equal_time import (
+    Counts,
     Estimate,
-    FilmMap,
-    Law,
+    Passes,
     bias_and_variance,
-    crossover_s,
-    film_map,
+    camera_row,
+    error_after,
+    page,
     paired_bias,
     reference_variance,
     squared_error,
-    weights,
 )
-from neurolens.base import status as st
-from neurolens.base.errors import InputError
-from neurolens.cameras.contract import Camera, CameraRays, FloatArray
-from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.ideal import ThinLens
-from neurolens.lens.shot import Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.render.scene import CameraSettings
+from experiments.lab import Row
 
 SHAPE = (12, 20, 3)
 Picture = NDArray[np.float64]
@@ -63,13 +50,6 @@ def test_bias_and_variance_of_known_pictures_with_a_noisy_reference(
     assert abs(variance.value - sigma**2) < 4 * variance.sd < 0.2 * sigma**2
 
 
-def test_the_jackknife_tells_how_far_estimates_spread() -> None:
-    sets = [bias_and_variance(0.2 + noise(8, 0.5, s), noise(2, 1e-9, 0), np.ones(SHAPE)) for s in range(40)]
-    for pick in (0, 1):
-        values, told = [s[pick].value for s in sets], [s[pick].sd for s in sets]
-        assert 0.7 < np.std(values) / np.mean(told) < 1.4
-
-
 def test_shared_random_numbers_resolve_a_bias_that_independent_passes_cannot() -> None:
     exact = truth() + noise(8, 1.0, 5)
     other = exact + 1e-3 + noise(8, 1e-3, 6)
@@ -80,16 +60,6 @@ def test_shared_random_numbers_resolve_a_bias_that_independent_passes_cannot() -
     assert paired_bias(exact, exact, np.ones(SHAPE)) == Estimate(0.0, 0.0)
 
 
-def test_errors_are_weighted_as_the_relative_mse_is() -> None:
-    halves = [np.full(SHAPE, 2.0), np.full(SHAPE, 2.0)]
-    weight = weights(halves[0], 0.01)
-    assert squared_error(halves[0] + 0.5, halves, weight) == pytest.approx(0.25 / 4.01)
-    assert paired_bias(noise(3, 0, 0) + 0.5, noise(3, 0, 0), weight).value == pytest.approx(0.25 / 4.01)
-    found, variance = bias_and_variance(np.full((3, *SHAPE), 2.5), halves, weight)
-    assert (found.value, variance.value) == (pytest.approx(0.25 / 4.01), pytest.approx(0, abs=1e-12))
-    assert squared_error(halves[0] + 0.5, halves, weights(halves[0], None)) == pytest.approx(0.25)
-
-
 def test_squared_error_is_free_of_the_references_noise_and_that_noise_is_known() -> None:
     sets = [truth() + noise(2, 0.3, seed) for seed in range(60)]
     errors = [squared_error(truth() + 0.1, halves, np.ones(SHAPE)) for halves in sets]
@@ -97,185 +67,59 @@ def test_squared_error_is_free_of_the_references_noise_and_that_noise_is_known()
     assert np.mean([reference_variance(h, np.ones(SHAPE)) for h in sets]) == pytest.approx(0.09 / 2, rel=0.03)
 
 
-# Laws of time
-
-EXACT = Law(0.0, 4.0, 2.0, ((0.5, 12.0), (1.0, 8.0)))
-
-
-def test_after_n_passes_the_variance_is_an_nth() -> None:
-    law = Law(0.5, 4.0, 2.0)
-    assert [law.at(2.0 * n) - 0.5 for n in (1, 2, 8)] == [4.0, 2.0, 0.5]
-    assert EXACT.at(0.7) == pytest.approx(12 * (8 / 12) ** (math.log(1.4) / math.log(2)))
-    assert EXACT.at(0.4) == math.inf
-
-
-def test_both_errors_are_equal_where_the_exact_lens_gets_ahead() -> None:
-    fast = Law(1e-4, 4.0, 1.0, ((0.25, 12.0),))
-    t = crossover_s(EXACT, fast)
-    assert t == pytest.approx((4.0 * 2.0 - 4.0 * 1.0) / 1e-4)
-    assert fast.at(t) == pytest.approx(EXACT.at(t))
-    assert fast.at(0.5 * t) < EXACT.at(0.5 * t) and fast.at(2 * t) > EXACT.at(2 * t)
-
-
-def test_a_crossover_within_the_first_pass_is_found_on_the_measured_points() -> None:
-    biased = Law(6.0, 1.0, 0.5, ((0.1, 20.0), (0.2, 9.0)))
-    t = crossover_s(EXACT, biased)
-    assert 0.5 < t < 2.0
-    assert EXACT.at(t) == pytest.approx(biased.at(t), rel=0.02)
-
-
-def test_no_crossover() -> None:
-    assert crossover_s(EXACT, Law(0.0, 4.0, 1.0, ((0.25, 12.0),))) == math.inf  # as good and faster: for ever
-    assert crossover_s(EXACT, Law(1.0, 40.0, 3.0, ((1.0, 90.0),))) == 0.0  # worse at all times
-
-
 # Results of one scene
 
 COUNTS = Counts((SHAPE[1], SHAPE[0]), short=(1, 2), repeats=2, pass_samples=4, passes=4, reference=64)
 
 
-def rendered(bias: float, seconds_a_sample: float, sigma: float = 0.4) -> Rendered:
+def rendered(bias: float, seconds_a_sample: float, sigma: float = 0.4) -> Passes:
     """Pictures of a camera whose variance is sigma^2 / samples; all cameras draw the same noise."""
     own: list[Picture] = []
     for k, (samples, _) in enumerate(COUNTS.jobs):
         own.append(truth() + bias + noise(1, sigma / math.sqrt(samples), 50 + k)[0])
-    return Rendered(own, [seconds_a_sample * n for n, _ in COUNTS.jobs])
+    return own, [seconds_a_sample * n for n, _ in COUNTS.jobs]
 
 
-def result(cameras: Sequence[tuple[str, float, float]]) -> SceneResult:
-    halves = list(truth() + noise(2, 0.01, 9))
-    by = {m: weights(truth(), eps) for m, eps in equal_time.MEASURES.items()}
-    film = FilmMap(np.full((4, 6), 2.0), 2.0, 3.0)
-    exact = rendered(0.0, cameras[0][2])
-    found: dict[str, CameraResult] = {
-        name: camera_result(name, rendered(bias, seconds), exact, halves, by, COUNTS, film)
-        for name, bias, seconds in cameras
-    }
-    noise2 = {m: reference_variance(halves, w) for m, w in by.items()}
-    shot = CameraSettings(position_m=(0, 0, 1), look_at_m=(0, 0, 0), focus_m=1.0)
-    return SceneResult("wall", shot, 1.8, COUNTS, 1, truth(), noise2, 0.01, found)
+def rows(cameras: Sequence[tuple[str, float, float]]) -> dict[str, Row]:
+    halves, exact = list(truth() + noise(2, 0.01, 9)), rendered(0.0, cameras[0][2])
+    return {name: camera_row(name, rendered(bias, s), exact, halves, COUNTS) for name, bias, s in cameras}
 
 
 @pytest.fixture(scope="module")
-def scene() -> SceneResult:
-    return result([("exact", 0.0, 0.02), ("mlp-16x2", 0.0, 0.01), ("thin lens", 0.2, 0.01)])
+def scene() -> dict[str, Row]:
+    return rows([("exact", 0.0, 0.02), ("mlp-16x2", 0.0, 0.01), ("thin lens", 0.2, 0.01)])
 
 
-def test_levels_hold_the_error_of_their_samples(scene: SceneResult) -> None:
-    exact = scene.cameras["exact"]
-    assert [level.samples for level in exact.levels] == [1, 2, 4, 8, 16]
-    for level in exact.levels:
-        assert level.mse == pytest.approx(0.16 / level.samples, rel=0.15)
-        assert level.seconds_min == pytest.approx(0.02 * level.samples)
-    assert [level.flip for level in exact.levels] == sorted((level.flip for level in exact.levels), reverse=True)
+def test_levels_hold_the_error_of_their_samples(scene: dict[str, Row]) -> None:
+    weight = float(np.mean(1 / (truth() ** 2 + 0.01)))
+    levels = scene["exact"]["levels"]
+    assert [level["samples"] for level in levels] == [1, 2, 4, 8, 16]
+    for level in levels:
+        assert level["rel_mse"] == pytest.approx(weight * 0.16 / level["samples"], rel=0.2)
+        assert level["seconds_min"] == pytest.approx(0.02 * level["samples"])
+    assert [level["flip"] for level in levels] == sorted((level["flip"] for level in levels), reverse=True)
 
 
-def test_a_camera_that_gives_the_exact_pictures_has_neither_bias_nor_flip(scene: SceneResult) -> None:
-    found = scene.cameras["mlp-16x2"]
-    assert found.bias2["mse"] == Estimate(0.0, 0.0) and found.flip_same == 0.0
-    biased = scene.cameras["thin lens"]
-    assert biased.bias2["mse"].value == pytest.approx(0.04, rel=1e-6)  # the noise is the same and cancels
-    assert biased.flip_same > 0.05
+def test_a_camera_that_gives_the_exact_pictures_has_neither_bias_nor_flip(scene: dict[str, Row]) -> None:
+    same, biased = scene["mlp-16x2"], scene["thin lens"]
+    assert same["bias2"] == {"value": 0.0, "sd": 0.0} and same["flip_paired"] == 0.0
+    weight = float(np.mean(1 / (truth() ** 2 + 0.01)))  # the noise is the same and cancels
+    assert biased["bias2"]["value"] == pytest.approx(0.04 * weight, rel=0.05)
+    assert biased["flip_paired"] > 0.05
 
 
-def test_the_exact_lens_is_ahead_when_its_law_says_so(scene: SceneResult) -> None:
-    """The law gives 0.16 (0.02 s - 0.01 s) / 0.2^2 = 40 ms for the absolute error."""
-    law, other = scene.cameras["exact"].law("mse"), scene.cameras["thin lens"].law("mse")
-    assert crossover_s(law, other) == pytest.approx(0.04, rel=0.5)
-    assert equal_time_page.equal_time_s(scene) == pytest.approx(0.16)
+def test_after_n_passes_the_variance_is_an_nth(scene: dict[str, Row]) -> None:
+    for name, bias2 in (("exact", 0.0), ("thin lens", scene["thin lens"]["bias2"]["value"])):
+        camera = scene[name]
+        variance, (pass_s, _) = camera["variance"]["value"], camera["pass_s"]
+        assert [error_after(camera, n * pass_s) - bias2 for n in (1, 2, 8)] == pytest.approx(
+            [variance / n for n in (1, 2, 8)]
+        )
 
 
-# Errors in the film's space
-
-FILM = (36.0, 18.0)
-LIGHT = (450.0, 650.0)
-
-
-class Shifted:
-    """A camera whose film lies wrong by some um, over part of it."""
-
-    def __init__(self, camera: Any, x_um: float, y_um: float, right_only: bool = False) -> None:
-        self.camera, self.shift, self.right_only = camera, np.float32([[1e-3 * x_um], [1e-3 * y_um]]), right_only
-        self.name, self.dispersive, self.wavelength_nm = "shifted", camera.dispersive, camera.wavelength_nm
-        self.film_mm, self.settings = camera.film_mm, camera.settings
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        shift = np.where(film_mm[0] > 0, self.shift, 0) if self.right_only else self.shift
-        rays: CameraRays = self.camera.sample((film_mm + shift).astype(np.float32), pupil, wavelength_nm)
-        return rays
-
-
-def mapped(exact: Any, camera: Camera, **size: int) -> FilmMap:
-    return film_map(exact, camera, wavelengths_nm=LIGHT, **{"columns": 6, "rows": 4, "samples": 16, **size})
-
-
-@pytest.mark.parametrize("focus_m", [0.5, 3.0, math.inf])
-def test_a_shift_of_the_film_is_found_in_micrometres(focus_m: float) -> None:
-    thin = ThinLens(50.0, 1.8, focus_m, FILM)
-    assert mapped(thin, thin).p99_um == 0.0  # of a thin lens, a thin lens is exact
-    found = mapped(thin, Shifted(thin, 30.0, -40.0))
-    assert found.median_um == pytest.approx(np.full((4, 6), 50.0), rel=1e-3)
-    assert found.p99_um == pytest.approx(50.0, rel=1e-3)
-
-
-def test_a_thin_lens_of_another_focal_length_scales_the_picture() -> None:
-    """Both in focus at D: a film point x is seen at x (D - s') / s', so that the error is x times the ratio less 1."""
-    exact, other = ThinLens(50.0, 2.0, 2.0, FILM), ThinLens(51.0, 2.0, 2.0, FILM)
-    sizes = [(2000 - c.image_distance_mm) / c.image_distance_mm for c in (exact, other)]
-    x, y = np.meshgrid((np.arange(6) - 2.5) * FILM[0] / 6, (np.arange(4) - 1.5) * FILM[1] / 4)
-    expected = 1000 * np.hypot(x, y) * (1 - sizes[1] / sizes[0])
-    assert mapped(exact, other).median_um == pytest.approx(expected, rel=1e-3)
-
-
-def test_the_map_is_turned_as_the_picture_is() -> None:
-    """Film at +x is the left of the picture (render.film.PixelGrid)."""
-    thin = ThinLens(50.0, 2.0, 2.0, FILM)
-    found = mapped(thin, Shifted(thin, 10.0, 0.0, right_only=True)).median_um
-    assert found[:, :3] == pytest.approx(np.full((4, 3), 10.0), rel=1e-3) and not found[:, 3:].any()
-
-
-@pytest.fixture(scope="module")
-def singlet() -> ExactCamera:
-    """f/4 biconvex lens, with much spherical aberration, coma and colour."""
-    lens = read_lens(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml")
-    return ExactCamera(lens, Shot((12.0, 6.0), 2.0, 4.0))
-
-
-def test_a_shift_behind_a_real_lens_is_found_through_its_aberrations(singlet: ExactCamera) -> None:
-    found = mapped(singlet, Shifted(singlet, 3.0, 4.0))
-    # The rays' own differentials hold aberrations; the pupil's outline moves with the film point, by little.
-    assert found.median_um == pytest.approx(np.full((4, 6), 5.0), rel=0.02)
-
-
-def test_another_pupil_outline_is_no_error_of_the_rays(singlet: ExactCamera) -> None:
-    """The same lens whose pupil is a tenth narrower: pupil points differ, and so would the rays."""
-    other: Any = copy(singlet)
-    other.film = copy(singlet.film)
-    outline = singlet.film.outline
-    narrower = replace(outline, x=np.float32(0.9) * outline.x, y=np.float32(0.9) * outline.y)
-    other.film.outline = other.film.pupil = narrower
-    point, light = np.full((2, 1), 0.3, np.float32), np.full(1, 550, np.float32)
-    moved = other.sample(point, point, light).origin_m - singlet.sample(point, point, light).origin_m
-    assert np.abs(moved).max() > 1e-5  # metres: it is another pupil
-    assert mapped(singlet, other).p99_um == 0.0
-
-
-def test_dark_film_is_not_a_number() -> None:
-    thin = ThinLens(50.0, 2.0, 2.0, FILM)
-
-    class Dark(Shifted):
-        def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-            rays = self.camera.sample(film_mm, pupil, wavelength_nm)
-            lost = np.where(film_mm[1] > 0, st.blocked(0, st.RIM), rays.status).astype(np.int32)
-            return replace(rays, status=lost)
-
-    found = mapped(thin, Dark(thin, 0, 0)).median_um
-    assert np.isnan(found[2:]).all() and not found[:2].any()
-
-
-def test_cameras_that_do_not_take_the_same_picture_are_refused() -> None:
-    thin = ThinLens(50.0, 2.0, 2.0, FILM)
-    with pytest.raises(InputError, match="film_mm"):
-        mapped(thin, ThinLens(50.0, 2.0, 2.0, (36.0, 24.0)))
-    with pytest.raises(InputError, match="focus_m"):
-        mapped(thin, ThinLens(50.0, 2.0, 3.0, FILM))
+def test_the_page_tells_a_bias_from_its_bound(scene: dict[str, Row]) -> None:
+    facts = {"scene": "wall", "f_number": 1.8, "focus_m": 1.0, "threads": 1, "counts": vars(COUNTS)}
+    text = page([{**facts, "reference_variance": 1e-4, "reference_flip": 0.01, "cameras": list(scene.values())}])
+    bias = 100 * math.sqrt(scene["thin lens"]["bias2"]["value"])
+    first = next(line for line in text.splitlines() if line.startswith("| thin lens"))
+    assert first.split("|")[2].strip().startswith(f"{bias:.3g}")

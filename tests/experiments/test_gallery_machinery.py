@@ -3,17 +3,14 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from gallery_shots import GALLERY, ROOT, shipped, shot
+from gallery_shots import ROOT, shipped, shot
 
 from experiments.__main__ import main
-from experiments.gallery.cameras import Window, exact_camera, surrogate_camera, widened
-from experiments.gallery.run import MOST_BYTES, check, fingerprint_of
-from experiments.gallery.settings import find_effects, read_effect
+from experiments.gallery.cameras import exact_camera, surrogate_camera
+from experiments.gallery.run import MOST_BYTES, fingerprint_of
+from experiments.gallery.settings import read_effect
 from neurolens.base.errors import InputError
-from neurolens.cameras.ideal import ThinLens
-from neurolens.readers.lensfile import read_lens
 
 EFFECT = """\
 title = "Small"
@@ -47,57 +44,6 @@ def written(folder: Path, old: str = "", new: str = "") -> Path:
     assert old in text
     path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
     return path
-
-
-def test_every_effect_of_the_gallery_can_be_read() -> None:
-    for path in find_effects(GALLERY):
-        effect = read_effect(path)
-        check(effect)
-        assert all(file.is_file() for panel in effect.panel for file in panel.files())
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "field"),
-    [
-        ("width = 24", "widht = 24", "panel[0].widht"),
-        ("samples = 2", "samples = 0", "panel[0].samples"),
-        ("f_number = 4", "widen = 9", "panel[0].widen"),
-        ('"two"', '"one"', "panel"),
-        ("9.0, 6.0]", "9.0, -6.0]", "panel[1].film_mm, window_mm"),
-        ('"edge_blur"', '"blur"', "measure"),
-        ('source = "Nobody."', 'source = ""\ncolumns = ["thick"]', "columns"),
-    ],
-)
-def test_a_mistake_in_a_file_is_one_error_that_names_its_field(tmp_path: Path, old: str, new: str, field: str) -> None:
-    path = written(tmp_path, old, new)
-    with pytest.raises(InputError) as caught:
-        check(read_effect(path))
-    assert (caught.value.file, caught.value.field) == (str(path), field)
-
-
-def test_a_window_sees_what_the_whole_film_sees_there() -> None:
-    whole = ThinLens(50.0, 2.0, 2.0)
-    window = Window(whole, (10.0, 4.0, 6.0, 4.0))
-    rng = np.random.default_rng(3)
-    film = (rng.uniform(-0.5, 0.5, (2, 50)) * [[6.0], [4.0]]).astype(np.float32)
-    pupil, nm = rng.random((2, 50), np.float32), np.full(50, 550, np.float32)
-    # Printed to the right and up is the film's -x and -y.
-    expected = whole.sample(film + np.array([[-10.0], [-4.0]], np.float32), pupil, nm)
-    for camera in (window, window.for_worker()):
-        found = camera.sample(film, pupil, nm)
-        np.testing.assert_array_equal(found.direction, expected.direction)
-        np.testing.assert_array_equal(found.weight, expected.weight)
-
-
-def test_widened_rims_stay_clear_of_the_centre_of_curvature() -> None:
-    lens = read_lens(ROOT / "lenses" / "laikin_double_gauss_127.toml")
-    wide = widened(lens, 3.0)
-    assert wide.stop_radius_mm == lens.stop_radius_mm
-    for before, after in zip(lens.surfaces, wide.surfaces, strict=True):
-        if not before.stop:
-            assert before.diameter_mm < after.diameter_mm <= 3 * before.diameter_mm
-            assert after.semi_diameter_mm <= 0.95 * abs(after.radius_mm) or after.diameter_mm == before.diameter_mm
-    assert widened(lens, 1.0) == lens
 
 
 def test_exact_and_surrogate_put_the_film_in_the_same_place_however_it_is_focused() -> None:

@@ -8,13 +8,11 @@ import pytest
 from lens_models import LENSES
 
 from experiments import make_models
-from experiments.__main__ import main
-from experiments.make_models import Entry, Library, chosen, fingerprint, read_list
+from experiments.make_models import Entry, Library, fingerprint, read_list
 from experiments.promises import read_index
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress
-from neurolens.base.settings import from_dict
 
 QUIET = Progress(quiet=True)
 
@@ -72,14 +70,6 @@ def files(folder: Path) -> list[str]:
     return [r["file"] for r in read_index(folder)]
 
 
-def test_a_list_holds_every_lens_of_its_folder_once(library: Library) -> None:
-    assert [e.state for e in library.entry] == ["two", "one", "three"]
-    assert [e.best for e in library.entry] == [False, True, True]
-    assert [e.state for e in chosen(library, ["t"])] == ["two", "three"]
-    with pytest.raises(InputError, match="three"):
-        chosen(library, ["nothing"])
-
-
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
     make_models.write_index([row("one.old.onnx", "one", rms_um=9.0), row("gone.x.onnx", "gone")], {}, tmp_path)
     for name in ("one.old.onnx", "gone.x.onnx"):
@@ -96,18 +86,6 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, library: Li
     assert "gone" not in (tmp_path / "README.md").read_text()
 
 
-def test_what_changed_is_made_again(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
-    make_models.make_models(library, library.entry, tmp_path, QUIET)
-    made["order"].clear()
-    (tmp_path / "three.ols-6.onnx").write_bytes(b"another")
-    text = (tmp_path / "lenses" / "one.toml").read_text()
-    (tmp_path / "lenses" / "one.toml").write_text(text.replace("3.25896", "3.25900"))
-    make_models.make_models(library, library.entry, tmp_path, QUIET)
-    assert made["order"] == ["one", "three"]
-    make_models.make_models(library, chosen(library, ["two"]), tmp_path, QUIET, again=True)
-    assert made["order"] == ["one", "three", "two"] and len(files(tmp_path)) == 4
-
-
 def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     tmp_path: Path, library: Library, made: dict[str, Any]
 ) -> None:
@@ -118,40 +96,3 @@ def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     made["broken"].clear()
     assert make_models.make_models(library, library.entry, tmp_path, QUIET) == []
     assert json.loads((tmp_path / "index.json").read_text())["left_out"] == {}
-
-
-@pytest.mark.whole  # a command of its own
-@pytest.mark.slow
-def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
-    (tmp_path / "list.toml").write_text(
-        "compile_exact = false\n[pairs]\ntrain = 3000\nheld_out = 3000\nrim = 3000\n"
-        f'[[entry]]\nlens = {{ file = "{LENSES}/cooke_triplet_50.toml" }}\n'
-        "models = [{ terms = 12, degree = 4, planes = false }, { terms = 20, degree = 5, planes = false }]\n"
-        "best = true\n"
-    )
-    command = ["models", "--list", str(tmp_path / "list.toml"), "--output", str(tmp_path / "out"), "--quiet"]
-    assert main(command) == 0
-    (only,) = read_index(tmp_path / "out")
-    assert only["model"] == "ols-20" and only["broken"] == [] and only["rms_um_at_21_6"] > only["rms_um"] > 0
-    assert only["ns_per_ray"]["min"] > 0 and only["lens_file"] == "lenses/cooke_triplet_50.toml"
-    before = (tmp_path / "out" / "index.json").read_bytes()
-    assert main(command) == 0 and (tmp_path / "out" / "index.json").read_bytes() == before
-    assert main([*command, "--times"]) == 0  # the same model, other times
-    (again,) = read_index(tmp_path / "out")
-    assert (
-        again["ns_per_ray"] != only["ns_per_ray"] and again["sha256"] == only["sha256"] and again.keys() == only.keys()
-    )
-
-
-@pytest.mark.parametrize(
-    "entry",
-    [
-        {"lens": {"file": "one.toml", "configuration": "../up"}},
-        {"lens": {"file": "one.toml"}, "models": [{"name": "a/b"}]},
-        {"lens": {"file": "one.toml"}, "models": [{"terms": 6}, {"terms": 6}]},
-        {"lens": {"file": "one.toml"}, "models": []},
-    ],
-)
-def test_names_that_are_no_file_names_are_refused(entry: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="entry"):
-        from_dict(Library, {"entry": [entry]}, "test")

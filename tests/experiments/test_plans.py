@@ -8,16 +8,9 @@ import pytest
 from experiments import lab, plans
 from experiments.plan_errors import by_rays, fresh_places, fresh_prints, moved, pieces_of, rendered
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.lens.shot import Shot
-from neurolens.plan.candidates import Choice
-from neurolens.plan.footprints import distance_mm, places_of
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
-from neurolens.setting.pupils import image_radius_mm
-from neurolens.setting.states import set_lens
-from neurolens.study.experiment import near_limit_m
 
 SIDE, SEEDS = 56, 4
 
@@ -54,19 +47,6 @@ def test_a_blur_is_found_as_the_way_that_light_moves() -> None:
         assert moved(exact, blurred, before).px == pytest.approx(wanted, rel=0.12)
 
 
-def test_light_alone_moves_nothing() -> None:
-    found = moved(*pictures((0.0, 0.0), 0.0, 0.03, 0.02), blur_px=0.0)
-    assert found.gain == pytest.approx(0.03, rel=0.05) and found.px < 0.02
-
-
-def test_noise_is_no_shift_and_flat_pictures_tell_nothing() -> None:
-    exact, same = pictures((0.0, 0.0), 0.0, 0.0, 0.3)
-    found = moved(exact, same, 1.0)
-    assert found.px < 0.02 and 0 < found.noise_px < 0.1
-    flat = np.ones((SEEDS, SIDE, SIDE, 3))
-    assert np.isinf(moved(flat, 1.1 * flat, 1.0).noise_px)
-
-
 class Shifted:
     """A camera whose picture is moved on its film by `by_mm` along x."""
 
@@ -94,57 +74,3 @@ def test_a_shifted_camera_is_as_far_off_by_rays_and_by_renders() -> None:
     for k in range(2):
         found = moved(renders[0][:, k], renders[1][:, k], blur_px=0.5)
         assert found.px == pytest.approx(0.4, rel=0.1, abs=3 * found.noise_px) and found.noise_px < 0.04
-
-
-class Outlined:
-    """A round stop of radius 10 mm, focused at 2 m, its pupil filled as a polygon of twice so many sides about it."""
-
-    film_mm, wavelength_nm, dispersive = (36.0, 24.0), None, False
-
-    def __init__(self, sides: int) -> None:
-        turn = np.linspace(0, np.pi, sides + 1)
-        x, y = 10 / np.cos(np.pi / sides / 2) * np.stack([np.cos(turn), np.sin(turn)])
-        rows = [np.tile(v, (1, 2, 1)).astype(np.float32) for v in (x, y * (np.sin(turn) > 1e-9))]
-        self._outline = PupilOutline(0.0, 30.0, (550.0,), np.zeros(2, np.float32), *rows)
-
-    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
-        point, area = self._outline.sample(film_mm, pupil, wavelength_nm)
-        weight = np.where(np.hypot(*point) <= 10, area / (np.pi * 100), 0).astype(np.float32)
-        flat = np.zeros_like(point[:1])
-        goal = np.concatenate([-film_mm / 50 * 2, flat - 2])
-        origin = 1e-3 * np.concatenate([point, flat])
-        way = (goal - origin) / np.linalg.norm(goal - origin, axis=0)
-        return CameraRays(origin, way, weight, np.zeros(len(weight), np.int8))
-
-
-def test_two_outlines_of_one_pupil_are_one_camera() -> None:
-    one, other = Outlined(32), Outlined(12)
-    film = np.array([[0.0, 9.0], [0.0, -5.0]])
-    places = places_of(one, film, np.array([0.8, np.inf]), np.full(1, 550.0), np.ones(1))
-    seen, pixel = fresh_prints(one, places), 0.004
-    plain = distance_mm(seen, fresh_prints(other, places), places.share) / pixel
-    assert plain == pytest.approx([0.24, 0.14], rel=0.05)  # beside 132 and 88 pixels of blur
-    assert (by_rays(other, one, places, seen, pixel, (1.0, 0.01))[0] < 0.35 * plain).all()
-    assert (by_rays(other, one, places, seen, pixel, (0.3,))[0] == plain).all()
-
-
-def test_scenes_suit_lenses() -> None:
-    for name in ("phone_lens_6", "ogawa_zoom_70_200"):
-        lens = set_lens(read_lens(f"lenses/{name}.toml"))
-        own = load_scene(lab.SCENES / "lights.toml").settings.camera
-        shot = plans.suited(load_scene(lab.SCENES / "lights.toml"), lens).settings.camera
-        assert shot.focus_m >= near_limit_m(lens) and shot.width == 1920
-        moved_m = np.linalg.norm(np.subtract(shot.position_m, own.position_m))
-        assert moved_m == pytest.approx(shot.focus_m - own.focus_m, abs=1e-6)  # what is in focus stays so
-        corner = np.hypot(*shot.film_mm) / 2
-        assert corner == pytest.approx(0.95 * image_radius_mm(lens)[0]) or shot.film_mm[0] == 36.0
-
-
-def test_a_decision_is_held_against_the_cheapest_that_holds() -> None:
-    every = [Choice(n, n, 0.0, 0.0, cost, 1.0) for n, cost in (("a", 10.0), ("b", 20.0), ("c", 30.0))]
-    rows = {"a": {"px": 0.3, "light": 0.0}, "b": {"px": 0.1, "light": 0.0}, "c": {"px": 0.0, "light": 0.02}}
-    for budget, best, holds, cheapest, ratio in (
-        (0.5, 1, True, "a", 2.0), (0.2, 0, False, "b", 0.5), (0.2, 2, False, "b", 1.5), (0.05, None, True, None, None),
-    ):  # fmt: skip
-        made = plans._decision("render", budget, None if best is None else every[best], every, rows)
-        assert (made["holds"], made["cheapest"], made["ratio"]) == (holds, cheapest, ratio)

@@ -71,18 +71,6 @@ def seen_once() -> Iterator[None]:
         yield
 
 
-@pytest.mark.whole  # test_ghosts holds every ghost against photons
-def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
-    """The light of photons with two reflections at most is that of the ghosts, block by block, within its noise."""
-    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--bins", "2", "--quiet"]
-    blocks = []
-    for words in (["--cell", "2"], ["--photons", "200000", "--reflections", "2", "--kernel", "0"]):
-        out = tmp_path / "one.exr"
-        assert main(["flare", *common, *words, "-o", str(out)]) == 0
-        blocks.append(read_exr(out)[0][..., 1].reshape(2, 8, 3, 8).sum((1, 3)))
-    np.testing.assert_allclose(blocks[1], blocks[0], rtol=0.12)
-
-
 def test_starburst_is_a_layer(tmp_path: Path) -> None:
     """What the module makes, added to the ghosts under its gain."""
     out = tmp_path / "star.exr"
@@ -124,16 +112,6 @@ def test_noise_is_that_of_the_seed_in_every_frame(tmp_path: Path) -> None:
     assert main([*words, "--seed", "3"]) == 0
     first, second, other = (read_exr(tmp_path / name)[0] for name in ("a.0001.exr", "a.0002.exr", "a.exr"))
     assert first.any() and np.array_equal(first, second) and not np.array_equal(first, other)
-
-
-def test_lens_by_keys(tmp_path: Path) -> None:
-    out = tmp_path / "a.exr"
-    words = ["flare", *SMALL, "--light", "5,3", "-o", str(out)]
-    assert main([*words, "--frames", "0:2", "--key", "f-number=0:5.6,2:22.4"]) == 0
-    assert main([*words, "--f-number", "11.2"]) == 0
-    first, middle, alone = (read_exr(tmp_path / name)[0] for name in ("a.0000.exr", "a.0001.exr", "a.exr"))
-    assert not np.array_equal(first, middle)
-    np.testing.assert_allclose(middle, alone, rtol=1e-4, atol=1e-6 * alone.max())
 
 
 def test_gains_and_tints(tmp_path: Path) -> None:
@@ -238,40 +216,6 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
         assert said in capsys.readouterr().err
 
 
-def test_rendered_frames_have_the_same_lights_and_layers(tmp_path: Path) -> None:
-    """A camera that turns from one lamp to the other: each alone would be kept there, and its ghosts be the layers."""
-    scene, out = tmp_path / "scene.toml", tmp_path / "a.exr"
-    lamp = "{ position_m = [1.1, 1.2, 0.0], intensity = [0.0, 0.0, 4.0] }"
-    text = SCENE.replace("points = [", f"points = [{lamp}, ").replace(', illuminant = "2900 K"', "")
-    text = (
-        text.replace('colour_space = "ACEScg"', "")
-        .replace('white_balance = "2900 K"', "")
-        .replace("bins = 3", "bins = 1")
-    )
-    text = text.replace("[2.0, 1.0, 0.5]", "[3.0, 0.0, 0.0]").replace("brightest = 2", "brightest = 3")
-    scene.write_text(text + "most = 1\ncell_px = 64.0\n")
-    words = ["render", str(scene), "--camera", "lenses/cooke_triplet_50.toml", "--layers", "beauty", "--quiet"]
-    keys = [
-        "--key",
-        "look-at=1:-0.3/1.3/0,2:0.5/1/0",
-        "--key",
-        "position=1:-0.3/1.3/2,2:0.5/1/2",
-        "--key",
-        "focus=1:2,2:1",
-    ]
-    names, red = [], []
-    for frame in ("1:1", "2:2", "1:2"):
-        assert main([*words, *keys, "--frames", frame, "-o", str(out), "--restart"]) == 0
-        found = [read_layers(file) for file in sorted(tmp_path.glob("a.*.exr"))]
-        names.append([sorted(layers) for layers in found])
-        red.append([layers["ghosts.R"].sum() > layers["ghosts.B"].sum() for layers in found])
-        for file in tmp_path.glob("a.*"):
-            file.unlink()
-    assert names[2][0] == names[2][1] and len(names[2][0]) == 15
-    assert red[0] == [True] and red[1] == [False] and len(set(red[2])) == 1
-    assert names[0][0] != names[1][0]  # so the choice matters
-
-
 def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
     """Of the same seeds' photons; what scatters adds to the glare, and a share of the film is no share of the rest."""
     common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--bins", "2", "--quiet"]
@@ -293,16 +237,11 @@ def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
     [
         (["--light", "180,0"], "within 90 degrees"),
         (["--light", "1"], "AZ,EL"),
-        (["--light", "1,2,3/4"], "AZ,EL"),
         (["--light", "1,2,1,0"], "positive distance"),
-        (["--light", "1,2,1,nan"], "positive distance"),
         (["--light", "0,0,1,0.001"], "outside the lens"),
         (["--light", "3,2,inf"], "finite"),
-        (["--light", "3,2,nan"], "finite"),
         (["--light", "0,0", "--coating", "s00"], "s00"),
         (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "--layers"),
-        (["--light", "1,2", "--without", "haze", "-o", "x.exr"], "layers of flare"),
-        (["--light", "0,0", "-o", "x.png"], ".exr"),
         (["--light", "0,0", "--coating", "velvet"], "velvet"),
         (["--light", "1,2", "--reflections", "4"], "--photons or --glare"),
         ([], "--light, --lights or --image"),
@@ -310,9 +249,7 @@ def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
         (["--light", "0,0", "--frames", "1:2"], "-o beside it"),
         (["--light", "0,0", "-o", "x.exr", "--gain", "s05=2"], "of this lens"),
         (["--light", "0,0", "-o", "x.exr", "--gain", "g01-00=2", "--photons", "9"], "single ghosts"),
-        (["--light", "0,0", "-o", "no/where.exr"], "folder that exists"),
         (["--lights", "none.csv"], "that exists"),
-        (["--image", "none.exr"], "none.exr"),
         (["--light", "0,0", "-o", "x.exr", "--width", "16384", "--film", "10x300", "--layers", "60"], "bytes"),
         (["--light", "0,0", "--path", "g99-01", "x.png"], "g99-01"),
         (["--light", "0,0", "--path", "g08-06", "x.gif"], "--path"),

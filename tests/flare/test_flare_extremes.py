@@ -4,7 +4,6 @@ import math
 import os
 import signal
 import threading
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import ghost_picture, photon_picture
+from neurolens.flare.picture import photon_picture
 from neurolens.flare.sources import highlights
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
@@ -147,21 +146,6 @@ def test_frames_end_when_asked_and_are_whole(tmp_path: Path, capsys: pytest.Capt
     assert [file.name for file in files] == [f"a.{k + 1:04d}.exr" for k in range(len(files))]
     assert all(file.with_suffix(".png").is_file() for file in files)
     assert all(read_exr(file)[0].any() for file in files)
-
-
-@pytest.mark.whole  # a large input
-def test_memory_does_not_grow_with_lights() -> None:
-    """Twelve lights take what two take: films under way are bounded."""
-    lens = set_lens(read_lens("lenses/cooke_triplet_50.toml"), focus_m=math.inf)
-    tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 360, 240)
-    peaks = []
-    for count in (2, 2, 12):  # the first compiles
-        lights = [Light(float(k), 3.0) for k in range(count)]
-        tracemalloc.start()
-        ghost_picture(tracer, lights, raster, wavelengths=4, cell_px=60.0, threads=2)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[2] < 1.2 * peaks[1]
 
 
 def test_total_reflection_inside() -> None:

@@ -202,7 +202,6 @@ def test_extremes_stay_finite(name: str) -> None:
 
 BAD = [
     (lambda: Light(180.0, 0.0), "within 90 degrees"),
-    (lambda: Light(0.0, 90.0), "within 90 degrees"),
     (lambda: Light(math.nan, 0.0), "within 90 degrees"),
     (lambda: Light(0.0, 0.0, distance_m=0.0), "positive distance"),
     (lambda: Light(0.0, 0.0, (1.0, -1.0, 0.0)), "at least 0"),
@@ -211,9 +210,7 @@ BAD = [
     (lambda: GhostTracer(replace(plate(), film_z_mm=None)), "focused"),
     (lambda: GhostTracer(plate()).trace(np.zeros((3, 4)), 550.0), r"\[6, N\]"),
     (lambda: coated(plate(), "velvet"), "velvet"),
-    (lambda: coated(plate(), "s03=bare"), "s00=NAME to s02=NAME"),
     (lambda: coated(plate(), "s02=three-layer"), "two different media"),
-    (lambda: coated(plate(), "bare,three-layer"), "one design"),
 ]
 
 

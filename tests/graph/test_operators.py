@@ -12,12 +12,11 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
-from neurolens.graph import derive
 from neurolens.graph.c import write_blocks, write_c
 from neurolens.graph.compiler import compile_c
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value, pruned
+from neurolens.graph.ir import Graph, Value
 from neurolens.graph.newton import determinant, limited_newton, solve
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
@@ -91,10 +90,6 @@ def inputs(count: int = 400) -> dict[str, Array]:
     return {"x": x[:, far][:, :count], "y": y[:, far][:, :count], "s": np.array([[0.7]]), "t": table}
 
 
-def test_every_rule_is_tested() -> None:
-    assert {kind for kind in derive._RULES if kind not in CASES} == set()
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_derivatives_are_those_of_central_differences(name: str) -> None:
     graph, given, step = graph_of(name), inputs(), 1e-5
@@ -144,22 +139,6 @@ def test_onnxruntime_gives_what_numpy_gives(name: str) -> None:
         np.testing.assert_allclose(rows, wanted + 0 * rows, rtol=0, atol=4e-6 * (1 + np.abs(wanted).max()))
     nodes = onnx.load_from_string(data).graph.node
     assert {name for node in nodes for name in node.output} - {name for node in nodes for name in node.input} == {"out"}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_rows_that_nothing_needs_are_left_out(name: str) -> None:
-    """And with them what only they need."""
-    graph, given = graph_of(name), inputs(50)
-    out, whole = graph.outputs["out"], evaluate(graph, given)["out"]
-    for row in range(out.rows):
-        less = pruned(graph, {"out": out[row]})
-        found = evaluate(less, given)["out"] + 0 * whole[:1]
-        np.testing.assert_allclose(found, whole[row : row + 1], rtol=1e-14, atol=0)
-        assert _computed_rows(less) <= _computed_rows(graph)
-
-
-def _computed_rows(graph: Graph) -> int:
-    return sum(node.rows for node in graph.nodes if node.kind not in ("input", "take", "concat"))
 
 
 def test_status_and_truths_of_any_float_in_every_reader(tmp_path: Path) -> None:
@@ -284,42 +263,3 @@ def test_steps_are_limited_and_singular_points_stay() -> None:
         found.append(evaluate(g, {"wanted": wanted, "start": start})["x"])
     np.testing.assert_allclose(np.hypot(*(found[0] - start)), [0.0, 0.1, 0.0], atol=1e-15)
     np.testing.assert_allclose(found[1][:, :2], [[0.0, 1.0], [0.0, 1.0]], atol=1e-12)
-
-
-def test_what_is_the_same_for_all_rays_is_done_once() -> None:
-    """A choice by numbers of the call, of values that differ by ray, also where the other side is NaN or infinite."""
-    g = Graph()
-    x, low, high = g.input("x"), g.input("low", per_call=True), g.input("high", per_call=True)
-    middle = (low + high) * 0.5
-    g.outputs["out"] = g.select(middle <= high, x * middle, (x - x) / (x - x)) + middle
-    g.outputs["other"] = g.select(high <= low, x / (x - x), x)
-    whole = lower(g)
-    once, rest = whole.of_the_call()
-    call = {"low": np.float32(1.0), "high": np.float32(2.0)}
-    known = {name: value.reshape(-1)[0] for name, value in once.evaluate(call).items()}
-    rays = {"x": np.array([0.0, -3.0, 7.0], np.float32)}
-    wanted, found = whole.evaluate(rays | call), rest.evaluate(rays | call | known)
-    for name in g.outputs:
-        np.testing.assert_array_equal(found[name], wanted[name])
-    steps = [rest.steps[k] for k in rest.live()]
-    rays_only = [s for s in steps if s.kind != "input"]
-    assert "pick" in {s.kind for s in rays_only} and known
-    for step in rays_only:  # nothing is left that no ray changes
-        assert any(isinstance(a, int) and not rest.steps[a].per_call for a in step.arguments)
-
-
-def test_an_output_added_later_is_found_and_what_others_need_is_kept() -> None:
-    g = Graph()
-    x = g.input("x")
-    twice = x + x
-    g.outputs["first"] = twice * twice
-    given = {"x": np.array([[1.0, 3.0]])}
-    assert evaluate(g, given)["first"].tolist() == [[4.0, 36.0]]
-    g.outputs["second"] = twice  # of nodes that are there
-    assert evaluate(g, given)["second"].tolist() == [[2.0, 6.0]]
-    g.outputs["x"] = x
-    g.outputs["first"] = x + 1.0
-    found = evaluate(g, given)
-    assert {name: rows.tolist() for name, rows in found.items()} == {
-        "first": [[2.0, 4.0]], "second": [[2.0, 6.0]], "x": [[1.0, 3.0]],
-    }  # fmt: skip

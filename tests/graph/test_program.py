@@ -17,8 +17,6 @@ from neurolens.graph.loworder import WORST, with_low_order_derivatives
 from neurolens.graph.program import RAY, Program
 from neurolens.graph.scalars import lower
 
-X, Y = (v.ravel() for v in np.meshgrid(np.linspace(0.3, 2.0, 9), np.linspace(0.35, 1.9, 8)))
-
 
 def program() -> Program:
     """Every kind of step."""
@@ -34,54 +32,6 @@ def program() -> Program:
         "constant": p.literal(4.0),
     }
     return p
-
-
-def test_another_order_is_the_same_program() -> None:
-    """Equal to the bit, and every step after those that it takes."""
-    values, ordered = program().evaluate({"x": X, "y": Y}), program().in_order_of_need()
-    found = ordered.evaluate({"x": X, "y": Y})
-    assert all(np.array_equal(found[name], value) for name, value in values.items())
-    assert ordered.count() == program().count()
-    for k, step in enumerate(ordered.steps):
-        assert all(a < k for a in step.arguments if isinstance(a, int))
-
-
-def test_what_is_divided_by_the_same_is_divided_once() -> None:
-    """But where the divisor is a number of each table: one over it could not be mixed."""
-    p = Program(tables=2)
-    x, y = p.input("x"), p.input("y") + 3.0
-    p.outputs = {"a": p.literal(2.0) / y, "b": x / y, "c": x / (y + 1.0), "d": x / p.literal([2.0, 4.0])}
-    p.outputs["e"] = y / p.literal([2.0, 4.0])
-    shared, given = p.with_shared_inverses(), {"x": X, "y": np.abs(Y)}
-    assert (p.count()["div"], shared.count()["div"]) == (5, 4)
-    for table in (0, 1):
-        found, wanted = (q.evaluate(given, table) for q in (shared, p))
-        assert all(np.allclose(found[name], value, rtol=3e-7) for name, value in wanted.items())
-
-
-def test_sums_in_parts_are_the_same_sums() -> None:
-    p = Program()
-    x, y = p.input("x"), p.input("y")
-    total, powers = p.literal(0.25), [x]
-    for k in range(11):
-        total = p.fma(powers[-1], k + 0.5, total)
-        powers.append(powers[-1] * y)
-    p.outputs = {"sum": total, "horner": p.horner(x, np.linspace(-1, 1, 12)), "spent": total * y}
-    short, given = p.with_shorter_sums(), {"x": X, "y": Y}
-    found, wanted = short.evaluate(given), p.evaluate(given)
-    assert all(np.allclose(found[name], value, rtol=2e-5) for name, value in wanted.items())
-
-    def longest(program: Program) -> int:
-        """Products of one sum that wait for one another."""
-        depth: dict[object, int] = {}
-        for k in program.live():
-            step = program.steps[k]
-            if step.kind == "fma":
-                depth[k] = 1 + depth.get(step.arguments[2], 0)
-        return max(depth.values())
-
-    assert longest(p) == 11 and longest(short) == 4
-    assert sum(short.count().values()) <= sum(p.count().values()) + 2
 
 
 def test_clamp_and_tanh_of_any_float_as_c_and_by_steps(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Lens files held against profiles: profiles made of a lens's own rays agree with it, and changes to it are seen."""
 
-import json
 import math
 from dataclasses import replace
 from functools import cache
@@ -19,8 +18,6 @@ from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial
 from neurolens.photographs.verify import names_of, verify
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.export import lens_facts
 
 ROOT = Path(__file__).parents[2]
 SONNAR = ROOT / "tests" / "data" / "sonnar_55_derived_rims.toml"  # lenses/sony_sonnar_55.toml before its fit
@@ -118,26 +115,6 @@ def test_the_sonnar_against_photographs() -> None:
     assert all(curve.rms < 0.2 for curve in c.light_stops.values())
 
 
-@pytest.mark.whole  # what it prints is compared below
-def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("lensfunpy")
-    picture, written = tmp_path / "sonnar.png", tmp_path / "sonnar.toml"
-    assert main(["verify", str(SONNAR), "-o", str(picture), "--lens-file", str(written)]) == 0
-    text = capsys.readouterr().out
-    assert "Sony FE 55mm f/1.8 ZA" in text and "the figures agree" in text and "neurolens rims" in text
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    again = read_lens(written)
-    card = lens_facts(again, domain_of(set_lens(again), focus_m=(math.inf, math.inf)))
-    assert card["measured"] == dict(again.measured) and card["believed_to_be"] == again.believed_to_be
-    assert dict(again.measured)["profile"] == "Sony FE 55mm f/1.8 ZA" and again.sha256 == read_lens(SONNAR).sha256
-    assert main(["verify", str(written), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data["measured"] == pytest.approx(dict(again.measured))
-    assert len(data["comparisons"][0]["distortion_percent"]["computed"]) == len(
-        data["comparisons"][0]["distortion_percent"]["height_mm"]
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
@@ -173,18 +150,3 @@ def test_light_alone_and_another_film(monkeypatch: pytest.MonkeyPatch) -> None:
         and c.distortion_percent.height_mm.max() <= (lens.image_radius_mm or math.inf) * 1.02
     )
     assert names_of(lens)[0] == "Some 50mm f/1.8"
-
-
-@pytest.mark.whole  # the command does
-def test_a_survey_holds_lenses_against_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("lensfunpy")
-    folder = tmp_path / "lenses"
-    folder.mkdir()
-    for name in ("sony_sonnar_55", "thorlabs_lb1471_biconvex_50"):
-        (folder / f"{name}.toml").write_bytes((ROOT / "lenses" / f"{name}.toml").read_bytes())
-    out = tmp_path / "found"
-    assert main(["survey", str(folder), "--no-fit", "--verify", "--jobs", "1", "--quiet", "-o", str(out)]) == 0
-    records = {r["file"]: r for r in json.loads((out / "survey.json").read_text())["lenses"]}
-    assert records["sony_sonnar_55.toml"]["photographs"]["profile"] == "Sony FE 55mm f/1.8 ZA"
-    assert any("no photographs" in note for note in records["thorlabs_lb1471_biconvex_50.toml"]["notes"])
-    assert "distortion_percent" in (out / "survey.csv").read_text().splitlines()[0]

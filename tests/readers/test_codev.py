@@ -180,42 +180,28 @@ def test_q_types_are_the_sums_of_forbes(kind: str, names: str, tmp_path: Path) -
     ("old", "new", "message"),
     [
         ("DIM   M", "DIM   F", r"line 4, DIM: got 'F', expected M \(mm\)"),
-        ("EPD   10.0", "EPD   -1", r"line 3, EPD: got -1.0"),
         ("EPD   10.0", "NAO   0.1", r"line 3, NAO: got '0.1', expected EPD or FNO"),
-        ("EPD   10.0\n", "", r"^$"),
         ("NBK7_SCHOTT", "NBK8_SCHOTT", r"line 12, glass: got 'NBK8'.*N-BK7"),
         ("NBK7_SCHOTT", "REFL", r"line 12, S: got 'REFL'.*no mirrors"),
         ("NBK7_SCHOTT", "0.5:60", r"index: got 0.5"),
         ("  STO", "  GRT", r"line 14, GRT: got .*given.*no grating"),
         ("  STO", "  STO; ADE 3", r"line 14, ADE: got 3.0, expected 0"),
         ("  STO", "  STO; SPS QBF", r"NRADIUS of SPS QBF: got 0.0, expected a normalisation radius above 0"),
-        ("  STO", "  STO; SPS QBF 9; SCO K 1", r"conic of SPS QBF: got 1.0, expected 0"),
-        ("  STO", "  STO; SPS QCN 9; SCO QC5 1", r"SCO of SPS QCN: got 'QC5', expected K, NRADIUS or QC4, QC6"),
         ("  STO", "  STO; SPS XYP 9", r"line 14, SPS: got 'XYP', expected one of ODD, QBF, QCN"),
-        ("  STO", "  STO; SCO K 1", r"line 14, SCO: got 'K', expected SPS before it"),
-        ("  STO", "  STO; AAS; CUX 1; AR 1e-6", r"AR of AAS: got 1e-06, expected 0"),
         ("  STO", "  STO; CIR OBS 2", r"CIR: got 'OBS'"),
         ("  STO", "  STO; MOD", r"line 14, MOD: got .*no ideal lens \(a module\)"),
-        ("  STO", "  STO; A 1e-5", r"ASP before coefficients"),
-        ("  STO", "  STO; K -1", r"CON or ASP before a conic"),
         ("  STO", "  STO; RDY S7 3", r"RDY: got 'S7', expected a surface from S0 to S1"),
         ("SO    0.0 0.1e14\n", "", r"line 11, S: got \(here\), expected one object SO"),
-        ("SI    0.0 0.0\n", "", r"SI: got \(missing\)"),
         ("S     50.0 5.0", "S     50.0", r"line 12, S: got 'NBK7_SCHOTT', expected a finite number"),
         ("CIR 9 ;", "CIR 60 ;", r"surface 2 of the file, diameter_mm: got 120"),
         ("GO\n", "GO &\n", r"a line that continues"),
         ("GO\n", "ZOO THI S1 1 2\nGO\n", r"line 19, ZOO: got 'THI', expected the count"),
         ("GO\n", "ZOO 2\nZOO RDY S1 1 2\nGO\n", r"line 20, ZOO: got 'RDY'.*other zooms are not read"),
-        ("GO\n", "ZOO 2\nZOO THI S1 1 2 3\nGO\n", r"line 20, ZOO THI: got 'S?1? ?1 2 3', expected 2 values"),
         ("GO\n", "ZOO 2\nZOO CIR S2 1 2\nGO\n", r"line 20, ZOO CIR: got 'S2', expected the stop"),
-        ("GO\n", "ZOO 2\nTHI S1 Z3 1\nGO\n", r"line 20, THI: got 'S1 Z3'"),
     ],
 )
 def test_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
     text = swapped(old, new)
-    if message == "^$":  # not a mistake: then the stop's own diameter rules
-        assert read(text, tmp_path).surfaces[0].diameter_mm == 16.0
-        return
     with pytest.raises(InputError, match=message):
         read(text, tmp_path)
 
@@ -242,24 +228,6 @@ ZOO VUY F1 0.1 0.2
     assert far.efl_mm is not None and math.isfinite(far.efl_mm)
 
 
-def test_rims_that_are_not_given_are_derived(tmp_path: Path) -> None:
-    lens = read(swapped("  CIR 9 ; CIR EDG 9.5\n", ""), tmp_path)
-    assert lens.rims == "derived" and 9 < lens.surfaces[1].diameter_mm < 12
-
-
-def test_a_lens_without_field_and_rims_is_refused(tmp_path: Path) -> None:
-    text = swapped("XAN   0.0 3.0\nYAN   0.0 4.0\n", "", swapped("  CIR 9 ; CIR EDG 9.5\n", ""))
-    with pytest.raises(InputError, match="--half-field"):
-        read(text, tmp_path)
-
-
-def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(tmp_path: Path) -> None:
-    with pytest.warns(NeurolensWarning, match="ask for a stop 10 wide, its own aperture is 6 "):
-        lens = read(swapped("CIR 8", "CIR 3.0"), tmp_path)
-    assert lens.surfaces[0].diameter_mm == pytest.approx(6.0)
-    assert lens.f_number == pytest.approx(first_order(lens).f_number)
-
-
 @pytest.mark.parametrize("radius", ["1.0", "-1.0", "2.0"])
 def test_a_bad_radius_gives_no_limit_that_the_field_keeps(radius: str, tmp_path: Path) -> None:
     text = swapped("  CIR 9 ; CIR EDG 9.5\n", "", swapped("  CIR 8\n  STO\n", ""))
@@ -270,11 +238,3 @@ def test_a_bad_radius_gives_no_limit_that_the_field_keeps(radius: str, tmp_path:
     except InputError as error:
         limit = re.search("at most ([-0-9.e+]+)", str(error))
         assert limit is None or 0 < float(limit[1].rstrip(",")) < 5
-
-
-@pytest.mark.parametrize(("word", "glass"), [("SK16_SCHOTT", "N-SK16"), ("BK7_SCHOTT", "N-BK7"), ("SK16", "SK16")])
-def test_a_glass_that_could_be_another_is_named(word: str, glass: str, tmp_path: Path) -> None:
-    with pytest.warns(NeurolensWarning, match=f"glass {word} is taken as [A-Za-z]+:{glass} "):
-        lens = read(swapped("NBK7_SCHOTT", word), tmp_path)
-    found = lens.surfaces[0].glass
-    assert found is not None and catalogue.find(found).name == glass

@@ -23,8 +23,6 @@ from neurolens.readers import any_format
 from neurolens.readers.any_format import read_any
 from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.readers.source import ReadOptions
-from neurolens.render.pictures import read_exr
-from neurolens.setting import focusing
 
 LENSES = Path(__file__).parents[2] / "lenses"
 SHOT = Shot((24.0, 16.0), 2.0, f_number=8.0)
@@ -132,46 +130,6 @@ def test_cameras_of_a_foreign_file_send_the_same_rays(kind: str, files: dict[str
     for part in ("origin_m", "direction", "weight", "status"):
         np.testing.assert_array_equal(*(getattr(r, part) for r in rays))
     assert (rays[0].status == 0).any()
-
-
-@pytest.mark.whole  # their cameras send the same rays
-def test_a_picture_and_source_of_a_foreign_file(
-    files: dict[str, Path], scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.setattr(focusing, "_RINGS", 64)  # rays of best focus, for both alike
-    made = {}
-    for kind in ("toml", "zmx"):
-        picture, source = tmp_path / f"{kind}.exr", tmp_path / f"{kind}.h"
-        assert main(["render", str(scene), "--camera", str(files[kind]), "-o", str(picture), "--quiet"]) == 0
-        assert main(["export", str(files[kind]), "--to", "c", "-o", str(source), "--name", "tessar"]) == 0
-        made[kind] = read_exr(picture)[0], source.read_text()
-    capsys.readouterr()
-    np.testing.assert_array_equal(made["toml"][0], made["zmx"][0])
-    code = [text[text.index("#include") :] for _, text in made.values()]
-    assert code[0] == code[1]
-
-
-@pytest.mark.whole  # study/test_odd_lenses.py evaluates a run folder
-@pytest.mark.usefixtures("no_plots")
-def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
-    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    small = ["pairs.train=1500", "pairs.held_out=600", "pairs.rim=600", "evaluation.vignetting_rays=2000"]
-    small += ["evaluation.rounds=0", 'model=[{method="ols",terms=12}]']
-    options = [word for text in small for word in ("--set", text)]
-    assert main(["train", "--lens", str(files["zmx"]), "--output", str(run), "--quiet", "--json", *options]) == 0
-    kept, model = run / "lenses" / "Tessar_100mm_1_4_5_v2_0.toml", run / "models" / "ols-12.onnx"
-    assert read_lens(kept).sha256 == read_any(files["zmx"]).sha256
-    capsys.readouterr()
-    from neurolens.study.check import lens_of_card
-    from neurolens.surrogates.card import read_card
-
-    card = read_card(model)
-    assert card["lens"]["id"] == "Tessar_100mm_1_4_5_v2_0"
-    for lens in (None, files["zmx"], files["toml"]):
-        assert lens_of_card(card, lens, model).sha256 == card["lens"]["sha256"]
 
 
 def test_what_a_name_means(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -209,23 +209,9 @@ def test_an_unknown_keyword_is_left_out_and_named(suffix: str, tmp_path: Path) -
         assert len(told) == 1 and ("QXW" in told[0] or "lines " in told[0])
 
 
-@pytest.mark.parametrize("kind", ["missing", "folder"])
-def test_no_file(kind: str, tmp_path: Path) -> None:
-    path = tmp_path / "lens.zmx"
-    if kind == "folder":
-        path.mkdir()
-    with pytest.raises(InputError, match="missing|not a regular file"):
-        read_any(path)
-
-
 def test_a_format_that_nobody_knows_lists_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"Zemax \(.zmx\).*CODE V.*OSLO|Zemax \(.zmx\).*OSLO.*CODE V"):
         read_text("what is this", ".abc", tmp_path)
-
-
-@pytest.mark.parametrize("suffix", WRITERS)
-def test_content_decides_whatever_the_suffix(suffix: str, tmp_path: Path) -> None:
-    assert len(read_text(TEXTS[suffix], ".lens_file", tmp_path).surfaces) == len(GAUSS.surfaces)
 
 
 TABLE = "# Singlet\n0 4.0 0 10\n50 5.0 1.5 20\n-50.0 0 1 20\n"

@@ -10,7 +10,7 @@ import pytest
 from lens_formats import swapped as swapped_in
 from shipped import singlet_mm
 
-from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
@@ -80,12 +80,6 @@ def read(text: str, tmp_path: Path, options: ReadOptions | None = None, encoding
     return read_zmx(path, options)
 
 
-def test_a_model_glass_s_partial_dispersion_is_told(tmp_path: Path) -> None:
-    with pytest.warns(NeurolensWarning, match="line 29, GLAS: a model glass's departure"):
-        lens = read(swapped("GLAS N-BK7 0 0 1.5 4.0E+1 0", "GLAS MODEL 1 0 1.6 40 0.01"), tmp_path)
-    assert (lens.surfaces[0].n_d, lens.surfaces[0].V_d) == (1.6, 40)
-
-
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
 def test_singlet_by_the_lensmakers_formula(encoding: str, tmp_path: Path) -> None:
     text = swapped("Singlet", "Einzellinse \u00d8 20")
@@ -133,12 +127,6 @@ def test_units_scale_every_length(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--units"):
         read(HEAD + BODY + TAIL, tmp_path, ReadOptions(units="cm"))
     assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, ReadOptions(units="in")) == inches
-
-
-def test_a_q_type_asphere_says_how_its_rows_were_taken(tmp_path: Path) -> None:
-    block = "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  XDAT 1 1\n  XDAT 2 1\n  XDAT 3 10\n  XDAT 4 0.5"
-    with pytest.warns(AssumedWarning, match="1 in XDAT 1 is taken to mean Qcon"):
-        read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -230,13 +218,6 @@ def test_a_qbfs_asphere_on_a_conic_focuses_all_zones(tmp_path: Path) -> None:
         assert crossing == pytest.approx(lens.surfaces[1].thickness_mm, abs=1e-3)
 
 
-def test_more_terms_than_an_even_asphere_has_are_its_next_powers(tmp_path: Path) -> None:
-    front = swapped("TYPE STANDARD", "TYPE EVENASPH\n  PARM 9 1E-24", BODY)
-    with pytest.warns(AssumedWarning, match="surface 1 of the file: PARM 9 and beyond"):
-        lens = read(HEAD + front + TAIL, tmp_path)
-    assert lens.surfaces[0].asphere == ((18, 1e-24),)
-
-
 def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
     front = 'TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""'
     text = swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75\n  PARM 2 1").replace("GLAS N-BK7", "COMM N-BK7")
@@ -252,30 +233,18 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
         ("MODE SEQ", "MODE NSC", r"line 2, MODE: got 'NSC'"),
         ("UNIT MM", "UNIT FURLONG", r"line 6, UNIT: got 'FURLONG', expected one of MM"),
         ("ENPD 10", "OBNA 0.1 0", r"line 7, OBNA"),
-        ("ENPD 10", "ENPD 0", r"line 7, ENPD: got 0.0, expected a number above 0"),
         ("GLAS N-BK7", "GLAS N-BK8", r"GLAS: got 'N-BK8', expected a glass.*N-BK7"),
-        ("GLAS N-BK7 0", "GLAS N-BK7 4", r"GLAS: got 'N-BK7 with solve 4'"),
         ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  CURV -2", r"PARAXIAL: got 0.0, expected PARM 1, a focal length"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  PARM 1 9\n  PARM 3 9\n  COMM ", r"PARM 3 of PARAXIAL: got 9.0"),
         ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  XDAT 1 2\n  XDAT 2 1\n  XDAT 4 1\n  CURV -2", r"0 \(Qbfs\) or 1"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1.5\n  CURV -2", r"XDAT 1 of XASPHERE: got 1.5"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1\n  XDAT 4 1\n  CURV -2", r"XDAT 4 of XASPHERE"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE XOSPHERE\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"a cone's tip"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 9\n  XDAT 11 1E-9\n  CURV -2", r"an XOSPHERE's"),
         ("GLAS N-BK7", "GLAS MIRROR", r"line 29, GLAS: got 'MIRROR'.*no mirrors"),
         ("GLAS N-BK7 0 0 1.5 4.0E+1", "GLAS ___BLANK 1 0 0.5 60", r"index: got 0.5"),
         ("SURF 2", "SURF 4", r"SURF: got '4', expected surface 2"),
         ("TYPE STANDARD\n  CURV -2", "TYPE COORDBRK\n  PARM 3 12\n  CURV -2", r"PARM 3 of COORDBRK: got 12.0"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XPOLYNOM\n  CURV -2", r"line 32, TYPE: got 'XPOLYNOM'"),
         ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 9 1E-5\n  CURV -2", r"PARM 9 of TOROIDAL"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  XDAT 3 1E-5\n  CURV -2", r"XDAT 3 of TOROIDAL"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE BICONICX\n  PARM 3 1\n  CURV -2", r"PARM 3 of BICONICX"),
         ("TYPE STANDARD\n  CURV -2", "TYPE ODDASPHE\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of ODDASPHE"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE STANDARD\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of STANDARD"),
         ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got .0 3 0., expected no obscuration"),
         ("  DIAM 9 1", "  CLAP 2 9 0\n  DIAM 9 1", r"CLAP: got '2 9', expected a round opening without a hole"),
-        ("  DIAM 9 1", "  OBDC 0 3\n  DIAM 9 1", r"OBDC"),
-        ("  DIAM 9 1", "  IGNR 1\n  DIAM 9 1", r"IGNR"),
         ("DIAM 9 1", "DIAM 60 1", r"surface 2 of the file, diameter_mm: got 120"),
         ("DISZ 45.0", "DISZ INFINITY", r"DISZ: got 'INFINITY'"),
         ("MNUM 1 1", "MNUM 1000 1", r"MNUM: got 1000"),
@@ -391,8 +360,6 @@ def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(sized: str, tmp_p
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("DIAM 9 1", "DIAM -12.7 1", r"line 35, DIAM: got -12.7, expected a semi-diameter above 0"),
-        ("DISZ 5.0", "DISZ -600", r"surface 1 of the file, thickness_mm: got -600.0, expected at least 0"),
         ("TYPE STANDARD\n  CURV 2", "TYPE COORDBRK\n  CURV 2", r"line 24, CURV of COORDBRK"),
         ('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""\n', "TYPE COORDBRK\n", r"line 28, GLAS of COORDBRK"),
     ],

@@ -294,15 +294,6 @@ def test_all_visible_light_from_380_to_780_nm() -> None:
     assert 0.02 < np.abs(found.film_mm - found.film_mm[0]).max() < 0.25  # lateral colour of tens of micrometres
 
 
-@pytest.mark.whole  # another lens
-def test_a_lens_set_for_a_zoom_has_companions_too() -> None:
-    lens = read_lens(ROOT / "lenses" / "ogawa_zoom_70_200.toml")
-    camera = ExactCamera(lens, Shot(FILM, 8.0, 5.6, zoom=next(iter(lens.configurations)).name))
-    assert camera.companion_reach_mm is not None
-    weight, alone = shares(camera, 2000)
-    assert weight.sum(axis=0).mean() == pytest.approx(alone.mean(), rel=0.01)
-
-
 @pytest.mark.parametrize("shape", [Aperture(mask=np.eye(7, dtype=bool)), *whole(Aperture(blades=5, rotation_deg=20.0))])
 def test_shapes_of_the_stop_block_companions_as_they_block_heroes(shape: Aperture) -> None:
     """Summed over many rays, heroes and companions carry as much light as heroes alone, compiled or not."""

@@ -12,7 +12,6 @@ from neurolens import __version__
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
-from neurolens.cli import main
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
@@ -127,17 +126,3 @@ def test_another_reader_finds_the_standard_attributes(spec: str, tmp_path: Path)
     assert tuple(found["sensorOverallDimensions"]) == FILM
     assert tuple(found["sensorAcquisitionRectangle"]) == (0, 0, 71, 47)
     assert read_exr(tmp_path / "a.exr")[1] == {"camera": 1}
-
-
-@pytest.mark.whole  # another state
-def test_frames_of_a_command_carry_their_own_focus(tmp_path: Path) -> None:
-    out = tmp_path / "pull.exr"
-    args = (
-        "render", "experiments/scenes/grid.toml", "--camera", MODEL, "--width", "16", "--height", "9", "--samples", "1",
-        "--frames", "1:2", "--key", "focus=1:2,2:inf", "--threads", "1", "--quiet", "-o", str(out),
-    )  # fmt: skip
-    assert main(args) == 0
-    first, last = (header(tmp_path / f"pull.000{k}.exr") for k in (1, 2))
-    assert (first["focus"], last["focus"]) == (2.0, math.inf)
-    assert (first["imageCounter"], last["imageCounter"]) == (1, 2)
-    assert first["pinholeFocalLength"] > last["pinholeFocalLength"] + 0.5

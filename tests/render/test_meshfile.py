@@ -97,19 +97,6 @@ def test_a_mesh_may_be_sheared_mirrored_and_scaled_along_axes(given: dict[str, A
     assert towards == pytest.approx(np.ones(len(out)))
 
 
-def test_a_matrix_that_flattens_is_refused() -> None:
-    with pytest.raises(InputError, match="matrix.*flatten nothing"):
-        MeshSettings("m", file=Path("a.obj"), matrix=((1, 0, 0, 0), (0, 1, 0, 0), (1, 1, 0, 0)))
-
-
-def test_nothing_is_merged_or_mended(tmp_path: Path) -> None:
-    # Two triangles in one place, one of them the other way round, and two vertices in one place.
-    path = tmp_path / "a.obj"
-    path.write_text("\ufeffv 0 0 0 # origin\nv 1 0 0\nv  0 1 0\n v 0 1 0\nf 1 2 3\n f\t1 4 2\n", "utf-8")
-    mesh = read_file(HERE, "file", path)
-    assert len(mesh.faces) == 2 and enclosed(TriangleSet(mesh.vertices + [0, 0, 1], mesh.faces)) == pytest.approx(0)
-
-
 def test_indices_are_counted_back_and_comments_may_be_latin_1(tmp_path: Path) -> None:
     absolute, relative = tmp_path / "a.obj", tmp_path / "b.obj"
     head, tail = b"# caf\xe9\ng K\xf6rper\n", b"v 0 0 1\nvt 1 1\nf %s %s %s\n"
@@ -191,24 +178,17 @@ def test_normals_of_the_file_are_used_and_turned(smooth: bool | None, tilted: bo
     [
         ("a.obj", b"", "at least one triangle"),
         ("a.obj", b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2.*v X Y Z"),
-        ("a.obj", b"v 0 0 nan\n", "line 1.*v X Y Z"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4.*f I J K"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "line 4.*counted from 1"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n", "line 4.*'-4'.*v from 1 to 3"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4.*'9'.*v from 1 to 3"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/2\n", "line 5.*'3/2'.*vt from 1 to 1"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n", "line 4.*vn from 1 to 0"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 2/1 3 4\n", "line 6.*corners of the same form"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1e400 0\nf 1 2 3\n", "v X Y Z"),
         ("a.obj", b"\xff\xfe\x00v", "text file"),
         ("a.ply", b"solid cube", "begins with ply"),
         ("a.ply", ply("binary_little_endian")[:-7], "ends before its last element"),
         ("a.ply", ply("ascii")[:-30], "ends before its last element"),
-        ("a.ply", ply("ascii").replace(b"1.25", b"nan"), "finite numbers"),
         ("a.ply", ply("ascii").replace(b"3 0 1 4", b"3 0 1 9"), "vertices from 0 to 4"),
         ("a.ply", ply("ascii").replace(b"element face 5", b"element face 0"), "at least one triangle"),
         ("a.ply", ply("binary_little_endian").replace(b"vertex 5", b"vertex 50000000"), "50000000 elements vertex in"),
-        ("a.stl", b"solid", r"\.obj or \.ply"),
     ],
 )
 def test_each_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
@@ -287,11 +267,6 @@ def test_each_triangle_has_the_colour_or_the_picture_of_its_material(tmp_path: P
     assert left[2] > 3 * left[0] and right[1] > 3 * max(right[0], right[2])
 
 
-def test_a_mesh_with_a_material_of_the_scene_keeps_it(tmp_path: Path) -> None:
-    found = loaded(tmp_path, material="own")
-    assert len(found.triangles) == 1 and set(found.settings.materials or {}) == {"own"}
-
-
 @pytest.mark.parametrize(
     ("obj", "mtl", "words"),
     [
@@ -302,8 +277,6 @@ def test_a_mesh_with_a_material_of_the_scene_keeps_it(tmp_path: Path) -> None:
         ),
         (OBJ.replace("usemtl red one\n", ""), MTL, "none before a face"),
         (OBJ.replace("my colours", "other"), MTL, r"other\.mtl: file: got .missing."),
-        (OBJ.replace("my colours", "9" * 400), MTL, r"9\.mtl: file"),
-        (OBJ, MTL.replace("0.6 0.1 0.05", "0.6 2 0"), "line 4, Kd: got '0.6 2 0'"),
         (OBJ, MTL.replace("map_Kd ", "map_Kd -s 2 2 2 "), "without options"),
         (OBJ, MTL.replace("wall.png", "gone.png"), r"textures\.room:wall\.file"),
         (OBJ, "Kd 1 1 1\n", "newmtl before it"),
@@ -319,11 +292,6 @@ def test_a_picture_without_coordinates_leaves_the_colour(tmp_path: Path) -> None
     with pytest.warns(NeurolensWarning, match="no texture coordinates: wall.png is left out"):
         found = loaded(tmp_path, bare)
     assert (found.settings.materials or {})["room:wall"].reflectance == (1.0, 1.0, 1.0) and not found.images
-
-
-def test_other_meshes_need_a_material(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"meshes\[0\]\.material: got .missing."):
-        scene_from_tables({"camera": CAMERA, "meshes": [{"file": "a.ply"}]}, tmp_path / "scene.toml")
 
 
 MIXED = """\
@@ -393,15 +361,10 @@ def test_ply_files_hold_more_than_triangles(order: str, tmp_path: Path) -> None:
     [
         ((b"3 0 1 4", b"2 0 1"), "a face of 2 corners"),
         ((b"3 0 1 4", b"nan 0 1 4"), "NaN"),
-        ((b"3 0 1 4", b"-3 0 1 4"), "ends before"),
-        ((b"3 0 1 4", b"1e300 0 1 4"), "ends before"),
         ((b"3 0 1 4", b"3 0 x 4"), "words that are no numbers"),
         ((b"property float z\n", b""), "no x, y and z"),
         ((b"uchar int vertex", b"uchar float vertex"), "by fractions"),
-        ((b"list uchar", b"list float"), "length is a fraction"),
         ((b"format ascii", b"format utf8"), "in its header"),
-        ((b"element vertex 5", b"element vertex -5"), "in its header"),
-        ((b"property float x", b"property list uchar int x"), "plain numbers"),
     ],
 )
 @pytest.mark.filterwarnings("error")
@@ -409,10 +372,3 @@ def test_ply_files_that_are_none_say_why(change: tuple[bytes, bytes], word: str,
     (tmp_path / "a.ply").write_bytes(ply("ascii").replace(*change))
     with pytest.raises(InputError, match=word):
         read_file(HERE, "meshes[0].file", tmp_path / "a.ply")
-
-
-@pytest.mark.filterwarnings("error")
-def test_corners_beyond_every_vertex_are_one_line(tmp_path: Path) -> None:
-    (tmp_path / "a.ply").write_bytes(ply("ascii").replace(b"3 0 1 4", b"3 0 1 4294967295"))
-    with pytest.raises(InputError, match="4294967295"):
-        read_mesh(HERE, "meshes[0]", MeshSettings(file=tmp_path / "a.ply", material="m"))

@@ -16,7 +16,7 @@ from neurolens.analysis.field_curves import colour, distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.cameras import field as fields
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.field import Field, field_of, frame_of, spectrum_of
+from neurolens.cameras.field import Field, field_of, spectrum_of
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import stmap as command
 from neurolens.lens.paraxial import chief_reach_mm, first_order
@@ -187,26 +187,6 @@ def test_lateral_colour_is_that_of_the_analysis() -> None:
     for field, lateral in zip(by_line[1:], found.lateral_um.T[1:], strict=True):
         assert np.abs(1e3 * (field.picture(place).real - height) - lateral[3:8]).max() < 0.1
     assert np.abs(found.lateral_um[3:8]).max() > 1  # there is some to be seen
-
-
-@pytest.mark.whole  # the maps of such a lens are below
-def test_both_meridians_of_an_anamorphic_lens_have_their_own_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fields, "_OTHER", (25, 24))
-    camera = make_camera(ROOT / "lenses" / "cooke_anamorphic_42.toml", Shot(film_mm=(20.0, 16.0), focus_m=3.0))
-    assert not fields.is_round(camera)
-    field = field_of(camera, 3.0)
-    frame = frame_of(camera)
-    squeeze = frame.reach_mm[1] / frame.reach_mm[0]
-    assert 1.9 < squeeze < 2.1
-    for k, meridian in enumerate(("x", "y")):
-        data = first_order(camera.lens, meridian=meridian)  # type: ignore[attr-defined, arg-type]
-        film = camera.settings["film_z_mm"]
-        assert frame.pupil_mm[k] == pytest.approx(film - data.entrance_pupil_z_mm)
-    # The size close to the axis is the paraxial one in both, but for coma at full aperture.
-    for turn in (1, 1j):
-        assert abs(field.ideal(np.array([0.8 * turn])) / (0.8 * turn) - 1).max() < 0.01
-    plates = plates_of([field], (400, 320), (20.0, 16.0))
-    assert worst_px(field, plates)[1] < 0.01 and redistort_map(field, plates)["B"].min() == 1
 
 
 def test_maps_of_an_anamorphic_lens_tell_their_pixels_shape_and_both_pupils(

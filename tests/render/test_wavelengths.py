@@ -87,14 +87,6 @@ def test_the_light_of_a_scene() -> None:
     assert np.all(np.isfinite(one[1]))
 
 
-@pytest.mark.parametrize("limits", [(587.5618, 587.5618), (540, 560)])
-def test_light_of_one_wavelength_makes_a_grey_picture(limits: tuple[float, float]) -> None:
-    spectral = SpectralRange(*limits)
-    assert not spectral.colours
-    assert np.all(spectral.response == 1)
-    assert np.allclose(spectral.wavelengths_nm(np.float32([0, 0.999])), limits, atol=0.1)
-
-
 def test_cauchy_index_has_the_asked_abbe_number() -> None:
     lines = [SpectralRange(nm, nm).refractive_index(1.62, 36.4)[0] for nm in (587.5618, 486.1327, 656.2725)]
     assert lines[0] == pytest.approx(1.62, abs=1e-6)
@@ -217,23 +209,6 @@ def test_a_camera_that_disperses_gets_one_wavelength_a_path() -> None:
     assert mode(prism(1e-4)) == "hero"
     with pytest.raises(InputError, match=r"film\.wavelengths: got 'hero', expected one: camera.*pixels"):
         mode(prism(0.05), "hero")
-
-
-def test_a_camera_of_little_dispersion_has_the_same_mean_with_four_lanes(tmp_path: Path) -> None:
-    # The prism's tint is in the weights of each lane.
-    made = room(tmp_path, "mirror")
-    one, hero = (renders(made, prism(1e-4), mode, 12) for mode in ("one", "hero"))
-    assert_same_mean(one, hero, 0.02)
-    grey = renders(scene(environment=WHITE), prism(1e-4), "hero", 1, samples=256).mean(axis=(0, 1, 2))
-    assert grey[2] > 1.2 * grey[0]
-    assert colour_noise(hero) < 0.4 * colour_noise(one)
-
-
-def test_one_wavelength_of_light_makes_the_same_grey_with_four_lanes() -> None:
-    made = scene({"wavelengths_nm": [550, 550]}, environment={"colour": [0.5, 0.5, 0.5]})
-    for mode in ("one", "hero"):
-        pictures = renders(made, Pinhole(4000.0, FILM), mode, 1)
-        assert pictures == pytest.approx(np.full_like(pictures, 0.5), abs=1e-4)
 
 
 def test_a_lens_that_disperses_less_than_a_pixel_shows() -> None:

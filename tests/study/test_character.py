@@ -6,7 +6,6 @@ import io
 import json
 import math
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -17,9 +16,7 @@ from shipped import whole
 from neurolens.analysis.fields import Scene
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
-from neurolens.base.lensname import maker_of
 from neurolens.cli import lens_list, main
-from neurolens.cli.lens import Lens as LensCommand
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.any_format import lens_files, read_any
 from neurolens.study import character as char
@@ -183,16 +180,6 @@ def test_the_library_is_sorted_by_each_key(sort: str, capsys: pytest.CaptureFixt
     rising = sort in lens_list.SORTS or sort == "cats-eye"
     assert known == sorted(known, reverse=not rising) and len(known) > 30
     assert found[len(known) :] == [None] * (len(rows) - len(known))
-
-
-def test_keys_are_those_of_the_command() -> None:
-    hint = get_type_hints(LensCommand, vars(__import__("neurolens.cli.lens", fromlist=["x"])))["sort"]
-    assert set(get_args(get_args(hint)[0])) == {*lens_list.SORTS, *lens_list.CHARACTER}
-
-
-def test_makers_stand_last_among_designers() -> None:
-    makers = {"Canon": "Canon", "Ikuo Mori, Nippon Kogaku": "Nippon Kogaku", "": "", "A, B, C ": "C"}
-    assert {text: maker_of(text) for text in makers} == makers
 
 
 def test_a_folder_of_ones_own_is_sorted_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

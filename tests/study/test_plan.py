@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -21,9 +20,7 @@ from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.cli import main
-from neurolens.cli import plan as command
 from neurolens.lens.apertures import Aperture
-from neurolens.lens.paraxial import first_order
 from neurolens.lens.shot import Shot
 from neurolens.plan import candidates as tried
 from neurolens.plan import costs, plots
@@ -311,10 +308,6 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     assert choices["pinhole + ST map"].light_error < 0.0045 < choices["pinhole"].light_error / 8
 
 
-def test_targets_are_those_of_the_command() -> None:
-    assert get_args(get_type_hints(command.Plan)["target"]) == get_args(Target)
-
-
 @pytest.mark.usefixtures("no_plots")
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
@@ -361,13 +354,3 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
         for seen in (found, replace(found, asked=asked))
     )
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
-
-
-@pytest.mark.whole  # another lens
-def test_a_zoom_is_planned_in_its_state() -> None:
-    lens = read_lens("lenses/ogawa_zoom_70_200.toml")
-    scene = scene_from_tables(wall(10.0, 5.6, focus_m=8.0))
-    seen = probe(scene, lens, zoom="135mm", across=2).exact.settings["efl_mm"]
-    assert seen == first_order(set_lens(lens, zoom="135mm", focus_m=8.0)).efl_mm == pytest.approx(135, rel=0.02)
-    with pytest.raises(InputError, match="zoom"):
-        probe(scene, lens, zoom="9mm", across=2)

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neurolens.analysis import plots as style
 from neurolens.analysis.layout import Layout, Line, Section
 from neurolens.base.errors import InputError
-from neurolens.plan.plots import _TITLES, _maps
 from neurolens.study import plots
 from neurolens.study.rays import Illumination
 
@@ -54,19 +52,3 @@ def test_bad_images_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="illumination"):
             plots.illumination_plot(bad, path)
     assert not list(tmp_path.iterdir())
-
-
-def test_maps_of_effects_share_a_scale_in_which_light_that_is_taken_is_dark() -> None:
-    light = {"vignetting": np.array([[0.0, -0.15]]), "flare": np.array([[0.02, 0.004]])}
-    blur = {"distortion": np.array([[11.0, 0.5]]), "coma": np.array([[0.0, 0.05]])}
-    for maps, unit in ((light, "relative"), (blur, "px")):
-        figure = style.new_figure(9.0, 2.0)
-        _maps(figure, maps, unit, (36.0, 20.0))
-        shown = [axes.images[0] for axes in figure.axes if axes.images]
-        assert len(shown) == 2 and len({(i.norm.vmin, i.norm.vmax) for i in shown}) == 1
-        assert any(_TITLES[unit] == axes.get_ylabel() for axes in figure.axes)
-        if unit == "relative":
-            none, corner = (np.array(shown[0].to_rgba(v)[:3]).mean() for v in (0.0, -15.0))
-            assert shown[0].norm.vmin == -shown[0].norm.vmax == -20.0 and none > 0.99 and corner < 0.5
-            red, _, blue, _ = shown[1].to_rgba(2.0)
-            assert red > blue  # added light is orange

@@ -24,7 +24,6 @@ from neurolens.render.scene import scene_from_tables
 from neurolens.render.settings import FlareSettings
 from neurolens.setting.pupils import camera_rays
 from neurolens.setting.states import set_lens
-from neurolens.study.scenes import nearest_depth_m
 from neurolens.trace.rays import Rays, trace
 
 LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
@@ -181,16 +180,3 @@ def test_lights_beyond_number_are_bounded() -> None:
     scene = wall(100.0, points=points)
     seen = SceneLights(scene).seen(scene, 60.0, most=8)
     assert len(seen) <= 8 and max(a.rgb[0] for a in seen) == pytest.approx(5 / 2.01**2, rel=0.1)
-
-
-def test_the_nearest_ball_in_view_counts_from_the_film() -> None:
-    """A ball on the axis has its depth in closed form; it is that of the plane through its front."""
-
-    def nearest(*centres: list[float]) -> float | None:
-        camera = {"position_m": [1.0, 2.0, 3.0], "look_at_m": [1.0, 2.0, 0.0], "focus_m": 2.0}
-        balls = [{"centre_m": c, "radius_m": 0.5, "material": "grey"} for c in centres]
-        return nearest_depth_m(wall(camera=camera, planes=[], spheres=balls), 50.0)
-
-    assert nearest([1.0, 2.0, 0.0], [1.0, 2.0, -4.0]) == pytest.approx(2.5, abs=1e-3)
-    assert nearest([2.0, 2.0, -2.0], [1.0, 2.0, 5.0]) == pytest.approx(4.5, abs=0.02)  # one is behind the camera
-    assert nearest() is nearest([1.0, 2.0, 5.0]) is None

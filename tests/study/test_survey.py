@@ -11,10 +11,8 @@ from typing import Any
 import pytest
 from report_results import Page
 
-from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.base.tasks import Here, Processes
-from neurolens.cli import main
 from neurolens.readers.any_format import collection_of
 from neurolens.study.survey import SurveySettings, Task, _csv, is_of, run_task, summary_of, survey
 
@@ -156,19 +154,6 @@ def test_summary_counts_goals_and_takes_a_missing_figure_for_the_worst() -> None
     found = summary_of(records)
     assert [found[key] for key in ("read", "refused", "fitted", "reach_goals", "promises_held")] == [2, 1, 2, 1, 1]
     assert summary_of(records[1:])["median"]["direction_rms_deg"] is None
-
-
-@pytest.mark.whole  # its records are above
-def test_the_command_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = _folder(tmp_path)
-    assert main(["survey", str(folder), "--no-fit", "--output", str(tmp_path / "o"), "--jobs", "1"]) == 0
-    out, err = capsys.readouterr()
-    assert "2 files: 1 read (0 of them doubtful), 1 refused" in out and "1 .me" in out
-    assert re.search(r"no\.zmx: refused: .*expected", err)
-    assert main(["survey", str(tmp_path / "nowhere")]) == 2
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="files of other kinds"):
-        collection_of(tmp_path / "empty")
 
 
 def test_a_file_that_takes_too_long_is_a_fault(tmp_path: Path) -> None:

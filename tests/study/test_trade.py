@@ -1,18 +1,13 @@
 """Offers, fronts and choices by time against what is known of them, and the page that a trade leaves."""
 
-import json
 import math
-import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.base.tomlfile import format_toml
-from neurolens.cli import main
 from neurolens.plan import plan as traded
 from neurolens.plan.candidates import Choice
 from neurolens.plan.costs import Work
@@ -70,43 +65,6 @@ def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
     assert spread(many[:3], None, 6) == many[:3]
     beside = Offer(choice("beside", 0.5, 0.0), 2.5)  # a choice that another camera betters is shown, too
     assert beside in spread(many, beside, 6) and spread(many[:2], beside) == [*many[:2], beside]
-
-
-@pytest.mark.whole  # the choice itself is below
-def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file, lens, folder = tmp_path / "scene.toml", tmp_path / "own.toml", tmp_path / "trade"
-    film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "samples": 4, "f_number": 5.6}
-    file.write_text(format_toml(scene(width=64, height=36, **film)))
-    lens.write_bytes(Path(LENS).read_bytes())  # no model of it ships
-    asked = ["--lens", str(lens), "--budget", "0.05px", "--no-fit", "--samples", "1", "--quiet"]
-    assert main(["plan", str(file), "--trade", *asked, "-o", str(folder)]) == 0
-    said, told = capsys.readouterr().out, json.loads((folder / "trade.json").read_text())
-    page = (folder / "trade.html").read_text()
-    sources = re.findall(r"(?:src|href)=[\"']([^\"']*)", page)
-    assert sources and all(source.startswith("data:image/png;base64,") for source in sources)
-    assert page.count("<img") == 2 and "http" not in page and "<script" not in page
-    cameras = {c["name"]: c for c in told["cameras"]}
-    assert told["chosen"] in told["front"] and cameras["exact"]["error_px"] == 0 and cameras["exact"]["flip"] == 0
-    seconds, errors = ([cameras[n][k] for n in told["front"]] for k in ("seconds", "error_px"))
-    assert seconds == sorted(seconds) and errors == sorted(errors, reverse=True) and cameras["exact"]["seconds"] > 0
-    chosen = cameras[told["chosen"]]
-    assert re.search(rf"picture takes ~?{chosen['seconds']:.3g} s", said) and "Half of that buys" in said
-    assert 0 < chosen["camera_seconds"] < chosen["seconds"] and told["chosen"] in told["alike"]
-    (row,) = (line for line in said.splitlines() if line.startswith("*  "))
-    assert f"{chosen['seconds']:.3g}" in row.replace("~", " ").split()  # advice, table and plot use one measurement
-    held = [c["seconds"] for c in told["cameras"] if c["error_px"] <= 0.05 and c["light_error"] <= 0.01]
-    assert chosen["seconds"] <= 1.2 * min(held)  # nothing within the budget is surely faster to equal noise
-
-
-@pytest.mark.whole  # the choice itself is above
-def test_a_plan_for_a_time_takes_the_most_faithful_camera_that_fits(tmp_path: Path) -> None:
-    file = tmp_path / "scene.toml"
-    file.write_text(format_toml(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4)))
-    asked = ["plan", str(file), "--lens", LENS, "--no-fit", "--quiet", "-o", str(tmp_path / "plan"), "--budget"]
-    assert main([*asked, "1e6s"]) == 0
-    told = json.loads((tmp_path / "plan" / "plan.json").read_text())
-    assert told["best"]["name"] == "exact" and told["budget_s"] == 1e6 and told["budget_px"] == 0
-    assert main([*asked, "20s", "--for", "glsl"]) == 2  # no time is known
 
 
 def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,30 +3,22 @@
 import json
 import math
 import os
-import signal
-import subprocess
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import lens_models
-import numpy as np
 import pytest
 from shipped import whole
 
 from neurolens.base.errors import InputError
-from neurolens.base.kept import Kept
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.cli import main
 from neurolens.study import measure
 from neurolens.study.experiment import default_experiment, read_experiment
 from neurolens.study.measure import fit_and_measure
-from neurolens.study.train import fit_and_measure_states, run_experiment, state_settings
-from neurolens.surrogates.file import pack, read_model
+from neurolens.study.train import run_experiment, state_settings
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.pairs import make_pairs
-from neurolens.surrogates.states import StateSettings
 
 pytestmark = pytest.mark.slow
 
@@ -60,9 +52,6 @@ scenes = ["ROOT/experiments/scenes/grid.toml"]
 width = 32
 height = 18
 samples = 4
-[scene_domain]
-scene = "ROOT/experiments/scenes/grid.toml"
-model = { method = "ols", terms = 24, planes = false }
 """
 
 
@@ -103,14 +92,6 @@ def test_errors_are_in_the_order_that_physics_gives_and_hold_when_stopped_down(r
     assert set(stopped["mlp-8x2"]) == {"2_stops", "4_stops"}
 
 
-def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
-    whole, shot, half = run[1]["domain_gain"]["rows"]
-    assert whole["nearest_m"] is None and 0.5 < shot["nearest_m"] < 10
-    assert shot["film_radius_mm"] < whole["film_radius_mm"]
-    assert shot["rms_um"] < whole["rms_um"]
-    assert half["coefficients_per_vector"] == shot["coefficients_per_vector"] / 2
-
-
 def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The final name comes when the errors are in the card."""
     there: list[list[Path]] = []
@@ -137,8 +118,7 @@ def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeyp
 def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:
     out = run[0] / "out"
     before = {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")}
-    quick = ["render.scenes=[]", "scene_domain=none"]
-    again = run_experiment(read_experiment(out / "config.toml", quick), out)
+    again = run_experiment(read_experiment(out / "config.toml", ["render.scenes=[]"]), out)
     assert {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")} == before
     assert [m["rms_um"] for m in again["models"]] == [m["rms_um"] for m in run[1]["models"]]
 
@@ -153,7 +133,6 @@ def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict
         ("nonsense=1", "nonsense"),
         ('model=[{name="../../evil"}]', "model"),
         ('model=[{name=".hidden"}]', "model"),
-        ('scene_domain.model.name="a/b"', "scene_domain"),
     ],
 )
 def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) -> None:
@@ -225,67 +204,6 @@ def test_states_that_cannot_be_asked_for(file: Path, overrides: list[str], field
         default_experiment(file, overrides).states()
 
 
-@pytest.mark.parametrize(
-    "settings", [ModelSettings("mlp"), ModelSettings("ols", basis="raw"), ModelSettings("ols", partitions=2)]
-)
-def test_models_that_know_no_states(settings: ModelSettings) -> None:
+def test_networks_know_no_states() -> None:
     with pytest.raises(InputError, match="many states"):
-        state_settings(settings, 1000, 1)
-
-
-@pytest.mark.whole  # as of one state
-def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
-    space = default_experiment(lens_models.LENSES / "nikon_zoom_80_200.toml", ['lens.zoom="range"']).states()
-    space = replace(space, axes=(replace(space.axes[0], degree=1),), focus_m=(math.inf, math.inf))
-    settings = StateSettings(terms=8, degree=2, rays=800, name="tiny")
-    first = fit_and_measure_states(space, settings, tmp_path, states=2)
-    card = load_model(tmp_path / "tiny.onnx").card
-    assert card["errors"]["rms_um"] == first["rms_um"] == max(r["rms_um"] for r in first["states"])
-    assert len(card["states"]["nodes"]) == first["nodes"] == 2
-    written = (tmp_path / "tiny.onnx").stat().st_mtime_ns
-    assert fit_and_measure_states(space, settings, tmp_path, states=2) == first
-    assert (tmp_path / "tiny.onnx").stat().st_mtime_ns == written
-
-
-KILLED = """
-import os, signal, sys
-from neurolens.cli import main
-from neurolens.base.kept import Kept
-saved, save = [], Kept.save
-def save_and_die(self, state, arrays, *, now=False):
-    save(self, state, arrays, now=True)
-    saved.append(state)
-    if len(saved) == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-Kept.save = save_and_die
-main(sys.argv[1:])
-"""
-
-
-@pytest.mark.whole  # test_mlp kills anywhere
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
-@pytest.mark.usefixtures("no_plots")
-def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same command once more ends with the very bytes of a run that nothing stopped, but for the time it took."""
-
-    def command(name: str) -> list[str]:
-        network = 'model=[{method="mlp",units=6,layers=1,steps=20}]'
-        return ["train", "--lens", SINGLET, "--output", str(tmp_path / name), *QUICK, "--set", network]
-
-    process = subprocess.run([sys.executable, "-c", KILLED, *command("killed")], capture_output=True, text=True)
-    assert process.returncode == -signal.SIGKILL, process.stderr
-    (left,) = (tmp_path / "killed").rglob("*.training.npz")
-    with np.load(left) as held:
-        assert b'"ended": false' in held["about.json"]
-    taken_up, load = [], Kept.load
-    monkeypatch.setattr(Kept, "load", lambda self: taken_up.append(load(self)) or taken_up[-1])
-    assert main(command("killed")) == main(command("whole")) == 0
-    assert taken_up[0] is not None and taken_up[-1] is None and not left.exists()
-
-    def made(name: str) -> tuple[dict, str]:
-        (file,) = (tmp_path / name).rglob("*.onnx")
-        card, core = load_model(file).card, read_model(file).at().core
-        assert card["fit"].pop("seconds") > 0
-        return card, json.dumps(pack(core))
-
-    assert made("killed") == made("whole")
+        state_settings(ModelSettings("mlp"), 1000, 1)

@@ -30,21 +30,21 @@ from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.source import Fix, at_wavelength, fixed_models, fused_program
 
 COUNT = 20_000
-CORES = (*lens_models.KINDS, "zones")
+CORES = lens_models.KINDS
 # Of a fisheye those whose forms differ for it: a dense and a sparse one, a series, cells.
 OF_FISHEYE = tuple(f"{method} fisheye" for method in ("hanika", "schrade", "taylor", "cells"))
 # Each kind of core, a fisheye whose rays graze its front, and lost rays; others and published methods in the whole run.
-MODELS = ("invariants", "network", "fisheye", "zones", "hemisphere", "residual")
+MODELS = ("invariants", "network", "fisheye", "hemisphere", "residual")
 FORMS = [
     *((form, kind) for form in ("onnx", "c") for kind in MODELS),
     *(("glsl", kind) for kind in lens_models.KINDS),
     *(("torch", kind) for kind in (*lens_models.KINDS, "residual")),
     *(pytest.param(form, "cylinders", marks=pytest.mark.slow) for form in ("onnx", "c")),
 ]
-OTHERS = ("raw", "thick", "singlet", "laser", *lens_models.PUBLISHED, "cylinders network")
+OTHERS = ("thick", "singlet", "laser", *lens_models.PUBLISHED, "cylinders network")
 OTHER_FORMS = whole(*((form, kind) for form in ("onnx", "c") for kind in OTHERS))
 # A ray within rounding of a cut may take the other cell; on the axis, rounding decides a ray's meridian.
-CUT = ("zones", "cells", "neurolens2017", "rtf", "ray-lut")
+CUT = ("cells", "neurolens2017", "rtf", "ray-lut")
 STRANGE = [math.nan, math.inf, -math.inf, 1e-42, -1e-42, 0.0, 3.4e38, -3.4e38, 1.9e19, 1e10, 1e3, -1e3]
 
 
@@ -192,7 +192,7 @@ def test_limits_of_the_domain_are_inside_and_nothing_beyond(form: str) -> None:
             assert np.all((found["status"] == st.OUTSIDE_DOMAIN) == (share > 1)), (film, pupil, nm, z)
 
 
-SYMMETRIC = ("invariants", "network", "thick", "zones", "residual")
+SYMMETRIC = ("invariants", "network", "thick", "residual")
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ WAVES_NM = (450.0, 550.0, 650.0)
 
 @pytest.mark.parametrize(
     ("form", "kind"),
-    [("c", "network"), ("c", "zones"), ("glsl", "invariants"), *whole(("c", "invariants"), ("c", "raw"))],
+    [("c", "network"), ("glsl", "invariants"), *whole(("c", "invariants"))],
 )
 def test_wavelengths_film_and_stop_fixed(form: str, kind: str) -> None:
     model, (steps, at), free = lens_models.model(kind), fixed(kind), sum(program(kind).count().values())
@@ -304,7 +304,7 @@ def test_what_is_stored_is_exact_in_float32(kind: str, tmp_path: Path) -> None:
     assert len(coefficients_text([model])) < (40_000 if kind in lens_models.PUBLISHED else 10_000)
 
 
-@pytest.mark.parametrize("kind", ["invariants", "raw", "network", "zones", "residual"])
+@pytest.mark.parametrize("kind", ["invariants", "network", "residual"])
 @pytest.mark.parametrize("wavelength_nm", [400.0, *whole(587.6)])
 def test_one_wavelength(kind: str, wavelength_nm: float, tmp_path: Path) -> None:
     model = lens_models.model(kind)

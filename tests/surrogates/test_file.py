@@ -20,7 +20,7 @@ from lens_models import edited
 from numpy.typing import NDArray
 from onnx import helper
 from shipped import SOME
-from writers import COLUMNS, compiled, glsl_rays, rays_of, written_rays
+from writers import compiled, rays_of, written_rays
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
@@ -32,7 +32,6 @@ from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import first_order
 from neurolens.study.speed import CompiledSource
 from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
-from neurolens.surrogates.axes import mixture_of
 from neurolens.surrogates.card import MODEL_KEY, card_to_json, read_metadata
 from neurolens.surrogates.export import card_of, export_onnx
 from neurolens.surrogates.file import onnx_of, read_model
@@ -148,9 +147,6 @@ def test_hostile_terms_end_soon(many: int, degree: int, tmp_path: Path) -> None:
 # ---- cards, coefficients, source code ----
 
 
-MODELS = Path(__file__).parents[2] / "models"
-
-
 def test_card_is_strict_json_and_says_what_the_model_is(tmp_path: Path) -> None:
     model = lens_models.model("invariants")
     session = onnxruntime.InferenceSession(str(lens_models.exported("invariants")), providers=["CPUExecutionProvider"])
@@ -169,25 +165,6 @@ def test_card_is_strict_json_and_says_what_the_model_is(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="errors"):
         export_onnx(model, tmp_path / "bad.onnx", {"rms_um": math.inf})
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_state_mixes_the_numbers_of_its_nodes_in_glsl_too() -> None:
-    file = MODELS / "nikon_zoom_80_200-range.states-64.onnx"
-    model = read_model(file)
-    card, program = model.card, fused_program(model.nodes)
-    program.mixture = mixture_of(model.axes)
-    for known in card["states"]["reference"][1:2]:  # between nodes
-        columns = (*COLUMNS, "film_z_mm", "stop_radius_mm")
-        numbers = [*known["rays"], known["film_z_mm"][0], known["stop_radius_mm"]]
-        rays = {name: np.float32(value) for name, value in zip(columns, numbers, strict=True)}
-        passed = np.array(known["status"]) == st.PASSED
-        for found in (
-            program.evaluate(rays | {"zoom_mm": known["state"][0]}),
-            glsl_rays(program, rays, 0, known["state"]),
-        ):
-            np.testing.assert_array_equal(found["status"], known["status"])
-            for name, wanted in zip(SCENE_RAY, np.array(known["scene_ray"]), strict=True):
-                np.testing.assert_allclose(found[name][passed], wanted[passed], atol=1e-3 if "mm" in name else 1e-5)
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
@@ -219,7 +196,7 @@ def put(array: dict[str, Any], form: str, at: slice, raw: bytes) -> None:
 def nest(data: dict[str, Any]) -> None:
     node = data["nodes"][0]
     for _ in range(20):
-        node["core"] = {"kind": "partitioned", "edges": [], "parts": [node["core"]]}
+        node["core"] = {"kind": "residual", "parts": [node["core"]]}
 
 
 DAMAGE: dict[str, Callable[[dict[str, Any]], object]] = {

@@ -1,9 +1,8 @@
-"""Fits near grazing, of zones, and with a network on top; what each part of a fit is worth; bad settings."""
+"""Fits near grazing, and with a network on top; what each part of a fit is worth; bad settings."""
 
 import math
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import lens_models
@@ -12,7 +11,6 @@ import pytest
 import torch
 from lens_models import LENSES, prepared
 
-from experiments.methods import ablated
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -21,14 +19,13 @@ from neurolens.lens.prescription import Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.surrogates import targets
 from neurolens.surrogates.assemble import refracted, tilt_series
-from neurolens.surrogates.cores import Partitioned, Refracted, Residual
+from neurolens.surrogates.cores import Refracted, Residual
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.fits.network import clear_training, training_s
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.targets import film_equivalent, targets_of
-from neurolens.surrogates.terms import invariant_exponents, raw_exponents
+from neurolens.surrogates.terms import invariant_exponents
 from neurolens.trace.shapes import sag_and_derivatives
 from neurolens.trace.surfaces import entered
 
@@ -38,7 +35,6 @@ from neurolens.trace.surfaces import entered
     [
         *(("degree", v) for v in (-1, 17, 10**9)),
         *(("terms", v) for v in (0, -3, 2001)),
-        *(("partitions", v) for v in (0, 65)),
         *(("units", v) for v in (0, 513)),
         *(("layers", v) for v in (0, 9)),
         *(("steps", v) for v in (0, 10**9)),
@@ -49,24 +45,8 @@ def test_numbers_without_bounds_are_refused(field: str, value: Any) -> None:
         ModelSettings(**{field: value})
 
 
-def test_raw_candidates_are_bounded_by_their_number() -> None:
-    with pytest.raises(InputError, match="degree"):
-        ModelSettings(basis="raw", degree=12)
-    assert len(raw_exponents(ModelSettings(basis="raw", degree=11).degree)) <= 5000
+def test_candidates_are_bounded_by_their_number() -> None:
     assert 2 * len(invariant_exponents(ModelSettings(degree=16).degree)) <= 5000
-
-
-@pytest.mark.whole  # test_mlp has checkpoints
-def test_checkpoints_of_zones_are_kept_apart_and_removed_together(tmp_path: Path) -> None:
-    file = tmp_path / "m.training.npz"
-    settings = ModelSettings("mlp", units=3, layers=1, steps=4, partitions=2)
-    first = fit_model(prepared(), settings, checkpoint=file)
-    assert sorted(f.name for f in tmp_path.iterdir()) == ["m.training.1.npz", "m.training.2.npz", "m.training.npz"]
-    spent = training_s(file)
-    assert 0 < spent <= first.fit_s
-    assert fit_model(prepared(), settings, checkpoint=file).fit_s >= spent  # earlier runs count
-    clear_training(file)
-    assert not list(tmp_path.iterdir()) and training_s(file) == 0
 
 
 # ---- what each part of a fit is worth ----
@@ -78,21 +58,6 @@ def _infinity(stem: str) -> Prepared:
     return prepare(make_pairs(lens, domain_of(lens), PairSettings(3000, 3000, 3000)))
 
 
-@cache
-def direction_rms(settings: ModelSettings) -> float:
-    model = fit_model(_infinity("angenieux_retrofocus_35"), settings)
-    targets = targets_of(model.lens, model.encoding, _infinity("angenieux_retrofocus_35").pairs.held_out)
-    return float((model.core(targets.field)[0][1] - targets.vectors[1]).square().sum(0).mean().sqrt())
-
-
-@pytest.mark.whole  # an ablation
-@pytest.mark.slow
-def test_every_part_of_the_fit_is_worth_something() -> None:
-    whole = direction_rms(ModelSettings(terms=24))
-    for name in ("planes not searched", "forward selection alone", "matching pursuit", "raw monomials"):
-        assert whole < 0.8 * direction_rms(ablated(ModelSettings(terms=24), name)), name
-
-
 def test_transmittance_terms_follow_absorption() -> None:
     """A lens whose glasses absorb the blue; the ray's own terms hold low powers of the wavelength only."""
     stem = "laikin_double_gauss_127"
@@ -102,29 +67,6 @@ def test_transmittance_terms_follow_absorption() -> None:
         truth = _infinity(stem).pairs.held_out
         off.append(float((model.predict(truth.inputs).transmittance - truth.transmittance).square().mean().sqrt()))
     assert off[1] < 4e-4 < off[0]
-
-
-@pytest.fixture(scope="module")
-def zoned() -> LensModel:
-    return fit_model(prepared(), ModelSettings(method="adaptive", terms=16, partitions=3))
-
-
-def rms_deg(model: LensModel) -> float:
-    held = prepared().pairs.held_out
-    out = model.predict(held.inputs).rays
-    return math.degrees(float(((out.dx - held.scene.dx) ** 2 + (out.dy - held.scene.dy) ** 2).mean().sqrt()))
-
-
-@pytest.mark.whole  # zones are held against their model in test_contract
-def test_zones_lower_the_error(zoned: LensModel) -> None:
-    whole = fit_model(prepared(), ModelSettings(method="adaptive", terms=16))
-    assert isinstance(zoned.core, Partitioned) and len(zoned.core.parts) == 3
-    assert rms_deg(zoned) < 0.8 * rms_deg(whole)
-
-
-def test_more_zones_than_rays_can_fill_are_refused() -> None:
-    with pytest.raises(InputError, match="partitions"):
-        fit_model(prepared(), ModelSettings(terms=16, partitions=10_000))
 
 
 SETTINGS = ModelSettings("ols+mlp", terms=12, degree=5, planes=False, units=8, layers=1, steps=60)
@@ -152,14 +94,6 @@ def test_it_is_the_sum_of_its_parts(model: LensModel) -> None:
     field = model.encoding(prepared().pairs.held_out.inputs.select(slice(0, 100)))
     for total, one, other in zip(model.core(field), *(part(field) for part in model.core.parts), strict=True):
         torch.testing.assert_close(total, one + other, rtol=0, atol=1e-13)
-
-
-def test_zones_and_what_is_refused() -> None:
-    zoned = fit_model(prepared(), replace(SETTINGS, units=3, steps=5, partitions=2))
-    assert isinstance(zoned.core, Partitioned)
-    assert all(isinstance(part, Residual) for part in zoned.core.parts)
-    with pytest.raises(InputError, match="basis"):
-        fit_model(prepared(), replace(SETTINGS, basis="raw", degree=3))
 
 
 # ---- rays that leave the front surface at grazing angles ----

@@ -191,7 +191,7 @@ def test_pairs_of_another_lens_are_refused() -> None:
         fit_inverse(inverse().model, prepared(FISHEYE).pairs)
 
 
-@pytest.mark.parametrize("kind", ["raw", *whole("network", "thick")])
+@pytest.mark.parametrize("kind", ["thick", *whole("network")])
 def test_other_cores_have_inverses_too(kind: str) -> None:
     model = lens_models.model(kind)
     inv = fit_inverse(model, prepared().pairs)
@@ -224,7 +224,7 @@ def _outputs(model: LensModel, rays: FilmRays) -> Tensor:
 CYLINDERS = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("cylinders",)]
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "zones", "residual", *CYLINDERS])
+@pytest.mark.parametrize("kind", [*KINDS, "residual", *CYLINDERS])
 def test_derivatives_are_the_finite_differences_of_the_model(kind: str) -> None:
     m = model(kind)
     rays = sample_domain(m.domain, 3000, seed=3)
@@ -259,7 +259,7 @@ def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> 
 # ---- as files ----
 
 
-FILE_KINDS = ("invariants", "raw", "network", "thick", "fisheye")
+FILE_KINDS = ("invariants", "network", "thick", "fisheye")
 
 
 @cache

@@ -14,10 +14,9 @@ from neurolens.graph.ir import Graph
 from neurolens.readers.lensfile import read_lens
 from neurolens.surrogates.assemble import DirectionSeries
 from neurolens.surrogates.domain import FilmRays, domain_of
-from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fit import Prepared, prepare
 from neurolens.surrogates.fits.polynomial import fit_planes, shifted
 from neurolens.surrogates.lightfield import Encoding, angle_vector
-from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.targets import targets_of
 from neurolens.surrogates.terms import invariant_exponents, monomials, solve, vector_columns
@@ -108,7 +107,6 @@ def test_short_series_hold_directions_to_the_last_bit_of_float32(degrees: float)
 
 
 ROOT = Path(__file__).parents[2] / "lenses"
-SETTINGS = ModelSettings(terms=40, growth=1)
 
 
 @cache
@@ -116,17 +114,6 @@ def prepared(stem: str = "angenieux_retrofocus_35") -> Prepared:
     """Focused from infinity to 1 m, so that the film planes of the rays differ."""
     lens = read_lens(ROOT / f"{stem}.toml")
     return prepare(make_pairs(lens, domain_of(lens, focus_m=(math.inf, 1.0)), PairSettings(4000, 4000, 4000)))
-
-
-@cache
-def fitted(planes: bool) -> LensModel:
-    return fit_model(prepared(), replace(SETTINGS, planes=planes))
-
-
-def direction_rms(model: LensModel) -> float:
-    truth = prepared().pairs.held_out
-    targets = targets_of(model.lens, model.encoding, truth)
-    return float((model.core(targets.field)[0][1] - targets.vectors[1]).square().sum(0).mean().sqrt())
 
 
 SHIFTS = [(0.0, 0.0), (-0.6, 0.2), (0.3, -0.2), (1.2, 0.5)]
@@ -155,11 +142,6 @@ def test_full_degree_fits_do_not_see_the_planes(shift: tuple[float, float]) -> N
         columns = vector_columns(monomials(targets.field.invariants(), invariant_exponents(2)), targets.field)
         found.append(solve(columns, targets.vectors[:2].flatten(1)) @ columns)
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-9)
-
-
-@pytest.mark.whole  # an ablation
-def test_sparse_fits_gain() -> None:
-    assert direction_rms(fitted(True)) < 0.7 * direction_rms(fitted(False))
 
 
 def test_too_few_rays_for_a_trial_leave_the_planes_alone() -> None:

@@ -1,8 +1,6 @@
 """Networks: accuracy on a simple lens, exact symmetry, repeatability, and the optimiser against autograd."""
 
-import itertools
 import math
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +15,6 @@ from neurolens.study.measure import onnx_predictor
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network, Residual
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model
 from neurolens.surrogates.fits import network as networks
 from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
 from neurolens.surrogates.fits.projection import (
@@ -150,25 +147,6 @@ def test_a_lens_without_dispersion_ignores_the_wavelength():
     assert torch.rad2deg(error.square().mean().sqrt()) < 0.05
 
 
-@pytest.mark.parametrize("kind", ["network", "zones"])
-def test_no_clock_decides_a_fit_and_its_progress_grows_to_one(singlet, monkeypatch, kind):
-    monkeypatch.setattr(networks, "STARTS", 2)
-    settings = {
-        "network": ModelSettings("mlp", units=4, layers=1, steps=25),
-        "zones": ModelSettings("mlp", units=3, layers=1, steps=4, partitions=2),
-    }[kind]
-    found = []
-    for each_look in (1e-3, 1e9):  # seconds that go by, as the fit sees it
-        now = itertools.count(0.0, each_look)
-        for clock in ("monotonic", "process_time", "perf_counter", "thread_time"):
-            monkeypatch.setattr(time, clock, lambda now=now: next(now))
-        shares: list[float] = []
-        model = fit_model(singlet, settings, shares.append)
-        assert shares == sorted(shares) and shares[-1] == 1.0 and 0 < shares[0] < 0.5
-        found.append(model.core(singlet.encoding(singlet.pairs.held_out.inputs)))
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-
-
 def _random_problem(rays: int = 60) -> Problem:
     g = torch.Generator().manual_seed(4)
     normal = lambda *shape: torch.randn(shape, generator=g, dtype=F64)  # noqa: E731
@@ -265,14 +243,6 @@ def test_a_training_killed_anywhere_ends_with_the_very_same_weights(singlet, tmp
     assert [f.name for f in tmp_path.iterdir()] == ["training.npz"]
 
 
-def test_a_training_that_ended_is_read_and_not_done_again(singlet, tmp_path):
-    file, shares = tmp_path / "training.npz", []
-    first = fit(singlet, units=4, steps=12, checkpoint=file)
-    again = fit(singlet, units=4, steps=12, checkpoint=file, progress=shares.append)
-    assert torch.equal(_weights(first), _weights(again))
-    assert shares == [1.0]
-
-
 @pytest.mark.parametrize(
     "damage", [lambda b: b[: len(b) // 2], "other seed", *whole(lambda b: b"", lambda b: b"no zip at all")]
 )
@@ -284,12 +254,3 @@ def test_a_checkpoint_that_is_damaged_or_of_another_fit_is_replaced(singlet, tmp
         file.write_bytes(damage(file.read_bytes()))
     weights = _weights(fit(singlet, **settings, checkpoint=file))
     assert torch.equal(weights, _weights(fit(singlet, **settings)))
-
-
-def test_rays_are_doubled_where_few_overfit(singlet, monkeypatch):
-    monkeypatch.setattr(networks, "FEWEST_RAYS", 125)
-    monkeypatch.setattr(networks, "STARTS", 1)
-    levels: list[int] = []
-    monkeypatch.setattr(networks.Kept, "save", lambda self, state, arrays, now: levels.append(state["level"]))
-    fit(singlet, units=8, steps=60)
-    assert levels == sorted(levels) and {0, 1} <= set(levels)

@@ -19,12 +19,11 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.lens.film_plane import colours
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
-from neurolens.setting.focusing import axial_rays, best_focus_z_mm
+from neurolens.setting.focusing import best_focus_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.study.check import check_states, random_states, space_of_card
 from neurolens.study.rays import ray_errors
@@ -34,7 +33,6 @@ from neurolens.surrogates.export import export_states
 from neurolens.surrogates.model import LensModel, mix
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.states import StateModel, StateSettings, StateSpace, fit_states, focus_axis, zoom_axis
-from neurolens.trace.rays import trace
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))
 FOCUS = Axis("focus", "1/m", (0.0, 1.0), 4)
@@ -140,35 +138,6 @@ def test_states_to_check_at_are_one_in_each_part_of_every_range() -> None:
     assert states == random_states((ZOOM, FOCUS), 10, seed=4) != random_states((ZOOM, FOCUS), 10, seed=5)
     for k, (low, high) in enumerate(axis.range for axis in (ZOOM, FOCUS)):
         assert sorted(int(10 * (s[k] - low) / (high - low)) for s in states) == list(range(10))
-
-
-@pytest.mark.whole  # cameras/test_osl.py focuses groups inside
-def test_a_model_of_internal_focus_is_focused_as_its_lens_is(tmp_path: Path) -> None:
-    """Its camera's film is that of the exact lens's best focus, and gives the exact lens its least spot."""
-    lens = read_lens(lens_models.LENSES / "tajima_retrofocus_24.toml")
-    axis = focus_axis(lens, degree=2)
-    fitted = fit_states(StateSpace(lens, (axis,)), StateSettings(terms=40, degree=5, rays=3000))
-    loaded = load_model(export_states(fitted, tmp_path / "focus.onnx", {"rms_um": 1.0}))
-    for focus_m in (math.inf, 1.0001 / axis.range[1]):
-        camera = OnnxCamera(loaded, Shot((36.0, 24.0), focus_m))
-        placed = set_lens(lens, focus_mode="internal", focus_m=None if math.isinf(focus_m) else focus_m)
-        best, found = best_focus_z_mm(placed, focus_m), camera.film.film_z_mm
-        assert placed.film_z_mm is not None and placed.film_z_mm - best > 0.1  # groups stand in paraxial focus
-        assert found == pytest.approx(best, abs=0.02)
-        least, there, paraxial = (spot_um(placed, focus_m, z) for z in (best, found, placed.film_z_mm))
-        assert least <= there < least + 0.5 and paraxial > 2 * least  # the model's rays are off by as much on the film
-
-
-def spot_um(lens: Lens, focus_m: float, film_z_mm: float) -> float:
-    """RMS radius on the axis, colours weighed as those of best focus."""
-    nm, weights = colours((400.0, 700.0))
-    total = np.zeros(2)
-    for wavelength, weight in zip(nm, weights, strict=True):
-        out = trace(lens, axial_rays(lens, film_z_mm - 1000 * focus_m), float(wavelength), towards="film")
-        r, passed = out.rays, out.status == 0
-        x, y = (c + (film_z_mm - r.z) * d / r.dz for c, d in ((r.x, r.dx), (r.y, r.dy)))
-        total += weight * np.array([float((x * x + y * y)[passed].sum()), int(passed.sum())])
-    return 1e3 * math.sqrt(total[0] / total[1])
 
 
 def test_structures_that_differ_are_no_state_model() -> None:

@@ -1,7 +1,6 @@
 """Lens files: each mistake is one error that names file, surface and field; what is written reads back the same."""
 
 import math
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -71,52 +70,30 @@ BAD_ROWS = [
     # keys
     (", V_d = 64.2", ", abbe = 64.2", ["surface 0, abbe", "unknown key", "radius_mm, thickness_mm"]),
     ("radius_mm = 50.0", "radius = 50.0", ["surface 0, radius", "unknown key", "did you mean 'radius_mm'?"]),
-    ("radius_mm = 40.0", "radius_cm = 4.0", ["surface 4, radius_cm", "unknown key", "did you mean 'radius_mm'?"]),
-    ("thickness_mm = 6.0", "thickness = 6.0", ["surface 0, thickness", "did you mean 'thickness_mm'?"]),
     ("radius_mm = 50.0, ", "", ["surface 0, radius_mm", "(missing)"]),
     ("thickness_mm = 6.0, ", "", ["surface 0, thickness_mm", "(missing)", "a finite number in mm"]),
-    (", thickness_mm = 70.0, diameter_mm = 18.0", ", thickness_mm = 70.0", ["surface 5, diameter_mm", "(missing)"]),
     ("n_d = 1.5168, ", "", ["surface 0, n_d", "(missing)", "V_d is given"]),
-    ("n_d = 1.62, V_d = 36.4, ", "", ["surface 1, n_d", "(missing)", "material is given"]),
     (ROW_3, "3.0", ["surface 3", "got 3.0", "a table"]),
     # the stop
     (", stop = true", "", ["surfaces", "no stop", "exactly one"]),
     (ROW_5, ROW_5 + ", stop = true", ["surfaces", "surfaces 3, 5", "exactly one"]),
     ("stop = true", "stop = 1", ["surface 3, stop", "got 1", "true or false"]),
-    ("stop = true", 'stop = "yes"', ["surface 3, stop", "'yes'", "true or false"]),
     # figures
     ("diameter_mm = 12.0", "diameter_mm = -12.0", ["surface 3, diameter_mm", "got -12.0", "above 0"]),
-    ("diameter_mm = 12.0", "diameter_mm = 0", ["surface 3, diameter_mm", "got 0", "above 0"]),
-    ("diameter_mm = 12.0", "diameter_mm = inf", ["surface 3, diameter_mm", "got inf", "finite"]),
     ("radius_mm = 40.0", "radius_mm = 0.0", ["surface 4, radius_mm", "got 0.0", "a plane is inf"]),
-    ("radius_mm = 40.0", "radius_mm = nan", ["surface 4, radius_mm", "got nan", "a number"]),
     ("thickness_mm = 6.0", "thickness_mm = inf", ["surface 0, thickness_mm", "got inf", "finite"]),
-    ("thickness_mm = 6.0", "thickness_mm = nan", ["surface 0, thickness_mm", "got nan", "finite"]),
     ("thickness_mm = 6.0", "thickness_mm = 1" + 400 * "0", ["surfaces[0].thickness_mm", "64 bits"]),
     ("n_d = 1.6,", "n_d = 0.99,", ["surface 4, n_d", "got 0.99", "from 1"]),
-    ("n_d = 1.6,", "n_d = 16.0,", ["surface 4, n_d", "got 16.0"]),
-    ("n_d = 1.6,", "n_d = nan,", ["surface 4, n_d", "got nan"]),
-    ("V_d = 50.0", "V_d = 0.0", ["surface 4, V_d", "got 0.0", "above 0"]),
     ("V_d = 50.0", "V_d = -50.0", ["surface 4, V_d", "got -50.0", "above 0"]),
     ('rims = "source"', 'rims = "source"\nobject_medium = { n = 1.3 }', ["object_medium, n", "did you mean 'n_d'?"]),
     ('rims = "source"', 'rims = "source"\nobject_medium = { n_d = 0.5 }', ["object_medium, n_d", "got 0.5", "from 1"]),
-    ('rims = "source"', 'rims = "source"\nobject_medium = 1.3', ["object_medium", "got 1.3", "a table"]),
     ('rims = "source"', 'rims = "source"\nwavelengths_nm = [0.55]', ["wavelengths_nm", "got 0.55", "100 to 20000 nm"]),
-    ('rims = "source"', 'rims = "source"\nwavelengths_nm = 550', ["wavelengths_nm", "got 550", "a list"]),
     # types
     ("radius_mm = 40.0", 'radius_mm = "40.0"', ["surface 4, radius_mm", "got '40.0'", "a number"]),
-    ("radius_mm = 40.0", 'radius_mm = "inf"', ["surface 4, radius_mm", "got 'inf'", "a number"]),
-    ("thickness_mm = 6.0", "thickness_mm = true", ["surface 0, thickness_mm", "got True", "a finite number"]),
-    ("diameter_mm = 12.0", "diameter_mm = [12.0]", ["surface 3, diameter_mm", "a finite number"]),
-    ("V_d = 50.0", "V_d = false", ["surface 4, V_d", "got False"]),
-    ("n_d = 1.6,", 'n_d = "BK7",', ["surface 4, n_d", "'BK7'"]),
     ('material = "F2"', "material = 2", ["surface 1, material", "got 2", "a text"]),
     # shapes, media, coatings
-    ("n_d = 1.6,", "n_d = 1.6, conic = nan,", ["surface 4, conic", "got nan"]),
     ("n_d = 1.6,", "n_d = 1.6, asphere = {},", ["surface 4, asphere", "{ 4 = 1e-6"]),
     ("n_d = 1.6,", "n_d = 1.6, asphere = { 1 = 1e-6 },", ["surface 4, asphere", "'1'", "from 2 to 40"]),
-    ("n_d = 1.6,", "n_d = 1.6, asphere = { 4.5 = 3 },", ["surface 4, asphere", "got '4.5'", "a whole power from 2"]),
-    ("n_d = 1.6,", "n_d = 1.6, asphere = { 4 = inf },", ["surface 4, asphere, power 4", "got inf"]),
     ("n_d = 1.6,", 'n_d = 1.6, cylinder = "z",', ["surface 4, cylinder", "'z'", '"x" or "y"']),
     ("n_d = 1.6,", "n_d = 1.6, absorption_per_mm = -1,", ["surface 4, absorption_per_mm", "got -1", "at least 0"]),
     (ROW_5, ROW_5 + ", absorption_per_mm = 0.1", ["surface 5, n_d", "(missing)", "absorption_per_mm is given"]),
@@ -129,58 +106,39 @@ BAD_ROWS = [
 ]
 BAD_HEADS = [
     ("schema = 1", "schema = 1\ncoating = 3", ["coating", "got 3", "[[coating]]"]),
-    ("schema = 1", "schema = 1\ncoating = [{ name = 'a', layers = [] }]", ["coating 0, layers", "1 to 200 layers"]),
-    ("schema = 1", "schema = 1\ncoating = [{ name = 'a', layers = [[1.38]] }]", ["coating 0, layers", "[1.38]"]),
-    (
-        "schema = 1",
-        "schema = 1\ncoating = [{ name = 'a', layers = [[1.38, 90, 0]] }]",
-        ["coating 0, layer 0, V_d", "above 0"],
-    ),
-    (
-        "schema = 1",
-        "schema = 1\ncoating = [{ name = 'a', layers = [[1.38, 0]] }]",
-        ["coating 0, layer 0, thickness_nm"],
-    ),
     *(
         ("schema = 1", f"schema = 1\ncoating = [{{ {given} }}]", said)
         for given, said in (
+            ("name = 'a', layers = []", ["coating 0, layers", "1 to 200 layers"]),
+            ("name = 'a', layers = [[1.38]]", ["coating 0, layers", "[1.38]"]),
+            ("name = 'a', layers = [[1.38, 90, 0]]", ["coating 0, layer 0, V_d", "above 0"]),
             ("name = 'a', layers = [[1.38, nan]]", ["coating 0, layer 0, thickness_nm", "got nan", "finite"]),
             ("name = 'a', layers = [[2.1, 9], [1.38, '99']]", ["coating 0, layer 1, thickness_nm", "got '99'"]),
             ("name = 'a', layers = [[1.38, 90, 0.3]]", ["coating 0, layer 0, V_d", "got 0.3", "780 nm"]),
             ("name = 'a', layers = [[1.38, 90], []]", ["coating 0, layers", "got []", "thickness in nm"]),
             ("name = 'a'", ["coating 0, layers", "(missing)"]),
             ("layers = [[1.38, 90]]", ["coating 0, name", "(missing)"]),
-            (
-                "name = 'a', layers = [[1.38, 90]], wavelengths_nm = [400, 500]",
-                ["coating 0, wavelengths_nm", "unknown"],
-            ),
+            ("name = 'a', layers = [[1.38, 90]], waves = [4]", ["coating 0, waves", "unknown"]),
         )
     ),
     ("schema = 1", "", ["schema", "(missing)", "1"]),
     ("schema = 1", "schema = 2", ["schema", "got 2", "expected 1"]),
-    ("schema = 1", "schema = true", ["schema", "got True"]),
     ("schema = 1", "schema = 1\nmount = 'K'", ["mount", "unknown key", "schema, name"]),
     ("schema = 1", "schema = 1\nhalf_field = 20", ["half_field", "did you mean 'half_field_deg'?"]),
     ("schema = 1", "schema = 1\nhalf_field_deg = 200", ["half_field_deg", "got 200", "180"]),
     ("schema = 1", "schema = 1\nimage_radius_mm = -1", ["image_radius_mm", "got -1", "above 0"]),
-    ("schema = 1", "schema = 1\nnotes = 3", ["notes", "got 3", "a text"]),
     ('name = "test"', "", ["name", "(missing)"]),
     ('source = "nobody"', 'source = " "', ["source", "a text"]),
     ("f_number = 4.0", "f_number = 0", ["f_number", "got 0", "above 0"]),
-    ("f_number = 4.0", 'f_number = "f/4"', ["f_number", "'f/4'"]),
     ('rims = "source"', 'rims = "guessed"', ["rims", "'guessed'", '"estimated"']),
     ('rims = "source"', "", ["rims", "(missing)", '"source", "estimated", "derived" or "photographs"']),
     ("surfaces = [", "rows = [", ["rows", "unknown key"]),
     # zoom states
     ('name = "near"', "", ["configuration 0, name", "(missing)"]),
     ("efl_mm = 80.0", "efl = 80.0", ["configuration 0, efl", "did you mean 'efl_mm'?"]),
-    ("efl_mm = 80.0", "efl_mm = -80.0", ['configuration "near", efl_mm', "above 0"]),
     ("2 = 3.0", "6 = 3.0", ['configuration "near", thickness_mm', "got '6'", "from 0 to 5"]),
     ("2 = 3.0", "-1 = 3.0", ['configuration "near", thickness_mm', "got '-1'"]),
-    ("2 = 3.0", "02 = 3.0", ['configuration "near", thickness_mm', "got '02'"]),
-    ("2 = 3.0", "front = 3.0", ['configuration "near", thickness_mm', "got 'front'"]),
     ("2 = 3.0", "2 = inf", ['configuration "near", thickness_mm, surface 2', "got inf"]),
-    ("2 = 3.0", "2 = true", ['configuration "near", thickness_mm, surface 2', "got True"]),
     ("2 = 3.0", "0 = 1.0", ['configuration "near", surface 0, thickness_mm', "overlap"]),
     ("[[configuration]]", "[configuration]", ["configuration", "[[configuration]]"]),
     ("thickness_mm = { 2 = 3.0, 5 = 75.0 }", "thickness_mm = 3.0", ['configuration "near", thickness_mm', "a table"]),
@@ -279,21 +237,6 @@ def test_unknown_dispersion_is_a_warning(tmp_path: Path) -> None:
     with pytest.warns(NeurolensWarning, match=r"lens\.toml.*surface 4: .*constant") as seen:
         assert read_lens(path).surfaces[4].V_d is None
     assert len(seen) == 1
-
-
-def test_a_coating_that_no_surface_has_is_a_warning(tmp_path: Path) -> None:
-    coating = '\n[[coating]]\nname = "mine"\nlayers = [[1.38, 99.6]]\n'
-    with pytest.warns(NeurolensWarning, match='lens.toml: coating "mine": no surface has it'):
-        read_lens(write(tmp_path, GOOD + coating))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        read_lens(write(tmp_path, replaced("n_d = 1.6,", 'n_d = 1.6, coating = "mine",') + coating))
-
-
-def test_known_dispersion_is_no_warning(tmp_path: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert read_lens(write(tmp_path, GOOD)).dispersive
 
 
 # Round trip

@@ -105,10 +105,6 @@ def test_the_exact_camera_takes_a_pinhole(point: tuple[float, float]) -> None:
     assert slope.mean(axis=1) == pytest.approx([point[0] / 30, point[1] / 30], abs=1e-3)
 
 
-def test_a_shut_pinhole_has_no_f_number() -> None:
-    assert first_order(pinhole(50, 1).with_stop_radius(0.0)).f_number == math.inf
-
-
 STAR = np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 1, 0, 1, 0]])
 SHAPES = [
     *(Aperture(n, 13.0) for n in (3, 4, 5, 6, 8, 9, 50)),
@@ -213,28 +209,17 @@ def test_round_stops_and_scale_know_nothing_of_blades() -> None:
     assert bladed.with_aperture(None) == lens
 
 
-def test_apertures_compare_by_what_they_are() -> None:
-    assert Aperture(mask=STAR) == Aperture(mask=STAR.astype(float)) != Aperture(mask=STAR.T)
-    assert Aperture(5) == Aperture(5, 0.0) != Aperture(6)
-    assert len({Aperture(5), Aperture(5), Aperture(mask=STAR), Aperture(mask=STAR)}) == 2
-
-
 @pytest.mark.parametrize(
     ("fields", "expected"),
     [
         ({}, "blades"),
         ({"blades": 5, "mask": STAR}, "blades"),
         ({"blades": 2}, "3 to 100"),
-        ({"blades": 101}, "3 to 100"),
         ({"blades": 5.0}, "integer"),
-        ({"blades": True}, "integer"),
         ({"blades": 5, "rotation_deg": math.nan}, "rotation_deg"),
         ({"blades": 5, "curvature": 1.1}, "curvature"),
-        ({"blades": 5, "curvature": math.nan}, "curvature"),
         ({"mask": np.zeros((4, 4))}, "shut everywhere"),
-        ({"mask": np.full((4, 4), math.nan)}, "shut everywhere"),
         ({"mask": np.ones(4)}, "mask"),
-        ({"mask": np.ones((0, 4))}, "mask"),
         ({"mask": np.ones((2, 5000))}, "4096"),
         ({"mask": np.array([["a"]])}, "mask"),
     ],
@@ -259,10 +244,7 @@ def test_blades_in_a_lens_file(tmp_path: Path) -> None:
     ("table", "expected"),
     [
         ("[aperture]\nblades = 1", "aperture, blades"),
-        ("[aperture]\nblades = 5.0", "aperture, blades"),
-        ("[aperture]\nrotation_deg = 3.0", "aperture, blades"),
         ("[aperture]\nblades = 5\ncurvature = 2.0", "aperture, curvature"),
-        ('[aperture]\nblades = 5\nrotation_deg = "3"', "aperture, rotation_deg"),
         ("[aperture]\nblades = 5\nrotation = 3", "rotation_deg"),
         ("aperture = 5", "aperture"),
     ],

@@ -156,7 +156,6 @@ def test_report(browser: Any, tmp_path: Path) -> None:
     results: Any = full_results(ATTACK)
     results["command"] = ATTACK
     results["exact"][0]["name"] = results["models"][1]["name"] = results["images"][0]["scene"] = ATTACK
-    results["domain_gain"]["scene"] = results["domain_gain"]["rows"][0]["name"] = ATTACK
     results["settings"] |= {ATTACK: ATTACK}
     results["models"][0] |= {"family": ATTACK, "variables": ATTACK, "poor": [ATTACK], "file": f"models/{NAMES[1]}.onnx"}
     text = opened(browser, write_report(tmp_path, Results(**results)))

@@ -28,7 +28,7 @@ from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
-from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
+from neurolens.trace.tracegraph import exact_graph
 from neurolens.view import page as pages
 from neurolens.view import shaders
 
@@ -209,55 +209,6 @@ def test_crossings_are_those_of_the_tracer() -> None:
     path = trace(lens, start, towards="scene", wavelength_nm=550.0, path=True).path
     wanted = np.stack([c.numpy() for p in path for c in (p.z, p.y)])
     assert np.allclose(found, wanted[: len(found)], atol=2e-4)
-
-
-ZMX = """\
-MODE SEQ
-NAME My singlet
-UNIT MM X W X CM MR CPMM
-ENPD 10.0
-FTYP 0 0 1 3 0 0 0
-WAVM 1 0.5876 1
-PWAV 1
-SURF 0
-  TYPE STANDARD
-  CURV 0.0
-  DISZ INFINITY
-SURF 1
-  TYPE STANDARD
-  STOP
-  CURV 0.02
-  DISZ 5.0
-  GLAS N-BK7 0 0 1.5168 64.17
-  DIAM 12 1
-SURF 2
-  TYPE STANDARD
-  CURV -0.02
-  DISZ 46.0
-  DIAM 12 1
-SURF 3
-  TYPE STANDARD
-  CURV 0.0
-  DISZ 0
-  DIAM 12
-"""
-
-
-@pytest.mark.whole  # all forms of a lens are made
-def test_a_lens_of_your_own_whose_glass_absorbs(tmp_path: Path) -> None:
-    """All of its forms are written, and say what their transmittance is."""
-    (tmp_path / "my_lens.zmx").write_text(ZMX)
-    out = tmp_path / "view.html"
-    assert main(["view", str(tmp_path / "my_lens.zmx"), "--jobs", "1", "-o", str(out), "--json"]) == 0
-    text = out.read_text(encoding="utf-8")
-    (lens,) = data_of(text)["lenses"]
-    (form,) = lens["forms"]
-    assert lens["name"] == "My singlet"
-    assert form["method"] == "every surface traced"
-    assert form["files"] == ["glsl", "c", "osl"]
-    (stream,) = re.findall(r'id="lenses-0">([^<]*)<', text)
-    written = unpacked(stream, lens["stream"][1])
-    assert written.count(TRANSMITTANCE.encode()) == 3
 
 
 @pytest.mark.parametrize(

@@ -307,25 +307,15 @@ def _fingerprint(tensors: list[Tensor], settings: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def of_zone(path: Path | None, zone: int) -> Path | None:
-    """The file of the zone-th fit (from 0) of a model; the first keeps the name."""
-    return path if path is None or zone == 0 else path.with_name(f"{path.stem}.{zone}{path.suffix}")
-
-
-def _files(path: Path) -> list[Path]:
-    return [f for f in (path, *path.parent.glob(f"{path.stem}.*{path.suffix}")) if f.is_file()]
-
-
 def training_s(path: Path | None) -> float:
     """Seconds that a model's training took, all runs of it together; 0 where no file has them."""
-    total = 0.0
-    for file in [] if path is None else _files(path):
-        with suppress(OSError, ValueError), read_arrays(file) as (about, _):
-            total += float(about["spent_s"])
-    return total
+    with suppress(OSError, ValueError):
+        if path is not None:
+            with read_arrays(path) as (about, _):
+                return float(about["spent_s"])
+    return 0.0
 
 
 def clear_training(path: Path) -> None:
-    """Remove the files of a model's training, once the model itself is written."""
-    for file in _files(path):
-        file.unlink()
+    """Remove the file of a model's training, once the model itself is written."""
+    path.unlink(missing_ok=True)

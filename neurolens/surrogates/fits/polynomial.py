@@ -1,4 +1,4 @@
-"""Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement, growth; and first order.
+"""Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement; and first order.
 
 One support serves position and direction, chosen by the film-equivalent error in the nearest focused plane and at
 infinity. The stop crossing, the transmittance and the gates are then fitted on the monomials that are computed anyway.
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import product
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
@@ -27,10 +27,8 @@ from neurolens.surrogates.cores import (
     DIRECTION,
     POSITION,
     STOP,
-    Basis,
     InvariantPolynomial,
     MirrorPolynomial,
-    RawPolynomial,
 )
 from neurolens.surrogates.fits.boundaries import (
     boundary_terms,
@@ -42,7 +40,6 @@ from neurolens.surrogates.fits.boundaries import (
     stop_crossing,
     transmittance_terms,
 )
-from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.lightfield import Encoding, LightField
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import (
@@ -61,14 +58,11 @@ from neurolens.surrogates.terms import (
     backward,
     forward,
     further,
-    grow,
     invariant_exponents,
     kept,
     monomials,
     ordered,
     powers,
-    raw_exponents,
-    raw_variables,
     replace_terms,
     solve,
     united,
@@ -92,44 +86,34 @@ _MIRROR_METHODS = ("omp", "ols")  # and networks (`mlp`)
 _CHUNK, _MOST_CANDIDATES = 4096, 2500
 
 
-def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomial | RawPolynomial:
+def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomial:
     """Fit by one of `POLYNOMIALS`.
 
     Raises:
-        InputError: an unknown method or basis, fewer than two terms, or too few training rays.
+        InputError: an unknown method, fewer than two terms, or too few training rays.
     """
-    for name, value, allowed in (("method", settings.method, POLYNOMIALS), ("basis", settings.basis, get_args(Basis))):
-        if value not in allowed:
-            raise InputError("fit", name, value, f"one of {', '.join(allowed)}")
+    if settings.method not in POLYNOMIALS:
+        raise InputError("fit", "method", settings.method, f"one of {', '.join(POLYNOMIALS)}")
     if settings.terms < 2:
         raise InputError("fit", "terms", settings.terms, "at least 2 coefficients per vector output")
     count = len(data.pairs.train)
     if count <= settings.terms:
         raise InputError("fit", "train", count, f"more training rays than the {settings.terms} terms")
-    return _fit_invariant(data, settings) if settings.basis == "invariants" else _fit_raw(data, settings)
-
-
-def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomial:
-    train = data.train
+    train, dispersive = data.train, data.encoding.dispersive
     invariants = train.field.invariants()
     outputs = weighed_apart(data.pairs.lens, data.pairs.domain, train.vectors, settings.position_weight)
-    dispersive = data.encoding.dispersive
-    if settings.method == "adaptive":
-        exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
-        first = exponents
-    else:
-        # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
-        field, wanted = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field)), outputs[..., :_CHOICE_RAYS]
-        exponents = invariant_exponents(settings.degree, dispersive=dispersive)
-        for _ in range(settings.growth if settings.method == "ols" else 0):
-            if 2 * len(exponents) <= settings.terms:
-                break
-            chosen = _choose(_sweep(exponents, field, wanted), replace(settings, replacement=False))
-            exponents = _grown(exponents, chosen, dispersive=dispersive)
-        chosen = _choose(_sweep(exponents, field, wanted), settings)
-        first = kept(exponents, chosen)[0]
-        if settings.method == "ols" and settings.replacement and settings.growth > 1 and len(chosen) == settings.terms:
-            exponents, chosen = _grown_on(data, exponents, chosen, lambda e: _sweep(e, field, wanted), settings.terms)
+    # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
+    field, wanted = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field)), outputs[..., :_CHOICE_RAYS]
+    exponents = invariant_exponents(settings.degree, dispersive=dispersive)
+    for _ in range(settings.growth if settings.method == "ols" else 0):
+        if 2 * len(exponents) <= settings.terms:
+            break
+        chosen = _choose(_sweep(exponents, field, wanted), replace(settings, replacement=False))
+        exponents = _grown(exponents, chosen, dispersive=dispersive)
+    chosen = _choose(_sweep(exponents, field, wanted), settings)
+    first = kept(exponents, chosen)[0]
+    if settings.method == "ols" and settings.replacement and settings.growth > 1 and len(chosen) == settings.terms:
+        exponents, chosen = _grown_on(data, exponents, chosen, lambda e: _sweep(e, field, wanted), settings.terms)
     chosen = chosen or [0]  # rays on the axis alone choose nothing
     exponents, columns = kept(exponents, chosen)
     own, features = len(exponents), monomials(invariants, exponents)
@@ -191,50 +175,6 @@ def _choose(sweep: Sweep, settings: ModelSettings) -> list[int]:
     if settings.method == "ols" and settings.replacement:
         replace_terms(sweep)
     return sorted(sweep.chosen)
-
-
-def _fit_raw(data: Prepared, settings: ModelSettings) -> RawPolynomial:
-    """Every component with a support of its own, as published, half of `terms` each; one more for the scalars."""
-    train = data.train
-    # Supports are chosen on the rays near the rims, where every output has a value; coefficients on all boundary rays.
-    rim = data.pairs.rim
-    variables, rim_variables = raw_variables(train.field), raw_variables(data.encoding(rim.inputs))
-    dispersive = data.encoding.dispersive
-    half = replace(settings, terms=max(settings.terms // 2, 1))
-    stop = data.pairs.lens.stop_index
-    crossing = torch.stack([rim.cross_x[stop], rim.cross_y[stop]]) / data.pairs.lens.stop_radius_mm
-    gates = gate_values(data.pairs.lens, data.gates, rim)
-    wanted = {"scalars": (rim_variables, torch.cat([gates, rim.transmittance[None]]))}
-    for axis in (0, 1):
-        wanted[f"stop {axis}"] = (rim_variables, crossing[axis][None])
-        for vector in (POSITION, DIRECTION):
-            wanted[f"{vector} {axis}"] = (variables, train.vectors[vector, axis][None])
-    exponents, places = united([_raw_support(*of, half, dispersive) for of in wanted.values()])
-    columns = dict(zip(wanted, places, strict=True))
-    features, boundary = monomials(variables, exponents), monomials(raw_variables(data.boundary_field), exponents)
-    crossing, weight = stop_crossing(data)
-    components = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
-    for axis in (0, 1):
-        for vector in (POSITION, DIRECTION):
-            at = columns[f"{vector} {axis}"]
-            components[vector, axis, at] = solve(features[at], train.vectors[vector, axis][None])[0]
-        at = columns[f"stop {axis}"]
-        components[STOP, axis, at] = solve(boundary[at], crossing[axis][None], weight)[0]
-    at = columns["scalars"]
-    scalars = torch.zeros((1 + len(data.gates), len(exponents)), dtype=torch.float64)
-    scalars[:, at] = solve_scalars(data, lambda field: monomials(raw_variables(field), exponents)[at])
-    return RawPolynomial(exponents, components.numpy(), scalars.numpy())
-
-
-def _raw_support(variables: Tensor, outputs: Tensor, settings: ModelSettings, dispersive: bool) -> Exponents:
-    """Exponents [K, 5] chosen for outputs [R, N] in common."""
-    # Outputs count by how much they vary: transmittance varies little about a large mean, which one term explains.
-    outputs = outputs / (outputs - outputs.mean(1, keepdim=True)).norm(dim=1, keepdim=True).clamp_min(1e-300)
-    if settings.method == "adaptive":
-        exponents, chosen = grow(variables, None, outputs[:, None], settings.terms, dispersive=dispersive)
-        return exponents[chosen]
-    exponents = raw_exponents(settings.degree, dispersive=dispersive)
-    return exponents[_choose(Sweep.of_columns(monomials(variables, exponents), outputs), settings)]
 
 
 def ideal_map(lens: Lens, encoding: Encoding, method: ParaxialMethod) -> Tensor:
