@@ -113,10 +113,7 @@ def _text(data: dict[str, Any]) -> str:
     lines = [f"{len(data['files'])} pictures of {columns} x {rows} kernels, {data['kernel_px']} pixels a side each"]
     for k, file in enumerate(data["files"]):
         cells = data["kernels"][k * columns * rows : (k + 1) * columns * rows]
-        widths = [cell["width_px"] for cell in cells]
-        light = [cell["light"][1] for cell in cells]
-        lines.append(
-            f"{file}: blur {min(widths)} to {max(widths)} pixels wide, light {number(min(light), 3)} to "
-            f"{number(max(light), 3)}"
-        )
+        widths, light = ([row[name] for row in cells] for name in ("width_px", "light"))
+        low, high = (number(by(v[1] for v in light), 3) for by in (min, max))
+        lines.append(f"{file}: blur {min(widths)} to {max(widths)} pixels wide, light {low} to {high}")
     return "\n".join(lines)

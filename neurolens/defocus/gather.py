@@ -183,6 +183,11 @@ class RayTable:
         return found
 
 
+def _points(count: int, numbers: int) -> FloatArray:
+    """Points [numbers, count] of the unit cube, evenly."""
+    return ((sobol(count, numbers) + 2.0**31 / count) / 2.0**32).astype(np.float32)
+
+
 def spread_of(row: FloatArray) -> NDArray[np.float64]:
     """The variance of the places [nodes, 3] at which rays of a node see a point: of a, 2 covariances, of b; summed over
     x and y, so that its root is the radius of an even disc over sqrt(2)."""
@@ -196,8 +201,8 @@ def spread_of(row: FloatArray) -> NDArray[np.float64]:
 
 def spread_over(camera: Camera, pinhole: PlatePinhole, size: tuple[int, int]) -> NDArray[np.float64]:
     """`spread_of` all nodes, [rows, columns, 3]."""
-    points = (sobol(_FEW, 3).astype(np.float64) + 2.0**31 / _FEW) / 2.0**32
-    table = RayTable(camera, pinhole, size, points[:2].astype(np.float32), points[2].astype(np.float32))
+    points = _points(_FEW, 3)
+    table = RayTable(camera, pinhole, size, points[:2], points[2])
     return np.stack([spread_of(table.row(j)) for j in range(table.cells[1] + 1)])
 
 
@@ -236,9 +241,7 @@ def _sizes(
                 low = np.where(inside, np.maximum(least[np.ix_(rows, columns)], 0), low)
                 high = np.where(inside, np.maximum(most[np.ix_(rows, columns)], 0), high)
         widest = np.maximum(widest, np.maximum(radius_px(here, low), radius_px(here, high)))
-    wanted = np.clip(np.ceil(np.log2(_LEAST / 2 + _A_PIXEL * widest)), math.log2(_LEAST), math.log2(samples)).astype(
-        np.uint8
-    )
+    wanted = np.ceil(np.log2(np.clip(_LEAST / 2 + _A_PIXEL * widest, _LEAST, samples))).astype(np.uint8)
     return np.ascontiguousarray(wanted.repeat(FINEST, 0).repeat(FINEST, 1)[:height, :width])
 
 
@@ -264,9 +267,9 @@ def gather(
     `spread`: `spread_over` of the camera.
     """
     width, height = size
-    points = (sobol(_SET, 5).astype(np.float64) + 2.0**31 / _SET) / 2.0**32
-    jitter = np.ascontiguousarray(points[2:4].T, np.float32)
-    table = RayTable(camera, pinhole, size, points[:2].astype(np.float32), points[4].astype(np.float32))
+    points = _points(_SET, 5)
+    jitter = np.ascontiguousarray(points[2:4].T)
+    table = RayTable(camera, pinhole, size, points[:2], points[4])
     (across, down), (structs, kept) = table.cells, as_structs(layers)
     sizes = _sizes(layers, pinhole, spread, size, samples)
     rgb = np.empty((height, width, 3), np.float32)

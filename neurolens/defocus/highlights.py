@@ -70,12 +70,9 @@ def take_highlights(
     _, ab, b = np.moveaxis(spread[nodes[0], nodes[1]], -1, 0)
     side = np.sign(ab + 2 * b * w[row, column])  # of the growth of the radius's square with the inverse depth
     wide = (radius > _LEAST_PX) & (radius < LARGEST / 3)  # still larger discs have little noise
-    row, column, radius, side = row[wide], column[wide], radius[wide], side[wide]
-    work = math.pi * radius**2
-    if work.sum() > _MOST_WORK:  # the brightest, as many as there is time for
-        order = np.argsort(-(bright / cap)[row, column])
-        kept = order[np.cumsum(work[order]) <= _MOST_WORK]
-        row, column, radius, side = row[kept], column[kept], radius[kept], side[kept]
+    order = np.flatnonzero(wide)[np.argsort(-(bright / cap)[row, column][wide])]  # the brightest first
+    some = np.sort(order[np.cumsum(math.pi * radius[order] ** 2) <= _MOST_WORK])  # as many as there is time for
+    row, column, radius, side = row[some], column[some], radius[some], side[some]
     light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
     rgb[row, column] -= light
     own = np.ones(len(row), bool)
@@ -106,16 +103,8 @@ def spread_highlights(
     border = np.array(pinhole.border_px((width, height)))
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
-    near = 4.0 * _FINE_PX / _FINE
-    step = (
-        np.where(
-            found.radius_px < near / 4,
-            found.radius_px / _FINE_PX,
-            near + np.log(np.maximum(found.radius_px, 1e-3)) / _FINE,
-        )
-        .round()
-        .astype(int)
-    )
+    radius, near = np.maximum(found.radius_px, 1e-3), 4.0 * _FINE_PX / _FINE
+    step = np.where(radius < near / 4, radius / _FINE_PX, near + np.log(radius) / _FINE).round().astype(int)
     for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), found.side.tolist(), strict=True)):
         groups[key].append(k)
     structs, kept = as_structs(layers)

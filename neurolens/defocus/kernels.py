@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +126,7 @@ def kernel_at(
     )
 
 
-def _disk(side: Array) -> Array:
+def _disk(side: NDArray[Any]) -> Array:
     """A grid [2, N, N] over the square of -1 to 1 on the disk: x sqrt(1 - y^2 / 2), and the same in y. It is smooth, as
     the one of `Camera.sample`, which has corners along the diagonals, is not."""
     x, y = np.meshgrid(side, side)
@@ -138,7 +139,7 @@ def _square(disk: Array) -> FloatArray:
     return turned(np.stack([0.5 + 0.5 * radius, np.full_like(radius, 0.5)]), np.arctan2(v, u))
 
 
-def _between(values: Array, at: Array) -> Array:
+def _between(values: NDArray[Any], at: NDArray[Any]) -> Array:
     """Values [..., cells + 1, cells + 1] at other columns and rows `at` of their grids, linear between points."""
     share = np.maximum(1 - np.abs(at[:, None] - np.arange(values.shape[-1])), 0)
     return np.asarray(share @ values @ share.T)
@@ -201,12 +202,12 @@ class _Aimed:
         if grooves.spacing_mm < least:
             raise InputError("kernel", "ring_spacing_mm", grooves.spacing_mm, f"at least {least:.2g} mm on this lens")
         fine = cells * max(1, math.ceil(least * _FINEST / grooves.spacing_mm / cells))
-        place, weight, slope, lit, response = (
+        place, weight, slope, whole, response = (
             _between(v, np.arange(fine + 1) * cells / fine)
             for v in (self.place, self.weight, self.slope, lit, response.reshape(-1, 5, *lit.shape))
         )
         moved = table.moved_px(moves(response.reshape(*response.shape[:2], -1), grooves)).reshape(place.shape)
-        return _Aimed(place + moved, np.where(lit > 1 - 1e-9, weight, 0), slope, self.film_by_plate)
+        return _Aimed(place + moved, np.where(whole > 1 - 1e-9, weight, 0), slope, self.film_by_plate)
 
     def sweep(self, corner: NDArray[np.int_]) -> Array:
         """See `Kernel.sweep`: a fit by least squares to the rays that pass."""

@@ -37,19 +37,16 @@ def defocus(
     """
     progress = progress or Progress(quiet=True)
     check_field(camera)
-    spread, taken = spread_over(camera, plate.pinhole, plate.size), []
-    if highlights:
-        for k, layer in enumerate(plate.layers):
-            taken.append(take_highlights(layer, plate.pinhole, spread, plate.size, plate.layers[:k]))
+    layers, pinhole, size = plate.layers, plate.pinhole, plate.size
+    spread = spread_over(camera, pinhole, size)
+    taken = [take_highlights(v, pinhole, spread, size, layers[:k]) for k, v in enumerate(layers) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:
-        found = gather(
-            plate.layers, plate.pinhole, camera, plate.size, spread, 1 << (samples - 1).bit_length(), threads, report
-        )
+        found = gather(layers, pinhole, camera, size, spread, 1 << (samples - 1).bit_length(), threads, report)
     for some in taken:
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                spread_highlights(found.rgb, some, plate.layers, plate.pinhole, camera, report)
-    _say(found, len(plate.layers))
+                spread_highlights(found.rgb, some, layers, pinhole, camera, report)
+    _say(found, len(layers))
     return replace(found, highlights=sum(len(some.radius_px) for some in taken))
 
 

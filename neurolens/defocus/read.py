@@ -109,10 +109,7 @@ def read_plate(
     layers = list[Layer]()
     for file in (path, *behind):
         own = header if file == path else header_of(file)
-        if any(
-            tuple(map(int, a)) != tuple(map(int, b))
-            for a, b in zip(own["dataWindow"], header["dataWindow"], strict=True)
-        ):
+        if not np.array_equal(own["dataWindow"], header["dataWindow"]):
             raise InputError(file, "dataWindow", f"({own['dataWindow']})".replace("\n", " "), "that of the plate")
         settings, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
         from_film = settings is not None if depth.from_film is None else depth.from_film
@@ -196,12 +193,10 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
         raise InputError(path, "channels", f"({', '.join(channels)[:200]})", "R, G, B and Z")
     height, width = channels["Z"].shape
     counts = np.array([[0 if v is None else len(v) for v in row] for row in channels["Z"]])
+    none = np.zeros(0, np.float32)
     flat = {
-        name: np.concatenate(
-            [np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None]
-            or [np.zeros(0, np.float32)]
-        )
-        for name in (*COLOURS, "Z", *(("A",) if "A" in channels else ()))
+        name: np.concatenate([none, *(np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None)])
+        for name in channels.keys() & {*COLOURS, "Z", "A"}
     }
     alpha = flat.get("A", np.ones_like(flat["Z"]))
     pixel = np.repeat(np.arange(height * width), counts.reshape(-1))
@@ -213,10 +208,8 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
     layers = []
     for k in range(min(int(rank.max(initial=0)) + 1, _MOST_LAYERS)):
         rows = kept[rank == k]
-        rgb, metres = (
-            np.zeros((height * width, 3), np.float32),
-            np.full(height * width, -np.inf if k else np.inf, np.float32),
-        )
+        rgb = np.zeros((height * width, 3), np.float32)
+        metres = np.full(height * width, -np.inf if k else np.inf, np.float32)
         rgb[place[rank == k]] = np.stack([flat[c][rows] for c in COLOURS], axis=1) / alpha[rows, None]
         metres[place[rank == k]] = flat["Z"][rows]
         layers.append((rgb.reshape(height, width, 3), metres.reshape(height, width)))
