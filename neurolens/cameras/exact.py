@@ -40,7 +40,9 @@ from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import SCALARS, Form
+from neurolens.trace.aiming import without_rims
 from neurolens.trace.rays import Rays, trace
+from neurolens.trace.surfaces import media
 from neurolens.trace.tracegraph import exact_graph
 
 
@@ -176,6 +178,22 @@ class ExactCamera(LensCamera):
         if os.getpid() != self._pid:
             torch.set_num_threads(1)
         return self
+
+    def path_by_height(
+        self, surfaces: list[int], film_mm: NDArray[Any], pupil_mm: NDArray[Any], wavelength_nm: NDArray[Any]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rays of film points [2, N] through pupil points [2, N]: optical direction cosines at the film [2, N]; of each
+        surface the distance from the axis and the path that a surface higher by 1 would add [surfaces, 2, N]."""
+        lens, outline, waves = without_rims(self.lens), self.film.outline, torch.from_numpy(wavelength_nm.astype("f8"))
+        film_z = np.full(waves.numel(), float(self.film.film_z_mm))
+        index = [np.asarray(m.n) * np.ones(waves.numel()) for m in media(lens, waves)]
+        way = np.stack([*(pupil_mm - film_mm), outline.pupil_z_mm - film_z])
+        way /= np.sqrt((way**2).sum(axis=0))
+        start = Rays(*map(torch.from_numpy, (*film_mm.astype(np.float64), film_z, *way)))
+        path = [start, *trace(lens, start, waves, path=True).path]  # from the film: surface k is number -1 - k
+        radius = [path[-1 - k].x.hypot(path[-1 - k].y).numpy() for k in surfaces]
+        added = [index[k + 1] * path[-2 - k].dz.numpy() - index[k] * path[-1 - k].dz.numpy() for k in surfaces]
+        return index[-1] * way[:2], np.stack([radius, added], 1)
 
     def _outline(
         self, bounds: PupilBounds | None, wavelength_nm: tuple[float, float], detail: Detail, progress: Progress | None
