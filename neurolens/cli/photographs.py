@@ -90,21 +90,9 @@ def _checked(tabled: Lens, profile: str | None) -> Checked:
 
 def _text(found: Verified, name: str, last: list[str]) -> str:
     other = f"; also possible: {', '.join(found.also)}" if found.also else ""
-    lines = [
-        f"{name}\nagainst lensfun's {found.profile}, crop {found.crop:g} (match of names: {found.certainty}{other})"
-    ]
-    header = (
-        "mm",
-        "distortion %",
-        "red µm",
-        "measured",
-        "blue µm",
-        "measured",
-        "f/8 stops",
-        "measured",
-        "widest",
-        "measured",
-    )
+    head = f"against lensfun's {found.profile}, crop {found.crop:g} (match of names: {found.certainty}{other})"
+    lines = [f"{name}\n{head}"]
+    header = "mm|distortion %|red µm|measured|blue µm|measured|f/8 stops|measured|widest|measured".split("|")
     lines.append(table(header, [_row(c) for c in found.comparisons]))
     lines.append("distortion: residual of its shape; colour and light: computed and measured at the largest height")
     return "\n".join([*lines, *(f"- {sentence}" for sentence in found.verdict), *last])
@@ -175,15 +163,10 @@ examples:
 
 
 def _rims_text(found: FittedRims, head: str) -> str:
-    rows = [
-        [
-            f"f/{f:g}",
-            f"{found.before_stops[f]:.3f}",
-            f"{found.after_stops[f]:.3f}",
-            "left out" if f in found.unused else "",
-        ]
-        for f in found.before_stops
-    ]
+    rows = []
+    for f, before in found.before_stops.items():
+        left_out = "left out" if f in found.unused else ""
+        rows.append([f"f/{f:g}", f"{before:.3f}", f"{found.after_stops[f]:.3f}", left_out])
     lines = [head, table(("aperture", "before", "after (stops RMS)", ""), rows)]
     for name, factor in (("in front of the stop", found.front), ("behind it", found.rear)):
         lines.append(f"rims {name}: {'as they are' if factor == 1 else f'times {factor:.3f}'}")

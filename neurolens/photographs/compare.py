@@ -12,29 +12,26 @@ over a cell: no ray is traced again for another aperture or another rim.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
-from neurolens.analysis.bundles import bundle, points
-from neurolens.analysis.field_curves import PROJECTIONS, RECTILINEAR
-from neurolens.analysis.fields import Result, Scene
+from neurolens.analysis.fields import Result
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.paraxial import stop_radius_mm
 from neurolens.lens.prescription import Lens
+from neurolens.photographs.figures import between, chief_angles, heights_of, ideal_heights, shapes
 from neurolens.photographs.profiles import Light, Profile, Radial
 from neurolens.setting.pupils import camera_rays, rear_opening_mm
 from neurolens.setting.states import at_infinity, set_lens
 from neurolens.trace.aiming import without_rims
 from neurolens.trace.rays import trace
 
-_COARSE, _FINE = 24, 40  # points a side of the grids that find what is lit, and that measure it
+_COARSE, _FINE = 24, 32  # points a side of the grids that find what is lit, and that measure it
 _WIDER = 1.5  # cells by which what is lit may reach beyond the lit points of a grid
 _FLATTEST = 1e-3  # a slope over the steeper one, below which it makes no difference
 
@@ -164,15 +161,8 @@ def _measured(radius: Array, cos4: Array, cell: Array) -> OpenLight:
 
 Array = NDArray[np.float64]
 
-_HEIGHTS, _FIELDS = 16, 26  # image heights that are compared, fields that are traced
-_FEWEST = 4  # fields with chief rays
-_INNER = 0.25  # share of half the diagonal from which shapes are compared
-_OUTER_MM = 20.0  # of full frame, to which
-_SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor and table
 # Broad bands of a camera: those at which rays agree best with lensfun's lateral colour.
 _BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
-IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
-          "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
 _STOP_SLACK = 1.03  # an aperture named in a profile counts as full where the lens's own is that near
 
 
@@ -215,13 +205,6 @@ class Comparison(Result):
     size: float = 1.0
 
 
-def heights_of(profile: Profile, lens: Lens) -> Array:
-    """Image heights at which shapes are compared, within the profile's film and the lens's image circle."""
-    half = profile.half_diagonal_mm
-    end = min(_OUTER_MM / profile.crop, lens.image_radius_mm or math.inf)
-    return np.linspace(_INNER * half, max(end, 1.01 * _INNER * half), _HEIGHTS)
-
-
 def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
     """The lens focused at infinity, a zoom at the focal length of a profile; its ends are rounded in names."""
     states = [c.efl_mm for c in lens.configurations if c.efl_mm and c.object_distance_mm is None]
@@ -231,91 +214,23 @@ def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
     return set_lens(lens)
 
 
-def stretch_of(lens: Lens, profile: Profile, height_mm: Array) -> Callable[[Array], Array]:
-    """The image height over that of the profile's ideal projection, to a scale, as a function of image heights.
-
-    It is NaN beyond the last height whose chief ray exists.
-    """
-    scene = Scene(lens)
-    angle, real = _chief(scene, height_mm.max())
-    ideal = PROJECTIONS[IDEAL.get(profile.projection, RECTILINEAR)](angle)
-    return partial(_between, known_mm=real, values=real / ideal)
-
-
-def _chief(scene: Scene, to_mm: float) -> tuple[Array, Array]:
-    """Field angles in rad and the image heights of their chief rays, rising to beyond a height where there is one."""
-    angle = math.atan(1.2 * to_mm / abs(scene.first_order.efl_mm))
-    for edge in (angle, min(1.4 * angle, 1.8)):
-        field = edge * np.linspace(0.02, 1, _FIELDS)
-        height = scene.chief_rays(np.degrees(field)).height_mm.numpy()
-        rising = int(np.argmin(np.diff(height, append=-math.inf) > 0)) + 1
-        if height[rising - 1] >= to_mm:
-            break
-    return field[:rising], height[:rising]
-
-
-def _between(height_mm: Array, known_mm: Array, values: Array) -> Array:
-    """Values at heights between known ones; NaN beyond."""
-    if len(known_mm) < _FEWEST:
-        return np.full_like(height_mm, math.nan)
-    return np.asarray(CubicSpline(known_mm, values)(np.where(height_mm <= known_mm[-1], height_mm, math.nan)))
-
-
-def _without_mean(values: Array, others: Array) -> Array:
-    """Percent beside the mean over the heights at which both are known."""
-    both = np.isfinite(values) & np.isfinite(others)
-    return 100 * (values / values[both].mean() - 1) if both.any() else np.full_like(values, math.nan)
-
-
 def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curve, float]:
-    """The shape of the distortion, measured and computed, and the size of the picture for which both agree best.
-
-    Crop factors are rounded, and a patent's example is seldom of the product's very focal length: heights are free by
-    some percent.
-    """
+    """The shape of the distortion, measured and computed, and the size of the picture for which both agree best."""
     height = heights_of(profile, lens)
-    measured, known = profile.stretch(radial, height), stretch_of(lens, profile, height * max(_SIZES))
-    found = []
-    for size in _SIZES:
-        ours = known(height * size)
-        curve = Curve(height, _without_mean(measured, ours), _without_mean(ours, measured))
-        found.append((-int(np.isfinite(ours).sum()), curve.rms, abs(size - 1), curve, float(size)))
-    return min(found, key=lambda f: f[:3])[3:]
-
-
-def shape_off(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> Array:
-    """The difference of `distortion_curve`, percent, by the stretch at the image heights of chief rays.
-
-    NaN at heights that no chief ray reaches, and everywhere where too few do.
-    """
-    real_mm = np.where(np.isfinite(stretch), real_mm, math.nan)
-    rising = int(np.argmin(np.diff(real_mm, append=-math.inf) > 0)) + 1
-    if not real_mm[0] > 0:
-        return np.full_like(height_mm, math.nan)
-    ours = _between(np.outer(height_mm, _SIZES), real_mm[:rising], stretch[:rising])
-    theirs = np.where(np.isfinite(ours), measured[:, None], math.nan)
-    ours = np.where(np.isfinite(theirs), ours, math.nan)
-    most = np.isfinite(ours).sum(axis=0)
-    if most.max() < _FEWEST:
-        return np.full_like(height_mm, math.nan)
-    ours, theirs = (v[:, most == most.max()] for v in (ours, theirs))
-    off = 100 * (theirs / np.nanmean(theirs, axis=0) - ours / np.nanmean(ours, axis=0))
-    return np.asarray(off[:, np.argmin(np.nansum(off**2, axis=0))])
+    angle, (real,) = chief_angles(lens, float(height.max()), [lens.reference_nm])
+    theirs, ours, size = shapes(height, profile.stretch(radial, height), real, real / ideal_heights(profile, angle))
+    return Curve(height, theirs, ours), size
 
 
 def colour_curves(lens: Lens, profile: Profile, radials: Mapping[str, Radial | None]) -> dict[str, Curve | None]:
     """How much farther from the axis red and blue lie than green, in um, over broad bands as a camera's."""
-    height, scene = heights_of(profile, lens), Scene(lens)
-    angle, _ = _chief(scene, float(height.max()))
-    waves = [nm for band in _BANDS_NM.values() for nm in band]
-    chief = bundle(scene.open, np.degrees(angle).tolist(), waves, points([0.0], [0.0]))
-    beside = 1000 * chief.tangential_mm[..., 0].numpy()
-    red, green, blue = (part.mean(axis=1) for part in np.split(beside, len(_BANDS_NM), axis=1))
-    real = chief.chief_height_mm.numpy()
+    height = heights_of(profile, lens)
+    _, real = chief_angles(lens, float(height.max()), [nm for band in _BANDS_NM.values() for nm in band])
+    red, green, blue = (np.mean(part, axis=0) for part in np.split(np.array(real), len(_BANDS_NM)))
     found: dict[str, Curve | None] = {}
     for band, ours in (("red", red - green), ("blue", blue - green)):
         radial = radials[band]
-        found[band] = radial and Curve(height, profile.shift_um(radial, height), _between(height, real, ours))
+        found[band] = radial and Curve(height, profile.shift_um(radial, height), between(height, green, 1000 * ours))
     return found
 
 
@@ -333,14 +248,15 @@ def near_f8(f_numbers: Iterable[float]) -> float:
 
 def light_curves(lens: Lens, profile: Profile, lights: Sequence[Light]) -> dict[float, Curve]:
     """The light over image height by f-number, in stops beside the axis."""
-    height = heights_of(profile, lens)
+    height, stop = heights_of(profile, lens), lens.stop_index
     rims = np.array(lens.semi_diameters_mm)
-    found = open_light(lens, np.concatenate([[0.0], height]), rims)
+    opened = open_light(lens, np.concatenate([[0.0], height]), rims)
+    past_rims = np.min([opened.inside(k, radius) for k, radius in enumerate(rims) if k != stop], axis=0)
     curves = {}
     for row in lights:
-        rims[lens.stop_index] = stop_for(lens, row.f_number)
+        inside = np.minimum(past_rims, opened.inside(stop, stop_for(lens, row.f_number)))
         with np.errstate(divide="ignore", invalid="ignore"):
-            sums = found.at(rims)
+            sums = (inside * opened.light).sum(axis=(1, 2))
             ours = np.log2(sums[1:] / sums[0])
         ours[~np.isfinite(ours)] = math.nan
         curves[row.f_number] = Curve(height, profile.stops(row, height), ours)
@@ -357,5 +273,5 @@ def compare(lens: Lens, profile: Profile, focal_mm: float) -> Comparison:
     radial, red, blue = row(profile.distortion), row(profile.red), row(profile.blue)
     distortion, size = (None, 1.0) if radial is None else distortion_curve(placed, profile, radial)
     colours = colour_curves(placed, profile, {"red": red, "blue": blue}) if red or blue else {}
-    light = light_curves(placed, profile, profile.light_at(focal_mm)) if profile.light else {}
+    light = light_curves(placed, profile, lights) if (lights := profile.light_at(focal_mm)) else {}
     return Comparison(focal_mm, distortion, colours.get("red"), colours.get("blue"), light, size)

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 # the tables that set them would refuse twice as many others.
 ALARM = Measures(*(1.5 * np.array(most) for most in (0.75, 55.0, 1.0, 0.9, 0.32, 5.5, 0.4)))
 _UNITS = {10.0: "centimetres", 25.4: "inches"}
+_OF_TERMS = (-1.0, "the sign"), (10.0, "the exponent (10 times)"), (0.1, "the exponent (a tenth)")
 _POWERS, _ROUNDS = (4, 6, 8, 10), 6  # of an asphere that may be missing; rounds of the search for its terms
 _NEAR_MM, _DAMPED = 1e-5, (1e-9, 1e-7, 1e-5, 1e-3, 1e-1)  # of sags at the rim, for slopes; shares of their squares
 _LIKELY, _ALIKE = 7, 4  # surfaces that are searched to the end, and named at most, for an asphere that is missing
@@ -81,15 +82,10 @@ def changes(lens: Lens) -> Iterator[Change]:
         if math.isfinite(s.radius_mm):
             yield Change(f"the sign of the radius of surface {k}", changed(lens, k, radius_mm=-s.radius_mm))
         for n, (power, a) in enumerate(s.asphere):
-            for factor, what in (
-                (-1.0, "the sign"),
-                (10.0, "the exponent (10 times)"),
-                (0.1, "the exponent (a tenth)"),
-            ):
+            for factor, what in _OF_TERMS:
                 asphere = (*s.asphere[:n], (power, factor * a), *s.asphere[n + 1 :])
-                yield Change(
-                    f"{what} of the coefficient of power {power} of surface {k}", changed(lens, k, asphere=asphere)
-                )
+                said = f"{what} of the coefficient of power {power} of surface {k}"
+                yield Change(said, changed(lens, k, asphere=asphere))
         fields = ["radius_mm", "thickness_mm"] + ["n_d"] * (s.glass is None)
         for field in fields:
             old = float(getattr(s, field))
@@ -202,9 +198,8 @@ def check(lens: Lens, profile: Profile) -> Checked:
     now = _best([Change("", placed)], profile, focal)
     before = _named(now)
     if now.sound:
-        return Checked(
-            False, None, before, None, (f"the table is sound, and no change is called for: {_told(before)}",)
-        )
+        sound = f"the table is sound, and no change is called for: {_told(before)}"
+        return Checked(False, None, before, None, (sound,))
     beyond = {name: v for name, v in before.items() if not v <= getattr(ALARM, name)}
     said = f"the table is doubtful: {_told(beyond, limits=True)}"
     best = _best(list(changes(placed)), profile, focal)

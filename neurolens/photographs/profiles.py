@@ -31,6 +31,7 @@ _FARTHEST = 2.0  # of half the short side, to which the formulae are tabulated
 _STEPS = 2001
 _SAME_FOCAL, _SAME_F = 0.02, 0.04  # relative differences within which two names speak of the same lens
 _CERTAIN, _LIKELY = 0.55, 0.25  # shares of the weight of all words that two names have in common
+_FISHEYE = re.compile("fish-?eye", re.IGNORECASE)  # of a profile that does not state its projection
 _OTHER = 0.5  # times the likeness, where the versions or the mounts differ
 
 
@@ -144,7 +145,7 @@ _SAME_WORD = {"asph": "aspherical", "mkii": "ii", "mkiii": "iii", "fuji": "fujif
               "nikkor": "nikon", "zuiko": "olympus", "takumar": "pentax", "rokkor": "minolta",
               "voigtlander": "cosina", "voigtländer": "cosina"}  # fmt: skip
 # Marks of which two names of one lens have the same: the version; and the mount, where both names have one.
-_VERSIONS = frozenset(("ii", "iii", "iv", "v", "vi", "new"))
+_VERSIONS = frozenset(("ii", "iii", "iv", "v", "vi", "new", "l"))
 _MOUNTS = frozenset(("ef", "rf", "fd", "z", "xf", "xc", "gf", "fe", "da", "fa", "dt", "af", "ai", "m", "tl", "sl"))
 _NO_WORD = frozenset(("mm", "lens", "f", "the", "and", "for", "of", "t", "zoom", "g1", "compatibles"))
 
@@ -222,7 +223,7 @@ def _profile(element: ElementTree.Element) -> Profile | None:
         model=model,
         crop=float(crop),
         aspect=float(across) / float(down or 1),
-        projection=(element.findtext("type") or "rectilinear").strip(),
+        projection=(element.findtext("type") or ("fisheye" if _FISHEYE.search(model) else "rectilinear")).strip(),
         distortion=tuple(r for e in rows["distortion"] if (r := _distortion(e)) is not None),
         red=tuple(r for e in rows["tca"] if (r := _colour(e, "r")) is not None),
         blue=tuple(r for e in rows["tca"] if (r := _colour(e, "b")) is not None),

@@ -16,8 +16,10 @@ from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import Comparison, Curve, compare, heights_of, near_f8
+from neurolens.photographs.compare import Comparison, Curve, compare, near_f8
+from neurolens.photographs.figures import heights_of
 from neurolens.photographs.profiles import Match, Profile, matches, name_of, profile_named
+from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import at_infinity
 
 # Residuals of the shape of distortion (percent) and of light (stops, root mean square over heights) that half and nine
@@ -81,7 +83,7 @@ def _median(values: Iterable[float]) -> float:
 def names_of(lens: Lens) -> list[str]:
     """The names under which a lens is looked for: what it is believed to be, its own, and that of its file."""
     stem = Path(lens.path).stem.replace("_", " ")
-    return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}", stem) if name.strip()]
+    return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}".strip(), stem) if name]
 
 
 def found_for(
@@ -118,7 +120,8 @@ def found_for(
 
 def _by_film(profiles: Sequence[Profile], lens: Lens) -> list[Profile]:
     """Profiles in the order of use: of the largest film that the lens lights, then with light, then others."""
-    radius = 1.1 * (lens.image_radius_mm or math.inf)
+    several = len({p.crop for p in profiles}) > 1
+    radius = 1.1 * (image_radius_mm(at_infinity(lens))[0] if several else math.inf)
     return sorted(profiles, key=lambda p: (p.half_diagonal_mm > radius, p.crop, not p.light))
 
 
@@ -176,7 +179,8 @@ def _said(found: Verified, fitted: bool) -> list[str]:
     if math.isnan(off):
         lines.append("distortion was not measured")
     else:
-        own = f" (two cameras differ by {slack:.2g}%)" if math.isfinite(slack) else ""
+        word = "contradict each other" if slack > DOUBTFUL_PERCENT else "differ"
+        own = f" (two cameras {word} by {slack:.2g}%)" if math.isfinite(slack) else ""
         sound = "agree" if off <= SOUND_PERCENT else "roughly agree" if off <= DOUBTFUL_PERCENT else "disagree"
         lines.append(f"the figures {sound} with the photographs: distortion within {off:.2g}% of the image height{own}")
     lines.append(_said_of_light(found, fitted))
@@ -208,22 +212,16 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
     subtitle = f"{head}\n{'; '.join(found.verdict)}"
     with drawing(path, 13.5, 5.2, title, subtitle) as figure:
         left, middle, right = figure.subplots(1, 3)
-        for axes, label in (
-            (left, "distortion, % of the height, mean removed"),
-            (middle, "beside green, µm"),
-            (right, "light beside the axis, stops"),
-        ):
+        labels = "distortion, % of the height, mean removed", "beside green, µm", "light beside the axis, stops"
+        for axes, label in zip((left, middle, right), labels, strict=True):
             axes.grid(True)
             axes.set(xlabel="image height, mm", ylabel=label)
         bent = [(c.focal_mm, c.distortion_percent) for c in found.comparisons if c.distortion_percent is not None]
         for colour, (focal, curve) in zip(FIELD_COLOURS, _some_of(bent), strict=False):
             _both(left, curve, colour, f"{focal:g} mm")
         for name, colour in (("red", "#d55e00"), ("blue", "#0072b2")):
-            fringes = [
-                (c.focal_mm, getattr(c, f"{name}_um"))
-                for c in found.comparisons
-                if getattr(c, f"{name}_um") is not None
-            ]
+            curves = ((c.focal_mm, getattr(c, f"{name}_um")) for c in found.comparisons)
+            fringes = [(focal, curve) for focal, curve in curves if curve is not None]
             for focal, curve in fringes[:1]:
                 _both(middle, curve, colour, f"{name}, {focal:g} mm")
         lit = [c for c in found.comparisons if c.light_stops]

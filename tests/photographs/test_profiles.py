@@ -41,6 +41,7 @@ def test_other_texts_are_no_names_or_match_nothing(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "model", "certainty"),
     [
+        ("Canon TS-E90mm f2.8L Macro", "Canon TS-E 90mm f/2.8", "likely"),
         ("Sony Sonnar T* FE 55mm F1.8 ZA", "FE 55mm f/1.8 ZA", "certain"),
         ("Canon EF50mm f1.4 USM", "Canon EF 50mm f/1.4 USM", "certain"),
         ("Nikon AF Nikkor 28mm f1.4D", "Nikon AF Nikkor 28mm f/1.4D", "certain"),

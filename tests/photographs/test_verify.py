@@ -14,7 +14,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.compare import compare, open_light
-from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial
+from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial, profile_named
 from neurolens.photographs.verify import names_of, verify
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
@@ -150,3 +150,28 @@ def test_light_alone_and_another_film(monkeypatch: pytest.MonkeyPatch) -> None:
         and c.distortion_percent.height_mm.max() <= (lens.image_radius_mm or math.inf) * 1.02
     )
     assert names_of(lens)[0] == "Some 50mm f/1.8"
+
+
+def test_the_profile_of_the_film_that_a_lens_lights_and_one_that_another_contradicts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A lens whose image circle is not stated is held against the largest film that it lights."""
+    lens = replace(lens_of("laikin_double_gauss_50"), believed_to_be="Some 50mm f/1.8", image_radius_mm=None)
+    whole, bent = own_profile(lens, 50.0), Radial(50.0, (0.9, 0.0, 0.1))
+    three = (replace(whole, crop=0.3), whole, replace(whole, crop=1.5, distortion=(bent,)))
+    from neurolens.photographs import profiles
+
+    monkeypatch.setattr(profiles, "database", lambda: three)
+    found = verify(lens)
+    assert found.crop == 1.0 and found.distortion_percent < 0.01
+    assert "two cameras contradict each other" in found.verdict[0]
+
+
+def test_a_fisheye_whose_profile_does_not_state_its_projection() -> None:
+    """Equidistant, which is what photographs of the Canon 15 mm f/2.8 are compared with: a rectilinear picture of 180
+    degrees would be infinite."""
+    pytest.importorskip("lensfunpy")
+    (canon,) = profile_named("Canon EF 15mm f/2.8 Fisheye")
+    assert canon.projection == "fisheye"
+    (plain,) = profile_named("Canon EF 50mm f/1.4 USM")[:1]
+    assert plain.projection == "rectilinear"
