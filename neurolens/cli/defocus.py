@@ -127,6 +127,7 @@ examples:
 
 
 def _text(data: dict[str, Any]) -> str:
-    layers = f"{data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread"
-    light = f"{data['filled']:.2%} of the light filled in, {data['beyond']:.2%} from beyond the plate"
-    return f"{data['file']}: {layers}, {light}"
+    said = (
+        f"{data['file']}: {data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread, "
+    )
+    return said + f"{data['filled']:.2%} of the light filled in, {data['beyond']:.2%} from beyond the plate"

@@ -159,10 +159,6 @@ class RayTable:
         """Film points [2, N] of film places [2, N], which a picture shows upright."""
         return ((place_px.T / self.size - 0.5) * self.camera.film_mm * (-1, 1)).T.astype(np.float32)
 
-    def moved_px(self, film_mm: NDArray[Any]) -> NDArray[Any]:
-        """Steps [2, N] on the film as steps of film places."""
-        return (film_mm.T * self.size / self.camera.film_mm * (-1, 1)).T
-
     def unturned(self, film_mm: FloatArray, pupil: FloatArray) -> FloatArray:
         """The samples that the camera takes for points of the pupil [2, N], seen from film points [2, N]."""
         return turned(pupil, -np.arctan2(film_mm[1], film_mm[0])) if self.turns else pupil

@@ -206,7 +206,8 @@ class _Aimed:
             _between(v, np.arange(fine + 1) * cells / fine)
             for v in (self.place, self.weight, self.slope, lit, response.reshape(-1, 5, *lit.shape))
         )
-        moved = table.moved_px(moves(response.reshape(*response.shape[:2], -1), grooves)).reshape(place.shape)
+        moved_mm = moves(response.reshape(*response.shape[:2], -1), grooves).T
+        moved = (moved_mm * table.size / table.camera.film_mm * (-1, 1)).T.reshape(place.shape)
         return _Aimed(place + moved, np.where(whole > 1 - 1e-9, weight, 0), slope, self.film_by_plate)
 
     def sweep(self, corner: NDArray[np.int_]) -> Array:
