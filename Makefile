@@ -13,8 +13,9 @@
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
 #   make docs     the documentation in build/docs; its links, commands, how-tos and, where there is a Chromium, its search
-#                 are tried (5 CPU minutes); NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to
-#                 in C++, NEUROLENS_MITSUBA=1 renders that in Mitsuba (extra "mitsuba", and LLVM 17 or later)
+#                 are tried (5 CPU minutes; NEUROLENS_WHOLE=1 runs what takes long in how-tos, too);
+#                 NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to in C++,
+#                 NEUROLENS_MITSUBA=1 renders that in Mitsuba (extra "mitsuba", and LLVM 17 or later)
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches

@@ -16,11 +16,13 @@ from neurolens.cli.arguments import Parser
 
 NAMES = {
     "extremes": ("extremes", "errors and statuses at the ends of what optics allows"),
-    "pupils": ("pupils", "share of rays that pass a lens, by how its pupil is sampled"),
+    "pupils": ("pupils", "share of rays that pass a lens of those sent through its outlines"),
     "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),
     "vignetting": ("vignetting", "false passes and blocks, illumination"),
     "clipping": ("vignetting:clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),
     "outside": ("outside", "random inputs through exported models"),
+    "wild": ("wild", "wild numbers in every language: equal statuses, no NaN"),
+    "radiance": ("radiance", "a radiance field from photographs through a lens: pinhole, thin lens and lens"),
     "fused": ("fused_speed", "models as C against the exact lens as C"),
     "rays": ("rays", "an open benchmark of lens rays: error and time, ours beside other programs"),
     "tracer": ("tracer_race", "the exact lens as C beside a tracer written by hand"),

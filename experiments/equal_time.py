@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -285,10 +285,10 @@ def page(rows: Sequence[Row]) -> str:
     return lab.page(*parts, machine)
 
 
-def error_after(camera: Mapping[str, object], seconds: float) -> float:
+def error_after(camera: Row, seconds: float) -> float:
     """The squared error after at least one pass, by the law of the module; a bias below 0 counts as none."""
-    bias2, variance, (pass_s, _) = (camera[key] for key in ("bias2", "variance", "pass_s"))  # type: ignore[misc]
-    return float(max(bias2["value"], 0.0) + variance["value"] * pass_s / seconds)  # type: ignore[index]
+    bias2, variance, pass_s = camera["bias2"]["value"], camera["variance"]["value"], camera["pass_s"][0]
+    return float(max(bias2, 0.0) + variance * pass_s / seconds)
 
 
 def _law_columns(row: Row) -> Sequence[lab.Column]:

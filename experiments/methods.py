@@ -149,7 +149,7 @@ def _quick(row: Row) -> Row:
 _FIGURES = (
     "rms_um p99_um max_um rms_infinity_um rms_px p99_px max_px rms_um_at_21_6 direction_rms_deg direction_p99_deg "
     "direction_max_deg position_rms_um position_p99_um transmittance_rms transmittance_max false_pass false_block "
-    "false_pass_near_rim false_block_near_rim rays share_beyond_60_deg"
+    "rays share_beyond_60_deg"
 ).split()
 
 

@@ -88,22 +88,6 @@ def test_errors_name_the_target_not_the_temporary_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_runs_that_share_a_folder_do_not_share_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target, other = tmp_path / "film.exr", tmp_path / "other"
-    monkeypatch.setattr("os.getpid", lambda: 7)  # as in two containers
-    with atomic_path(target) as first, atomic_path(target) as second:
-        assert first != second
-        first.write_bytes(b"first")
-        second.write_bytes(b"second")
-    assert target.read_bytes() == b"first"
-    monkeypatch.setattr("secrets.token_hex", lambda n: "0" * 2 * n)
-    other.write_bytes(b"kept")
-    first.with_name(f".neurolens-{'0' * 16}.tmp.exr").symlink_to(other)  # a trap with the name to come
-    with pytest.raises(FileExistsError), atomic_path(target) as temporary:
-        temporary.write_bytes(b"bad")
-    assert other.read_bytes() == b"kept"
-
-
 def test_what_killed_runs_left_is_removed_after_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = (f".neurolens-{k:016x}.tmp{suffix}" for k, suffix in enumerate((".exr", "", ".so")))
     left, fresh, users = tmp_path / next(names), tmp_path / next(names), tmp_path / ".mine.tmp.so"

@@ -100,34 +100,6 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
     assert parse(["trade", *words]) == parse(["plan", *words, "--trade"])
 
 
-@pytest.mark.parametrize(
-    ("given", "name"),
-    [
-        ("cooke_triplet_50", "cooke_triplet_50.toml"),
-        ("fused:cooke_triplet_50", "cooke_triplet_50.toml"),
-        ("thin", "thin"),
-    ],
-)
-def test_a_camera_may_be_a_lens_of_the_project_by_name(given: str, name: str) -> None:
-    size = ["--size", "36x24", "--film", "36x24"]
-    for command in (
-        ["stmap", given, *size, "-o", "a"],
-        ["projection", given, *size, "--model", "opencv"],
-        ["render", "a.toml", "--camera", given, "--film", "36x24", "-o", "a.exr"],
-    ):
-        kind, _, found = build_parser().parse_args(command).camera.rpartition(":")
-        assert Path(found).name == name and Path(found).is_file() == ("cooke" in given)
-        assert kind == given.rpartition(":")[0]
-
-
-def test_export_takes_lenses_of_the_project_by_name_and_refuses_bad_names_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = ["export", "cooke_triplet_50", "--to", "c", "-o", str(tmp_path / "a.h")]
-    assert build_parser().parse_args(given).model.endswith("cooke_triplet_50.toml")
-    assert "no word of C" in failure(capsys, *given, "--name", "int")
-
-
 # Bad input
 
 

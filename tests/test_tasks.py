@@ -245,30 +245,3 @@ def framed(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
 def test_frames_of_a_cluster_are_those_of_one_machine(framed: Callable[..., dict[str, bytes]], cluster: str) -> None:
     assert framed("there.exr", "--dask", cluster) == framed("here.exr")
     assert not Path("there.exr.tiles").exists()
-
-
-@pytest.mark.whole  # a second cluster
-def test_a_lost_scheduler_leaves_what_is_done(
-    framed: Callable[..., dict[str, bytes]], cluster: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    doomed = Cluster(1, tmp_path)
-    monkeypatch.setattr("neurolens.base.cluster._TIMEOUT", "4s")
-    seen: list[Path] = []
-
-    def kept(data: bytes, folder: Path) -> list[Path]:
-        seen.extend(unpack(data, folder))
-        if len(seen) == 3:
-            doomed.kill()
-        return seen
-
-    monkeypatch.setattr("neurolens.frames.farm.unpack", kept)
-    with pytest.raises(AssertionError):
-        framed("a.exr", "--dask", doomed.address)
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1 and "is lost: what is done is kept, the same command goes on" in err
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a.exr.tiles").iterdir()}
-    assert len(before) + 2 * (tmp_path / "a.0001.exr").exists() >= 2
-    seen.clear()
-    assert framed("a.exr", "--dask", cluster) == framed("here.exr")
-    assert 1 <= len(seen) < 8 and not (tmp_path / "a.exr.tiles").exists()

@@ -7,7 +7,7 @@ import torch
 
 from neurolens.base import status as st
 from neurolens.lens.prescription import Lens
-from neurolens.study.rays import NEAR_RIM, SEED, ZONES, deciding_rim_ratio, false_shares
+from neurolens.study.rays import SEED, ZONES, false_shares
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import trace_pairs
@@ -19,7 +19,7 @@ def vignetting_errors(
     lens: Lens, domain: Domain, predict: Callable[[FilmRays, float | None], Any], *,
     stop_radius_mm: float | None = None, count: int = 300_000, seed: int = SEED,
 ) -> dict[str, Any]:  # fmt: skip
-    """The false shares over all rays, near a rim, and by zone; and the share that passes.
+    """The false shares over all rays and by zone; and the share that passes.
 
     Args:
         predict: takes rays and the stop radius in mm, gives a status [N], 0 where the ray passes.
@@ -31,17 +31,15 @@ def vignetting_errors(
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
         exact = trace_pairs(stopped, rays, domain.pupil_z_mm)
-        near = (deciding_rim_ratio(stopped, exact) - 1).abs() <= NEAR_RIM
         zone = torch.hypot(rays.film_x, rays.film_y) / domain.film_radius_mm
-        parts.append((exact.status == st.PASSED, predict(rays, radius).status == st.PASSED, near, zone))
-    exact_passes, model_passes, near, zone = (torch.cat(v) for v in zip(*parts, strict=True))
+        parts.append((exact.status == st.PASSED, predict(rays, radius).status == st.PASSED, zone))
+    exact_passes, model_passes, zone = (torch.cat(v) for v in zip(*parts, strict=True))
 
     def shares(part: torch.Tensor) -> dict[str, float | None]:
         return false_shares(exact_passes[part], model_passes[part])
 
     return {
         **false_shares(exact_passes, model_passes),
-        **{f"{key}_near_rim": value for key, value in shares(near).items()},
         "stop_radius_mm": radius,
         "passing_share": float(exact_passes.double().mean()),
         "zones": {n: shares((zone >= low) & ((zone < high) | (high == 1.0))) for n, (low, high) in ZONES.items()},

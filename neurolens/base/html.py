@@ -21,7 +21,6 @@ from jinja2.filters import do_mark_safe
 
 from neurolens.base.errors import one_line
 
-_SPECIAL = re.compile(r"([\\`*_|<\[])")  # characters of Markdown
 _FOLDERS = [Path(__file__).parents[1] / name for name in ("templates", "view/page")]
 
 

@@ -6,7 +6,7 @@ the graph of their lens inside (`whole_camera`); cameras whose lens is a functio
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,6 +23,8 @@ from neurolens.lens.apertures import Aperture
 if TYPE_CHECKING:
     from neurolens.cameras.lenscamera import LensFilm
 
+Array = NDArray[np.float64]
+
 # How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
 UNIT_SLACK = 1e-3
 # Areas below (mm^2) are none: the outline at the end of the light.
@@ -30,6 +32,7 @@ _NO_AREA = 1e-30
 # Outputs of a lens's graph with derivatives by the film point.
 D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
 METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
+_HAIR = 1e-18  # keeps the middle of a disc finite
 _AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
@@ -88,6 +91,29 @@ def weight_graph(
     for name in derivatives:
         g.outputs[name] = g.input(name, 6) * METRES
     return g
+
+
+def unit_disc(square: Value) -> Value:
+    """The point [2] of the unit disc of a point of the unit square, evenly (Shirley and Chiu 1997)."""
+    g = square.graph
+    a, b = g.split(square * 2.0 - 1.0, (1, 1))
+    flat = b * b <= a * a
+    size = g.select(flat, a, b)
+    angle = g.select(flat, b, a) / g.select(size * size <= _HAIR, 1.0, size)
+    squared = angle * angle
+    cos = size * g.series(squared, _COS)
+    sin = size * angle * g.series(squared, _SIN)
+    return g.concat(g.select(flat, cos, sin), g.select(flat, sin, cos))
+
+
+def _series(function: Callable[[Array], Array]) -> Array:
+    """The polynomial of a function of squares of angles up to pi / 4, in units of that, to float32's last bit."""
+    fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
+    return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
+
+
+_COS = _series(lambda s: np.cos(np.pi / 4 * np.sqrt(np.maximum(s, 0))))
+_SIN = _series(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))
 
 
 class LensGraph(NamedTuple):

@@ -2,7 +2,8 @@
 
 A path that carries several wavelengths follows the scene ray of one, the hero. At a companion wavelength the same scene
 ray belongs to another film point, some microns away, and to another pupil point. Polynomials of low order give both
-shifts; the lens's own graph then says whether the companion passes and how much of its light arrives.
+shifts and the ratio of their light. Whether a companion passes the lens is certain inside the pupil; near the pupil's
+edge the lens's own graph decides.
 """
 
 from __future__ import annotations
@@ -19,134 +20,197 @@ from neurolens.base import status as st
 from neurolens.cameras.cameragraph import LensGraph, lens_inside, status_graph, unrounded
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import RAY
 
 Array = NDArray[np.float64]
 
 # Degrees in film and pupil point of the terms without a wavelength, linear in the wavelengths, and quadratic.
 _DEGREES = (7, 3, 1)
+_LIGHT_DEGREE, _TINT = 4, 8  # of the ratio of light: in film and pupil point, and in the wavelength alone
 _STEPS, _CLOSE = 5, 1e-4  # of Newton's method; how well a shift must keep the scene ray, mm
 _FAR_MM = 50.0  # from the lens, where an error of a direction counts as an error of the position
 _FEWEST = 500  # rays, to fit to
 _WORST_MM, _WORST = 5e-4, 0.05  # RMS error of the film point, alone and of the shifts, one of which must do
-_BEYOND = 1.5  # the farthest shift over that of the rays of the fit
+_BEYOND = 1.5  # the farthest shift over that of the rays of the fit, and the edge of the pupil over where they are lost
+_SURELY = 0.02  # the share of the rays, next to the edge, that are traced in any case
 
 
 class Shift(NamedTuple):
     """The shift from the film and pupil point of the hero to those of a companion.
 
     Attributes:
-        of_hero: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`; output `shift` [12], what all companions share.
-        graph: inputs those of `of_hero`, `shift` and `companion_nm`; outputs `companion` [4], the film and pupil point
-            in mm of the same scene ray at the companion wavelength, and `known`, 0 beyond the film or the reach.
+        of_hero: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`; what all companions share: outputs `film_shift` and
+            `pupil_shift` [6], `tint`.
+        graph: inputs those and the outputs of `of_hero`, and `companion_nm`; outputs `film_there`, `pupil_there` [2],
+            the points in mm of the same scene ray at the companion wavelength, `ratio` of its light to the hero's, and
+            `known`, 0 beyond the film or the reach.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
+        edge_mm: a companion passes if the hero does, and the hero's `margin` of `lanes_graph` is larger than this.
     """
 
     of_hero: Graph
     graph: Graph
     reach_mm: tuple[float, float]
+    edge_mm: float
 
 
 def fit_shift(
-    lens: Graph, samples: Mapping[str, Array], companion_nm: Array, film_mm: tuple[float, float]
+    lens: Graph, samples: Mapping[str, Array], margin: Array, companion_nm: Array, film_mm: tuple[float, float]
 ) -> Shift | None:
     """Fit the shift of a lens; None if too few rays pass, or the error on held-out rays is too large.
 
     Args:
         lens: the graph of the lens (`cameragraph.LensGraph`).
         samples: its inputs for rays that cover film, pupil and wavelengths; half of them measure the error.
+        margin: [N] of these rays, see `lanes_graph`.
         companion_nm: [N] wavelengths of the companions. film_mm: width and height of the film.
     """
-    rays = samples["rays"]
-    shift, kept = _solved(lens, samples, companion_nm)
-    if kept.sum() < _FEWEST:
+    found = _solved(lens, samples, companion_nm)
+    if found.kept.sum() < _FEWEST:
         return None
-    rays, shift, companion_nm = rays[:, kept], shift[:, kept], companion_nm[kept]
+    rays, values, companion_nm = (v[..., found.kept] for v in (samples["rays"], found.values, companion_nm))
     waves = (1000 / np.stack([rays[4], companion_nm])) ** 2
-    low, high = float(waves.min()), float(waves.max())
-    middle, spread = 0.5 * (low + high), 0.5 * (high - low)
+    middle, spread = 0.5 * float(waves.min() + waves.max()), 0.5 * float(np.ptp(waves))
     scale = np.repeat([np.abs(rays[:2]).max(), np.abs(rays[2:4]).max()], 2)
-    columns = np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread])
-    exponents, odd = _monomials()
-    products = np.stack([np.prod(columns.T**powers, axis=1) for powers in exponents]) * (columns[5] - columns[4])
-    train = np.arange(rays.shape[1]) % 2 == 0
-    weights = np.zeros((4, len(exponents)))
-    for row in range(4):  # x of film and pupil are odd in x and even in y
-        terms = odd == row % 2
-        sizes = np.linalg.norm(products[terms][:, train], axis=1)
-        part = (products[terms][:, train] / sizes[:, None]).T
-        weights[row, terms] = np.linalg.lstsq(part, shift[row, train], rcond=1e-10)[0] / sizes
-    left, size = (
-        float(np.sqrt(np.mean(np.sum(v[:2, ~train] ** 2, axis=0)))) for v in (shift - weights @ products, shift)
-    )
-    if left > max(_WORST_MM, _WORST * size):
+    weights, tint, left = _terms(np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread]), values)
+    if left > max(_WORST_MM, _WORST * float(np.sqrt(np.mean(np.sum(values[:2] ** 2, axis=0))))):
         return None
-    x, y = (_BEYOND * float(v) for v in np.abs(shift[:2]).max(axis=1))
-    return Shift(*_shift_graphs((exponents, weights), scale, (middle, spread), (x, y), film_mm), (x, y))
+    x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
+    graphs = _shift_graphs(weights, tint, scale, (middle, spread), (x, y), film_mm)
+    on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
+    lost = margin[found.kept][on_film & ~found.passed[found.kept]]
+    return Shift(*graphs, (x, y), max(_BEYOND * float(lost.max(initial=0)), float(np.quantile(margin, _SURELY))))
+
+
+def _terms(columns: Array, values: Array) -> tuple[Array, Array, float]:
+    """Fit the values [5, N] of `_Solved` by variables [6, N]: weights [5, M] of the monomials, coefficients of the
+    light by wavelength, and the RMS error of the film point on the half of the rays that were not fitted."""
+    exponents, parity = _monomials()
+    products = np.stack([np.prod(columns.T**powers, axis=1) for powers in exponents]) * (columns[5] - columns[4])
+    tints = np.stack([columns[5] ** k - columns[4] ** k for k in range(1, _TINT + 1)])
+    train = np.arange(values.shape[1]) % 2 == 0
+    weights, tint = np.zeros((5, len(exponents))), np.zeros(_TINT + 1)
+    for row, kind in enumerate((0, 1, 0, 1, 2)):
+        terms = parity == kind
+        part = np.concatenate([products[terms], tints[: _TINT if kind == 2 else 0]])[:, train]
+        sizes = np.linalg.norm(part, axis=1)
+        solved = np.linalg.lstsq((part / sizes[:, None]).T, values[row, train], rcond=1e-10)[0] / sizes
+        weights[row, terms], tint[1:] = solved[: terms.sum()], solved[terms.sum() :] if kind == 2 else 0
+    left = (values - weights @ products)[:2, ~train]
+    along = np.linspace(-1, 1, 8 * _TINT)
+    light = np.exp(np.vander(along, _TINT + 1, increasing=True) @ tint)
+    return weights, np.polyfit(along, light, _TINT)[::-1], float(np.sqrt(np.mean(np.sum(left**2, axis=0))))
 
 
 def _shift_graphs(
-    terms: tuple[NDArray[np.int64], Array], scale: Array, waves: tuple[float, float], *limits_mm: tuple[float, float]
+    weights: Array, tint: Array, scale: Array, waves: tuple[float, float], *limits_mm: tuple[float, float]
 ) -> tuple[Graph, Graph]:
-    """The graphs of `Shift`, for exponents [M, 6] and weights [4, M] of variables so scaled, the reach and the film."""
-    exponents, weights = terms
-    each, place = np.unique(exponents[:, :5], axis=0, return_inverse=True)
-    powers = np.zeros((len(_DEGREES), 4, len(each)))  # of the companion's variable
-    powers[exponents[:, 5], :, place.ravel()] = weights.T
+    """The graphs of `Shift`, for what `_terms` finds in variables so scaled, the reach and the film."""
+    exponents, of_hero, g = _monomials()[0], Graph(), Graph()
 
     def variable(g: Graph, name: str) -> Value:
         inverse = 1000.0 / g.input(name)
         return (inverse * inverse + -waves[0]) * (1 / waves[1])
 
-    of_hero, g = Graph(), Graph()
-    start, point = (h.concat(h.input("film_mm", 2), h.input("pupil_mm", 2)) for h in (of_hero, g))
+    start = of_hero.concat(of_hero.input("film_mm", 2), of_hero.input("pupil_mm", 2))
     variables = of_hero.concat(start * (1 / scale), variable(of_hero, "wavelength_nm"))
-    of_hero.outputs["shift"] = of_hero.polynomial(each, powers.reshape(-1, len(each)), variables)
+    for name, rows in (("film_shift", slice(0, 2)), ("pupil_shift", slice(2, 4)), ("tint", slice(4, 5))):
+        used = weights[rows].any(axis=0)
+        each, place = np.unique(exponents[used][:, :5], axis=0, return_inverse=True)
+        powers = np.zeros((1 if name == "tint" else len(_DEGREES), len(weights[rows]), len(each)))
+        powers[exponents[used][:, 5], :, place.ravel()] = weights[rows][:, used].T  # of the companion's variable
+        of_hero.outputs[name] = of_hero.polynomial(each, powers.reshape(-1, len(each)), variables)
     hero, other = (variable(g, name) for name in ("wavelength_nm", "companion_nm"))
-    constant, linear, quadratic = g.split(g.input("shift", 12), [4, 4, 4])
-    moved = point + (constant + (linear + quadratic * other) * other) * (other - hero)
-    reach, half = np.array(limits_mm[0]), 0.5 * np.array(limits_mm[1])
-    near = (moved - point)[:2].between(-reach, reach) & moved[:2].between(-half, half)
-    g.outputs |= {"companion": moved, "known": near[0] & near[1]}
+    for what in ("film", "pupil"):
+        constant, linear, quadratic = g.split(g.input(f"{what}_shift", 6), [2, 2, 2])
+        moved = (constant + (linear + quadratic * other) * other) * (other - hero)
+        g.outputs[f"{what}_there"] = there = g.input(f"{what}_mm", 2) + moved
+        if what == "film":
+            reach, half = (np.array(limits) for limits in limits_mm)
+            near = moved.between(-reach, reach) & there.between(-0.5 * half, 0.5 * half)
+            g.outputs["known"] = near[0] & near[1]
+    light = g.series(other, tint) / g.series(hero, tint)
+    g.outputs["ratio"] = light.maximum(0.0) * ((other - hero) * g.input("tint") + 1.0)
     return of_hero, g
 
 
-def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
-    """The graph of companions: from a ray's film and pupil point and two wavelengths to the companion's light.
+def lanes_graph(shift: Shift, companions: int) -> Graph:
+    """The graph of all wavelengths of a ray, as if the lens let pass every companion.
 
-    Inputs: those of `Shift.graph`, beyond whose limits companions are outside the domain, and those of the lens for a
-    whole call; with `mask_too` the table of a mask.
-    Outputs: `companion` [2], the film point, `transmittance`, `status`; without `mask_too` also `stop_xy_mm` of a lens
-    with a mask.
+    Inputs: those of `Shift.of_hero`, `companion_nm` [companions], and of the hero's ray `square` [2], `area_mm2` and
+    `weight`.
+    Outputs: `light` [companions], the weights that they would have alone, 0 where they are not `known`; `places`, the
+    film points of all wavelengths, the hero's where there is no light; `margin`, how far inside the pupil the
+    ray passes, about in mm.
     """
     g = Graph()
-    shifted = g.inline(shift, {})
-    found, aperture = lens_inside(g, lens, g.concat(shifted["companion"], g.input("companion_nm")), mask_too)
-    given = {**found, "lens_status": unrounded(found["status"])}
-    status = g.inline(status_graph(aperture, lens.stopped, lens.unit), given)["status"]
-    status = g.select(shifted["known"], status, status.maximum(float(st.OUTSIDE_DOMAIN))).whole()
-    g.outputs |= {"companion": shifted["companion"][:2], "transmittance": found["transmittance"], "status": status}
+    film, light, weight = g.input("film_mm", 2), g.input("companion_nm", companions), g.input("weight")
+    same = g.inline(pruned(shift.of_hero, {k: shift.of_hero.outputs[k] for k in ("film_shift", "tint")}), {})
+    wanted = {k: v for k, v in shift.graph.outputs.items() if k != "pupil_there"}
+    found = [
+        g.inline(pruned(shift.graph, wanted), same | {"companion_nm": light[k], "film_mm": film})
+        for k in range(companions)
+    ]
+    lanes = [g.select(f["known"], f["ratio"] * weight, 0.0) for f in found]
+    there = (g.select(lane <= 0.0, film, f["film_there"]) for lane, f in zip(lanes, found, strict=True))
+    g.outputs |= {"light": g.concat(*lanes), "places": g.concat(film, *there)}
+    inside = (g.input("square", 2) * 2.0 - 1.0).abs()
+    g.outputs["margin"] = (1.0 - inside[0].maximum(inside[1])) * g.input("area_mm2").maximum(0.0).sqrt()
     return g
+
+
+def companion_graph(lens: LensGraph, shift: Shift, mask_too: bool) -> Graph:
+    """The graph that says whether companions pass: from a ray's film and pupil point and two wavelengths.
+
+    Inputs: those of `Shift.of_hero`, `companion_nm`, and those of the lens for a whole call; with `mask_too` the table
+    of a mask.
+    Outputs: `status`; without `mask_too` also `stop_xy_mm` of a lens with a mask.
+    """
+    g = Graph()
+    there = shifted(g, shift)
+    found, aperture = lens_inside(g, lens, g.concat(there, g.input("companion_nm")), mask_too)
+    given = {**found, "lens_status": unrounded(found["status"])}
+    g.outputs["status"] = g.inline(status_graph(aperture, lens.stopped, lens.unit), given)["status"].whole()
+    return g
+
+
+def shifted(g: Graph, shift: Shift) -> Value:
+    """Film and pupil points [4] of companions in a graph of the inputs of `Shift`."""
+    of_hero = {k: v for k, v in shift.of_hero.outputs.items() if k != "tint"}
+    wanted = {k: shift.graph.outputs[k] for k in ("film_there", "pupil_there")}
+    there = g.inline(pruned(shift.graph, wanted), g.inline(pruned(shift.of_hero, of_hero), {}))
+    return g.concat(there["film_there"], there["pupil_there"])
 
 
 @cache
 def _monomials() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Exponents [M, 6] of film x, y, pupil x, y, hero and companion; and [M] 0 where odd in x, 1 where odd in y.
+    """Exponents [M, 6] of film x, y, pupil x, y, hero and companion; and [M] 0 where odd in x alone, 1 where odd in y
+    alone, as shifts are, 2 where odd in neither, as light is.
 
     Lenses with two planes of symmetry have no others, round or with cylinders.
     """
-    found = []
+    found, parity = [], []
     for *point, hero, other in product(*[range(_DEGREES[0] + 1)] * 4, *[range(len(_DEGREES))] * 2):
-        order = hero + other
-        if order < len(_DEGREES) and sum(point) <= _DEGREES[order] and sum(point) % 2:
+        order, x, y = hero + other, (point[0] + point[2]) % 2, (point[1] + point[3]) % 2
+        shifts = x + y == 1 and order < len(_DEGREES) and sum(point) <= _DEGREES[order]
+        if shifts or (not (x or y or order) and 0 < sum(point) <= _LIGHT_DEGREE):
             found.append((*point, hero, other))
-    exponents = np.array(found, np.int64)
-    return exponents, 1 - (exponents[:, 0] + exponents[:, 2]) % 2
+            parity.append(y if shifts else 2)
+    return np.array(found, np.int64), np.array(parity)
 
 
-def _solved(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Shifts [4, N] of film and pupil points by Newton's method in float64, and [N] which of them are solutions."""
+class _Solved(NamedTuple):
+    """Shifts [4, N] of film and pupil points and the logarithm of the ratio of light, `values` [5, N]; [N] whether they
+    are solutions (`kept`), and whether the companion passes."""
+
+    values: Array
+    kept: NDArray[np.bool_]
+    passed: NDArray[np.bool_]
+
+
+def _solved(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) -> _Solved:
+    """Solve for the shifts by Newton's method in float64."""
     graph = with_derivatives(lens, ["scene_ray"], [("rays", row) for row in range(4)])
     names = [derivative("scene_ray", row) for row in RAY]
     scale = np.array([1.0, 1.0, 1.0, *[_FAR_MM] * 3])[:, None]
@@ -166,4 +230,6 @@ def _solved(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) -> t
             place += np.linalg.solve(normal, turned @ left.T[..., None])[..., 0].T
         found = evaluate(lens, {**samples, "rays": np.concatenate([place, companion_nm[None]])})
         kept &= np.abs(found["scene_ray"] * scale - wanted).max(axis=0) < _CLOSE
-    return place - start, kept
+        ratio = np.log(found["transmittance"] / hero["transmittance"])
+    kept &= np.isfinite(ratio[0])
+    return _Solved(np.concatenate([place - start, ratio]), kept, found["status"][0] == st.PASSED)

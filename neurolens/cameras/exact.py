@@ -21,11 +21,12 @@ from neurolens.base import status as st
 from neurolens.base.files import fingerprint_of, kept_in_cache, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.cameragraph import D_FILM, METRES, LensGraph
+from neurolens.cameras.companions import lanes_graph, shifted
 from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lenscamera import GraphRun, Kind, LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
-from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, PupilTable, outline_of
+from neurolens.cameras.pupil_search import COARSE, FINE, Detail, PupilTable, outline_of
 from neurolens.cameras.sampling import arrived, lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -39,7 +40,9 @@ from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import SCALARS, Form
+from neurolens.trace.aiming import without_rims
 from neurolens.trace.rays import Rays, trace
+from neurolens.trace.surfaces import media
 from neurolens.trace.tracegraph import exact_graph
 
 
@@ -79,7 +82,7 @@ class ExactCamera(LensCamera):
         film_z, tabled = self.lens.film_z_mm, at_infinity(self.lens)
         assert film_z is not None  # `set_lens` places the film
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
-        detail = FINE if not self.lens.anamorphic else COARSE if bounds is None else COARSE_TIGHT
+        detail = COARSE if self.lens.anamorphic else FINE
         self._film_z_mm, self._pupil_z_mm = film_z, pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
         read = [dtype, self._pupil_z_mm, self.film_mm, detail, bounds and asdict(bounds)]
@@ -109,10 +112,11 @@ class ExactCamera(LensCamera):
         }
         self.start(runtime)
 
-    def _run(self, kind: Kind) -> GraphRun:
+    def _run(self, kind: Kind, companions: int = 0) -> GraphRun:
         if self.runtime != "trace":
-            return super()._run(kind)
-        return {"companion": self._companion, "differentials": self._moved}.get(kind, self._traced)
+            return super()._run(kind, companions)
+        own: dict[Kind, GraphRun] = {"hero": self._hero, "companion": self._companion, "differentials": self._moved}
+        return own.get(kind, self._traced)
 
     def _traced(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         return self.film.outputs(rays["film_mm"], rays["square"], rays["wavelength_nm"][0])
@@ -131,13 +135,17 @@ class ExactCamera(LensCamera):
     def _moves(self) -> Graph:
         return with_film_derivatives(self.lens_graph().graph)
 
+    def _hero(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+        assert self._shift is not None
+        found = self._traced(rays)
+        return found | evaluate(lanes_graph(self._shift, len(rays["companion_nm"])), rays | found)
+
     def _companion(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         assert self._shift is not None
-        shifted = evaluate(self._shift.graph, rays | evaluate(self._shift.of_hero, rays))
-        moved = shifted["companion"]
-        found = self._scene(moved[:2], moved[2:], rays["companion_nm"][0])
-        status = np.where(shifted["known"] > 0, found.status, st.OUTSIDE_DOMAIN)
-        return {"companion": moved, "transmittance": found.transmittance[None], "status": status}
+        g = Graph()
+        g.outputs["there"] = shifted(g, self._shift)
+        there = evaluate(g, rays)["there"]
+        return {"status": self._scene(there[:2], there[2:], rays["companion_nm"][0]).status[None]}
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""
@@ -170,6 +178,22 @@ class ExactCamera(LensCamera):
         if os.getpid() != self._pid:
             torch.set_num_threads(1)
         return self
+
+    def path_by_height(
+        self, surfaces: list[int], film_mm: NDArray[Any], pupil_mm: NDArray[Any], wavelength_nm: NDArray[Any]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rays of film points [2, N] through pupil points [2, N]: optical direction cosines at the film [2, N]; of each
+        surface the distance from the axis and the path that a surface higher by 1 would add [surfaces, 2, N]."""
+        lens, outline, waves = without_rims(self.lens), self.film.outline, torch.from_numpy(wavelength_nm.astype("f8"))
+        film_z = np.full(waves.numel(), float(self.film.film_z_mm))
+        index = [np.asarray(m.n) * np.ones(waves.numel()) for m in media(lens, waves)]
+        way = np.stack([*(pupil_mm - film_mm), outline.pupil_z_mm - film_z])
+        way /= np.sqrt((way**2).sum(axis=0))
+        start = Rays(*map(torch.from_numpy, (*film_mm.astype(np.float64), film_z, *way)))
+        path = [start, *trace(lens, start, waves, path=True).path]  # from the film: surface k is number -1 - k
+        radius = [path[-1 - k].x.hypot(path[-1 - k].y).numpy() for k in surfaces]
+        added = [index[k + 1] * path[-2 - k].dz.numpy() - index[k] * path[-1 - k].dz.numpy() for k in surfaces]
+        return index[-1] * way[:2], np.stack([radius, added], 1)
 
     def _outline(
         self, bounds: PupilBounds | None, wavelength_nm: tuple[float, float], detail: Detail, progress: Progress | None

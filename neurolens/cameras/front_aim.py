@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensFilm
-from neurolens.trace.shapes import Shape, sag_and_derivatives
+from neurolens.lens.prescription import Surface
+from neurolens.trace.shapes import sag_and_derivatives
 from neurolens.trace.surfaces import meet_front
 
 Array = NDArray[np.float64]
@@ -48,7 +49,7 @@ class FrontAim:
         reach_mm: from the vertex to the farthest point of all boxes, on the surface.
     """
 
-    shape: Shape | None
+    shape: Surface | None
     angle_rad: float
     boxes: Array
     reach_mm: float

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import camera_rays
+from neurolens.cameras.cameragraph import camera_rays, unit_disc
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
 from neurolens.cameras.sampling import (
     LEAST_COS2,
@@ -33,7 +33,7 @@ from neurolens.cameras.sampling import (
     stratified,
 )
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Graph
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.film_plane import film_z_mm
 from neurolens.lens.shot import check_film
@@ -213,7 +213,7 @@ def ideal_graph(aperture: Aperture | None = None) -> Graph:
     radius_mm, spread, lean, distance, per_distance, per_depth, scale, place = (
         g.input(name, per_call=True) for name in names.split()
     )
-    entrance = _disk(g, square) * radius_mm
+    entrance = unit_disc(square) * radius_mm
     slope = entrance * spread + film * lean
     height = film + slope * distance
     across = film * per_distance + height * per_depth  # an object plane at infinity is no special case
@@ -230,18 +230,6 @@ def ideal_graph(aperture: Aperture | None = None) -> Graph:
     g.outputs["weight"] = g.select(status <= float(st.PASSED), cos2 * cos2 * scale, 0.0)
     g.outputs["status"] = status.whole()
     return g
-
-
-def _disk(g: Graph, square: Value) -> Value:
-    """`sampling.concentric_disk` in a graph."""
-    a, b = g.split(square * 2.0 - 1.0, (1, 1))
-    steep = a.abs() <= b.abs()
-    radius, other = g.select(steep, b, a), g.select(steep, a, b)
-    angle = other * radius * (math.pi / 4) * (1.0 / (radius * radius).maximum(1e-30))
-    turn2 = angle * angle  # at most (pi / 4)^2, where these series end below the rounding of float32
-    cos = g.series(turn2, [(-1) ** k / math.factorial(2 * k) for k in range(6)])
-    sin = angle * g.series(turn2, [(-1) ** k / math.factorial(2 * k + 1) for k in range(5)])
-    return g.concat(g.select(steep, sin, cos), g.select(steep, cos, sin)) * radius
 
 
 class ThinLens(ThickLens):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays, weight_graph, whole_camera
-from neurolens.cameras.companions import Shift, companion_graph, fit_shift
+from neurolens.cameras.companions import Shift, companion_graph, fit_shift, lanes_graph
 from neurolens.cameras.contract import (
     MANY_RAYS_A_CALL,
     RAYS_A_CALL,
@@ -93,7 +93,7 @@ class LensFilm:
         return camera_rays(self.outputs(film_mm, square, wavelength_nm))
 
     def outputs(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> dict[str, NDArray[Any]]:
-        """The outputs of the camera's graph, with `pupil_mm` and `transmittance`, for the inputs of `sample`."""
+        """The outputs of the camera's graph, `pupil_mm`, `area_mm2` and `transmittance`, for the inputs of `sample`."""
         pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
         lit = (area > 0) & is_light(wavelength_nm)
         some = np.flatnonzero(lit)  # a film point that nothing reaches is dark: no ray is traced
@@ -102,7 +102,7 @@ class LensFilm:
         whole["status"][:] = st.OUTSIDE_DOMAIN
         for name, part in found.items():
             whole[name][..., some] = part
-        return whole | {"pupil_mm": pupil}
+        return whole | {"pupil_mm": pupil, "area_mm2": area[None]}
 
     def _weighted(
         self, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
@@ -137,7 +137,7 @@ class LensFilm:
 
 
 Runtime = Literal["onnxruntime", "c", "trace"]
-# What a camera computes: rays, with differentials, with what companions need, or companions (`companion_graph`).
+# What a camera computes: rays, with differentials, with companions, or whether companions pass (`companion_graph`).
 Kind = Literal["rays", "differentials", "hero", "companion"]
 # Film points, pupil squares [2, N] and wavelengths [1, N] by name to what `camera_rays` takes.
 GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
@@ -201,7 +201,7 @@ class LensCamera:
 
     def start(self, runtime: Runtime) -> None:
         """Choose what runs the camera; C is compiled at once. Raises InputError: no C compiler, or one that fails."""
-        self.runtime, self._runs = runtime, dict[Kind, GraphRun]()
+        self.runtime, self._runs = runtime, dict[tuple[Kind, int], GraphRun]()
         if runtime == "c":
             self.settings = self.settings | {"runtime": "fused"}
             self._run("rays")
@@ -214,25 +214,23 @@ class LensCamera:
         """
         if self.companion_reach_mm is None:
             raise InputError(self.path, "wavelengths", "(several a ray)", "one: this lens has no companions")
-        light = np.ascontiguousarray(wavelength_nm, np.float32)
-        film, square = self._checked(film_mm, pupil, light[0])
-        hero = self._run("hero")({"film_mm": film, "square": square, "wavelength_nm": light[:1]})
-        rays, lanes = camera_rays(hero), len(light)
-        same = {"film_mm": film, "wavelength_nm": light[:1]}
-        same |= {name: hero[name] for name in ("pupil_mm", "shift") if name in hero}
-        passed, through = np.empty((lanes, film.shape[1]), np.bool_), np.empty(light.shape, np.float32)
-        places = np.empty((lanes, *film.shape), np.float32)
-        passed[0], places[0] = rays.weight > 0, film
-        through[0] = np.where(passed[0], hero["transmittance"][0], 0)
-        for lane in range(1, lanes):
-            companion = self._run("companion")(same | {"companion_nm": light[lane : lane + 1]})
-            power = np.maximum(companion["transmittance"][0], 0)
-            passed[lane] = (companion["status"][0] == st.PASSED) & np.isfinite(power) & passed[0]
-            through[lane] = np.where(passed[lane], power, 0)
-            places[lane] = np.where(passed[lane], companion["companion"][:2], film)  # what does not pass has any place
-        shared = through[0] * passed.sum(axis=0, dtype=np.float32)
-        through *= rays.weight / np.maximum(shared, np.finfo(np.float32).tiny)
-        return SpectralRays(rays, through, places)
+        nm = np.ascontiguousarray(wavelength_nm, np.float32)
+        film, square = self._checked(film_mm, pupil, nm[0])
+        given = {"film_mm": film, "square": square, "wavelength_nm": nm[:1], "companion_nm": nm[1:]}
+        lanes = len(nm)
+        hero = self._run("hero", lanes - 1)(given)
+        rays = camera_rays(hero)
+        light, places = hero["light"], hero["places"].reshape(lanes, 2, -1)
+        edge = np.flatnonzero((hero["margin"][0] < self._edge_mm) & (rays.weight > 0))
+        same = {"film_mm": film, "pupil_mm": hero["pupil_mm"], "wavelength_nm": nm[:1]}
+        near = {name: np.tile(values.take(edge, axis=1), lanes - 1) for name, values in same.items()}
+        near["companion_nm"] = nm[1:].take(edge, axis=1).reshape(1, -1)
+        passes = (self._run("companion")(near)["status"] == st.PASSED).reshape(lanes - 1, -1)
+        light[:, edge] *= passes
+        places[1:, :, edge] = np.where(passes[:, None], places[1:, :, edge], film[:, edge])
+        weight = np.concatenate([rays.weight[None], light])
+        weight /= np.maximum(np.count_nonzero(weight, axis=0), 1).astype(np.float32)
+        return SpectralRays(rays, weight, places)
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
@@ -253,35 +251,43 @@ class LensCamera:
             raise ValueError(f"film {film.shape}, square {square.shape}, wavelengths {wavelength.shape}")
         return film, square
 
-    def _run(self, kind: Kind) -> GraphRun:
+    def _run(self, kind: Kind, companions: int = 0) -> GraphRun:
         """The camera's graph in its runtime, made when it is first needed."""
-        if kind not in self._runs:
-            self._runs[kind] = self._made(kind)
-        return self._runs[kind]
+        if (kind, companions) not in self._runs:
+            self._runs[kind, companions] = self._made(kind, companions)
+        return self._runs[kind, companions]
 
-    def _made(self, kind: Kind) -> GraphRun:
+    def _made(self, kind: Kind, companions: int) -> GraphRun:
         lens = self.lens_graph(SCALARS if self.runtime == "c" else ONNX)
         if kind == "differentials":
             lens = lens._replace(graph=self._with_moves(lens.graph))
         mask_too = self.runtime != "c"
         if kind == "companion":
             assert self._shift is not None
-            graph, numbers = companion_graph(lens, self._shift.graph, mask_too), self._of_the_lens()
+            graph, numbers = companion_graph(lens, self._shift, mask_too), self._of_the_lens()
         else:
-            also = ("pupil_mm", "transmittance") if kind == "hero" else ()
+            also = ("pupil_mm", "area_mm2") if kind == "hero" else ()
             graph, numbers = whole_camera(self.film, lens, also, mask_too)
-            if kind == "hero" and self._shift is not None:
-                pupil = {"pupil_mm": graph.outputs["pupil_mm"]}
-                graph.outputs |= graph.inline(self._shift.of_hero, pupil)
+            if kind == "hero":
+                assert self._shift is not None
+                area = graph.outputs.pop("area_mm2")
+                same = {k: graph.outputs[k] for k in ("pupil_mm", "weight")} | {"area_mm2": area}
+                graph.outputs |= graph.inline(lanes_graph(self._shift, companions), same)
         made = _compiled(graph, numbers, self.film, lens) if self.runtime == "c" else None
         return made or self._in_onnxruntime(graph, numbers, lens)
 
     @cached_property
     def _shift(self) -> Shift | None:
         """The shift of companions, fitted once."""
-        samples = {name: values.astype(np.float64) for name, values in self._film_samples().items()}
+        given, margin = self._film_samples()
+        samples = {name: values.astype(np.float64) for name, values in given.items()}
         companions = np.random.default_rng(1).permutation(samples["rays"][4])
-        return fit_shift(self.lens_graph().graph, samples, companions, self.film_mm)
+        return fit_shift(self.lens_graph().graph, samples, margin, companions, self.film_mm)
+
+    @cached_property
+    def _edge_mm(self) -> float:
+        """`Shift.edge_mm`; all of the pupil where a shape in the stop has other edges."""
+        return self._shift.edge_mm if self._shift and self.lens_graph().aperture is None else math.inf
 
     def _of_the_lens(self) -> dict[str, float]:
         """The inputs of the lens's graph for a whole call."""
@@ -312,19 +318,21 @@ class LensCamera:
         """The lens's graph with the derivatives of its rays by the film point."""
         if self.runtime != "c":
             return with_film_derivatives(graph)
-        fitted = with_low_order_derivatives(graph, self._film_samples())
+        fitted = with_low_order_derivatives(graph, self._film_samples()[0])
         self.differentials_error = None if fitted is None else fitted.error
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
-    def _film_samples(self) -> dict[str, FloatArray]:
-        """Inputs of the lens's graph for rays all over film, pupil and wavelengths."""
+    def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
+        """Inputs of the lens's graph for rays all over film, pupil and wavelengths, and their `lanes_graph` margins."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))
         wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
-        rays = np.stack([*film, *outline.sample(film, square, wavelength)[0], wavelength])
-        return {"rays": rays} | {k: np.array([[value]], np.float32) for k, value in self._of_the_lens().items()}
+        pupil, area = outline.sample(film, square, wavelength)
+        margin = ((1 - np.abs(2 * square - 1).max(axis=0)) * np.sqrt(area)).astype(np.float64)
+        call = {k: np.array([[value]], np.float32) for k, value in self._of_the_lens().items()}
+        return {"rays": np.stack([*film, *pupil, wavelength])} | call, margin
 
 
 def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph) -> GraphRun:
@@ -343,6 +351,9 @@ def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: Len
         found["status"][0, shut] = lens.stopped
         if "weight" in found:
             found["weight"][0, shut] = 0
+        if "light" in found:
+            found["light"][:, shut] = 0
+            found["places"][2:, shut] = np.tile(rays["film_mm"][:, shut], (len(found["light"]), 1))
         return found
 
     return masked

@@ -17,10 +17,9 @@ from neurolens.cameras.cameragraph import LensGraph, status_graph
 from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
-from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.cameras.onnxmaps import InverseRays, OnnxInverse, load_inverse
+from neurolens.cameras.onnxlens import InverseRays, LensRays, OnnxInverse, OnnxLens, load_inverse, load_model
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE_TIGHT, PupilTable, outline_of
+from neurolens.cameras.pupil_search import COARSE, PupilTable, outline_of
 from neurolens.cameras.sampling import (
     arrived,
     beyond_circle,
@@ -321,7 +320,7 @@ def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilO
     bounds = PupilTable.of(domain["bounds"])
     if squeeze_of(scene, _SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
         return outline_of(bounds, scene.passes, wavelength_nm)
-    return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE_TIGHT)
+    return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE)
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:

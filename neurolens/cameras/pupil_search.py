@@ -51,58 +51,12 @@ class PupilTable:
         return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), pupil_rows(bounds))
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of boxes near the end of float32 nothing passes
-def tightened(
-    table: PupilTable, passes: Passes, wavelength_nm: Sequence[float], lattice: tuple[int, int] = (96, 48)
-) -> PupilTable:
-    """The same rows with boxes cut to what passes now at any of the wavelengths, for example through a closed stop.
-
-    Bounds move on a lattice of the table's own boxes, along and across one half, one step wider than what passes: the
-    boundary lies between two points.
-    """
-    low, high, half = (a[:, None] for a in table.rows)
-    count = table.rows.shape[1]
-    u, v = (np.linspace(0, 1, n, dtype=np.float32) for n in lattice)
-    radius = table.film_radius_mm * np.minimum(np.arange(count) / (count - 1), 1 - 1e-6)
-    along, across = low + (high - low) * u, half * v
-    shape = (2, count, *lattice)
-    film, pupil = np.zeros(shape, np.float32), np.empty(shape, np.float32)
-    film[0] = radius[:, None, None]
-    pupil[0], pupil[1] = along[:, :, None], across[:, None, :]
-    passed = passes_any(passes, film.reshape(2, -1), pupil.reshape(2, -1), wavelength_nm).reshape(shape[1:])
-    passed &= (low <= high)[:, :, None]
-    boxes = np.tile(np.array([[1], [-1], [0]], np.float32), count)
-    for k in np.flatnonzero(passed.any((1, 2))):
-        columns, lines = np.flatnonzero(passed[k].any(1)), np.flatnonzero(passed[k].any(0))
-        boxes[:, k] = (
-            along[k, max(columns[0] - 1, 0)],
-            along[k, min(columns[-1] + 1, len(u) - 1)],
-            across[k, min(lines[-1] + 1, len(v) - 1)],
-        )
-    return replace(table, rows=_with_neighbours(boxes))
-
-
-def passes_any(
-    passes: Passes, film: FloatArray, pupil: FloatArray, wavelength_nm: Sequence[float]
-) -> NDArray[np.bool_]:
-    """Test whether rays of film points [2, N] through pupil points [2, N] pass at any of the wavelengths."""
-    passed = np.zeros(film.shape[1], bool)
-    for wavelength in wavelength_nm:
-        left = np.flatnonzero(~passed)
-        passed[left] = passes(film[:, left], pupil[:, left], wavelength)
-    return passed
-
-
-def _with_neighbours(boxes: FloatArray) -> FloatArray:
-    """Every box joined with the boxes of the film radii next to it."""
-    low = np.where(boxes[0] <= boxes[1], boxes[0], np.inf)
-    high = np.where(boxes[0] <= boxes[1], boxes[1], -np.inf)
-    padded = [np.pad(a, 1, constant_values=c) for a, c in ((low, np.inf), (high, -np.inf), (boxes[2], 0.0))]
-    low, high, half = (
-        f([a[:-2], a[1:-1], a[2:]], axis=0) for f, a in zip((np.min, np.max, np.max), padded, strict=True)
-    )
-    empty = low > high
-    return np.stack([np.where(empty, 1, low), np.where(empty, -1, high), half]).astype(np.float32)
+def tightened(table: PupilTable, passing: PassTest, lattice: tuple[int, int] = (96, 48)) -> PupilTable:
+    """The same rows with boxes cut to what passes now, for example through a closed stop."""
+    last = table.rows.shape[1] - 1
+    place = np.minimum(np.arange(last + 1), last * (1 - 1e-6))
+    found = _lattice(_boxes(table, place), table.film_radius_mm * place / last, passing, lattice)
+    return replace(table, rows=found.boxes.astype(np.float32))
 
 
 class SearchFrame(NamedTuple):
@@ -123,8 +77,12 @@ def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
     def passing(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
         film = np.zeros(points.shape, np.float32)
         film[0] = radius
-        flat = film.reshape(2, -1), points.astype(np.float32).reshape(2, -1)
-        return passes_any(passes, *flat, wavelength_nm).reshape(points.shape[1:])
+        rays = np.concatenate([film, points]).reshape(4, -1).astype(np.float32)
+        passed = np.zeros(rays.shape[1], np.bool_)
+        for wavelength in wavelength_nm:
+            left = np.flatnonzero(~passed)
+            passed[left] = passes(rays[:2, left], rays[2:, left], wavelength)
+        return passed.reshape(points.shape[1:])
 
     return passing
 
@@ -132,10 +90,15 @@ def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
 def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
     """The largest film radius, within those of the table, from which a ray is found to pass."""
     last = table.rows.shape[1] - 1
+
+    def light(box: Float64Array, place: float) -> Float64Array | None:
+        """The box [3, 1] about what passes at a fractional row within a box, or None where nothing does."""
+        found = _lattice(box, np.array([table.film_radius_mm * place / last]), passing).boxes
+        return found if found[0] <= found[1] else None
+
     lit, dark = None, None
-    for place in np.minimum(np.flatnonzero(table.rows[0] <= table.rows[1]), last * (1 - 1e-6))[::-1]:
-        # The rows of the table hold their neighbours, so the last of them may be dark.
-        box = _passing_box(_boxes(table, place[None]), table.film_radius_mm * place / last, passing)
+    for place in np.minimum(np.arange(last + 1), last * (1 - 1e-6))[::-1]:
+        box = light(_boxes(table, place[None]), place)
         if box is not None:
             lit = place
             break
@@ -145,25 +108,14 @@ def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
     for _ in range(_END_HALVINGS if dark is not None else 0):
         middle = (lit + dark) / 2
         # What is left of the pupil mostly lies in what was left before: a lattice there finds smaller regions.
-        radius = table.film_radius_mm * middle / last
-        left = _passing_box(box, radius, passing)
+        left = light(box, middle)
         if left is None:
-            left = _passing_box(_boxes(table, middle[None]), radius, passing)
+            left = light(_boxes(table, middle[None]), middle)
         if left is None:
             dark = middle
         else:
             lit, box = middle, left
     return float(table.film_radius_mm * lit / last) if lit > 0 else None
-
-
-def _passing_box(box: Float64Array, radius: float, passing: PassTest) -> Float64Array | None:
-    """The box [3, 1] about what passes of a lattice on a box, a step wider, or None where nothing does."""
-    passed, (x, y) = _lattice(box, np.array([radius]), passing)
-    if not passed.any():
-        return None
-    x, y, (low, high, half) = x[passed], y[passed], box[:, 0]
-    step, rise = (high - low) / _COARSE_LATTICE[0], half / _COARSE_LATTICE[1]
-    return np.array([[x.min() - step], [x.max() + step], [y.max() + rise]])
 
 
 def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
@@ -176,29 +128,38 @@ def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
     return np.stack([np.minimum(low[a], low[b]), np.maximum(high[a], high[b]), np.maximum(half[a], half[b])])
 
 
-def _lattice(boxes: Float64Array, radius: Float64Array, passing: PassTest) -> tuple[NDArray[np.bool_], Float64Array]:
-    """Test lattices on boxes [3, M] from film radii [M]: which points pass [M, A, B], and the points [2, M, A, B]."""
+class _Found(NamedTuple):
+    """What passes of lattices: boxes [3, M] about it, a step wider (low > high where nothing passes); mean along x."""
+
+    boxes: Float64Array
+    centre: Float64Array
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of empty boxes, and of those near the end of float32, nothing passes
+def _lattice(
+    boxes: Float64Array, radius: Float64Array, passing: PassTest, size: tuple[int, int] = _COARSE_LATTICE
+) -> _Found:
+    """Test lattices of points on boxes [3, M] from film radii [M]."""
     low, high, half = boxes
-    u, v = ((np.arange(n) + 0.5) / n for n in _COARSE_LATTICE)
-    points = np.empty((2, radius.size, *_COARSE_LATTICE))
-    points[0] = low[:, None, None] + (high - low)[:, None, None] * u[:, None]
-    points[1] = half[:, None, None] * v
-    return passing(radius[:, None, None], points), points
+    u, v = ((np.arange(n) + 0.5) / n for n in size)
+    x, y = points = np.empty((2, radius.size, *size))
+    x[:] = low[:, None, None] + (high - low)[:, None, None] * u[:, None]
+    y[:] = half[:, None, None] * v
+    passed = passing(radius[:, None, None], points) & (low <= high)[:, None, None]
+    left, right = np.where(passed, x, np.inf).min((1, 2)), np.where(passed, x, -np.inf).max((1, 2))
+    top = np.where(passed, y, 0).max((1, 2))
+    centre = np.where(passed, x, 0).sum((1, 2)) / np.maximum(passed.sum((1, 2)), 1)
+    step, rise = (high - low) / size[0], half / size[1]
+    return _Found(np.where(passed.any((1, 2)), [left - step, right + step, top + rise], [[1], [-1], [0]]), centre)
 
 
 def frame_of(table: PupilTable, radius: Float64Array, passing: PassTest) -> SearchFrame:
     """Centroid and extent of what passes at each film radius, from a lattice."""
     place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
-    low, high, half = boxes = _boxes(table, place)
-    passed, (x, y) = _lattice(boxes, radius, passing)
-    count = passed.sum((1, 2))
-    centre = np.where(passed, x, 0).sum((1, 2)) / np.maximum(count, 1)
-    low = np.where(passed, x, np.inf).min((1, 2)) - (high - low) / _COARSE_LATTICE[0]
-    high = np.where(passed, x, -np.inf).max((1, 2)) + (high - low) / _COARSE_LATTICE[0]
-    half = np.where(passed, y, 0).max((1, 2)) + half / _COARSE_LATTICE[1]
+    boxes, centre = _lattice(_boxes(table, place), radius, passing)
     # A row whose lattice misses a small region takes what its neighbours have.
-    rows, found = np.arange(radius.size), count > 0
-    centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, low, high, half))
+    rows, found = np.arange(radius.size), boxes[0] <= boxes[1]
+    centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, *boxes))
     stretch = np.stack([(high - low) / 2, half])
     off_centre = np.abs(centre - (low + high) / 2) / stretch[0]
     return SearchFrame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))
@@ -225,7 +186,7 @@ class Detail(NamedTuple):
         wavelengths: shares of the way from the shortest to the longest, in 1 / wavelength^2, the ends among them.
         steps, coarse, fine: steps outwards, and halvings of the one that crosses the boundary, of two searches.
         reach: how many times farther than the first search found the second looks.
-        tighten: lattice on each box, along and across, where the table may be much wider than what passes.
+        tighten: lattice on each box, along and across, for the table may be much wider than what passes.
     """
 
     rows: int = 65
@@ -235,14 +196,13 @@ class Detail(NamedTuple):
     coarse: int = 5
     fine: int = 12
     reach: float = math.inf
-    tighten: tuple[int, int] | None = (96, 48)
+    tighten: tuple[int, int] = (96, 48)
 
 
 FINE = Detail()
 # For a lens with cylinders: each test takes tracing at many azimuths, and no outline fits all of them.
 # What is left out errs towards outlines too wide: halvings end outside what passes.
-COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, None)
-COARSE_TIGHT = COARSE._replace(tighten=(48, 24))
+COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, (48, 24))
 
 
 def outline_of(
@@ -267,7 +227,7 @@ def outline_of(
     ends = tuple(sorted(set(wavelength_nm)))
     wavelengths_nm = sorted({wavelength_between(ends, share) for share in detail.wavelengths})
     passing = pass_test(passes, wavelengths_nm)
-    tight = tightened(table, passes, wavelengths_nm, detail.tighten) if detail.tighten else table
+    tight = tightened(table, passing, detail.tighten)
     end = end_of_light(tight, passing)
     if end is None:
         return None

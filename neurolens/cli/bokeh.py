@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,20 +11,12 @@ from neurolens import __version__
 from neurolens.base.settings import positive, setting
 from neurolens.cli.arguments import CAMERAS_HELP, check_folder, output_path
 from neurolens.cli.output import number
-from neurolens.cli.stmap import PictureCommand, channels_nm
+from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
 
 if TYPE_CHECKING:
     from neurolens.defocus.atlas import Cell
 
 _MOST = 64  # fields along a side
-
-
-def _grid(text: str) -> tuple[int, int]:
-    """Type of --grid."""
-    words = text.lower().split("x")
-    if len(words) == 2 and all(w.isascii() and w.isdecimal() and 1 <= int(w[:9]) <= _MOST for w in words):
-        return int(words[0]), int(words[1])
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected COLUMNSxROWS, each from 1 to {_MOST}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +47,10 @@ examples:
         kind=positive("a distance in metres", infinite=True), metavar="M",
     )  # fmt: skip
     grid: tuple[int, int] = setting(
-        (5, 3), "columns and rows of places in the picture (default: 5x3)", kind=_grid, metavar="CxR"
+        (5, 3),
+        "columns and rows of places in the picture (default: 5x3)",
+        kind=whole_pair("COLUMNSxROWS", _MOST),
+        metavar="CxR",
     )
     wavelengths: tuple[float, float, float] | None = setting(
         None, "one wavelength for red, green and blue each (default: those that make each channel's light)",
@@ -119,10 +113,7 @@ def _text(data: dict[str, Any]) -> str:
     lines = [f"{len(data['files'])} pictures of {columns} x {rows} kernels, {data['kernel_px']} pixels a side each"]
     for k, file in enumerate(data["files"]):
         cells = data["kernels"][k * columns * rows : (k + 1) * columns * rows]
-        widths = [cell["width_px"] for cell in cells]
-        light = [cell["light"][1] for cell in cells]
-        lines.append(
-            f"{file}: blur {min(widths)} to {max(widths)} pixels wide, light {number(min(light), 3)} to "
-            f"{number(max(light), 3)}"
-        )
+        widths, light = ([row[name] for row in cells] for name in ("width_px", "light"))
+        low, high = (number(by(v[1] for v in light), 3) for by in (min, max))
+        lines.append(f"{file}: blur {min(widths)} to {max(widths)} pixels wide, light {low} to {high}")
     return "\n".join(lines)

@@ -88,7 +88,7 @@ examples:
         from neurolens.base.lensname import compiled
         from neurolens.cameras.build import make_camera
         from neurolens.cameras.field import frame_of
-        from neurolens.defocus.picture import check_field, defocus, describe
+        from neurolens.defocus.picture import check_field, defocus
         from neurolens.defocus.read import DepthSettings, read_plate
         from neurolens.render.pictures import standard_attributes, write_exr, write_png
         from neurolens.render.sensor import about, expose
@@ -109,7 +109,8 @@ examples:
         depth = DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
         plate = read_plate(self.plate, self.film, frame_of(camera), depth, self.behind)
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
-        data: dict[str, Any] = describe(found, plate, self.plate) | {"file": str(self.out)}
+        data: dict[str, Any] = {"plate": self.plate.name, "layers": len(plate.layers), "file": str(self.out)}
+        data |= {name: getattr(found, name) for name in ("highlights", "filled", "beyond")}
         metadata = {"version": __version__, "camera": camera.settings, "defocus": data}
         layers = {}
         if counted := {k: v for k, v in vars(self.sensor).items() if v is not None}:
@@ -126,9 +127,6 @@ examples:
 
 
 def _text(data: dict[str, Any]) -> str:
-    said = [f"{data['file']}: {data['layers']} layer{'s' * (data['layers'] > 1)}"]
-    said.append(f"{data['highlights']} highlights spread")
-    said.append(
-        f"{100 * data['filled']:.2f}% of the light filled in, {100 * data['beyond']:.2f}% from beyond the plate"
-    )
-    return ", ".join(said)
+    layers = f"{data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread"
+    light = f"{data['filled']:.2%} of the light filled in, {data['beyond']:.2%} from beyond the plate"
+    return f"{data['file']}: {layers}, {light}"

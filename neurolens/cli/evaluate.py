@@ -56,16 +56,14 @@ keeps its own; ./lenses; the project's."""
     seed: int | None = setting(
         None, "of the rays (default: one that differs from the fit's)", kind=whole(0), metavar="N"
     )
-    threads: int = setting(1, "for the timing (default: 1)", within=(1, 256))
 
     def run(self) -> int:
         """Measure, compare, time; 1 where a promise does not hold."""
         from neurolens.cameras.model import load_model
         from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
         from neurolens.study.speed import time_model
-        from neurolens.surrogates.card import transmittance_of
 
-        model = load_model(self.model)  # on one thread: the race distributes batches
+        model = load_model(self.model)
         space = space_of_card(model.card, model.axes, self.lens, self.model) if model.axes else None
         lens = space.lens if space else lens_of_card(model.card, self.lens, self.model)
         progress = self.progress({"measure": 10, "time": 2})
@@ -75,13 +73,12 @@ keeps its own; ./lenses; the project's."""
             else:
                 figures, promises = check_model(model, lens, rays=self.rays, seed=self.seed)
         with progress.stage("time"):
-            timing = time_model(model, self.model.stem, rounds=10, threads=self.threads)
+            timing = time_model(model, self.model.stem, rounds=10)
         holds = all(p.holds for p in promises)
         data = {
             "model": str(self.model),
             "lens": {"id": model.card["lens"]["id"], "name": lens.name, "file": lens.path},
             "method": model.card["fit"]["method"],
-            "transmittance": transmittance_of(model.card),
             **figures,
             "ns_per_ray": timing,
             "promises": [{**asdict(p), "holds": p.holds} for p in promises],
@@ -92,8 +89,6 @@ keeps its own; ./lenses; the project's."""
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:
-    from neurolens.surrogates.card import AVERAGED
-
     header: tuple[str, ...] = ("figure", "promised", "measured", "allowed", "")
     rows: list[tuple[str, ...]] = [
         (p.key, number(p.promised), number(p.measured), number(p.allowed), "" if p.holds else "does not hold")
@@ -111,10 +106,7 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
         f"{data['model']}: {data['method']} of {lens['name']} ({lens['file']})\n"
         f"{data['rays']} fresh rays, seed {data['seed']}",
         table(header, rows),
-        f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
-        f"batches of {timing['batch']}",
+        f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}) on one thread, batches of {timing['batch']}",
     ]
     parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
-    if data["transmittance"] == AVERAGED:
-        parts.append("Transmittance: its fit averaged over polarisation at every surface, the lens here does not.")
     return "\n\n".join([*parts, verdict])

@@ -85,7 +85,7 @@ def _places() -> list[Path]:
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
     """The facts of the cards in a folder, with the times beside them; a file that is no model is left out."""
-    from neurolens.surrogates.card import read_card, transmittance_of
+    from neurolens.surrogates.card import read_card
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
     for file in sorted(folder.glob("*.onnx")):
@@ -102,7 +102,6 @@ def models_in(folder: Path) -> Iterator[dict[str, Any]]:
                 "efl_mm": float(card["lens"]["efl_mm"]),
                 "film_radius_mm": float(domain["film_radius_mm"]),
                 "focus_m": list(domain["focus_m"]),
-                "transmittance": transmittance_of(card),
                 "states": [str(a["name"]) for a in (card.get("states") or {}).get("axes", ())],
                 **{k: errors.get(k) for k in ("rms_um", "rms_px", "direction_rms_deg", "poor")},
                 "bytes": file.stat().st_size,
@@ -177,9 +176,7 @@ def _text(within: tuple[str, float] | None, listed: Sequence[dict[str, Any]], ke
 
 def _remarks(model: dict[str, Any]) -> list[str]:
     """The remarks in the last column."""
-    from neurolens.surrogates.card import AVERAGED
-
     found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []
     found += ["one focus"] * _of_a_shot(model)
     found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []
-    return found + ["averaged transmittance"] * (model["transmittance"] == AVERAGED)
+    return found

@@ -74,7 +74,7 @@ examples:
 
 
 def fitted_to(
-    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str, keep_focal: bool = False
+    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
 ) -> tuple[projections.Projection, projections.Residual, dict[str, Any]]:
     """A projection fitted to a field, what it leaves, and both as data; raises InputError as `fit`."""
     from neurolens.analysis.projections import fit, residual
@@ -83,7 +83,7 @@ def fitted_to(
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
         focal = focal[0], focal[0]
-    fitted = fit(kind, *shown(field, size, film_mm), size, focal, source, keep_focal)
+    fitted = fit(kind, *shown(field, size, film_mm), size, focal, source)
     left = residual(fitted, *shown(field, size, film_mm, _HELD_OUT))
     rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
     data: dict[str, Any] = {

@@ -46,12 +46,16 @@ _CHANNELS_NM = (611.4, 549.1, 464.2)
 _NAMES = ("red", "green", "blue")
 
 
-def _pixels(text: str) -> tuple[int, int]:
-    """Type of --size."""
-    words = text.lower().split("x")
-    if len(words) == 2 and all(w.isascii() and w.isdecimal() and 1 <= int(w[:9]) <= _LARGEST for w in words):
-        return int(words[0]), int(words[1])
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected WIDTHxHEIGHT in pixels, each from 1 to {_LARGEST}")
+def whole_pair(names: str, most: int) -> Callable[[str], tuple[int, int]]:
+    """Type of --size and --grid: two whole numbers with x between them."""
+
+    def pair(text: str) -> tuple[int, int]:
+        words = text.lower().split("x")
+        if len(words) == 2 and all(w.isascii() and w.isdecimal() and 1 <= int(w[:9]) <= most for w in words):
+            return int(words[0]), int(words[1])
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected {names}, each from 1 to {most}")
+
+    return pair
 
 
 def channels_nm(text: str) -> tuple[float, ...]:
@@ -78,7 +82,9 @@ class PictureCommand(Glasses, Reporting):
         None, "height of the lens's picture (default: from --width and the film's shape)", within=(1, _LARGEST),
         metavar="PIXELS",
     )  # fmt: skip
-    size: tuple[int, int] | None = setting(None, argparse.SUPPRESS, kind=_pixels, metavar="WxH")  # the old spelling
+    size: tuple[int, int] | None = setting(
+        None, argparse.SUPPRESS, kind=whole_pair("WIDTHxHEIGHT in pixels", _LARGEST), metavar="WxH",
+    )  # fmt: skip  # the old spelling
     film: tuple[float, float] = setting(..., "size of the film in mm", kind=film_size, metavar="WxH")
     state: LensState = lens_state()
 

@@ -11,6 +11,7 @@ from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.records import plain
 from neurolens.cli.arguments import Answering
 from neurolens.cli.output import number, table
+from neurolens.study import pages
 
 if TYPE_CHECKING:
     from neurolens.plan.plan import Offer, Trade
@@ -87,51 +88,42 @@ def _sentences(result: Trade) -> list[str]:
     return sentences
 
 
-def _text(result: Trade, folder: Path) -> str:
-    flips, front = {s.offer.choice.name: s.flip for s in result.shown}, result.front
-    rows = [
-        ("*" if o == result.chosen else "+" if o in front else "", o.choice.name, number(o.choice.error_px, 3),
-         number(o.choice.light_error, 2), _seconds(o), number(o.camera, 2), number(o.choice.noise, 3),
-         number(flips.get(o.choice.name), 2), o.choice.how)
-        for o in result.offered
-    ]  # fmt: skip
-    shown = table(("", "camera", "px", "light", result.unit, "in camera", "noise", "FLIP", ""), rows, left=2)
-    legend = f"* for the budget, + no other betters it; {result.unit}: of the {result.what}, one thread, to the noise "
-    legend += "that the exact lens has with the scene's samples, ~ noisy; noise: times the paths that this takes; "
-    legend += f"FLIP at {result.samples} samples a pixel of the same random numbers, with noise where cameras use them "
-    legend += "otherwise"
-    written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
-    return "\n\n".join([shown, legend, "\n".join(_sentences(result)), written])
-
-
-def _page(result: Trade, folder: Path, title: str) -> str:
-    from neurolens.base.html import html
-    from neurolens.study import pages
-
+def _cameras(result: Trade) -> pages.Table:
+    """Every camera with its figures: a disc before the choice for the budget, a ring where no other betters it."""
     flips = {s.offer.choice.name: s.flip for s in result.shown}
     records = [
         {**asdict(o.choice), "seconds": {"min": o.seconds, "median": o.seconds + o.more},
          "camera": o.camera, "flip": flips.get(o.choice.name)} for o in result.offered
     ]  # fmt: skip
+    of = f"of the {result.what}, one thread, to the exact lens's noise with the scene's samples; ~ noisy"
     columns = (
         pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
         pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
-        pages.Column(
-            result.unit,
-            "seconds.min",
-            about=f"of the {result.what}, one thread, to the exact lens's noise with the scene's samples; ~ noisy",
-        ),
-        pages.Column("in the camera", "camera", about=f"{result.unit} of these"),
+        pages.Column(result.unit, "seconds.min", about=of),
+        pages.Column("in the camera", "camera", digits=2, about=f"{result.unit} of these"),
         pages.Column("noise", "noise", about="times the paths that equal error takes"),
         pages.Column("FLIP", "flip", digits=2, about="of the small pictures, from the exact lens's"),
     )
     front = result.front
     marks = ["● " if o == result.chosen else "○ " if o in front else "" for o in result.offered]
     names = [f"{m}{_short(o)}" for m, o in zip(marks, result.offered, strict=True)]
+    return pages.table(names, records, columns)
+
+
+def _text(result: Trade, folder: Path) -> str:
+    names, records, columns = _cameras(result)
+    rows = [(name, *(c.cell(r) for c in columns), r["how"]) for name, r in zip(names, records, strict=True)]
+    shown = table(("camera", *(c.heading for c in columns), ""), rows)
+    legend = ["● for the budget, ○ no other betters it", *(f"{c.heading}: {c.about}" for c in columns)]
+    written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
+    return "\n\n".join([shown, "\n".join(legend), "\n".join(_sentences(result)), written])
+
+
+def _page(result: Trade, folder: Path, title: str) -> str:
+    from neurolens.base.html import html
+
     caption = (
         f"{result.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
-    )
-    caption += (
         "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
     )
     figures = [
@@ -139,5 +131,4 @@ def _page(result: Trade, folder: Path, title: str) -> str:
         {"file": "pictures.png", "title": "What is seen", "caption": caption},
     ]
     shown = pages.figures_of(folder, [{**f, "wide": True} for f in figures], inside=True)
-    cameras = pages.table(names, records, columns)
-    return html("trade.html", title=title, lead=_sentences(result), shown=shown, cameras=cameras)
+    return html("trade.html", title=title, lead=_sentences(result), shown=shown, cameras=_cameras(result))

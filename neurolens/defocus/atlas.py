@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.defocus.kernels import Kernel, kernel_at
-from neurolens.defocus.plate import Eye, FloatArray
+from neurolens.defocus.plate import FloatArray, PlatePinhole
 from neurolens.defocus.rings import Grooves
 
 _LARGEST = 16384  # pixels a side of an atlas
@@ -33,20 +33,16 @@ class Cell:
         """Pixels a side, odd, that hold the kernel about its place."""
         if self.kernel is None:
             return 1
-        height, width = self.kernel.light.shape[:2]
-        reach = [
-            max(abs(corner - math.floor(middle)), abs(corner + length - 1 - math.floor(middle)))
-            for corner, length, middle in zip(self.kernel.corner_px, (width, height), self.place_px, strict=True)
-        ]
-        return 2 * max(reach) + 1
+        first = np.subtract(self.kernel.corner_px, np.floor(self.place_px))
+        return 2 * int(np.abs([first, first + self.kernel.light.shape[1::-1] - 1]).max()) + 1
 
 
-def eye_of(camera: Camera, size: tuple[int, int]) -> Eye:
+def pinhole_of(camera: Camera, size: tuple[int, int]) -> PlatePinhole:
     """The camera's own pinhole, whose picture has `size` pixels on its film: that of `neurolens stmap`."""
     frame = frame_of(camera)
     per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
     reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
-    return Eye(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1])
+    return PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1])
 
 
 def kernels_over(
@@ -64,25 +60,24 @@ def kernels_over(
     Raises:
         InputError: a distance within the lens; kernels too large for memory.
     """
-    eye, found = eye_of(camera, size), []
+    pinhole, found = pinhole_of(camera, size), []
+    places = [
+        ((i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1])
+        for j, i in itertools.product(range(fields[1]), range(fields[0]))
+    ]
     for number, distance in enumerate(distances_m):
-        ahead = distance - eye.before_film_mm / 1000
+        ahead, cells = distance - pinhole.before_film_mm / 1000, list[Cell]()
         if not ahead > 0:
-            raise InputError(
-                "kernels", "distance_m", distance, f"above {eye.before_film_mm / 1000:g}, the entrance pupil"
+            expected = f"above {pinhole.before_film_mm / 1000:g}, the entrance pupil"
+            raise InputError("kernels", "distance_m", distance, expected)
+        for place in places:
+            kernel = kernel_at(
+                camera, pinhole, size, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves
             )
-        cells = []
-        for j in range(fields[1]):
-            for i in range(fields[0]):
-                place = (i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1]
-                kernel = kernel_at(
-                    camera, eye, size, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves
-                )
-                middle = place if kernel is None else kernel.middle_px
-                field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
-                cells.append(Cell(field, distance, middle, kernel))
-                _check_size(fields, cells[-1].width_px)
-                report((number + len(cells) / (fields[0] * fields[1])) / len(distances_m))
+            field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
+            cells.append(Cell(field, distance, place if kernel is None else kernel.middle_px, kernel))
+            _check_size(fields, cells[-1].width_px)
+            report((number + len(cells) / len(places)) / len(distances_m))
         found.append(cells)
     return found
 
@@ -110,9 +105,7 @@ def as_preview(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
     """The atlas with each kernel as bright as the others, to be looked at."""
     picture = as_picture(cells, columns, side)
     for k in range(len(cells)):
-        j, i = divmod(k, columns)
-        part = picture[j * side :, i * side :][:side, :side]
-        lit = part[part > 0]
-        if lit.size:
-            part /= float(np.percentile(lit, 90))
+        part = picture[k // columns * side :, k % columns * side :][:side, :side]
+        if part.any():
+            part /= float(np.percentile(part[part > 0], 90))
     return picture

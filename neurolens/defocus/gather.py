@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
-from neurolens.defocus.plate import FINEST, Eye, FloatArray, Layer, as_structs
+from neurolens.defocus.plate import FINEST, FloatArray, Layer, PlatePinhole, as_structs
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.render.colour import SpectralRange
 from neurolens.render.sampler import sobol
@@ -40,11 +40,12 @@ LIGHT_NM = (400.0, 700.0)
 @dataclass(frozen=True)
 class Gathered:
     """The picture [H, W, 3] that a camera takes of a plate, and the shares of its light that the plate did not have:
-    `filled`, behind the edges of things, and `beyond`, outside of the plate."""
+    `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs."""
 
     rgb: FloatArray
     filled: float
     beyond: float
+    highlights: int = 0
 
 
 class _Table(ctypes.Structure):
@@ -116,8 +117,10 @@ class RayTable:
     A point of the pupil is the same place in the lens for all film points.
     """
 
-    def __init__(self, camera: Camera, eye: Eye, size: tuple[int, int], pupil: FloatArray, hue: FloatArray) -> None:
-        self.camera, self.eye, self.size, self.pupil = camera, eye, size, pupil
+    def __init__(
+        self, camera: Camera, pinhole: PlatePinhole, size: tuple[int, int], pupil: FloatArray, hue: FloatArray
+    ) -> None:
+        self.camera, self.pinhole, self.size, self.pupil = camera, pinhole, size, pupil
         pitch = max(_PITCH, max(size) / _NODES)
         self.cells = tuple(max(1, math.ceil(n / pitch)) for n in size)
         self.turns = turns_pupil(camera)
@@ -173,11 +176,16 @@ class RayTable:
             rays = self.camera.sample(*(np.ascontiguousarray(v[..., part]) for v in (film, pupil, nm)))
             passed = (rays.status == 0) & (rays.direction[2] < 0)
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                lines = self.eye.lines(rays.origin_m, rays.direction)
+                lines = self.pinhole.lines(rays.origin_m, rays.direction)
             passed &= np.isfinite(lines).all(axis=0)
             found[part, :4] = np.where(passed, lines, 0).T
             found[part, 4] = np.where(passed, rays.weight, 0)
         return found
+
+
+def _points(count: int, numbers: int) -> FloatArray:
+    """Points [numbers, count] of the unit cube, evenly."""
+    return ((sobol(count, numbers) + 2.0**31 / count) / 2.0**32).astype(np.float32)
 
 
 def spread_of(row: FloatArray) -> NDArray[np.float64]:
@@ -191,10 +199,10 @@ def spread_of(row: FloatArray) -> NDArray[np.float64]:
     return np.stack([(weight * t).sum(axis=(1, 2)) for t in terms], axis=1)
 
 
-def spread_over(camera: Camera, eye: Eye, size: tuple[int, int]) -> NDArray[np.float64]:
+def spread_over(camera: Camera, pinhole: PlatePinhole, size: tuple[int, int]) -> NDArray[np.float64]:
     """`spread_of` all nodes, [rows, columns, 3]."""
-    points = (sobol(_FEW, 3).astype(np.float64) + 2.0**31 / _FEW) / 2.0**32
-    table = RayTable(camera, eye, size, points[:2].astype(np.float32), points[2].astype(np.float32))
+    points = _points(_FEW, 3)
+    table = RayTable(camera, pinhole, size, points[:2], points[2])
     return np.stack([spread_of(table.row(j)) for j in range(table.cells[1] + 1)])
 
 
@@ -205,7 +213,7 @@ def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float6
 
 
 def _sizes(
-    layers: list[Layer], eye: Eye, spread: NDArray[np.float64], size: tuple[int, int], samples: int
+    layers: list[Layer], pinhole: PlatePinhole, spread: NDArray[np.float64], size: tuple[int, int], samples: int
 ) -> NDArray[np.uint8]:
     """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel."""
     width, height = size
@@ -226,16 +234,14 @@ def _sizes(
                 cell = FINEST << int(k)
                 rows, columns = (
                     np.clip(((p + border) / cell).astype(int), 0, n - 1)
-                    for p, border, n in zip(places, eye.border_px(size)[::-1], bounds.shape, strict=False)
+                    for p, border, n in zip(places, pinhole.border_px(size)[::-1], bounds.shape, strict=False)
                 )
                 least, most = _around(bounds[..., 0], np.minimum), _around(bounds[..., 1], np.maximum)
                 inside = level == k
                 low = np.where(inside, np.maximum(least[np.ix_(rows, columns)], 0), low)
                 high = np.where(inside, np.maximum(most[np.ix_(rows, columns)], 0), high)
         widest = np.maximum(widest, np.maximum(radius_px(here, low), radius_px(here, high)))
-    wanted = np.clip(np.ceil(np.log2(_LEAST / 2 + _A_PIXEL * widest)), math.log2(_LEAST), math.log2(samples)).astype(
-        np.uint8
-    )
+    wanted = np.ceil(np.log2(np.clip(_LEAST / 2 + _A_PIXEL * widest, _LEAST, samples))).astype(np.uint8)
     return np.ascontiguousarray(wanted.repeat(FINEST, 0).repeat(FINEST, 1)[:height, :width])
 
 
@@ -248,7 +254,7 @@ def _around(values: FloatArray, by: np.ufunc) -> FloatArray:
 
 def gather(
     layers: list[Layer],
-    eye: Eye,
+    pinhole: PlatePinhole,
     camera: Camera,
     size: tuple[int, int],
     spread: NDArray[np.float64],
@@ -261,11 +267,11 @@ def gather(
     `spread`: `spread_over` of the camera.
     """
     width, height = size
-    points = (sobol(_SET, 5).astype(np.float64) + 2.0**31 / _SET) / 2.0**32
-    jitter = np.ascontiguousarray(points[2:4].T, np.float32)
-    table = RayTable(camera, eye, size, points[:2].astype(np.float32), points[4].astype(np.float32))
+    points = _points(_SET, 5)
+    jitter = np.ascontiguousarray(points[2:4].T)
+    table = RayTable(camera, pinhole, size, points[:2], points[4])
     (across, down), (structs, kept) = table.cells, as_structs(layers)
-    sizes = _sizes(layers, eye, spread, size, samples)
+    sizes = _sizes(layers, pinhole, spread, size, samples)
     rgb = np.empty((height, width, 3), np.float32)
     lost = np.zeros(3)
     edges = [round(j * height / down) for j in range(down + 1)]

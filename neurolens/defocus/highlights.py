@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import Camera
 from neurolens.defocus.gather import compiled, radius_px
 from neurolens.defocus.kernels import LARGEST, kernel_at
-from neurolens.defocus.plate import Eye, FloatArray, Layer, as_structs
+from neurolens.defocus.plate import FloatArray, Layer, PlatePinhole, as_structs
 
 _WINDOW = 33  # pixels about which surroundings are meant
 _BRIGHTER, _ABOVE = 8.0, 3.0  # than the geometric mean of the surroundings, and than their mean
@@ -26,6 +26,7 @@ _LEAST_PX = 1.5  # radius of the blur: what is sharper has no noise
 _PLACES = 32  # kernels along the longer side of the film
 _FINE_PX, _FINE = 0.25, 0.03  # steps of the radius between kernels, absolute and relative
 _MOST_WORK = 4e9  # pixels of kernels
+_SAME = 0.01  # of inverse depth, within which two layers show the same thing
 _CELLS, _COLOURS = 24, 2
 
 
@@ -41,8 +42,17 @@ class Highlights:
     light: FloatArray
 
 
-def take_highlights(layer: Layer, eye: Eye, spread: NDArray[np.float64], size: tuple[int, int]) -> Highlights:
-    """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes."""
+def take_highlights(
+    layer: Layer,
+    pinhole: PlatePinhole,
+    spread: NDArray[np.float64],
+    size: tuple[int, int],
+    before: Sequence[Layer] = (),
+) -> Highlights:
+    """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes.
+
+    What the layers `before` show, too, at the same place and depth, is taken out and left to them.
+    """
     rgb, w = layer.texel[..., :3], layer.texel[..., 3]
     bright = rgb.max(axis=2)
     log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
@@ -52,21 +62,25 @@ def take_highlights(layer: Layer, eye: Eye, spread: NDArray[np.float64], size: t
     row, column = np.nonzero((bright > cap) & (w >= 0))
     nodes = [
         np.clip(((v + 0.5 - border) / n * (k - 1)).round().astype(int), 0, k - 1)
-        for v, border, n, k in zip((row, column), eye.border_px(size)[::-1], size[::-1], spread.shape[:2], strict=True)
+        for v, border, n, k in zip(
+            (row, column), pinhole.border_px(size)[::-1], size[::-1], spread.shape[:2], strict=True
+        )
     ]
     radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
     _, ab, b = np.moveaxis(spread[nodes[0], nodes[1]], -1, 0)
     side = np.sign(ab + 2 * b * w[row, column])  # of the growth of the radius's square with the inverse depth
     wide = (radius > _LEAST_PX) & (radius < LARGEST / 3)  # still larger discs have little noise
-    row, column, radius, side = row[wide], column[wide], radius[wide], side[wide]
-    work = math.pi * radius**2
-    if work.sum() > _MOST_WORK:  # the brightest, as many as there is time for
-        order = np.argsort(-(bright / cap)[row, column])
-        kept = order[np.cumsum(work[order]) <= _MOST_WORK]
-        row, column, radius, side = row[kept], column[kept], radius[kept], side[kept]
+    order = np.flatnonzero(wide)[np.argsort(-(bright / cap)[row, column][wide])]  # the brightest first
+    some = np.sort(order[np.cumsum(math.pi * radius[order] ** 2) <= _MOST_WORK])  # as many as there is time for
+    row, column, radius, side = row[some], column[some], radius[some], side[some]
     light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
     rgb[row, column] -= light
-    return Highlights(np.stack([column, row], axis=1) + np.float64(0.5), w[row, column], radius, side, light)
+    own = np.ones(len(row), bool)
+    for other in before:
+        own &= np.abs(other.texel[row, column, 3] - w[row, column]) > _SAME * w[row, column]
+    row, column = row[own], column[own]
+    place = np.stack([column, row], axis=1) + np.float64(0.5)
+    return Highlights(place, w[row, column], radius[own], side[own], light[own])
 
 
 def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -81,36 +95,28 @@ def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def spread_highlights(
-    picture: FloatArray, found: Highlights, layers: list[Layer], eye: Eye, camera: Camera,
+    picture: FloatArray, found: Highlights, layers: list[Layer], pinhole: PlatePinhole, camera: Camera,
     report: Callable[[float], None] = lambda _: None,
 ) -> None:  # fmt: skip
     """Add the light of highlights to a picture [H, W, 3]."""
     height, width = picture.shape[:2]
-    border = np.array(eye.border_px((width, height)))
+    border = np.array(pinhole.border_px((width, height)))
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
-    near = 4.0 * _FINE_PX / _FINE
-    step = (
-        np.where(
-            found.radius_px < near / 4,
-            found.radius_px / _FINE_PX,
-            near + np.log(np.maximum(found.radius_px, 1e-3)) / _FINE,
-        )
-        .round()
-        .astype(int)
-    )
+    radius, near = np.maximum(found.radius_px, 1e-3), 4.0 * _FINE_PX / _FINE
+    step = np.where(radius < near / 4, radius / _FINE_PX, near + np.log(radius) / _FINE).round().astype(int)
     for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), found.side.tolist(), strict=True)):
         groups[key].append(k)
     structs, kept = as_structs(layers)
     for number, rows in enumerate(groups.values()):
         place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
         kernel = kernel_at(
-            camera, eye, (width, height), (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS
+            camera, pinhole, (width, height), (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS
         )
         if kernel is not None:
             points = np.empty((len(rows), 8), np.float32)
             points[:, :2], points[:, 2] = found.place_px[rows], found.inverse_depth[rows]
-            points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.turn.T
+            points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.film_by_plate.T
             points[:, 5:] = found.light[rows]
             sweep, light = np.ascontiguousarray(kernel.sweep, np.float32), np.ascontiguousarray(kernel.light)
             compiled().splat(

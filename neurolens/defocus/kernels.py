@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.defocus.gather import LIGHT_NM, RayTable, channel_wavelengths, turned
-from neurolens.defocus.plate import Eye, FloatArray
+from neurolens.defocus.plate import FloatArray, PlatePinhole
 from neurolens.defocus.rings import Grooves, moves, responses
 from neurolens.flare.areas import LOST, draw_edges, edges_of
 
@@ -25,7 +26,8 @@ GRID = 48  # cells of the pupil along a side
 COLOURS = 5  # wavelengths of a channel
 _STEPS = 5  # of Newton's method
 _CLOSE = 0.01  # pixels by which a ray may miss the point
-_FAR = 0.02  # of the kernel's width: what misses by more is left out
+_FAR = 0.02  # of the kernel's width: the places of rays that miss by more are not used
+_SURE = 0.5  # share of the light whose rays meet the point, below which the places of all rays count
 LARGEST = 2048  # pixels a side of a kernel
 _RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
 _MARGIN = 2  # pixels around it
@@ -39,14 +41,14 @@ class Kernel:
     Attributes:
         light: [h, w, 3] the part of the radiance of one square pixel of the plate that arrives at each pixel.
         corner_px: column and row in the film, of its first pixel; whole numbers.
-        turn: [2, 2] by how much the point's picture moves on the film as the point moves in the plate, pixels.
+        film_by_plate: [2, 2] by how much the point's picture moves on the film as the point moves in the plate, pixels.
         place_px: the point in the plate. sweep: [2, 3] how fast the ray from a film pixel to the point moves in the
             plate as it comes nearer (pixels by 1/m): the constant, and the factors of column and row in the kernel.
     """
 
     light: FloatArray
     corner_px: tuple[int, int]
-    turn: Array
+    film_by_plate: Array
     place_px: tuple[float, float]
     sweep: Array
 
@@ -78,7 +80,7 @@ class Kernel:
 
 
 def kernel_at(
-    camera: Camera, eye: Eye, size: tuple[int, int], place_px: tuple[float, float], inverse_depth: float,
+    camera: Camera, pinhole: PlatePinhole, size: tuple[int, int], place_px: tuple[float, float], inverse_depth: float,
     guess_px: tuple[float, float], cells: int = GRID, colours: int = COLOURS,
     wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
 ) -> Kernel | None:  # fmt: skip
@@ -93,7 +95,7 @@ def kernel_at(
         InputError: a kernel of over 2048 pixels a side; grooves on a lens without aspheres, or too many.
     """
     pupil = _square(_RIM * _disk(np.linspace(-1, 1, cells + 1)))
-    table = RayTable(camera, eye, size, pupil, np.zeros(pupil.shape[1], np.float32))
+    table = RayTable(camera, pinhole, size, pupil, np.zeros(pupil.shape[1], np.float32))
     if wavelengths_nm is not None:
         nm = np.array(wavelengths_nm, np.float32)[:, None]
     elif len(table.nm) > 1:
@@ -119,10 +121,12 @@ def kernel_at(
     colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
     for k in range(nm.size):
         aimed.draw(light, k, corner, colour[[k // nm.shape[1]]] / nm.shape[1])
-    return Kernel(np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.turn, place_px, aimed.sweep(corner))
+    return Kernel(
+        np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.film_by_plate, place_px, aimed.sweep(corner)
+    )
 
 
-def _disk(side: Array) -> Array:
+def _disk(side: NDArray[Any]) -> Array:
     """A grid [2, N, N] over the square of -1 to 1 on the disk: x sqrt(1 - y^2 / 2), and the same in y. It is smooth, as
     the one of `Camera.sample`, which has corners along the diagonals, is not."""
     x, y = np.meshgrid(side, side)
@@ -135,7 +139,7 @@ def _square(disk: Array) -> FloatArray:
     return turned(np.stack([0.5 + 0.5 * radius, np.full_like(radius, 0.5)]), np.arctan2(v, u))
 
 
-def _between(values: Array, at: Array) -> Array:
+def _between(values: NDArray[Any], at: NDArray[Any]) -> Array:
     """Values [..., cells + 1, cells + 1] at other columns and rows `at` of their grids, linear between points."""
     share = np.maximum(1 - np.abs(at[:, None] - np.arange(values.shape[-1])), 0)
     return np.asarray(share @ values @ share.T)
@@ -146,14 +150,14 @@ class _Aimed:
     """Rays of a pupil's grid, of several wavelengths one after the other, that see a point.
 
     Attributes: of N rays, or after `on_grid` of rays [waves, cells + 1, cells + 1].
-        place: [2, ...] on the film in pixels. weight: [...]. slope: [2, ...], b of their lines. turn: [2, 2] the mean
-            derivatives of places by the point's.
+        place: [2, ...] on the film in pixels. weight: [...]. slope: [2, ...], b of their lines.
+        film_by_plate: [2, 2] the mean derivatives of places by the point's.
     """
 
     place: Array
     weight: Array
     slope: Array
-    turn: Array
+    film_by_plate: Array
 
     def on_grid(self, waves: int, cells: int) -> _Aimed:
         """The rays as grids, their places taken from `_RIM` to the outline itself, along the radii of the pupil."""
@@ -165,7 +169,7 @@ class _Aimed:
         within = _between(place, cells / 2 + nearer * index)
         solid = (weight > 0) & (_between(weight > 0, cells / 2 + nearer * index) > 1 - 1e-9) & (far > 0)
         more = (1 / _RIM - 1) * far / np.where(far > 0, far - near, 1) * (place - within)
-        return _Aimed(place + np.where(solid, more, 0), weight, slope, self.turn)
+        return _Aimed(place + np.where(solid, more, 0), weight, slope, self.film_by_plate)
 
     def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], colour: Array) -> None:
         """Add the light of a wavelength to a kernel's picture, each quarter of the pupil with its cells cut along the
@@ -198,12 +202,12 @@ class _Aimed:
         if grooves.spacing_mm < least:
             raise InputError("kernel", "ring_spacing_mm", grooves.spacing_mm, f"at least {least:.2g} mm on this lens")
         fine = cells * max(1, math.ceil(least * _FINEST / grooves.spacing_mm / cells))
-        place, weight, slope, lit, response = (
+        place, weight, slope, whole, response = (
             _between(v, np.arange(fine + 1) * cells / fine)
             for v in (self.place, self.weight, self.slope, lit, response.reshape(-1, 5, *lit.shape))
         )
         moved = table.moved_px(moves(response.reshape(*response.shape[:2], -1), grooves)).reshape(place.shape)
-        return _Aimed(place + moved, np.where(lit > 1 - 1e-9, weight, 0), slope, self.turn)
+        return _Aimed(place + moved, np.where(whole > 1 - 1e-9, weight, 0), slope, self.film_by_plate)
 
     def sweep(self, corner: NDArray[np.int_]) -> Array:
         """See `Kernel.sweep`: a fit by least squares to the rays that pass."""
@@ -230,12 +234,12 @@ def _aimed(
     good = (weight > 0) & (moved[0][1] > 0) & (moved[1][1] > 0)
     if not good.any():
         return _Aimed(place, np.zeros(len(waves)), slope, np.eye(2))
-    turn = np.linalg.inv(np.stack([((m[0] - at) / step)[:, good].mean(axis=1) for m in moved], axis=1))
+    film_by_plate = np.linalg.inv(np.stack([((m[0] - at) / step)[:, good].mean(axis=1) for m in moved], axis=1))
     for _ in range(_STEPS):
         off = wanted - at
         # Rays that do not pass say nothing about where the point's light is: they move as the others do.
         off[:, weight <= 0] = off[:, weight > 0].mean(axis=1, keepdims=True) if (weight > 0).any() else 0.0
-        place = place + turn @ off
+        place = place + film_by_plate @ off
         at, weight, slope = seen(place)
         if np.hypot(*(wanted - at))[weight > 0].max(initial=0.0) < _CLOSE:
             break
@@ -245,6 +249,9 @@ def _aimed(
     stretch = np.abs(xx * yy - xy * yx)
     known = np.all([found[1] > 0 for found in (*ahead, *behind)], axis=0) & (stretch > 0)
     known &= np.hypot(*(place - np.array(table.size)[:, None] / 2)) > 1  # on the axis the pupil's outline turns over
-    area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(turn))))
+    area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(film_by_plate))))
     close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
-    return _Aimed(place, np.where(close, weight, 0) * area, slope, turn)
+    light, kept = weight * area, np.where(close, weight, 0) * area
+    # The light of rays that Newton's method leaves beside the point goes where the others' goes.
+    share = kept.sum() / max(light.sum(), 1e-30)
+    return _Aimed(place, kept / share if share > _SURE else light, slope, film_by_plate)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,32 +13,16 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
 from neurolens.defocus.gather import Gathered, gather, spread_over
 from neurolens.defocus.highlights import spread_highlights, take_highlights
-from neurolens.defocus.plate import FloatArray
 from neurolens.defocus.read import Plate
 
 _SAID = 0.002  # share of the light that was made up, from which it is said
 _EDGE = 9  # points of each side of the film that are tried
 
 
-@dataclass(frozen=True)
-class Defocused:
-    """The picture [H, W, 3], linear sRGB, and what was done.
-
-    Attributes:
-        highlights: number of pixels that were spread as discs. filled: share of light from behind the edges of things,
-            which the plate does not show and its neighbours stood for. beyond: share from beyond the plate's borders.
-    """
-
-    rgb: FloatArray
-    highlights: int
-    filled: float
-    beyond: float
-
-
 def defocus(
     plate: Plate, camera: Camera, samples: int = 64, threads: int = 1, highlights: bool = True,
     progress: Progress | None = None,
-) -> Defocused:  # fmt: skip
+) -> Gathered:  # fmt: skip
     """The picture that a camera takes of a plate.
 
     Args:
@@ -55,19 +37,17 @@ def defocus(
     """
     progress = progress or Progress(quiet=True)
     check_field(camera)
-    spread, taken = spread_over(camera, plate.eye, plate.size), []
-    if highlights:
-        taken = [take_highlights(layer, plate.eye, spread, plate.size) for layer in plate.layers]
+    layers, pinhole, size = plate.layers, plate.pinhole, plate.size
+    spread = spread_over(camera, pinhole, size)
+    taken = [take_highlights(v, pinhole, spread, size, layers[:k]) for k, v in enumerate(layers) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:
-        found = gather(
-            plate.layers, plate.eye, camera, plate.size, spread, 1 << (samples - 1).bit_length(), threads, report
-        )
+        found = gather(layers, pinhole, camera, size, spread, 1 << (samples - 1).bit_length(), threads, report)
     for some in taken:
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                spread_highlights(found.rgb, some, plate.layers, plate.eye, camera, report)
-    _say(found, len(plate.layers))
-    return Defocused(found.rgb, sum(len(some.radius_px) for some in taken), found.filled, found.beyond)
+                spread_highlights(found.rgb, some, layers, pinhole, camera, report)
+    _say(found, len(layers))
+    return replace(found, highlights=sum(len(some.radius_px) for some in taken))
 
 
 def _say(found: Gathered, layers: int) -> None:
@@ -95,14 +75,3 @@ def check_field(camera: Camera) -> None:
     if widest > WIDEST_DEG:
         expected = f"at most {WIDEST_DEG:g}: a plate is a plane, on which no wider field has room"
         raise InputError(camera.name, "half field, degrees", round(widest, 1), expected)
-
-
-def describe(found: Defocused, plate: Plate, path: Path) -> dict[str, Any]:
-    """What the metadata of the picture say of it."""
-    return {
-        "plate": path.name,
-        "layers": len(plate.layers),
-        "highlights": found.highlights,
-        "filled": found.filled,
-        "beyond": found.beyond,
-    }

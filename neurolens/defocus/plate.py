@@ -22,7 +22,7 @@ _MIXED = 4.0  # steps of the surfaces beside an edge, below which the pixel betw
 
 
 @dataclass(frozen=True)
-class Eye:
+class PlatePinhole:
     """The pinhole that a plate was rendered through.
 
     Attributes:
@@ -52,8 +52,8 @@ class Layer:
     """One layer of a plate.
 
     Args:
-        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the eye, 0 for the sky, below 0 where the layer
-            has nothing.
+        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the pinhole, 0 for the sky, below 0 where the
+            layer has nothing.
     """
 
     def __init__(self, rgb: FloatArray, inverse_depth: FloatArray) -> None:
@@ -96,12 +96,9 @@ def as_structs(layers: list[Layer]) -> tuple[Any, list[Any]]:
 
 def _lesser(step: FloatArray, axis: int) -> FloatArray:
     """The lesser of the steps to the two neighbours along an axis; of a border pixel, the one that it has."""
-    if step.shape[axis] == 0:
-        shape = list(step.shape)
-        shape[axis] = 1
-        return np.zeros(shape, np.float32)
-    first, last = step.take([0], axis), step.take([-1], axis)
-    return np.minimum(np.concatenate([first, step], axis), np.concatenate([step, last], axis))
+    padded = np.pad(step, [(int(a == axis), int(a == axis)) for a in (0, 1)], constant_values=np.inf)
+    count = step.shape[axis] + 1
+    return np.minimum(padded.take(range(count), axis), padded.take(range(1, count + 1), axis))
 
 
 def _unmixed(w: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
 from neurolens.cameras.field import Frame
-from neurolens.defocus.plate import Eye, FloatArray, Layer
+from neurolens.defocus.plate import FloatArray, Layer, PlatePinhole
 from neurolens.render.colour import SRGB, ColourSpace, conversion, converted
 from neurolens.render.pictures import (
     COLOURS,
@@ -37,6 +37,7 @@ _COMBINED = ("Combined.", "combined.")
 _SKY_M = 1e9  # and beyond it
 _MOST_LAYERS = 8  # of a deep file
 _LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
+_MOST_VALUES = 1 << 29  # of the later parts of a file
 _MOST_DEEP = 1 << 25  # pixels of a deep file, which is read whole
 _OPAQUE = 0.5  # opacity from which a deep sample hides what is behind it
 _SAME = 1e-3  # relative: shapes of plate and film
@@ -61,10 +62,10 @@ class DepthSettings:
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate: its layers, the front first, its eye, the size of the picture in pixels, and its colour space."""
+    """A plate: its layers, the front first, its pinhole, the size of the picture in pixels, and its colour space."""
 
     layers: list[Layer]
-    eye: Eye
+    pinhole: PlatePinhole
     size: tuple[int, int]
     space: ColourSpace
 
@@ -103,26 +104,23 @@ def read_plate(
         check_size(path, "displayWindow", f"({pixels[0]} x {pixels[1]} pixels)", pixels, _LARGEST, _MOST_PIXELS)
     start = [int(v) for v in header["dataWindow"][0]]
     centre = size[0] / 2 + int(left) - start[0], size[1] / 2 + int(top) - start[1]
-    eye = Eye((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
+    pinhole = PlatePinhole((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
     space = read_colour_space(path) or SRGB
     layers = list[Layer]()
     for file in (path, *behind):
         own = header if file == path else header_of(file)
-        if any(
-            tuple(map(int, a)) != tuple(map(int, b))
-            for a, b in zip(own["dataWindow"], header["dataWindow"], strict=True)
-        ):
+        if not np.array_equal(own["dataWindow"], header["dataWindow"]):
             raise InputError(file, "dataWindow", f"({own['dataWindow']})".replace("\n", " "), "that of the plate")
-        pinhole, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
-        from_film = pinhole is not None if depth.from_film is None else depth.from_film
+        settings, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
+        from_film = settings is not None if depth.from_film is None else depth.from_film
         for rgb, metres in _layers(file, depth, several=file == path):
-            w, cosine = _inverse_depth(file, metres, depth, eye, 1e-3 * before if from_film else 0.0)
+            w, cosine = _inverse_depth(file, metres, depth, pinhole, 1e-3 * before if from_film else 0.0)
             light = np.maximum(_finite(file, rgb), 0)
             light = light if colours is SRGB else converted(light, conversion(colours, SRGB)).astype(np.float32)
-            if pinhole is not None and pinhole.get("vignetting", "both") in ("both", "natural"):
+            if settings is not None and settings.get("vignetting", "both") in ("both", "natural"):
                 light /= (cosine**4)[..., None]
             layers.append(Layer(light, w))
-    return Plate(layers, eye, film_px, space)
+    return Plate(layers, pinhole, film_px, space)
 
 
 def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -139,7 +137,7 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
     """Colours and depths of the layers of a file."""
     if header_of(path)["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
         return _deep(path)
-    planes, _ = decoded_channels(path, path, "file")
+    planes = _planes(path)
     found = list[tuple[str, str]]()
     for name in planes:
         prefix = name.removesuffix("R")
@@ -168,6 +166,23 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
     return layers
 
 
+def _planes(path: Path) -> dict[str, FloatArray]:
+    """The channels of all parts; of two with one name the later one has the name of its part before it."""
+    planes, _ = decoded_channels(path, path, "file")
+    with whole_file(path, "file", path), OpenEXR.File(str(path), header_only=True) as file:
+        kinds, count = {part.type() for part in file.parts}, sum(len(p.header["channels"]) for p in file.parts[1:])
+    if count and kinds <= {OpenEXR.scanlineimage, OpenEXR.tiledimage}:
+        shape = next(iter(planes.values())).shape
+        check_size(path, "file", f"{path}, {count} channels of later parts", (*shape, count), _LARGEST, _MOST_VALUES)
+        with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
+            for part in file.parts[1:]:
+                for name, channel in part.channels.items():
+                    if channel.pixels.shape == shape:
+                        known = f"{part.name()}.{name}" if name in planes else name
+                        planes[known] = np.asarray(channel.pixels, np.float32)
+    return planes
+
+
 def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
     """The layers of a deep file: the opaque samples of each pixel, sorted by depth."""
     size = [int(last) + 1 - int(first) for first, last in zip(*header_of(path)["dataWindow"], strict=True)]
@@ -178,12 +193,10 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
         raise InputError(path, "channels", f"({', '.join(channels)[:200]})", "R, G, B and Z")
     height, width = channels["Z"].shape
     counts = np.array([[0 if v is None else len(v) for v in row] for row in channels["Z"]])
+    none = np.zeros(0, np.float32)
     flat = {
-        name: np.concatenate(
-            [np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None]
-            or [np.zeros(0, np.float32)]
-        )
-        for name in (*COLOURS, "Z", *(("A",) if "A" in channels else ()))
+        name: np.concatenate([none, *(np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None)])
+        for name in channels.keys() & {*COLOURS, "Z", "A"}
     }
     alpha = flat.get("A", np.ones_like(flat["Z"]))
     pixel = np.repeat(np.arange(height * width), counts.reshape(-1))
@@ -195,10 +208,8 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
     layers = []
     for k in range(min(int(rank.max(initial=0)) + 1, _MOST_LAYERS)):
         rows = kept[rank == k]
-        rgb, metres = (
-            np.zeros((height * width, 3), np.float32),
-            np.full(height * width, -np.inf if k else np.inf, np.float32),
-        )
+        rgb = np.zeros((height * width, 3), np.float32)
+        metres = np.full(height * width, -np.inf if k else np.inf, np.float32)
         rgb[place[rank == k]] = np.stack([flat[c][rows] for c in COLOURS], axis=1) / alpha[rows, None]
         metres[place[rank == k]] = flat["Z"][rows]
         layers.append((rgb.reshape(height, width, 3), metres.reshape(height, width)))
@@ -215,16 +226,16 @@ def _finite(path: Path, rgb: FloatArray) -> FloatArray:
 
 
 def _inverse_depth(
-    path: Path, metres: FloatArray, depth: DepthSettings, eye: Eye, eye_m: float
+    path: Path, metres: FloatArray, depth: DepthSettings, pinhole: PlatePinhole, pinhole_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Inverse depth from the eye, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
+    """Inverse depth from the pinhole, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
 
-    `eye_m`: the eye's distance before the place from which depth counts.
+    `pinhole_m`: the pinhole's distance before the place from which depth counts.
     """
     height, width = metres.shape
     x, y = (
         (np.arange(n, dtype=np.float32) + 0.5 - c) / r
-        for n, c, r in zip((width, height), eye.centre_px, eye.reach_px, strict=True)
+        for n, c, r in zip((width, height), pinhole.centre_px, pinhole.reach_px, strict=True)
     )
     cosine = (1 / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)).astype(np.float32)
     nothing = np.isneginf(metres)
@@ -240,7 +251,7 @@ def _inverse_depth(
         if most <= 1 and depth.scale_m is None and not nothing.any():
             expected = "depth in metres; this looks like inverse or normalised depth (--depth-scale 1: it is none)"
             raise InputError(path, "depth", f"({least:g} to {most:g} m)", expected)
-    z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(eye_m)
+    z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(pinhole_m)
     if (close := solid & (z <= 1e-3)).any():
         raise InputError(path, "depth", f"({float(z[close].min()):g} m)", "more than 0 m before the pinhole")
     w = np.divide(1, z, out=np.zeros_like(z), where=solid)

@@ -42,39 +42,22 @@ def aspheres(camera: Any) -> list[int]:
     found = [k for k, s in enumerate(surfaces) if s.cylinder is None and (s.asphere or s.conic)]
     if not found:
         raise InputError(
-            camera.name, "ring_height", "(no asphere)", "the file of a lens with aspheres, which have grooves"
+            camera.name, "ring_height", "(no asphere)", "the file of a lens with aspheres, to have grooves"
         )
     return found
 
 
-def responses(camera: Any, film_mm: Array, square: Array, nm: Array) -> Array:
+def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDArray[Any]) -> Array:
     """How light moves: [aspheres, 5, N] for rays of film points [2, N] by points of the pupil's square [2, N].
 
     Of each asphere the distance in mm from the axis at which the ray meets it, and by how many mm light moves on the
     film, x and y, for a slope of 1 there, then for a height of 1 mm.
     """
-    from torch import from_numpy
-
-    from neurolens.trace.aiming import without_rims
-    from neurolens.trace.rays import trace
-    from neurolens.trace.surfaces import Rays, media
-
-    surfaces, lens, outline = aspheres(camera), without_rims(camera.lens), camera.film.outline
+    surfaces, outline = aspheres(camera), camera.film.outline
     pupil, _ = outline.sample(*(v.astype(np.float32) for v in (film_mm, square, nm)))
-    waves, film_z = from_numpy(nm.astype(np.float64)), np.full(nm.size, float(camera.film.film_z_mm))
-    index = [np.asarray(m.n) * np.ones(nm.size) for m in media(lens, waves)]
 
-    def through(x: float, y: float) -> tuple[Array, Array]:
-        """Direction cosines at the film; of each asphere the ray's distance from the axis, and the path by height."""
-        way = np.stack([*(pupil + np.array([[x], [y]]) - film_mm), outline.pupil_z_mm - film_z])
-        way /= np.sqrt((way**2).sum(axis=0))
-        start = Rays(*map(from_numpy, (*film_mm.astype(np.float64), film_z, *way)))
-        path = [start, *trace(lens, start, waves, path=True).path]  # from the film: surface k is number -1 - k
-        radius = [path[-1 - k].x.hypot(path[-1 - k].y).numpy() for k in surfaces]
-        added = [index[k + 1] * path[-2 - k].dz.numpy() - index[k] * path[-1 - k].dz.numpy() for k in surfaces]
-        return index[-1] * way[:2], np.stack([radius, added], 1)
-
-    (q, here), *moved = (through(x, y) for x, y in ((0.0, 0.0), (_STEP_MM, 0.0), (0.0, _STEP_MM)))
+    steps = _STEP_MM * np.array([[0, 0], [1, 0], [0, 1]])[..., None]
+    (q, here), *moved = (camera.path_by_height(surfaces, film_mm, pupil + step, nm) for step in steps)
     (ax, ay), (bx, by) = (m[0] - q for m in moved)
     to_a, to_b = (m[1] - here for m in moved)
     gradient = np.stack([to_a * by - to_b * ay, to_b * ax - to_a * bx], 2) / (ax * by - ay * bx)

@@ -381,7 +381,7 @@ def read_ghosts(path: str | Path) -> GhostModel:
             float(card["lens"]["stop_radius_mm"]),
             dict(card["fit"]),
         )
-        if not (0 < low < high < math.inf and 0 < model.sine <= 1) or not model.lens.has_hash(card["lens"]["sha256"]):
+        if not (0 < low < high < math.inf and 0 < model.sine <= 1) or model.lens.sha256 != card["lens"]["sha256"]:
             raise ValueError("its domain or prescription is not that of its card")
         for pair, ghost in zip(model.pairs, model.ghosts, strict=True):
             reference = card["reference"][output_of(pair)]

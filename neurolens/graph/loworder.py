@@ -113,20 +113,21 @@ class _Fitted:
     def of(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> _Fitted | None:
         """The start of a fit; None where too few rays pass."""
         thinner = slice(None, None, max(1, samples["rays"].shape[1] // _ENOUGH))
-        samples = {name: rows[:, thinner] for name, rows in samples.items()}
-        exact = {name: rows.astype(np.float64) for name, rows in samples.items()}
-        status, wanted = evaluate(graph, exact)["status"][0], _slopes(graph, exact)
-        passed = np.broadcast_to(status == st.PASSED, samples["rays"].shape[1:]) & np.isfinite(wanted).all((0, 1))
+        doubles = {name: rows[:, thinner].astype(np.float64) for name, rows in samples.items()}
+        status = evaluate(graph, doubles)["status"][0]
+        wanted = _slopes(graph, doubles)
+        passed = np.broadcast_to(status == st.PASSED, doubles["rays"].shape[1:]) & np.isfinite(wanted).all((0, 1))
         if passed.sum() < _FEWEST:
             return None
         found = Graph()
         found.outputs = found.inline(graph, {})
-        columns, variables = _variables(found, samples["rays"].astype(np.float64)[:, passed])
+        columns, variables = _variables(found, doubles["rays"][:, passed])
         monomials = _monomials(len(columns))
         one = np.ones(int(passed.sum()))
         products = np.stack([np.prod([one, *(columns[k] for k in m)], axis=0) for m in monomials])
         weights = np.zeros((6, 2, len(monomials)))
         wanted = np.broadcast_to(wanted, (6, 2, len(passed)))[..., passed]
+        samples = {name: rows.astype(np.float32) for name, rows in doubles.items()}  # as it will be used
         return _Fitted(found, samples, passed, variables, monomials, products, wanted, weights)
 
     def finished(self, used: NDArray[np.bool_], reach_mm: float) -> LowOrder:

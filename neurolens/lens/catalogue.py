@@ -192,11 +192,6 @@ def all_glasses() -> tuple[Glass, ...]:
     return (*added, *(_glass(row) for row in range(len(_table()["glasses"]))))
 
 
-def nearest(n_d: float, V_d: float, count: int = 3) -> list[Glass]:
-    """Return the `count` glasses nearest to an index and Abbe number; 0.001 in n_d weighs as much as 0.5 in V_d."""
-    return sorted(all_glasses(), key=lambda g: _distance(g.n_d - n_d, g.V_d - V_d))[:count]
-
-
 def by_code(code: str, count: int = 3) -> list[Glass]:
     """Return the glasses nearest to a six-digit code: "517642", also written "517.642" or "517/642", is 1.517 and 64.2.
 

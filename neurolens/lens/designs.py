@@ -48,67 +48,63 @@ with an optional wavelength in nm (550; of the broad and of three layers 510)'
 )
 
 
-def quarter_wave(at_nm: float = DESIGN_NM) -> Coating:
+Films = tuple[tuple[float, ...], ...]  # (index, thickness in nm) of each, or (n_d, thickness, V_d), as of `Coating`
+
+
+def _quarter_wave(_low: float, _high: float, at_nm: float) -> Films:
     """One film of magnesium fluoride a quarter of a wave thick: R = ((n0 ns - n^2) / (n0 ns + n^2))^2 at `at_nm`."""
-    return Coating(f"quarter-wave {at_nm:g}", ((MAGNESIUM_FLUORIDE, at_nm / (4 * MAGNESIUM_FLUORIDE)),))
+    return ((MAGNESIUM_FLUORIDE, at_nm / (4 * MAGNESIUM_FLUORIDE)),)
 
 
-def v_coat(n_before: float, n_after: float, at_nm: float = DESIGN_NM) -> Coating:
+def _v_coat(low: float, high: float, at_nm: float) -> Films:
     """Two films without any reflection at `at_nm` and normal incidence (Macleod, section 3.2: equations of tan^2).
 
     Magnesium fluoride over tantala (2.10), over alumina (1.63) for glass above 1.90; of the two solutions the thinner,
-    which is the broader. `n_before` and `n_after` are the media on the scene's and on the film's side.
+    which is the broader.
 
     Raises:
         InputError: no two films of these indices bring the reflection of these media to zero.
     """
-    low, high = sorted((n_before, n_after))
     for pair in V_PAIRS:
         solution = _v_phases(low, high, *pair)
         if solution is not None:
-            layers = tuple(_film(n, phase, at_nm) for n, phase in zip(pair, solution, strict=True))
-            return Coating(f"v-coat {at_nm:g}", _oriented(layers, n_before, n_after))
+            return tuple(_film(n, phase, at_nm) for n, phase in zip(pair, solution, strict=True))
     tried = " or ".join(f"{a:g} over {b:g}" for a, b in V_PAIRS)
-    expected = f"media whose reflection films of {tried} can cancel"
-    raise InputError("v-coat", "media", f"({n_before:g} to {n_after:g})", expected)
+    raise InputError("v-coat", "media", f"({low:g} to {high:g})", f"media whose reflection films of {tried} can cancel")
 
 
-def broadband(n_before: float, n_after: float, at_nm: float = BROADBAND_NM) -> Coating:
-    """Return the classic triple layer, quarter, half and quarter wave from the rarer side (Cox, Hass and Thelen 1962).
+def _broadband(low: float, high: float, at_nm: float) -> Films:
+    """The classic triple layer, quarter, half and quarter wave from the rarer side (Cox, Hass and Thelen 1962).
 
     The inner film's index, outer * sqrt(n_high / n_low), leaves no reflection at `at_nm`; mixtures of oxides have such
     indices (1.7 on crown glass).
     """
-    low, high = sorted((n_before, n_after))
     inner, quarter = MAGNESIUM_FLUORIDE * math.sqrt(high / low), math.pi / 2
     films = ((MAGNESIUM_FLUORIDE, quarter), (TANTALA, 2 * quarter), (inner, quarter))
-    layers = tuple(_film(index, phase, at_nm) for index, phase in films)
-    return Coating(f"broadband {at_nm:g}", _oriented(layers, n_before, n_after))
+    return tuple(_film(index, phase, at_nm) for index, phase in films)
 
 
-def single_layer(at_nm: float = DESIGN_NM) -> Coating:
-    """`quarter_wave` of a fluoride that disperses: what lenses had from the 1940s to the 60s."""
-    return Coating(f"single-layer {at_nm:g}", (_dispersive(FLUORIDE, 0.25, at_nm),))
+def _single_layer(_low: float, _high: float, at_nm: float) -> Films:
+    """The quarter wave of a fluoride that disperses: what lenses had from the 1940s to the 60s."""
+    return (_dispersive(FLUORIDE, 0.25, at_nm),)
 
 
-def three_layer(n_before: float, n_after: float, at_nm: float = BROADBAND_NM) -> Coating:
-    """`broadband` of films that disperse: multi-coated lenses from 1970 on.
+def _three_layer(low: float, high: float, at_nm: float) -> Films:
+    """The broadband coating of films that disperse: multi-coated lenses from 1970 on.
 
     The inner film is a mixture of oxides with the index that leaves no reflection at `at_nm`, if the media have there
     the indices given, and alumina's V_d.
     """
-    low, high = sorted((n_before, n_after))
     outer, middle = _dispersive(FLUORIDE, 0.25, at_nm), _dispersive(TANTALUM_OXIDE, 0.5, at_nm)
     inner = index_at(*FLUORIDE, at_nm) * math.sqrt(high / low)
     V_d = ALUMINIUM_OXIDE[1]
     # index_at is linear in n_d: n_d + (n_d - 1) rise = inner.
     rise = index_at(2.0, V_d, at_nm) - 2.0
-    films = outer, middle, _dispersive(((inner + rise) / (1 + rise), V_d), 0.25, at_nm)
-    return Coating(f"three-layer {at_nm:g}", _oriented(films, n_before, n_after))
+    return outer, middle, _dispersive(((inner + rise) / (1 + rise), V_d), 0.25, at_nm)
 
 
-def multi_layer(n_before: float, n_after: float, at_nm: float = DESIGN_NM) -> Coating:
-    """Return seven films on glass of index 1.43 to 2.05: today's broadband coatings.
+def _multi_layer(low: float, high: float, at_nm: float) -> Films:
+    """Seven films on glass of index 1.43 to 2.05: today's broadband coatings.
 
     Fluoride over tantalum oxide and silica in turn; thicknesses by least squares of the reflected amplitude from 400 to
     700 nm at 0 and 30 degrees, for six glasses, linear between them, and scaled by `at_nm` / 550.
@@ -116,25 +112,23 @@ def multi_layer(n_before: float, n_after: float, at_nm: float = DESIGN_NM) -> Co
     Raises:
         InputError: a surface that is not between air and such glass.
     """
-    low, high = sorted((n_before, n_after))
     if low != 1 or not min(MULTI_LAYER) <= high <= max(MULTI_LAYER):
         expected = f"air and glass of index {min(MULTI_LAYER)} to {max(MULTI_LAYER)}"
-        raise InputError("multi-layer", "media", f"({n_before:g} to {n_after:g})", expected)
+        raise InputError("multi-layer", "media", f"({low:g} to {high:g})", expected)
     films = (FLUORIDE, *(TANTALUM_OXIDE, SILICA) * 3)
     table = zip(*MULTI_LAYER.values(), strict=True)
     thick = [float(np.interp(high, list(MULTI_LAYER), row)) * at_nm / DESIGN_NM for row in table]
-    layers = tuple((n_d, nm, V_d) for (n_d, V_d), nm in zip(films, thick, strict=True))
-    return Coating(f"multi-layer {at_nm:g}", _oriented(layers, n_before, n_after))
+    return tuple((n_d, nm, V_d) for (n_d, V_d), nm in zip(films, thick, strict=True))
 
 
-# By the names of lens files: what makes them of the media on both sides and a wavelength, and the usual wavelength.
-_DESIGNS: dict[str, tuple[Callable[[float, float, float], Coating], float]] = {
-    "quarter-wave": (lambda n_before, n_after, at_nm: quarter_wave(at_nm), DESIGN_NM),
-    "v-coat": (v_coat, DESIGN_NM),
-    "broadband": (broadband, BROADBAND_NM),
-    "single-layer": (lambda n_before, n_after, at_nm: single_layer(at_nm), DESIGN_NM),
-    "three-layer": (three_layer, BROADBAND_NM),
-    "multi-layer": (multi_layer, DESIGN_NM),
+# By the names of lens files: films from the side of the lower index, of both indices and a wavelength; the usual one.
+_DESIGNS: dict[str, tuple[Callable[[float, float, float], Films], float]] = {
+    "quarter-wave": (_quarter_wave, DESIGN_NM),
+    "v-coat": (_v_coat, DESIGN_NM),
+    "broadband": (_broadband, BROADBAND_NM),
+    "single-layer": (_single_layer, DESIGN_NM),
+    "three-layer": (_three_layer, BROADBAND_NM),
+    "multi-layer": (_multi_layer, DESIGN_NM),
 }
 
 
@@ -162,9 +156,10 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     if n_before == n_after:
         raise InputError(file, where, name, f"a surface between two different media (both are {n_before:g})")
     try:
-        return Coating(name, make(n_before, n_after, at_nm).layers)
+        films = make(min(n_before, n_after), max(n_before, n_after), at_nm)
     except InputError as error:
         raise InputError(file, where, name, f"another design: {error}") from None
+    return Coating(name, films if n_before < n_after else films[::-1])
 
 
 def is_design(coating: Coating, n_before: float, n_after: float) -> bool:
@@ -183,13 +178,6 @@ def _dispersive(film: tuple[float, float], waves: float, at_nm: float) -> tuple[
 def _film(index: float, phase: float, at_nm: float) -> tuple[float, float]:
     """(index, thickness in nm) of a film whose phase thickness is `phase` rad at `at_nm`."""
     return index, phase * at_nm / (2 * math.pi * index)
-
-
-def _oriented(
-    from_low: tuple[tuple[float, ...], ...], n_before: float, n_after: float
-) -> tuple[tuple[float, ...], ...]:
-    """Return the layers given from the side of the lower index, as seen from the scene's side."""
-    return from_low if n_before <= n_after else from_low[::-1]
 
 
 def _v_phases(n_0: float, n_s: float, n_1: float, n_2: float) -> tuple[float, float] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any
@@ -240,18 +240,11 @@ class Lens:
     @property
     def sha256(self) -> str:
         """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts)."""
-        return self._hash(_terms)
-
-    def has_hash(self, sha256: str) -> bool:
-        """Whether a hash is the lens's, now or when two figures of a glass meant two terms of Cauchy's formula."""
-        return sha256 in (self.sha256, self._hash(lambda m: []))
-
-    def _hash(self, terms: Callable[[Surface | Medium], list[int]]) -> str:
-        rows = [_figures(s, terms(s)) for s in self.surfaces]
+        rows = [_figures(s) for s in self.surfaces]
         rows[-1][1] = None
         m = self.object_medium
         if m != Medium():
-            rows.append([float(m.n_d), m.V_d, m.glass, *terms(m)])
+            rows.append([float(m.n_d), m.V_d, m.glass, *_terms(m)])
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
     @property
@@ -329,11 +322,11 @@ def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = N
 
 
 def _terms(m: Surface | Medium) -> list[int]:
-    """The number of terms of `glass.cauchy`, two in earlier versions, where it makes the index of a medium."""
+    """The number of terms of `glass.cauchy` where it makes the index of a medium."""
     return [3] if m.V_d is not None and m.glass is None else []
 
 
-def _figures(s: Surface, terms: list[int]) -> list[Any]:
+def _figures(s: Surface) -> list[Any]:
     """List the figures of a surface that decide where rays go, for the hash; default values are left out."""
     radius = float(s.radius_mm)
     row = [
@@ -351,7 +344,7 @@ def _figures(s: Surface, terms: list[int]) -> list[Any]:
         "across": s.across,
         "focal_mm": s.focal_mm,
         "glass": s.glass,
-        "cauchy": terms,
+        "cauchy": _terms(s),
         "absorption_per_mm": float(s.absorption_per_mm),
         "coating": s.coating and [[float(v) for v in layer] for layer in s.coating.layers],
     }

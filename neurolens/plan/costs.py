@@ -42,7 +42,7 @@ _STEP_NS, _DEAR_NS, _DEAR = 0.2761, 2.324, ("div", "sqrt")
 # Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
-_STRIPS, _STRIP_PATHS, _SAMPLES = 3, 60_000, 16  # of a picture, to measure noise: number, paths of each, of a pixel
+_STRIPS, _STRIP_PATHS, _SAMPLES = 3, 180_000, 16  # of a picture, to measure noise: number, paths of all, of a pixel
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 _MOST_DARK = 0.05  # of the places
 
@@ -104,13 +104,11 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
         plain, colours: cameras of the same lens, without and with its dispersion. weights: theirs at the places, as
             for `noise`.
     """
-    width, height = scene.settings.camera.width, scene.settings.camera.height
-    rows = min(max(_STRIP_PATHS // (_SAMPLES * width), 2), height)
-    firsts = np.unique(np.linspace(0, height - rows, _STRIPS + 2).astype(int)[1:-1])
+    strips = strips_of(scene, _STRIP_PATHS, 2)
     rest, calls, variance = [], [], []
     for camera, weight in zip((plain, colours), weights, strict=True):
         _strip(scene, camera, 0, (0, 1))  # what is fitted or compiled once is no part of a path
-        jobs = [[_strip(scene, camera, seed, (int(k), int(k) + rows)) for k in firsts] for seed in (0, 1)]
+        jobs = [[_strip(scene, camera, seed, rows) for rows in strips] for seed in (0, 1)]
         ns = [[1e9 * j.film.seconds[1] / (j.tiling.pixels * _SAMPLES) for j in some] for some in jobs]
         several = jobs[0][0].mode == "companions" and not getattr(camera, "lateral", False)
         calls.append(float(LANES) if several else 1.0)
@@ -123,6 +121,14 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
         variance.append(float(np.minimum(apart, most).mean()) / mean**2 / noise(weight, places.share))
     ratio = variance[1] / variance[0] if variance[0] > 0 and math.isfinite(variance[1]) else 1.0
     return Work((rest[0], rest[1]), (calls[0], calls[1]), (1.0, ratio))
+
+
+def strips_of(scene: Scene, paths: int, least: int) -> list[tuple[int, int]]:
+    """The first row of each of some strips of a picture, and the one after its last: for so many paths in all."""
+    shot = scene.settings.camera
+    rows = min(max(paths // (_STRIPS * _SAMPLES * shot.width), least), shot.height)
+    firsts = np.unique(np.linspace(0, shot.height - rows, _STRIPS + 2).astype(int)[1:-1])
+    return [(int(first), int(first) + rows) for first in firsts]
 
 
 def _strip(scene: Scene, camera: Camera, seed: int, rows: tuple[int, int]) -> Job:

@@ -15,15 +15,12 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import Camera, CameraRays
-
-if TYPE_CHECKING:
-    pass
 
 Array = NDArray[np.float64]
 _Real = TypeVar("_Real", bound=np.floating[Any])

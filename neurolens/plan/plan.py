@@ -35,7 +35,7 @@ from neurolens.cameras.build import as_c, ideal_as, with_dispersion
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.prescription import Lens
 from neurolens.plan.candidates import EXACT, PAIRS, Choice, Target, camera_of, candidates, shot_domain
-from neurolens.plan.costs import ALONE, UNIT, Work, noise, ns_a_ray, small, work_of
+from neurolens.plan.costs import ALONE, UNIT, Work, noise, ns_a_ray, small, strips_of, work_of
 from neurolens.plan.probe import LIGHT, Effect, Probe, SceneNeeds, effects_of, probe
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
@@ -45,7 +45,7 @@ from neurolens.study.image import Image, flip_map
 
 _SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
 _ACROSS, _SAMPLES = 240, 16  # of pictures
-_STRIPS, _STRIP_ROWS, _STRIP_PATHS = 3, 16, 2_000_000  # of a picture: their number, least rows, paths of all
+_STRIP_ROWS, _STRIP_PATHS = 16, 2_000_000  # of strips of a picture: least rows, paths of all
 _SHOWN = 8  # most of them, beside the exact lens
 ALIKE = 1.2  # times the least cost of a whole picture: costs are no more accurate
 _BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for, besides the one asked for
@@ -339,11 +339,8 @@ def plan_seen(scene: Scene, lens: Lens, flip_budget: float, **options: Any) -> P
 
 def _strips(scene: Scene, camera: Camera) -> list[FloatArray]:
     """Rows of a camera's picture at the scene's own size, in some places."""
-    shot = scene.settings.camera
-    rows = min(max(_STRIP_PATHS // (_STRIPS * _SAMPLES * shot.width), _STRIP_ROWS), shot.height)
-    firsts = np.unique(np.linspace(0, shot.height - rows, _STRIPS + 2).astype(int)[1:-1])
     drawn = partial(render, scene, camera, samples=_SAMPLES, film=replace(scene.settings.film, wavelengths="one"))
-    return [drawn(rows=(int(first), int(first) + rows)).rgb for first in firsts]
+    return [drawn(rows=rows).rgb for rows in strips_of(scene, _STRIP_PATHS, _STRIP_ROWS)]
 
 
 def paths(scene: Scene) -> int:

@@ -194,13 +194,8 @@ def _biconic(block: Block) -> dict[str, Any]:
     for name, value in block.terms.items():
         if value and name != "KX" and not name.endswith("P"):
             raise block.start.error(f"{name} of AAS", value, "0: a biconic has no terms of higher order")
-    x, y, along_y = block.curvature_x or 0.0, block.curvature, block.rotational()
-    if x == 0:
-        return along_y | ({"cylinder": "y"} if y else {})
-    if y == 0:
-        return {"radius_mm": 1 / x, "conic": conic_x, "cylinder": "x"}
-    same = (x, conic_x) == (y, block.conic)
-    return along_y if same else along_y | {"cylinder": "y", "across": (1 / x, conic_x)}
+    radius_x = 1 / block.curvature_x if block.curvature_x else math.inf
+    return block.crossed(block.rotational(), radius_x, conic_x)
 
 
 def _special(block: Block) -> dict[str, Any]:

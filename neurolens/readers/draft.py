@@ -55,6 +55,17 @@ class Block:
         conic = self.conic if self.curvature else 0.0
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
+    def crossed(self, curve: dict[str, Any], radius_x: float, conic_x: float | None) -> dict[str, Any]:
+        """A curve in y, as `rotational` has it, bent in x too: turned, or with a conic a biconic; a cylinder where one
+        of both is straight (an infinite radius), and round where they are the same."""
+        bent = bool(self.curvature or curve["asphere"])
+        if math.isinf(radius_x):
+            return curve | ({"cylinder": "y"} if bent else {})
+        if not bent:
+            return {"radius_mm": radius_x, "conic": conic_x or 0.0, "cylinder": "x"}
+        same = math.isclose(radius_x * self.curvature, 1.0, rel_tol=1e-12) and (conic_x or 0.0) == self.conic
+        return curve if same and not curve["asphere"] else curve | {"cylinder": "y", "across": (radius_x, conic_x)}
+
     def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
         """A surface of Forbes's kind, made as by `rotational`: coefficients from m = 0, a normalisation radius."""
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter

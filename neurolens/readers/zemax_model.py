@@ -147,17 +147,11 @@ def _q_type(block: Block) -> dict[str, Any]:
 
 
 def _crossed(block: Block) -> dict[str, Any]:
-    """Return a toroidal or biconic surface, a cylinder where one of its radii is infinite, or round."""
+    """Return a toroidal or biconic surface."""
     biconic, radius_x = block.kind == "BICONICX", block.parameter(1)
     conic_x = block.parameter(2) if biconic else None
     curve = block.rotational(() if biconic else [(2 * i - 2, block.parameter(i)) for i in range(2, 9)])
-    flat = block.curvature == 0 and not curve["asphere"]
-    if radius_x == 0:
-        return curve if flat else curve | {"cylinder": "y"}
-    if flat:
-        return {"radius_mm": radius_x, "conic": conic_x or 0.0, "cylinder": "x"}
-    equal = math.isclose(radius_x * block.curvature, 1.0, rel_tol=1e-12) and (conic_x or 0.0) == block.conic
-    return curve if equal and not curve["asphere"] else curve | {"cylinder": "y", "across": (radius_x, conic_x)}
+    return block.crossed(curve, radius_x or math.inf, conic_x)
 
 
 MAX_CONFIGURATIONS = 200

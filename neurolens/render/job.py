@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.dispersion import film_shift
+from neurolens.graph.compiler import c_source, has_compiler, load_compiled
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
 from neurolens.render.environment import sun_spectrum, total_spectrum
@@ -32,6 +35,23 @@ LANES = 4  # wavelengths of a hero path
 _FINE = 1024  # wavelengths at which the light of a scene is summed
 _PROBES, _PROBED_WAVELENGTHS = 1024, 5
 _LITTLE_PX = 0.05  # pixels; a smaller shift is hidden by the pixel filter, a box one pixel wide
+
+
+class _Grid(ctypes.Structure):
+    _fields_ = [  # noqa: RUF012
+        *((name, ctypes.c_int) for name in ("width", "height", "lateral")),
+        *((name, ctypes.c_float) for name in ("film_x", "film_y")),
+    ]
+
+
+@cache
+def _light_of_tile(bins: int) -> Any:
+    """The function of `spill.c`, compiled once."""
+    known = {"LANES": LANES, "BINS": bins, "SAMPLES": columns.SAMPLES_A_PASS, "BRIGHTEST": f"{_BRIGHTEST_SAMPLE:g}f"}
+    known |= {name: getattr(columns, name) for name in ("LUMINANCE2", "DROPPED", "COLUMNS")}
+    call = load_compiled(c_source("render/spill.c", **known)).light_of_tile
+    call.argtypes, call.restype = [*[ctypes.c_size_t] * 5, *[ctypes.c_void_p] * 8], None
+    return call
 
 
 class LensRays(NamedTuple):
@@ -90,12 +110,19 @@ class Job:
         self._response = self.spectral.rotated(self.spectral.response)  # [lanes, 3, bins]
         self.luminance_row = SRGB.to_xyz[1] @ self.balance
         self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
-        self._basis = self.spectral.rotated(self.spectral.basis)[1:].astype(np.float32)
+        basis = self.spectral.rotated(self.spectral.basis)  # [lanes, 3, bins]
+        table = np.stack([np.concatenate([t, self._luminance[:, None]], axis=1) for t in (self._response, basis)])
+        self._bins = np.ascontiguousarray(table.transpose(3, 0, 1, 2), np.float32)  # as `spill.c` has them
+        tints = getattr(camera, "tints", None)
+        light = None if tints is None else self.spectral.rotated(tints(self.spectral.centres_nm))
+        self._tints: FloatArray | None = None
+        if light is not None:
+            self._tints = np.where(light[0] > 0, light / np.maximum(light[0], 1e-30), 0).astype(np.float32)
         self.sampler = Sampler(samples, seed)
         self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
         self.rows = rows or (0, grid.height)
         first, stop = (row * grid.width for row in self.rows)
-        near = self._reach()  # samples so far from the job's rows have companions in them
+        near = self._near = self._reach()  # samples so far from the job's rows have companions in them
         tiling = Tiling.of(grid.width * grid.height, samples)
         self.tiling = tiling.around(max(first - near, 0), min(stop + near, tiling.pixels))
         self.own = slice(first - self.tiling.start, stop - self.tiling.start)
@@ -142,19 +169,21 @@ class Job:
             shared = np.count_nonzero(lens.weight, axis=0).astype(np.float32)
         value = trace(self.world, self.sampler, keys, *rays, self.max_depth, first_distance=distance, shared=shared)
         sums = np.empty((len(pixels), columns.COLUMNS))
-        spill = self._sum_light(sums, value, bins, pixel, lens)
+        spill = self._sum_light(sums, value, bins, lens, within)
         self._sum_depth(sums, lens.origin, lens.direction, distance)
         sums[:, columns.PASSED] = np.count_nonzero(lens.weight[0].reshape(len(pixels), -1), axis=1)
         return sums, spill, np.array([answered - called, time.perf_counter() - began])
 
     def _sum_light(
-        self, sums: NDArray[np.float64], value: FloatArray, bins: Index, pixel: Index, lens: LensRays
+        self, sums: NDArray[np.float64], value: FloatArray, bins: Index, lens: LensRays, tile: slice
     ) -> Spill | None:
         """Colour, and the squared luminance of each sample; and the light of companions, of any pixel.
 
         Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
         with it the whole file.
         """
+        if lens.places is not None:
+            return self._spill(sums, value, bins, lens, tile)
         response, factors = (t.take(bins, axis=-1, mode="clip") for t in (self._response, self._luminance))
         dropped = ~(np.abs(np.einsum("ln,ln->n", factors, value)) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
@@ -163,65 +192,21 @@ class Job:
         sums[:, columns.DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
         luminance = np.einsum("ln,ln->n", factors, value).reshape(shape)
         sums[:, columns.LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
-        light = response * value[:, None]
-        own = light if lens.places is None else light[:1]
-        sums[:, columns.RGB] = np.einsum("lcps->pc", own.reshape(len(own), 3, *shape))
-        return None if lens.places is None else self._spill(light, response, bins, pixel, lens, shape)
+        sums[:, columns.RGB] = np.einsum("lcn,ln->cn", response, value).reshape(3, *shape).sum(axis=2).T
+        return None
 
-    def _spill(
-        self, light: FloatArray, response: FloatArray, bins: Index, pixel: Index, lens: LensRays, shape: tuple[int, int]
-    ) -> Spill:
-        """The light [lanes, 3, N] of the companions, at the pixels where it arrives.
-
-        Chance decides how many companions cross the edge of a pixel, and that is noise which a thin lens does not have.
-        A control variate removes most of it: the light that the other samples of the hero's pixel predict. The
-        prediction is divided among pixels in the shares that it has on average over all places in the hero's pixel; the
-        residual goes to the pixel of the companion's film point. This leaves the mean as it is. Where the camera's
-        dispersion is only lateral, all light is divided so, as an ST map does that is read between pixels.
-
-        `response`: [lanes, 3, N], of the film.
-        """
-        assert lens.places is not None
-        width, height = self.grid.width, self.grid.height
-        target = self.grid.pixels_at(lens.places[1:])
-        per_mm = np.array([[-width / self.grid.film_mm[0]], [height / self.grid.film_mm[1]]], np.float32)
-        moved = (lens.places[1:] - lens.places[0]) * per_mm
-        whole = np.floor(moved)
-        across, down = (moved - whole).swapaxes(0, 1)
-        whole += np.stack(np.divmod(pixel, width)[::-1]).astype(np.float32)
-        last = np.array([[width - 2], [height - 2]], np.float32)
-        inside = ((whole >= 0) & (whole <= last)).all(axis=1)
-        column, row = whole.swapaxes(0, 1).astype(np.intp)
-        near = np.where(inside, row * width + column, target)
-        lateral = getattr(self.camera, "lateral", False)
-        predicted = inside if lateral else self._predicted(light, bins, lens.weight, shape) * inside
-        first = min(int(near.min()), int(target.min()))
-        places = np.empty((5, *target.shape), np.intp)
-        for k, by in enumerate((0, 1, width, width + 1), 1):
-            np.add(near, by - first, out=places[k])
-        np.subtract(target, first, out=places[0])
-        both = across * down
-        shares = (1 - across - down + both, across - both, down - both, both)
-        sums, amount = list[NDArray[Any]](), np.empty(places.shape)  # as `bincount` takes it
-        for channel in range(3):
-            expected = predicted * (light if lateral else response)[1:, channel]
-            np.subtract(light[1:, channel], expected, out=amount[0])
-            for k, share in enumerate(shares, 1):
-                np.multiply(expected, share, out=amount[k])
-            sums.append(np.bincount(places.reshape(-1), amount.reshape(-1)))
-        return Spill(first, np.stack(sums, axis=1))
-
-    def _predicted(self, light: FloatArray, bins: Index, weight: FloatArray, shape: tuple[int, int]) -> FloatArray:
-        """Weighted radiance [lanes - 1, N] of the companions, predicted by the mean of their pixel's other samples."""
-        pixels, samples = shape
-        if samples == 1:
-            return np.zeros_like(weight[1:])
-        colour = light.sum(axis=0).reshape(3, pixels, samples)
-        others = (colour.sum(axis=2, keepdims=True) - colour) / np.float32(samples - 1)
-        open_share = weight.sum(axis=0).reshape(pixels, samples).mean(axis=1, keepdims=True)
-        others /= np.where(open_share > 0, open_share, np.float32(1))
-        radiance = np.einsum("lcn,cn->ln", self._basis.take(bins, axis=-1, mode="clip"), others.reshape(3, -1))
-        return radiance * weight[1:]
+    def _spill(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, lens: LensRays, tile: slice) -> Spill:
+        """The light of the companions at the pixels where it arrives, and the sums of the tile (`spill.c`)."""
+        start = tile.start + self.tiling.start
+        first = max(start - self._near, 0)
+        stop = min(start + len(sums) + self._near, self.grid.width * self.grid.height)
+        spill, lateral = np.zeros((stop - first, 4)), bool(getattr(self.camera, "lateral", False))
+        grid = _Grid(self.grid.width, self.grid.height, lateral, *self.grid.film_mm)
+        arrays = [np.ascontiguousarray(a) for a in (self._bins, bins, value, lens.weight, lens.places)]
+        size = len(sums), len(bins) // len(sums), start, first, len(spill)
+        pointers = (a.ctypes.data for a in (*arrays, sums, spill))
+        _light_of_tile(self.spectral.bins)(*size, ctypes.byref(grid), *pointers)
+        return Spill(first, spill[:, :3])
 
     def _sum_depth(
         self, sums: NDArray[np.float64], origin: FloatArray, direction: FloatArray, distance: FloatArray
@@ -239,14 +224,14 @@ class Job:
     def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> LensRays:
         """Rays of the hero wavelengths, with the weights of all lanes."""
         lanes = self.spectral.lanes
-        nm = np.stack([self._camera_wavelengths(_turned(hue, np.float32(k / lanes))) for k in range(lanes)])
+        used = lanes if self._tints is None or self.mode == "companions" else 1
+        nm = np.stack([self._camera_wavelengths(_turned(hue, np.float32(k / lanes))) for k in range(used)])
         if self.mode == "companions":
             return self._camera_rays(camera, film_mm, pupil, nm)
         hero = self._camera_rays(camera, film_mm, pupil, nm[:1])
         weight = np.repeat(hero.weight, lanes, axis=0)
-        if (tints := getattr(camera, "tints", None)) is not None:  # nothing else depends on the wavelength
-            light = tints(nm)
-            weight *= np.divide(light, light[0], out=np.zeros_like(light), where=light[0] > 0)
+        if self._tints is not None:  # nothing else depends on the wavelength
+            weight *= self._tints.take(self.spectral.bin_of(hue), axis=-1)
         elif camera.dispersive or not getattr(camera, "achromatic", False):
             for lane in range(1, lanes):
                 weight[lane] = self._camera_rays(camera, film_mm, pupil, nm[lane : lane + 1]).weight
@@ -410,7 +395,8 @@ def mode_for(
     """How paths carry wavelengths: see `Job`.
 
     Raises:
-        InputError: the settings ask for "hero", and the camera disperses but cannot place companions in whole pixels.
+        InputError: the settings ask for "hero", and the camera disperses but cannot place companions in whole pixels,
+            or there is no C compiler for the sums of their light.
     """
     if film.wavelengths == "one":
         return "one"
@@ -419,11 +405,11 @@ def mode_for(
         return "hero"
     asked = film.wavelengths == "hero"
     placed = film.fill_factor == 1 and getattr(camera, "companion_reach_mm", None) is not None
-    if placed and (asked or not getattr(camera, "costly", False)):
+    if placed and has_compiler() and (asked or not getattr(camera, "costly", False)):
         return "companions"
     if asked:
-        expected = f"one: camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
-        raise InputError("render", "film.wavelengths", "hero", expected)
+        why = f"camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
+        raise InputError("render", "film.wavelengths", "hero", f"one: {'there is no C compiler' if placed else why}")
     return "one"
 
 

@@ -18,6 +18,7 @@ from functools import cached_property, reduce
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.cameras.cameragraph import unit_disc
 from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.shaders.stop_image import HAIR, StopImage, frame_of_film_point, moving_polynomial
 
@@ -288,29 +289,6 @@ def _within_blades(
         x, y, _ = shape.point(direction, direction[0] * share)
         share = blades.drawn(start, at_stop(x, y) - start, margin)
     return share
-
-
-def unit_disc(square: Value) -> Value:
-    """The point [2] of the unit disc of a point of the unit square, evenly (Shirley and Chiu 1997)."""
-    g = square.graph
-    a, b = g.split(square * 2.0 - 1.0, (1, 1))
-    flat = b * b <= a * a
-    size = g.select(flat, a, b)
-    angle = g.select(flat, b, a) / g.select(size * size <= HAIR, 1.0, size)
-    squared = angle * angle
-    cos = size * g.series(squared, _COS)
-    sin = size * angle * g.series(squared, _SIN)
-    return g.concat(g.select(flat, cos, sin), g.select(flat, sin, cos))
-
-
-def _series(function: Callable[[Array], Array]) -> Array:
-    """The polynomial of a function of squares of angles up to pi / 4, in units of that, to float32's last bit."""
-    fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
-    return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
-
-
-_COS = _series(lambda s: np.cos(np.pi / 4 * np.sqrt(np.maximum(s, 0))))
-_SIN = _series(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))
 
 
 @dataclass(frozen=True)

@@ -403,9 +403,7 @@ def _drawn_in_boxes(
     lens: ShaderLens, radius: Array, stop: Array, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Random pupil points [2, N] in the boxes of film points, in their frames, and whether rays pass there."""
-    count, radii = radius.size, np.linspace(0, lens.film_radius_mm, lens.table.rows.shape[1])
-    low, high, half = (np.interp(radius, radii, row) for row in lens.table.rows)
-    pupil = np.stack([low + (high - low) * rng.random(count), half * rng.uniform(-1, 1, count)])
+    count, pupil = radius.size, lens.drawn_in_boxes(radius, rng)
     angle = 2 * np.pi * rng.random(count) * lens.anamorphic
     turn = np.exp(1j * angle)
     film, turned = radius * turn, (pupil[0] + 1j * pupil[1]) * turn

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,17 +17,11 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.shaders.source import Focusing
 
+if TYPE_CHECKING:
+    from neurolens.shaders.pupil import PupilCircles, PupilDisc
+
+Array = NDArray[np.float64]
 _PART = 1 << 15  # rays that are evaluated together
-
-
-class Pupil(Protocol):
-    """The sampler of a shader's rays: `graph` takes a film point and two random numbers to a pupil point."""
-
-    @property
-    def film_radius_mm(self) -> float: ...
-
-    @property
-    def graph(self) -> Graph: ...
 
 
 @dataclass(frozen=True)
@@ -69,6 +63,12 @@ class ShaderLens:
                 radii.append(end_of_light(self.table, pass_test(passes, self.wavelength_nm)) or 0.0)
         return min(max(radii), self.film_radius_mm)
 
+    def drawn_in_boxes(self, radius: Array, rng: np.random.Generator) -> Array:
+        """Random pupil points [2, N] in the boxes of film points at radii [N] along +x."""
+        radii = np.linspace(0, self.film_radius_mm, self.table.rows.shape[1])
+        low, high, half = (np.interp(radius, radii, row) for row in self.table.rows)
+        return np.stack([low + (high - low) * rng.random(radius.size), half * rng.uniform(-1, 1, radius.size)])
+
     def _passes(
         self, film: FloatArray, pupil: FloatArray, nanometres: float, film_z: float, azimuth: float
     ) -> NDArray[np.bool_]:
@@ -105,11 +105,12 @@ def _row(value: ArrayLike) -> NDArray[np.float32]:
     return np.asarray(value, np.float32).reshape(1, -1)
 
 
-Array = NDArray[np.float64]
 _SAMPLES, _TRIES = 20_000, 64  # film points; samples that decide whether one has light
 
 
-def passing_share(lens: ShaderLens, pupil: Pupil, stops: Sequence[float] = (1.0, 0.5, 0.25)) -> dict[float, float]:
+def passing_share(
+    lens: ShaderLens, pupil: PupilCircles | PupilDisc, stops: Sequence[float] = (1.0, 0.5, 0.25)
+) -> dict[float, float]:
     """The share of samples that pass, all over the film, by shares of the widest stop.
 
     Film points without light do not count: those whose ray is blocked count where any of 64 more rays passes.
@@ -133,7 +134,7 @@ def passing_share(lens: ShaderLens, pupil: Pupil, stops: Sequence[float] = (1.0,
 
 
 def _sampled(
-    lens: ShaderLens, pupil: Pupil, square: Array, film: Array, call: Array, share: float
+    lens: ShaderLens, pupil: PupilCircles | PupilDisc, square: Array, film: Array, call: Array, share: float
 ) -> NDArray[np.bool_]:
     """Test whether rays [N] of points of the unit square pass, at film positions and wavelengths `call` [2, N]."""
     (film_z, nanometres), stop = call, np.array([[share * lens.stop_radius_mm]])

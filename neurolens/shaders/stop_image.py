@@ -267,9 +267,7 @@ def draw_rays(lens: ShaderLens, image: StopImage | None, seed: int) -> StopRays:
     angle = 2 * np.pi * rng.random(count) if lens.anamorphic else np.zeros(count)
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
     if image is None:
-        radii = np.linspace(0, lens.film_radius_mm, lens.table.rows.shape[1])
-        low, high, half = (np.interp(radius, radii, row) for row in lens.table.rows)
-        x, y = low + (high - low) * rng.random(count), half * rng.uniform(-1, 1, count)
+        x, y = lens.drawn_in_boxes(radius, rng)
         pupil = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
     else:
         turn = 2 * np.pi * rng.random(count)

@@ -23,13 +23,11 @@ from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.lens.prescription import Lens
 from neurolens.study.rays import (
-    NEAR_RIM,
     PIXELS_ACROSS,
     ZONES,
     EachRay,
     Predict,
     RayErrors,
-    deciding_rim_ratio,
     each_ray,
     false_shares,
 )
@@ -64,7 +62,6 @@ class FreshRays:
         drawn: [N] rays uniform over the film and pupil discs, blocked ones included.
         passes: [N] bool, at full aperture.
         stop_square: [N] squared distance from the axis (mm^2) at the stop.
-        near: [N] bool, full aperture: within 2% of the radius of the rim that decides.
     """
 
     lens: Lens
@@ -74,7 +71,6 @@ class FreshRays:
     drawn: FilmRays
     passes: Tensor
     stop_square: Tensor
-    near: Tensor
 
     def stop_radius_mm(self, state: str) -> float:
         """The radius of one of `STOPS`, in mm."""
@@ -87,10 +83,9 @@ def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, see
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
         exact = trace_pairs(lens, rays, domain.pupil_z_mm)
-        near = (deciding_rim_ratio(lens, exact) - 1).abs() <= NEAR_RIM
-        parts.append((*rays.columns(), exact.status == st.PASSED, _stop_square(lens, exact), near))
-    *drawn, passes, square, near = (torch.cat(c) for c in zip(*parts, strict=True))
-    return FreshRays(lens, domain, held_out, _stop_square(lens, held_out), FilmRays(*drawn), passes, square, near)
+        parts.append((*rays.columns(), exact.status == st.PASSED, _stop_square(lens, exact)))
+    *drawn, passes, square = (torch.cat(c) for c in zip(*parts, strict=True))
+    return FreshRays(lens, domain, held_out, _stop_square(lens, held_out), FilmRays(*drawn), passes, square)
 
 
 def with_more(fresh: FreshRays, seed: int) -> FreshRays:
@@ -125,7 +120,7 @@ class Findings:
     """Errors of one model on `FreshRays`.
 
     Attributes:
-        figures: those of `rays.RayErrors`, false_pass, false_block and both near rims at full aperture.
+        figures: those of `rays.RayErrors`, false_pass and false_block at full aperture.
         stopped_down: false_pass and false_block of the states of `STOPS` but the first.
         zones: by state of `ZONED` and zone: rms_um, direction_rms_deg of `rays` rays, and false_pass, false_block of
             `passing` rays that the exact lens passes. None with fewer than `LEAST_RAYS`, or where an RMS is not
@@ -150,8 +145,7 @@ def measure(fresh: FreshRays, predict: Predict) -> Findings:
     model = {s: predict(fresh.drawn, fresh.stop_radius_mm(s)).status == st.PASSED for s in STOPS}
     exact = {s: fresh.passes & (fresh.stop_square <= fresh.stop_radius_mm(s) ** 2) for s in STOPS}
     shares = {s: false_shares(exact[s], model[s]) for s in STOPS}
-    near = false_shares(exact["full"][fresh.near], model["full"][fresh.near])
-    full = {**shares.pop("full"), **{f"{key}_near_rim": value for key, value in near.items()}}
+    full = shares.pop("full")
     zones = {s: {z: _zone(fresh, each, s, z, exact[s], model[s]) for z in ZONES} for s in ZONED}
     return Findings({**asdict(RayErrors.over(fresh.lens, fresh.domain, each)), **full}, shares, zones, each)
 
@@ -211,7 +205,7 @@ def finite(value: float | None) -> float | None:
 # Keys of the ray and vignetting errors that a model's card promises and its record shows.
 CARD_KEYS = tuple(
     "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max "
-    "false_pass false_block false_pass_near_rim false_block_near_rim".split()
+    "false_pass false_block".split()
 )
 # Reported as poor: false passes or blocks beyond this share, an RMS error beyond so many pixels of 4000 across.
 POOR_SHARE, POOR_PX = 0.01, 1.0

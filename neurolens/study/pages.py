@@ -168,7 +168,6 @@ _AXIS_COLUMNS = (Column("zoom (mm)", "zoom", digits=5), Column("focus (1/m)", "f
 _EXACT_COLUMNS = (
     Column("time min (ns/ray)", "ns_per_ray.min"),
     Column("median (ns/ray)", "ns_per_ray.median"),
-    Column("threads", "ns_per_ray.threads"),
 )
 _CAMERA_COLUMNS = (
     Column("render (s)", "render_s"),

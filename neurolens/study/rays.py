@@ -274,7 +274,6 @@ def pupil_middle(domain: Domain, radius: Tensor) -> Tensor:
     return torch.lerp(middle[below], middle[below + 1], place - below)
 
 
-NEAR_RIM = 0.02  # relative distance to a rim's radius that counts as near
 ZONES = {"centre": (0.0, 1 / 3), "mid": (1 / 3, 2 / 3), "edge": (2 / 3, 1.0)}  # shares of the film radius
 SEED = 104729  # unlikely as the seed of a fit's rays
 
@@ -292,21 +291,6 @@ def false_shares(exact_passes: Tensor, model_passes: Tensor) -> dict[str, float 
 def _share(part: Tensor, whole: Tensor) -> float | None:
     total = int(whole.sum())
     return int(part.sum()) / total if total else None
-
-
-def deciding_rim_ratio(lens: Lens, pairs: PairSet) -> Tensor:
-    """[N] largest crossing radius over rim radius along each ray, stop included: at most 1 where every rim passes it.
-
-    Surfaces beyond one that the ray misses, or that reflects it totally, do not count.
-    """
-    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
-    ratio = torch.hypot(pairs.cross_x, pairs.cross_y) / radii
-    on_the_way, largest = torch.ones(len(pairs), dtype=torch.bool), torch.zeros(len(pairs), dtype=torch.float64)
-    for k in range(len(lens.surfaces) - 1, -1, -1):  # camera rays meet the last surface first
-        on_the_way = on_the_way & (pairs.meets[k] > 0)
-        largest = torch.where(on_the_way, torch.maximum(largest, ratio[k]), largest)
-        on_the_way = on_the_way & (pairs.refracts[k] > 0)
-    return largest
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ MAX_CARD = 2**20
 
 # Relative slack of a domain's bounds: the rounding of float32 inputs, and no more.
 DOMAIN_SLACK = 1.00001
-# Transmittance of unpolarised light: with the polarisation that surfaces give to it, or averaged over it at each.
-POLARISED, AVERAGED = "polarised", "averaged"
+# Transmittance of unpolarised light, with the polarisation that surfaces give to it.
+POLARISED = "polarised"
 
 _MAX_BYTES = 64 * 2**20
 _MAX_ENTRIES = 100  # of metadata; models have two
@@ -144,11 +144,6 @@ def _culprit(value: Any, path: str) -> tuple[str, Any]:
     return path, value
 
 
-def transmittance_of(card: Mapping[str, Any]) -> str:
-    """Which transmittance of unpolarised light a model holds: POLARISED, or AVERAGED where its card states none."""
-    return str(card.get("transmittance", AVERAGED))
-
-
 # ---- what must stand in a card ----
 
 
@@ -217,6 +212,7 @@ _LENS_AND_DOMAIN: dict[str, Rule] = {
 }
 _RULES: dict[str, Rule] = {
     **_LENS_AND_DOMAIN,
+    "transmittance": (lambda v: v == POLARISED, f'"{POLARISED}"'),
     "fit": _TABLE,
     "fit.method": _TEXT,
     "fit.settings": _TABLE,
@@ -224,7 +220,6 @@ _RULES: dict[str, Rule] = {
 }
 _NODE_RULES = {**_LENS_AND_DOMAIN, "lens.infinity_film_z_mm": _NUMBER, "lens.film_z_mm": _NUMBER}
 _OPTIONAL: dict[str, Rule] = {
-    "transmittance": (lambda v: v in (POLARISED, AVERAGED), f'"{POLARISED}" or "{AVERAGED}"'),
     "lens.stop_surface": (lambda v: _is_integer(v, 0, 9999), "an integer"),
     "lens.index_ratio": _POSITIVE,
     "domain.nearest_m": (lambda v: v is None or _is_positive(v), "a number above 0, or null"),

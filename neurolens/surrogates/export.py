@@ -26,7 +26,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.setting.focusing import at_infinity
 from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.axes import STATE
-from neurolens.surrogates.card import CARD_KEY, CARD_KIND, CARD_SCHEMA, MODEL_KEY, card_to_json
+from neurolens.surrogates.card import CARD_KEY, CARD_KIND, CARD_SCHEMA, MODEL_KEY, POLARISED, card_to_json
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import as_stored, coefficients_text, onnx_of
 from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, front_index, scene_graph, stop_graph
@@ -177,7 +177,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
         "schema": CARD_SCHEMA,
         "lens": lens_facts(model.lens, model.domain),
         "units": UNITS,
-        "transmittance": model.transmittance,
+        "transmittance": POLARISED,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
         "status_codes": {str(code): st.describe(code) for code in sorted(codes)} | {str(stop): stopped},

@@ -38,14 +38,12 @@ from neurolens.surrogates.card import (
     check_card,
     default_state,
     read_metadata,
-    transmittance_of,
 )  # fmt: skip
 from neurolens.surrogates.cores import CORES, Core
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Domain, Gate, LensModel, Scales, mixed, with_one_angle
 
 SCHEMA = 2
-_ONE_NODE = 1  # an earlier schema: one state, and no angle
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 16  # of cores in cores
 _MAX_CORES = 1000  # of one file
@@ -109,7 +107,7 @@ def read_model(path: str | Path) -> ModelFile:
     with np.errstate(all="ignore"), damage_said(file):
         data = json.loads(inflated(metadata[MODEL_KEY]))
         check_tree(data, "coefficients")
-        if data["schema"] not in (_ONE_NODE, SCHEMA):
+        if data["schema"] != SCHEMA:
             raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}: {again}")
         model = ModelFile(file, card, _nodes(file, card, data), data)
         _check_reference(model)
@@ -130,11 +128,11 @@ def damage_said(file: str | Path, what: str = "its coefficients are damaged") ->
 def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[LensModel, ...]:
     states = card.get("states")
     domains = [node["domain"] for node in states["nodes"]] if states else [card["domain"]]
-    parts = [data] if data["schema"] == _ONE_NODE else data["nodes"]
+    parts = data["nodes"]
     if len(parts) != len(domains) or len(parts) > _MAX_NODES:
         raise ValueError(f"{len(parts)} nodes, expected {len(domains)}, at most {_MAX_NODES}")
     lens = unpacked_lens(data["lens"])
-    if not states and not lens.has_hash(card["lens"]["sha256"]):
+    if not states and lens.sha256 != card["lens"]["sha256"]:
         raise ModelError(f"{file}: its prescription is not that of its card")
     nodes = [
         LensModel(
@@ -148,14 +146,11 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
             settings=dict(card["fit"]["settings"]),
             fit_s=float(card["fit"]["seconds"]),
             direction="slope" if data["direction"] == "slope" else "angle",
-            transmittance=transmittance_of(card),
-            angle=float(data.get("angle", math.pi)),
+            angle=float(data["angle"]),
         )
         for part, domain in zip(parts, domains, strict=True)
     ]
     check_size(nodes[0].core)
-    if "angle" not in data:
-        nodes = [_traced(file, node) for node in nodes]
     if not 0 < nodes[0].angle <= math.pi:
         raise ValueError(f"angle: got {nodes[0].angle!r}, expected above 0, up to pi")
     return tuple(nodes)
@@ -185,18 +180,6 @@ def check_size(core: Any) -> None:
             f"{rows} terms and units, {weights} numbers and {products} products of terms, expected at most "
             f"{_MAX_WORK}, {_MAX_WEIGHTS} and {_MAX_PRODUCTS}"
         )
-
-
-def _traced(file: Path, model: LensModel) -> LensModel:
-    """The model with the largest angle of its rays, which files of the first schema do not hold."""
-    try:
-        from neurolens.surrogates.pairs import with_angle
-    except ModuleNotFoundError as error:
-        raise ModelError(
-            f"{file}: an old file, which only a machine with torch reads: there `neurolens export MODEL.onnx --to onnx "
-            "-o NEW.onnx` writes it as others read it"
-        ) from error
-    return with_angle(model)
 
 
 def _check_reference(model: ModelFile) -> None:

@@ -143,7 +143,6 @@ class InverseModel:
         stop_x: Tensor,
         stop_y: Tensor,
         wavelength_nm: Tensor,
-        stop_radius_mm: float | None = None,
         steps: int = STEPS,
         start: Tensor | None = None,
     ) -> InverseRays:
@@ -151,25 +150,13 @@ class InverseModel:
 
         Args:
             start: [2, N] in place of the first guess: pupil points, centred and scaled as the model's.
-
-        Raises:
-            InputError: as `LensModel.predict`.
         """
         import torch
 
         inputs = {"stop_rays": torch.stack([film_x, film_y, stop_x, stop_y, wavelength_nm])}
-        if start is not None:
-            inputs["start"] = start
-        return self._solved("stop", inputs, film_z, stop_radius_mm, steps)
+        return self._solved("stop", inputs if start is None else inputs | {"start": start}, film_z, steps)
 
-    def from_scene(
-        self,
-        scene: Rays,
-        film_z: Tensor,
-        wavelength_nm: Tensor,
-        stop_radius_mm: float | None = None,
-        steps: int = STEPS,
-    ) -> InverseRays:
+    def from_scene(self, scene: Rays, film_z: Tensor, wavelength_nm: Tensor, steps: int = STEPS) -> InverseRays:
         """The camera rays of light that comes along scene rays; all [N], in the dtype of the inputs.
 
         Args:
@@ -177,27 +164,21 @@ class InverseModel:
                 camera ray: away from the lens, against the light. Light from a scene point S through a point X of the
                 front surface has direction (S - X) / |S - X|.
             film_z: the film planes, mm.
-
-        Raises:
-            InputError: as `LensModel.predict`.
         """
         import torch
 
         *lines, wavelength = (c.detach().double().numpy() for c in (*scene, wavelength_nm))
         rays_at_front = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=wavelength)
         front, solid = (torch.from_numpy(a).to(film_z.dtype) for a in rays_at_front)
-        inputs = {"front_rays": torch.cat([front, wavelength_nm[None]])}
-        out = self._solved("scene", inputs, film_z, stop_radius_mm, steps)
+        out = self._solved("scene", {"front_rays": torch.cat([front, wavelength_nm[None]])}, film_z, steps)
         return out._replace(density=out.density / solid)
 
-    def _solved(
-        self, name: str, inputs: dict[str, Tensor], film_z: Tensor, stop_radius_mm: float | None, steps: int
-    ) -> InverseRays:
+    def _solved(self, name: str, inputs: dict[str, Tensor], film_z: Tensor, steps: int) -> InverseRays:
         import torch
 
         from neurolens.surrogates.domain import FilmRays
 
-        radius = film_z.new_full((1, 1), self.model.checked_radius_mm(stop_radius_mm))
+        radius = film_z.new_full((1, 1), self.model.domain.stop_radius_mm)
         graph = _exact_graph(self, name, steps, "start" in inputs)
         out = evaluate(graph, {**inputs, "film_z_mm": film_z[None], "stop_radius_mm": radius})
         film_x, film_y, pupil_x, pupil_y, wavelength = out["rays"]

@@ -23,7 +23,7 @@ from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
-from neurolens.surrogates.card import DOMAIN_SLACK, POLARISED, mix_domain
+from neurolens.surrogates.card import DOMAIN_SLACK, mix_domain
 from neurolens.surrogates.cores import Array, Core
 from neurolens.surrogates.lightfield import Encoding
 
@@ -139,8 +139,6 @@ class LensModel:
         settings: JSON-able settings of the fit.
         fit_s: seconds that the fit took.
         direction: what the core's direction vector is: the angle vector, or the slope for first-order models.
-        transmittance: "polarised" as the tracer follows it, or "averaged" over s and p at every surface (of files made
-            by version 0.1.0 and earlier).
         angle: largest angle (rad) between the axis and the rays that the exact lens passes, enlarged by 5%; see
             `pairs.with_angle`. A core's direction vector is no longer than that. Where it is, as a network's may be far
             from the rays of its fit, the ray lies outside the domain. Where all rays point forwards the angle stays
@@ -157,7 +155,6 @@ class LensModel:
     settings: dict[str, Any] = field(default_factory=dict)
     fit_s: float = 0.0
     direction: Literal["angle", "slope"] = "angle"
-    transmittance: str = POLARISED
     angle: float = math.pi
 
     def predict(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:

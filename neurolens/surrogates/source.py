@@ -34,7 +34,7 @@ from neurolens.graph.shading import LANGUAGES, write_shading
 from neurolens.lens.glass import inverse_square_um
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
 from neurolens.surrogates.axes import mixture_of, state_names
-from neurolens.surrogates.card import DOMAIN_SLACK, POLARISED, axes_of, transmittance_of
+from neurolens.surrogates.card import DOMAIN_SLACK, axes_of
 from neurolens.surrogates.model import Domain, LensModel, with_one_angle
 
 WRITERS: Mapping[str, Callable[..., str]] = {
@@ -286,9 +286,8 @@ def comment_of(
         lines.append(f"Errors on held-out rays, whole domain of the exported model: {', '.join(figures)}.")
     if errors.get("poor"):
         lines.append(f"Poor: {', '.join(errors['poor'])}.")
-    how = "followed" if transmittance_of(card) == POLARISED else "averaged at every surface"
     lines.append("Units: mm, nm; directions are unit vectors, transmittance a share of the power of unpolarised light.")
-    lines.append(f"Transmittance: the polarisation that surfaces give to the light is {how}.")
+    lines.append("Transmittance: the polarisation that surfaces give to the light is followed.")
     gone = {g["status"] for g in card["gates"]} - set(gates)
     codes = [f"{code} {words}" for code, words in card["status_codes"].items() if int(code) not in gone]
     lines.append(f"Status: {'; '.join(codes)}.")

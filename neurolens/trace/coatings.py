@@ -123,11 +123,8 @@ def _responses(
         index = index_at(n_d, V_d[0], wavelength_nm) if V_d else n_d
         index2 = index * index
         layer_q2 = q0_2 + (index - n_before) * (index + n_before)
-        if not phase_beyond and _always_propagates(index, n_before, n_after):
-            c, e, f = _propagating(layer_q2, wave_number * thickness_nm)
-        else:
-            c, e, f, layer_fade = _propagating_or_evanescent(layer_q2, wave_number * thickness_nm)
-            fade = fade * layer_fade
+        c, e, f, layer_fade = _film(layer_q2, wave_number * thickness_nm)
+        fade = fade * layer_fade
         s, p = times_film(s, p, (c, e, f), index2)
     response_s = _response(q0, q, s, passes, fade, phase_beyond)
     q0_p, q_p = q0 / (n_before * n_before), q / (n_after * n_after)
@@ -162,22 +159,10 @@ def _response(
     return Response(before, after, plus, minus, passes, fade)
 
 
-def _always_propagates(index: Any, n_before: Any, n_after: Any) -> bool:
-    """Test whether light that gets through cannot be evanescent in a layer: its n sin is at most n of both media."""
-    known = isinstance(index, float | int)
-    return known and any(isinstance(n, float | int) and n < index for n in (n_before, n_after))
+def _film(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """cos, sin / q and q sin of the phase q phase_per_q of a film, and the factor `fade` that all three contain.
 
-
-def _propagating(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """cos, sin / q and q sin of the phase q phase_per_q; finite but meaningless where q2 <= 0."""
-    q = torch.sqrt(torch.where(q2 > 0, q2, 1.0))
-    phase = q * phase_per_q
-    sine = torch.sin(phase)
-    return torch.cos(phase), sine / q, sine * q
-
-
-def _propagating_or_evanescent(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the same through q2 = 0 to evanescent waves (cosh, sinh), and the factor `fade` that all three contain.
+    Through q2 = 0 they become those of evanescent waves (cosh, sinh).
 
     cos and sin / q are entire functions of q2: there is no kink at q2 = 0, and none in the derivatives. Without the
     factor exp(-phase) of evanescent waves a thick film would overflow.

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib import import_module
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,26 +38,6 @@ DEEP = 0.25
 _UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
 Quadric = tuple[Any, Any, Any]
-
-
-class Shape(Protocol):
-    """A surface of revolution, or a cylinder bent in x or y only: c h^2 / (1 + sqrt(1 - (1 + k) c^2 h^2)) + sum a h^p.
-
-    Attributes:
-        curvature: 1/mm. conic: k. asphere: pairs (p, a). cylinder: the axis that is bent, or None.
-        across: what bends it along the other axis, or None; see `Surface`.
-    """
-
-    @property
-    def curvature(self) -> Any: ...
-    @property
-    def conic(self) -> Any: ...
-    @property
-    def asphere(self) -> Any: ...
-    @property
-    def cylinder(self) -> str | None: ...
-    @property
-    def across(self) -> Any: ...
 
 
 class Figure(NamedTuple):
@@ -112,7 +92,7 @@ def is_plain(surface: Surface) -> bool:
     return not (conic or surface.asphere or surface.cylinder)
 
 
-def curve_of(shape: Shape, number: Callable[[Any], Any] = float) -> Figure:
+def curve_of(shape: Surface, number: Callable[[Any], Any] = float) -> Figure:
     """Return the figure of a shape by its own numbers; `number` turns fields that are tensors into numbers."""
     c, k = number(shape.curvature), number(shape.conic)
     powers = {int(n): number(a) for n, a in shape.asphere}
@@ -153,10 +133,9 @@ def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
     """Return the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
     asphere = tuple((p, _number(a)) for p, a in surface.asphere)
     curve = _number(surface.curvature), _number(surface.conic), asphere, _extent_mm(surface)
+    (c, other, cz), steps = _fitted(*curve, surface.across)
     if not surface.across:
-        (c, cz), steps = _fitted(*curve)
         return (c * (surface.cylinder != "y"), c * (surface.cylinder != "x"), cz), steps
-    (c, other, cz), steps = _fitted_crossed(*curve, surface.across)
     return ((other, c, cz) if surface.cylinder == "y" else (c, other, cz)), steps
 
 
@@ -197,46 +176,29 @@ def _number(value: Any) -> float:
 
 @lru_cache(maxsize=4096)
 def _fitted(
-    curvature: float, conic: float, asphere: tuple[tuple[int, float], ...], rim_mm: float
-) -> tuple[tuple[float, float], int]:
-    if not math.isfinite(rim_mm):
-        return (curvature, curvature * (1 + conic)), STEPS[-1][1]
-    radius_mm = 1 / curvature if curvature else math.inf
-    same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere)
-    points = [(h, sag_mm(same, h, 0.0)) for h in (rim_mm * i / 24 for i in range(1, 25))]
-    points = [(h, z) for h, z in points if math.isfinite(z)]
-    # Linear least squares for c and cz: each point's error is that of its height along the axis, times 2.
-    hh, hz, zz = (sum(h ** (4 - 2 * k) * z ** (2 * k) for h, z in points) for k in range(3))
-    hb, zb = sum(2 * h * h * z for h, z in points), sum(2 * z**3 for _, z in points)
-    determinant = hh * zz - hz * hz
-    if determinant > 1e-9 * hh * zz:
-        c, cz = (hb * zz - zb * hz) / determinant, (zb * hh - hb * hz) / determinant
-    else:
-        c, cz = (hb / hh if hh else curvature), 0.0
-    worst = max((abs(c * h * h + cz * z * z - 2 * z) / 2 for h, z in points), default=math.inf)
-    return (c, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
-
-
-@lru_cache(maxsize=4096)
-def _fitted_crossed(
     curvature: float,
     conic: float,
     asphere: tuple[tuple[int, float], ...],
     rim_mm: float,
-    across: tuple[float, float | None],
+    across: tuple[float, float | None] | None,
 ) -> tuple[tuple[float, float, float], int]:
-    """Return the fit of a toroid or biconic: along the curve, across it, along z."""
+    """Return the fit along the curve, across it and along z, by linear least squares: each point's error is that of
+    its height along the axis, times 2."""
     if not math.isfinite(rim_mm):
-        return (curvature, 1 / across[0], 0.0), STEPS[-1][1]
+        start = (curvature, 1 / across[0], 0.0) if across else (curvature, curvature, curvature * (1 + conic))
+        return start, STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
-    same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere, cylinder="y", across=across)
-    h, turn = np.meshgrid(rim_mm * np.arange(1, 25) / 24, np.linspace(0, math.pi / 2, 9))
-    a, h = h.ravel() * np.sin(turn.ravel()), h.ravel() * np.cos(turn.ravel())
+    bent = "y" if across else None
+    same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere, cylinder=bent, across=across)
+    turns = np.linspace(0, math.pi / 2, 9) if across else np.zeros(1)
+    h, turn = (v.ravel() for v in np.meshgrid(rim_mm * np.arange(1, 25) / 24, turns))
+    a, h = h * np.sin(turn), h * np.cos(turn)
     z = sag_mm(same, a, h)
     a, h, z = (v[np.isfinite(z)] for v in (a, h, z))
-    fit, *_ = np.linalg.lstsq(np.stack([h * h, a * a, z * z], 1), 2 * z, rcond=1e-9)
-    worst = np.abs(fit @ np.stack([h * h, a * a, z * z]) - 2 * z).max(initial=0.0) / 2
-    c, other, cz = fit.tolist()
+    columns = np.stack([h * h, a * a, z * z] if across else [h * h, z * z], 1)
+    fit, *_ = np.linalg.lstsq(columns, 2 * z, rcond=1e-9)
+    worst = np.abs(columns @ fit - 2 * z).max(initial=0.0) / 2
+    c, other, cz = fit.tolist() if across else (fit[0].item(), fit[0].item(), fit[1].item())
     return (c, other, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
 
 
@@ -363,7 +325,7 @@ def sag(o: Arithmetic, figure: Figure, x: Any, y: Any) -> tuple[Any, Any]:
     return z, square if curve.cos2 is None else o.least(curve.cos2, square)
 
 
-def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
+def sag_mm(shape: Surface, x: Any, y: Any, *, held: bool = False) -> Any:
     """Return the depth z (mm) of a surface at points x, y (mm) relative to its vertex, towards +z.
 
     Args:
@@ -377,7 +339,7 @@ def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
     return float(z) if is_number(x) and is_number(y) else z
 
 
-def sag_and_derivatives(shape: Shape, x: Any, y: Any) -> tuple[Any, Any, Any]:
+def sag_and_derivatives(shape: Surface, x: Any, y: Any) -> tuple[Any, Any, Any]:
     """Depth (mm) at points x, y (numpy arrays) and its derivatives by x and y; NaN beyond the end of a conic."""
     figure, z = curve_of(shape), sag_mm(shape, x, y)
     if figure.across:

@@ -28,7 +28,6 @@ from neurolens.trace.shapes import (
     STEEPEST,
     Figure,
     Quadric,
-    Shape,
     crossed,
     curve_of,
     depth,
@@ -384,7 +383,7 @@ def radius2(o: Arithmetic, met: Hit) -> Any:
 
 
 def meet_front(
-    shape: Shape | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
+    shape: Surface | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
 ) -> tuple[Array, Array]:
     """(x, y) where the line of each ray meets the front surface, None the plane z = 0, next to its vertex; else NaN.
 
@@ -400,7 +399,7 @@ def meet_front(
 
 
 def front_rays(
-    shape: Shape | None,
+    shape: Surface | None,
     x: Array,
     y: Array,
     z: Array,
@@ -432,7 +431,7 @@ def front_rays(
         return np.stack([x, y, ratio * dx, ratio * dy]), wider * np.where(angle > 1e-12, sine / angle, 1.0)
 
 
-def entered(shape: Shape, x: Array, y: Array, d: Array, index: Array) -> tuple[Array, Array]:
+def entered(shape: Surface, x: Array, y: Array, d: Array, index: Array) -> tuple[Array, Array]:
     """Return the unit directions [3, N] inside the front glass of rays that leave it at (x, y) along d [3, N].
 
     Also the solid angle of a bundle of them outside over that inside, n^2 cos(inside) / cos(outside) [N].

@@ -219,6 +219,19 @@ def test_keys_of_a_lens_go_with_its_lights(scene: Any, tmp_path: Path) -> None:
     ]
 
 
+def test_materials_that_shine_are_named_as_left_out(
+    scene: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    light(scene, "POINT", (0, 0, -4.0))
+    for name, strength in (("neon tube", 5.0), ("paint", 0.0)):
+        material = bpy.data.materials.new(name)
+        material.node_tree.nodes["Principled BSDF"].inputs["Emission Strength"].default_value = strength
+        wall(scene, (1, 2), -5.0).data.materials.append(material)
+    rows(tmp_path)
+    said = capfd.readouterr().out
+    assert "Left out" in said and "neon tube" in said and "paint" not in said
+
+
 @pytest.mark.parametrize("case", ["no light", "no folder", "no camera"])
 def test_mistakes_are_one_line(case: str, scene: Any, tmp_path: Path) -> None:
     path, said = tmp_path / "lights.json", {"no light": "no light that is rendered", "no camera": "no camera"}

@@ -11,6 +11,7 @@ import pytest
 from camera_helpers import FILM, GAUSS, ROOT
 from shipped import whole
 
+from neurolens.cameras.cameragraph import unit_disc
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
@@ -27,7 +28,7 @@ from neurolens.setting.states import set_lens
 from neurolens.shaders import blender_shader as shaders
 from neurolens.shaders import lowtests, osl, pupil_fit, stop_image
 from neurolens.shaders.blender_shader import _smallest, exact_lens
-from neurolens.shaders.pupil import Blades, PupilCircles, PupilDisc, unit_disc
+from neurolens.shaders.pupil import Blades, PupilCircles, PupilDisc
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, passing_share
 from neurolens.surrogates import states

@@ -9,6 +9,7 @@ from typing import Any
 import lens_models
 import numpy as np
 import pytest
+import torch
 from camera_helpers import film_rays
 from command_line import failure
 from numpy.typing import ArrayLike, NDArray
@@ -19,13 +20,18 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cli import export_lens, main
+from neurolens.cli.export_lens import lens_program, pupil_planes_mm
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
+from neurolens.setting import focusing
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.setting.states import set_lens
-from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras
+from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.states import gap_axis, zoom_axis
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
 
 ROOT = Path(__file__).parents[2]
 LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
@@ -64,8 +70,9 @@ def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["laikin_double_gauss_50", *whole("phone_lens_6")])
-def test_the_film_of_a_focus_and_stop_is_that_of_best_focus(name: str) -> None:
+def test_the_film_of_a_focus_and_stop_is_that_of_best_focus(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an exact lens, within the error that is told; it rises as objects come nearer, and stays beyond the ends."""
+    monkeypatch.setattr(focusing, "_RINGS", 96)  # rays of best focus, for the function as for what it is held to
     lens = set_lens(read_lens(LENS.with_name(f"{name}.toml")))
     near_m, widest = 12e-3 * float(first_order(lens).efl_mm), float(lens.stop_radius_mm)
 
@@ -141,6 +148,35 @@ def test_the_exact_lens_as_a_function(tmp_path: Path, monkeypatch: pytest.Monkey
     np.testing.assert_allclose(found[4][passed], wanted.transmittance[passed], rtol=1e-4)
 
 
+@pytest.mark.whole  # as of a model
+def test_the_zoom_of_an_exact_lens_is_an_argument() -> None:
+    """Between the source's positions: rays of the tracer through the lens zoomed there."""
+    lens = read_lens(LENS.with_name("nikon_zoom_70_200.toml"))
+    axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: set_lens(lens, zoom=zoom_mm))
+    assert error_mm < 1e-4
+    nodes = [set_lens(lens, zoom=v) for v in axis.nodes]
+    planes = pupil_planes_mm(nodes, (axis,))
+    program, plane = lens_program(nodes, (axis,), planes), number_of((axis,), planes)
+    names = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm", "film_z_mm", "stop_radius_mm")
+    for zoom_mm in (146.1, 80.3):
+        at = set_lens(lens, zoom=zoom_mm)
+        film_z, random = best_focus_z_mm(at, 5.0), np.random.default_rng(3)
+        pupil_z = plane if isinstance(plane, float) else float(plane.evaluate({"zoom_mm": zoom_mm})["value"])
+        film, pupil = random.uniform(-15, 15, (2, 400)), random.uniform(-16, 16, (2, 400))
+        given = dict(zip(names, (*film, *pupil, 550.0, film_z, at.stop_radius_mm), strict=True))
+        found = program.evaluate(given | {"zoom_mm": zoom_mm})
+        way = np.stack([*(pupil - film), np.full(400, pupil_z - film_z)])
+        way /= np.sqrt((way**2).sum(0))
+        rays = Rays(*(torch.as_tensor(row) for row in (*film, np.full(400, film_z), *way)))
+        out = trace(at, rays, 550.0, towards="scene")
+        passed = out.status.numpy() == st.PASSED
+        assert passed.sum() > 60 and (found["status"] != out.status.numpy()).mean() < 0.01
+        passed &= found["status"] == st.PASSED
+        x, dy = out.rays.x.numpy(), out.rays.dy.numpy()
+        assert np.abs(found["x_mm"] - x)[passed].max() < 2e-3 and np.abs(found["dy"] - dy)[passed].max() < 2e-5
+    assert program.evaluate(given | {"zoom_mm": 60.0})["status"].min() == st.OUTSIDE_DOMAIN
+
+
 def run_compiled(language: str, source: str, folder: Path, given: str = "", *arguments: str) -> str:
     """What a program prints; skipped where there is no compiler."""
     compiler = shutil.which("c++" if language == "c++" else "cc")
@@ -151,6 +187,51 @@ def run_compiled(language: str, source: str, folder: Path, given: str = "", *arg
     assert done.returncode == 0, done.stderr
     command = [str(folder / "a.out"), *arguments]
     return subprocess.run(command, input=given.encode(), capture_output=True, check=True).stdout.decode("latin-1")
+
+
+@pytest.mark.whole  # the rays of a written camera are above
+def test_an_integrator_in_c_plus_plus_sees_what_the_camera_sees(tmp_path: Path) -> None:
+    """Its picture of three spheres, pixel by pixel, against rays of the camera and the same spheres in numpy."""
+    file, width, height, samples = lens_models.exported("invariants"), 48, 32, 4
+    command = ["export", str(file), "--to", "c", "--camera", "--focus", str(FOCUS_M), "--name", "lens"]
+    assert main([*command, "-o", str(tmp_path / "lens_camera.h")]) == 0
+    source = (ROOT / "experiments" / "integrator.cpp").read_text()
+    printed = run_compiled("c++", source, tmp_path, "", str(width), str(samples)).encode("latin-1")
+    head = f"P6\n{width} {height}\n255\n".encode()
+    assert printed.startswith(head)
+    picture = np.frombuffer(printed[len(head) :], np.uint8).reshape(-1, 3).astype(int)
+    made = make_camera(file, Shot(FILM, FOCUS_M))
+    n = np.arange(width * height * samples)
+    a, b, u, v = ((0.5 + n * 1.1673039782614187**-k) % 1.0 for k in (1, 2, 3, 4))
+    pixel = n // samples
+    film = np.stack([0.5 - (pixel % width + a) / width, (pixel // width + b) / height - 0.5]) * np.array([FILM]).T
+    square = np.stack([u, v]).astype(np.float32)
+    wanted = np.empty((width * height, 3))
+    for channel, nm in enumerate((610.0, 550.0, 465.0)):
+        rays = made.sample(film.astype(np.float32), square, np.full(n.size, nm, np.float32))
+        seen = rays.weight * radiance(rays.origin_m, rays.direction, channel)
+        wanted[:, channel] = 255 * np.sqrt(seen.reshape(-1, samples).mean(1)).clip(0, 1)
+    difference = np.abs(picture - wanted)
+    assert (difference < 1.5).mean() > 0.995 and picture.std() > 20 and difference.mean() < 0.6
+
+
+def radiance(origin: NDArray[np.float32], direction: NDArray[np.float32], channel: int) -> NDArray[np.float64]:
+    """That of the spheres of experiments/integrator.cpp."""
+    text = (ROOT / "experiments" / "integrator.cpp").read_text()
+    rows = re.findall(r"^    \{\{(.*?)\}, (\S+)f, \{(.*?)\}\}", text, re.MULTILINE)
+    found, nearest = np.full(origin.shape[1], (0.35, 0.45, 0.6)[channel]), np.full(origin.shape[1], np.inf)
+    assert len(rows) == 3
+    for place, size, colour in rows:
+        centre, tint = ([float(t.strip(" f")) for t in part.split(",")] for part in (place, colour))
+        to, radius = origin - np.array(centre)[:, None], float(size)
+        along = (to * direction).sum(0)
+        d = along**2 - (to**2).sum(0) + radius**2
+        t = -along - np.sqrt(d.clip(0))
+        hit = (d > 0) & (t > 0) & (t < nearest)
+        normal = (to + t * direction) / radius
+        sun = (normal * np.array([[0.4], [0.7], [0.59]])).sum(0).clip(0)
+        found, nearest = np.where(hit, tint[channel] * (0.25 + 0.75 * sun), found), np.where(hit, t, nearest)
+    return found
 
 
 ZOOM = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"

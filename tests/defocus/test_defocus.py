@@ -20,7 +20,7 @@ from neurolens.cli import main
 from neurolens.defocus.gather import gather, spread_over, turned
 from neurolens.defocus.highlights import spread_highlights, take_highlights
 from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.plate import Eye, Layer
+from neurolens.defocus.plate import Layer, PlatePinhole
 from neurolens.defocus.read import DepthSettings, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
@@ -38,25 +38,25 @@ def thin(f_number: float = 1.4, focus_m: float = FOCUS_M) -> ThinLens:
     return ThinLens(50.0, f_number, focus_m, FILM)
 
 
-def eye_of(camera: Camera, size: tuple[int, int] = SIZE) -> Eye:
+def pinhole_of(camera: Camera, size: tuple[int, int] = SIZE) -> PlatePinhole:
     frame = frame_of(camera)
     per_mm = size[0] / camera.film_mm[0]
     reach = frame.reach_mm[0] * per_mm, frame.reach_mm[1] * per_mm
-    return Eye(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[0])
+    return PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[0])
 
 
 def blurred(
     camera: Camera, rgb: np.ndarray, w: np.ndarray, highlights: bool = False, samples: int = 128, threads: int = 1
 ) -> np.ndarray:
     size = (w.shape[1], w.shape[0])
-    eye, layers = eye_of(camera, size), [Layer(rgb.astype(np.float32), np.asarray(w, np.float32))]
-    spread, taken = spread_over(camera, eye, size), None
+    pinhole, layers = pinhole_of(camera, size), [Layer(rgb.astype(np.float32), np.asarray(w, np.float32))]
+    spread, taken = spread_over(camera, pinhole, size), None
     if highlights:
-        taken = take_highlights(layers[0], eye, spread, size)
+        taken = take_highlights(layers[0], pinhole, spread, size)
         assert len(taken.radius_px)
-    found = gather(layers, eye, camera, size, spread, samples, threads).rgb
+    found = gather(layers, pinhole, camera, size, spread, samples, threads).rgb
     if taken is not None:
-        spread_highlights(found, taken, layers, eye, camera)
+        spread_highlights(found, taken, layers, pinhole, camera)
     return found
 
 
@@ -158,15 +158,17 @@ def test_a_sharp_screen_hides_the_blur_behind_it() -> None:
 def test_what_lies_behind_an_edge_comes_from_the_layer_behind() -> None:
     """A near screen before a wall that is red where the screen hides it: only the layer behind knows."""
     camera = thin()
-    eye, w_far = eye_of(camera), in_focus(camera)
+    pinhole, w_far = pinhole_of(camera), in_focus(camera)
     rgb, w = flat(1.0, w_far)
     rgb[:, :192], w[:, :192] = 0.0, 2.0
     hidden, far = flat(1.0, w_far)
     hidden[:, :192] = (1.0, 0.0, 0.0)
     layers = [Layer(rgb.astype(np.float32), w.astype(np.float32))]
-    spread = spread_over(camera, eye, SIZE)
-    alone = gather(layers, eye, camera, SIZE, spread, 128)
-    both = gather([*layers, Layer(hidden.astype(np.float32), far.astype(np.float32))], eye, camera, SIZE, spread, 128)
+    spread = spread_over(camera, pinhole, SIZE)
+    alone = gather(layers, pinhole, camera, SIZE, spread, 128)
+    both = gather(
+        [*layers, Layer(hidden.astype(np.float32), far.astype(np.float32))], pinhole, camera, SIZE, spread, 128
+    )
     assert alone.filled > 0.001 and both.filled < alone.filled / 20
     left = 192 - int(disc_px(camera, 2.0) / 2)
     assert alone.rgb[108, left, 1] > 0.15 and both.rgb[108, left, 1] < 0.02 < 0.15 < both.rgb[108, left, 0]
@@ -176,9 +178,14 @@ def test_planes_that_recede_have_no_edges() -> None:
     camera = thin()
     rgb, w = flat(1.0, 0.0)
     w[:] = np.linspace(0.05, 1.0, SIZE[1])[:, None]
-    eye = eye_of(camera)
+    pinhole = pinhole_of(camera)
     found = gather(
-        [Layer(rgb.astype(np.float32), w.astype(np.float32))], eye, camera, SIZE, spread_over(camera, eye, SIZE), 64
+        [Layer(rgb.astype(np.float32), w.astype(np.float32))],
+        pinhole,
+        camera,
+        SIZE,
+        spread_over(camera, pinhole, SIZE),
+        64,
     )
     assert found.filled < 1e-4
 
@@ -208,8 +215,8 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     exact: Camera, place: tuple[float, float], w: float
 ) -> None:
     """Against rays from the point through the front of the lens, traced the other way."""
-    eye = eye_of(exact)
-    kernel = kernel_at(exact, eye, SIZE, place, w, place)
+    pinhole = pinhole_of(exact)
+    kernel = kernel_at(exact, pinhole, SIZE, place, w, place)
     assert kernel is not None
     rgb, depth = flat(0.0, w)
     row, column = int(place[1]), int(place[0])
@@ -219,8 +226,11 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     if w == 0:
         return
     z = 1 / w
-    slope = (place[0] - eye.centre_px[0]) / eye.reach_px[0], -(place[1] - eye.centre_px[1]) / eye.reach_px[1]
-    point = np.array([slope[0] * z, slope[1] * z, -z - eye.before_film_mm / 1000], np.float32)
+    slope = (
+        (place[0] - pinhole.centre_px[0]) / pinhole.reach_px[0],
+        -(place[1] - pinhole.centre_px[1]) / pinhole.reach_px[1],
+    )
+    point = np.array([slope[0] * z, slope[1] * z, -z - pinhole.before_film_mm / 1000], np.float32)
     square, _ = stratified(300, (500.0, 600.0))
     count = square.shape[1]
     hit = cast(DifferentialCamera, exact).to_film(
@@ -297,6 +307,30 @@ def test_layers_of_a_file_are_found_by_their_names(tmp_path: Path) -> None:
     assert [layer.texel[0, 0, 3] for layer in plate.layers] == pytest.approx([0.4, 0.2, 0.2])
 
 
+def test_depth_may_be_in_another_part(tmp_path: Path) -> None:
+    """As compositing programs write it: colours in one part, depth in the next; a third repeats names."""
+    full = np.full(SIZE[::-1], 0.5, np.float32)
+    parts = [
+        OpenEXR.Part({}, {c: full * k for c in names}, name)
+        for name, names, k in (("rgb", "RGB", 1), ("depth", ["Z"], 8), ("far", "RGBZ", 20))
+    ]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    front, behind = read_plate(tmp_path / "parts.exr", FILM, frame_of(thin()), DepthSettings()).layers
+    assert front.texel[0, 0] == pytest.approx([0.5, 0.5, 0.5, 0.25])
+    assert behind.texel[0, 0] == pytest.approx([10, 10, 10, 0.1])
+
+
+def test_lights_that_two_layers_show_are_spread_once() -> None:
+    """A layer behind is a whole picture without the things in front: it shows the lights beside them, too."""
+    camera, size = thin(), SIZE
+    rgb, w = flat(0.0, 0.0)
+    rgb[108, 194] = 1e4
+    pinhole, spread = pinhole_of(camera), spread_over(camera, pinhole_of(camera), size)
+    layers = [Layer(rgb.astype(np.float32), w.astype(np.float32)) for _ in range(2)]
+    lights = [len(take_highlights(layer, pinhole, spread, size, layers[:k]).light) for k, layer in enumerate(layers)]
+    assert lights == [1, 0] and layers[1].texel[108, 194, 0] < 1e4
+
+
 def test_samples_of_a_deep_file_are_layers(tmp_path: Path) -> None:
     def samples(near: float, far: float) -> np.ndarray:
         cells = np.empty(SIZE[::-1], object)
@@ -328,22 +362,24 @@ def test_overscan_is_beyond_the_film(tmp_path: Path) -> None:
     plate = read_plate(tmp_path / "wide.exr", FILM, frame_of(thin()), DepthSettings())
     assert plate.size == SIZE and plate.layers[0].size == (SIZE[0] + 20, SIZE[1] + 20)
     camera = thin()
-    found = gather(plate.layers, plate.eye, camera, SIZE, spread_over(camera, plate.eye, SIZE), 16)
+    found = gather(plate.layers, plate.pinhole, camera, SIZE, spread_over(camera, plate.pinhole, SIZE), 16)
     assert found.rgb[2:-2, 2:-2].max() < 1e-3 and found.beyond == 0
 
 
 def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
     """A light in the border, just off the film: its disc reaches the picture, as the closed form says."""
     camera, border = thin(), 20
-    eye = eye_of(camera)
-    eye = Eye(eye.reach_px, (eye.centre_px[0] + border, eye.centre_px[1] + border), eye.before_film_mm)
+    pinhole = pinhole_of(camera)
+    pinhole = PlatePinhole(
+        pinhole.reach_px, (pinhole.centre_px[0] + border, pinhole.centre_px[1] + border), pinhole.before_film_mm
+    )
     rgb, w = flat(0.0, 2.0, (SIZE[0] + 2 * border, SIZE[1] + 2 * border))
     rgb[108 + border, border - 5] = 1e4  # 4.5 pixels from the edge
     rgb_before = rgb.copy()
-    layers, spread = [Layer(rgb.astype(np.float32), w.astype(np.float32))], spread_over(camera, eye, SIZE)
-    taken = take_highlights(layers[0], eye, spread, SIZE)
+    layers, spread = [Layer(rgb.astype(np.float32), w.astype(np.float32))], spread_over(camera, pinhole, SIZE)
+    taken = take_highlights(layers[0], pinhole, spread, SIZE)
     picture = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
-    spread_highlights(picture, taken, layers, eye, camera)
+    spread_highlights(picture, taken, layers, pinhole, camera)
     # The same light within a film that is as much larger.
     wide = ThinLens(50.0, 1.4, FOCUS_M, (FILM[0] * w.shape[1] / SIZE[0], FILM[1] * w.shape[0] / SIZE[1]))
     whole = blurred(wide, rgb_before, w, highlights=True)[border:-border, border:-border]
@@ -393,15 +429,15 @@ def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
 
 def test_a_kernel_has_the_area_of_rays_traced_from_the_point(exact: Camera) -> None:
     """Pixels above half of the mean, against a histogram of camera rays that see a small patch there."""
-    eye, place, w = eye_of(exact), (330.5, 150.5), 2.5
-    kernel = kernel_at(exact, eye, SIZE, place, w, place)
+    pinhole, place, w = pinhole_of(exact), (330.5, 150.5), 2.5
+    kernel = kernel_at(exact, pinhole, SIZE, place, w, place)
     assert kernel is not None
     height, width = kernel.light.shape[:2]
     random, count = np.random.default_rng(5), 1_500_000
     px = np.array(kernel.corner_px)[:, None] + np.array([[width], [height]]) * random.random((2, count))
     film = np.stack([-(px[0] / SIZE[0] - 0.5) * FILM[0], (px[1] / SIZE[1] - 0.5) * FILM[1]]).astype(np.float32)
     rays = exact.sample(film, random.random((2, count)).astype(np.float32), np.full(count, 549.0, np.float32))
-    lines = eye.lines(rays.origin_m, rays.direction)
+    lines = pinhole.lines(rays.origin_m, rays.direction)
     seen = np.hypot(lines[0] + w * lines[2] - place[0], lines[1] + w * lines[3] - place[1]) < 1.5
     weight = rays.weight * (seen & (rays.status == 0))
     cells = [(px[k] - kernel.corner_px[k]).astype(int) for k in (0, 1)]
@@ -420,10 +456,10 @@ def test_a_plate_of_our_own_says_its_pinhole_and_its_film(tmp_path: Path, scene:
     camera = thin(1.0)
     plates = [read_plate(tmp_path / f"{name}.exr", FILM, frame_of(camera), DepthSettings()) for name in "ab"]
     assert [plate.size for plate in plates] == [(64, 36)] * 2 and plates[1].layers[0].size == (128, 72)
-    assert plates[0].eye.before_film_mm == 50.0
+    assert plates[0].pinhole.before_film_mm == 50.0
     # Depth counts from the film, 50 mm behind the hole; the ball's front is 1.9 m from it, 0.4 m off the axis.
     assert 1 / plates[0].layers[0].texel[..., 3].max() == pytest.approx(2.0 - 0.1 - 0.05, abs=0.02)
-    one, two = (gather(p.layers, p.eye, camera, p.size, spread_over(camera, p.eye, p.size), 64) for p in plates)
+    one, two = (gather(p.layers, p.pinhole, camera, p.size, spread_over(camera, p.pinhole, p.size), 64) for p in plates)
     assert two.beyond == 0 and one.beyond > 0
     np.testing.assert_allclose(one.rgb[4:-4, 4:-4].mean(axis=(0, 1)), two.rgb[4:-4, 4:-4].mean(axis=(0, 1)), rtol=0.01)
     # The weight of the hole, cos^4, is taken out: what is left is the radiance of the white surroundings.
@@ -444,10 +480,10 @@ def test_highlights_before_and_behind_the_focus_have_their_own_kernels() -> None
 def test_a_light_too_wide_for_a_kernel_stays_among_the_others() -> None:
     camera = thin(0.7)
     size = (96, 54)
-    eye = eye_of(camera, size)
+    pinhole = pinhole_of(camera, size)
     layer = Layer(*(v.astype(np.float32) for v in flat(0.0, 400.0, size)))
     layer.texel[20, 40, :3] = 1e4
-    assert not len(take_highlights(layer, eye, spread_over(camera, eye, size), size).radius_px)
+    assert not len(take_highlights(layer, pinhole, spread_over(camera, pinhole, size), size).radius_px)
     assert layer.texel[20, 40, 0] == 1e4
 
 
@@ -463,7 +499,7 @@ def test_alpha_says_where_a_layer_has_nothing(tmp_path: Path) -> None:
     assert front[5, 9] == pytest.approx([0.4, 0.4, 0.4, 1.0]) and front[5, 300, 3] < 0
     camera = thin()
     alone, both = (
-        gather(layers, plate.eye, camera, SIZE, spread_over(camera, plate.eye, SIZE), 64).rgb[108, :, 1]
+        gather(layers, plate.pinhole, camera, SIZE, spread_over(camera, plate.pinhole, SIZE), 64).rgb[108, :, 1]
         for layers in (plate.layers[:1], plate.layers)
     )
     assert alone[300] == 0 and both[300] == pytest.approx(0.97, abs=0.04)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from experiments.gallery import bokeh
 from experiments.gallery.bokeh import LightDisc, light_disc
 from experiments.gallery.cameras import CAMERAS, PostProcessed, View, illumination, post_process, shot_of, strength_for
-from experiments.gallery.measures import MEASURES
+from experiments.gallery.measures import MEASURES, PROJECTIONS, blur_mm, exposure, field_angles, scale
 from experiments.gallery.run import check
 from experiments.gallery.settings import read_effect
 from neurolens.base import status as st
@@ -22,8 +22,13 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.lens.shot import Shot
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot, StopShape
 from neurolens.readers.lensfile import read_lens
+from neurolens.render.images import make_aperture
 from neurolens.render.scene import load_scene
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import Rays, trace
@@ -72,6 +77,20 @@ def test_every_effect_reads_and_its_thin_lens_measures(name: str) -> None:
         assert found.get(key, value) == pytest.approx(value, rel=0.01, abs=0.2)
 
 
+@pytest.mark.whole
+def test_light_falls_off_faster_the_wider_the_stop() -> None:
+    """A Tessar: rims alone at f/1, stop and rims at f/4, at f/8 the cosine law of its exit pupil and no more."""
+    wide, four = (relative(camera("brendel_tessar_100.toml", n, MEDIUM, 10.0), 41.0)[-1] for n in (1.0, 4.0))
+    model_four, eight = (
+        relative(camera("brendel_tessar_100.mlp-16x2.onnx", n, MEDIUM, 10.0), 41.0)[-1] for n in (4.0, 8.0)
+    )
+    assert (wide, four, eight) == pytest.approx((0.37, 0.63, 0.80), abs=0.02)
+    assert model_four == pytest.approx(four, abs=2e-3)
+    thin = camera("thin", 8.0, MEDIUM, 10.0, 100.0)
+    law = (1 + (np.linspace(0, 41, 5) / thin.image_distance_mm) ** 2) ** -2
+    assert relative(thin, 41.0) == pytest.approx(law, rel=2e-3)
+
+
 @pytest.mark.parametrize(("lens", "least"), [("brendel_tessar_100", 0.08), ("hudson_double_gauss_100", 0.16)])
 def test_no_post_process_has_the_falloff_of_a_lens(lens: str, least: float) -> None:
     """With centre and corner met, the lens is brighter in between, by what the cosine law cannot bend."""
@@ -87,29 +106,156 @@ def test_no_post_process_has_the_falloff_of_a_lens(lens: str, least: float) -> N
     assert post_process(np.linspace(0, corner, 5), strength_for(corner, curve[-1])) == pytest.approx(curve, abs=1e-3)
 
 
+def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0) -> float:
+    """First-order diameter of the disc of a light on the axis: D m |d - s| / d.
+
+    D is the diameter of the entrance pupil, d and s the distances from it of the light and of what is in focus, m the
+    magnification there: the pupil's cone cut by the plane in focus, and that plane's picture.
+
+    Args:
+        lens: focused, its film in place. distance_m: from film to light.
+    """
+    data: Any = first_order(lens, wavelength_nm)
+    assert lens.film_z_mm is not None
+    light_z = lens.film_z_mm - 1e3 * distance_m
+    behind = lens.film_z_mm - float(data.rear_principal_z_mm)
+    efl = float(data.efl_mm)
+    focus_z = float(data.front_principal_z_mm) - 1 / (1 / efl - 1 / behind)
+    to_light, to_focus = (float(data.entrance_pupil_z_mm) - z for z in (light_z, focus_z))
+    magnification = (behind - efl) / efl
+    return float(data.entrance_pupil_diameter_mm) * magnification * abs(to_light - to_focus) / to_light
+
+
+@pytest.mark.whole  # test_two_stops_halve_the_blur is of its physics
+def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
+    efl_mm = 75.0
+    lens = set_lens(
+        read_lens(ROOT / "lenses" / "tronnier_double_gauss_100.toml"),
+        focal_length_mm=efl_mm,
+        f_number=11.0,
+        focus_m=1.4,
+    )
+    exact = camera("tronnier_double_gauss_100.toml", 11.0, (24.0, 16.0), 1.4, efl_mm)
+    thin = camera("thin", 11.0, (24.0, 16.0), 1.4, efl_mm)
+    behind = thin.image_distance_mm
+    s = 1400 - behind
+    for distance in (1.0, 2.0):
+        assert blur_mm(exact, distance) == pytest.approx(paraxial_blur_mm(lens, distance), rel=0.05)
+        closed = efl_mm / 11 * behind / s * abs(1e3 * distance - 1400) / (1e3 * distance - behind)
+        assert blur_mm(thin, distance) == pytest.approx(closed, rel=5e-3)
+    assert blur_mm(exact, 1.4) < 0.1 * blur_mm(exact, 1.0)
+    # Perspective is a matter of place: the ratio of sizes is that of the distances from the entrance pupil.
+    ratio = scale(exact, 1.0) / scale(exact, 2.0)
+    assert ratio == pytest.approx((2000 - 1.1 * efl_mm) / (1000 - 1.1 * efl_mm), rel=0.01)
+    assert ratio == pytest.approx(scale(thin, 1.0) / scale(thin, 2.0), rel=0.01)
+
+
+@pytest.mark.whole  # cameras/test_ideal.py frames them
+@pytest.mark.parametrize(("name", "panel"), [("depth-of-field", 5), ("series-focal-length", 0), ("pinhole", 0)])
+def test_the_ideal_cameras_of_a_panel_are_framed_as_its_lens(name: str, panel: int) -> None:
+    """What is in focus has one size in all columns."""
+    chosen = read_effect(GALLERY / f"{name}.toml").panel[panel]
+    shot = shot_of(chosen, load_scene(chosen.scene))
+    exact, thin, hole = (CAMERAS[column](shot, None) for column in ("exact", "thin", "pinhole"))
+    assert isinstance(thin, ThinLens) and isinstance(hole, Pinhole)
+    assert scale(thin, shot.focus_m) == pytest.approx(scale(exact, shot.focus_m), rel=2e-3)
+    assert hole.settings["efl_mm"] == pytest.approx(thin.image_distance_mm, rel=1e-9)
+
+
+@pytest.mark.whole
+def test_open_blur_of_lens_and_surrogate_agree_and_leave_first_order() -> None:
+    """A shipped model, focused at 1.5 m: wide open its blur in focus is what the thin lens does not have."""
+    film = (24.0, 16.0)
+    exact, model = (camera(f"tronnier_double_gauss_100.{e}", 2.0302, film, 1.5) for e in ("toml", "mlp-16x2.onnx"))
+    for distance in (1.1, 1.5, 2.0):
+        assert blur_mm(model, distance) == pytest.approx(blur_mm(exact, distance), rel=0.01)
+    assert blur_mm(exact, 1.5) > 0.05 > 1e3 * blur_mm(camera("thin", 2.0302, film, 1.5, 100.7), 1.5)
+
+
+def test_two_stops_halve_the_blur_and_quarter_the_light() -> None:
+    for name in ("tronnier_double_gauss_100.mlp-16x2.onnx", "thin"):
+        efl = 100.7163 if name == "thin" else None
+        wide, closed = (camera(name, n, (24.0, 16.0), 1.5, efl) for n in (5.6, 11.2))
+        assert blur_mm(wide, 2.5) / blur_mm(closed, 2.5) == pytest.approx(2, rel=0.03)
+        assert exposure(wide) / exposure(closed) == pytest.approx(4, rel=0.03)
+    with pytest.raises(InputError, match="a lens, a model or a thin lens"):
+        exposure(Pinhole(36.0))
+
+
+def test_a_pinhole_draws_itself_on_every_point() -> None:
+    """2 a (1 + f / d) at a distance d before the hole, whatever the distance in focus."""
+    hole = make_camera(GALLERY / "lenses" / "pinhole_36.toml", Shot(film_mm=(18.0, 12.0), focus_m=1.5, f_number=100.0))
+    for distance in (0.3, 0.5, 2.0):
+        before = 1e3 * distance - 36
+        assert blur_mm(hole, distance) == pytest.approx(0.36 * (1 + 36 / before), rel=5e-3)
+        assert scale(hole, distance) == pytest.approx(36 / before, rel=1e-3)
+    assert blur_mm(ThinLens(36.0, 100.0, 1.5), 1.5) < 1e-3
+    assert blur_mm(Pinhole(36.0), 0.5) == 0
+
+
+@pytest.mark.whole
+def test_fisheyes_bend_the_room_as_the_equisolid_projection() -> None:
+    model = load_model(ROOT / "models" / "horimoto_fisheye_16.mlp-16x2.onnx")
+    film = (36.4, 24.2667)
+    exact, surrogate = (camera(f"horimoto_fisheye_16.{e}", 8.0, film, 2.0) for e in ("toml", "mlp-16x2.onnx"))
+    radii = np.array([5.0, 10.0, 15.0, 20.0])
+    angles = field_angles(exact, radii)
+    assert field_angles(surrogate, radii) == pytest.approx(angles, abs=1e-3)
+    focal = model.card["lens"]["efl_mm"]
+    assert radii == pytest.approx(focal * PROJECTIONS["equisolid"](angles), rel=0.02)
+    assert focal * PROJECTIONS["rectilinear"](angles[-1]) > 2 * radii[-1]
+    assert 2 * math.degrees(field_angles(exact, np.array([21.8]))[0]) == pytest.approx(179, abs=3)
+    thin = camera("thin", 8.0, film, 2.0, 16.0)
+    seen = thin.image_distance_mm * np.tan(field_angles(thin, radii))
+    assert seen == pytest.approx(radii, rel=5e-3)
+
+
 TRONNIER, COOKE = "tronnier_double_gauss_100", "cooke_anamorphic_42"
-FILM, FOCUS_M, F_NUMBER = (54.0, 36.0), 1.42, 2.0302
-FAR_M = 12.0
+FILM, FOCUS_M = (54.0, 36.0), 1.42
+FAR_M, NEAR_M = 12.0, 0.85
+SHAPES = {"4": {"blades": 4}, "6": {"blades": 6}, "50": {"blades": 50}} | {
+    name: {"aperture_mask": GALLERY / "scenes" / f"{name}.png"} for name in ("star", "heart")
+}
 
 
 @cache
-def taken_by(kind: str) -> ExactCamera | OnnxCamera | ThinLens:
+def shape(name: str) -> Aperture | None:
+    return None if name == "round" else make_aperture(StopShape(**SHAPES[name]))  # type: ignore[arg-type]
+
+
+@cache
+def taken_by(kind: str, stop: str = "round", f_number: float = 2.0302) -> ExactCamera | OnnxCamera | ThinLens:
     """The double Gauss, its shipped model, or a thin lens of its focal length."""
     if kind == "thin":
-        return ThinLens(100.7163, F_NUMBER, FOCUS_M, FILM)
+        return ThinLens(100.7163, f_number, FOCUS_M, FILM, aperture=shape(stop))
     if kind == "surrogate":
         model = load_model(ROOT / "models" / f"{TRONNIER}.mlp-16x2.onnx")
-        return OnnxCamera(model, Shot(FILM, FOCUS_M, F_NUMBER))
+        return OnnxCamera(model, Shot(FILM, FOCUS_M, f_number, aperture=shape(stop)))
     with pytest.warns(UserWarning, match="V_d"):
         lens = read_lens(ROOT / "lenses" / f"{TRONNIER}.toml")
-    return ExactCamera(lens, Shot(FILM, FOCUS_M, F_NUMBER))
+    return ExactCamera(lens.with_aperture(shape(stop)), Shot(FILM, FOCUS_M, f_number))
 
 
 @cache
-def disc(kind: str, place: str) -> LightDisc:
-    taken = taken_by(kind)
-    share = {"far": 0, "half": 0.48, "edge": 0.93}[place]
-    return light_disc(taken, bokeh.light_towards(taken, share, FAR_M), count=3000)
+def disc(kind: str, stop: str, place: str, f_number: float = 2.0302) -> LightDisc:
+    taken = taken_by(kind, stop, f_number)
+    share, distance = {"far": (0, FAR_M), "near": (0, NEAR_M), "half": (0.48, FAR_M), "edge": (0.93, FAR_M)}[place]
+    return light_disc(taken, bokeh.light_towards(taken, share, distance), count=3000)
+
+
+@pytest.mark.parametrize("place", ["far", "near", "edge"])
+def test_the_disc_of_a_thin_lens_has_its_closed_form(place: str) -> None:
+    """Round everywhere, of diameter D (s' / s) |d - s| / d for a light d and a focus s before the lens.
+
+    Its second moments make it 1% smaller: at f/2 the rim's rays weigh cos^4 = 0.89.
+    """
+    behind = taken_by("thin").image_distance_mm  # type: ignore[union-attr]
+    s, d = 1e3 * FOCUS_M - behind, 1e3 * (NEAR_M if place == "near" else FAR_M) - behind
+    expected = 100.7163 / 2.0302 * behind / s * abs(d - s) / d
+    found = disc("thin", "round", place)
+    if place != "edge":  # off the axis the rim's rays shift the centroid
+        assert 2 * found.outline_mm(30) == pytest.approx(np.full(30, expected), rel=0.02)
+    assert found.axes_mm == pytest.approx((0.99 * expected, 0.99 * expected), rel=3e-3)
 
 
 @pytest.mark.parametrize("place", ["far", "edge"])
@@ -122,7 +268,7 @@ def test_the_disc_found_backwards_is_that_of_light_traced_forwards(place: str) -
     out = taken.to_film(np.repeat(light[:, None], side**2, axis=1), pupil, np.full(side**2, 550, np.float32))
     lit = out.status == st.PASSED
     forwards = LightDisc(out.film_mm[:, lit].astype(float), out.weight[lit].astype(float) / side**2)
-    backwards = disc("exact", place)
+    backwards = disc("exact", "round", place)
     assert backwards.centre_mm == pytest.approx(forwards.centre_mm, abs=5e-3)
     assert backwards.axes_mm == pytest.approx(forwards.axes_mm, rel=5e-3)
     assert backwards.total == pytest.approx(forwards.total, rel=0.01)
@@ -131,16 +277,56 @@ def test_the_disc_found_backwards_is_that_of_light_traced_forwards(place: str) -
 @pytest.mark.parametrize("kind", ["exact", "surrogate"])
 def test_rims_cut_cats_eyes_across_the_radius(kind: str) -> None:
     """Narrower, smaller and darker the nearer to the corner, long across the radius; a thin lens has none."""
-    far, half, edge = (disc(kind, place) for place in ("far", "half", "edge"))
+    far, half, edge = (disc(kind, "round", place) for place in ("far", "half", "edge"))
     ratios = [d.axes_mm[1] / d.axes_mm[0] for d in (far, half, edge)]
     assert ratios[0] > 0.995 and 0.75 < ratios[1] < 0.9 and 0.6 < ratios[2] < 0.7
     assert 1 > half.area_mm2 / far.area_mm2 > 1.2 * edge.area_mm2 / far.area_mm2
     assert edge.total / far.total == pytest.approx(0.47, abs=0.03)
     radius = math.degrees(math.atan2(edge.centre_mm[1], edge.centre_mm[0]))
     assert (edge.long_axis_deg - radius) % 180 == pytest.approx(90, abs=2)
-    null = disc("thin", "edge")
+    null = disc("thin", "round", "edge")
     assert null.axes_mm[1] / null.axes_mm[0] > 0.995
-    assert null.area_mm2 / disc("thin", "far").area_mm2 > 0.99
+    assert null.area_mm2 / disc("thin", "round", "far").area_mm2 > 0.99
+
+
+def test_the_surrogate_draws_the_discs_of_the_lens() -> None:
+    for place in ("far", "near", "edge"):
+        exact, model = disc("exact", "round", place), disc("surrogate", "round", place)
+        assert model.axes_mm == pytest.approx(exact.axes_mm, rel=0.01)
+        assert model.centre_mm == pytest.approx(exact.centre_mm, abs=5e-3)
+
+
+# One shape in the exact lens; the model, which shares the code that tests shapes, stands for the others.
+@pytest.mark.parametrize(
+    ("kind", "stop", "corners"), [("exact", "6", 6), ("surrogate", "6", 6), ("thin", "4", 4), ("surrogate", "star", 5)]
+)
+def test_a_disc_has_the_corners_of_the_stop_and_its_area_passes(kind: str, stop: str, corners: int) -> None:
+    """The area exactly of a thin lens; a real lens's stop is not evenly seen from the film, by some hundredths."""
+    waves, depth = bokeh.outline_waves(disc(kind, stop, "far"))
+    assert waves == corners
+    assert depth > 0.03 > 3 * bokeh.outline_waves(disc(kind, "round", "far"))[1]
+    area = shape(stop).area_share  # type: ignore[union-attr]
+    assert bokeh.passage(taken_by(kind, stop)) == pytest.approx(area, abs=0.003 if kind == "thin" else 0.025)
+
+
+def test_fifty_blades_are_round_and_masks_open_the_shares_that_the_page_gives() -> None:
+    assert bokeh.passage(taken_by("thin", "50")) == pytest.approx(math.sin(math.pi / 25) * 25 / math.pi, abs=3e-3)
+    assert bokeh.outline_waves(disc("thin", "50", "far"))[1] < 0.01
+    for name, share in (("star", 0.452), ("heart", 0.470)):
+        assert shape(name).area_share == pytest.approx(share, abs=2e-3)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("kind", ["surrogate", "thin"])
+def test_a_heart_stands_behind_the_focus_and_hangs_before_it(kind: str) -> None:
+    far, near = disc(kind, "heart", "far"), disc(kind, "heart", "near")
+    assert bokeh.overlap(far, near, turned=True) > bokeh.overlap(far, near) + 0.1
+    # A heart's mass is above its tip: its third moment along y is below 0, and turned with the film above.
+    y, x = np.mgrid[1:-1:256j, -1:1:256j]
+    mask = shape("heart").inside(x, y, 1.0)  # type: ignore[union-attr]
+    assert ((y[mask] - y[mask].mean()) ** 3).mean() < 0
+    for found, sign in ((far, 1), (near, -1)):
+        off = found.film_mm[1] - found.centre_mm[1]
+        assert sign * (off**3 * found.flux).sum() > 0
 
 
 def test_an_anamorphic_lens_draws_upright_ovals() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import statistics
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from experiments.make_models import errors_by_kind
 from neurolens.study.advice import recommended
 
 ROOT = Path(__file__).parents[2]
@@ -78,6 +80,19 @@ def test_speed_in_glsl(start: str, way: str) -> None:
     assert_printed(error, [rows[key]["rms_um"] for key in keys])
 
 
+def test_cost_in_our_renderer() -> None:
+    page = (ROOT / "experiments" / "results" / "render_times" / "README.md").read_text(encoding="utf-8")
+
+    def goal(text: str) -> float:
+        (line,) = (line for line in page.splitlines() if line.startswith(f"| {text}"))
+        return float(line.split("|")[3].strip().rstrip("%"))
+
+    _, exact, models, _, _ = cells("a picture of our renderer")
+    assert_printed(exact, [goal("exact, C: overhead a refraction")])
+    camera = "{}, C: camera above the thin lens's, of the {} pinhole"
+    assert_printed(models, [goal(camera.format(m, s)) for m in ("polynomial", "network") for s in ("cheap", "dear")])
+
+
 def test_cost_in_cycles_is_that_of_the_same_lens() -> None:
     rows = {r["camera"]: r for r in results("osl_speed")["rows"] if r["scene"] == "sky"}
     both = (
@@ -112,3 +127,31 @@ def test_speed_of_ghosts() -> None:
     assert_printed(second, [ray[1], picture[1]])
     assert_printed(times, [ray[0] / ray[1], picture[0] / picture[1]])
     assert_printed(error, [fitted["rms_um"], 100 * abs(fitted["energy"])])
+
+
+def test_errors_of_the_networks_that_ship() -> None:
+    rows = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))["models"]
+    kinds = errors_by_kind(rows, "mlp-16x2")
+    round_, anamorphic, single, named = kinds.values()
+    text = README.partition("the shipped 16x2 networks")[2].partition("poor as their cards")[0]
+    said = re.sub(r"\s+", " ", text).replace("f/2", "")
+    expected = [statistics.median(round_), len(round_), min(round_), max(round_), min(anamorphic), max(anamorphic)]
+    assert_printed(said, [*expected, *sorted(single)])
+    polynomials = errors_by_kind(rows, "ols-64")["lenses by name"]
+    text = README.partition("Polynomials of the lenses by name")[2].partition(" [Every")[0]
+    both = [[statistics.median(some), len(some), min(some), max(some)] for some in (polynomials, named)]
+    assert_printed(text, both[0] + both[1])
+
+
+def test_speed_up_on_dask() -> None:
+    rows = [r for r in results("dask")["rows"] if r["part"] == "speed-up"]
+    seconds = {(r["what"].partition(",")[0], r["how"]): r["seconds"] for r in rows}
+    text = README.partition("`python -m experiments dask`")[2].partition("\n")[0]
+    times = [seconds[what, "plain"] / seconds[what, "2 workers"] for what in ("survey", "render")]
+    assert_printed(text, [times[0], 8, times[1]])
+
+
+def test_light_of_averaged_polarisation() -> None:
+    worst = [r["bare"]["relative"] for r in results("transmittance")["lenses"]]
+    text = README.partition("averaging it at every surface")[2].partition("(`python")[0]
+    assert_printed(text, [100 * max(worst), len(worst), 100 * statistics.median(worst)])

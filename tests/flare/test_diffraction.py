@@ -248,6 +248,35 @@ def test_star_out_of_focus(aperture: Aperture | None, light: Light) -> None:
         assert np.abs(film - expected)[outside].sum() < 0.03 * expected[outside].sum()
 
 
+@pytest.mark.parametrize(("shift_mm", "rel"), whole((0.0, 0.02), (1.0, 0.05)))
+def test_ends_of_the_range(shift_mm: float, rel: float) -> None:
+    """At 400 and 700 nm rings are as bright as the sum over cells at that wavelength, in focus and 1 mm out of it; in
+    focus, far from the centre, as bright as Airy's: 2 F_number lambda / (pi^2 r^2) of the light beyond r."""
+    lens, nm = double_gauss(8.0, None, shift_mm), np.linspace(400.0, 700.0, 7)
+    pixel = 0.015
+    raster = Raster((53 * pixel, 53 * pixel), 53, 53)
+    stars = list(d._stars(lens, AXIS, nm, raster, 1))
+    x = np.arange(-26, 27) * pixel
+    within = (np.arange(10) + 0.5) / 10 - 0.5
+    fine = (x[:, None] + within * pixel).reshape(-1)
+    far = np.hypot(x, x[:, None])
+    middle = p.exit_pupil(lens, AXIS, 550.0)
+    assert middle is not None and len(stars) == 7
+    for k in (0, 6):
+        pupil = p.exit_pupil(lens, AXIS, nm[k], middle)
+        assert pupil is not None
+        expected = d.far_field(pupil, p.outline(middle), fine, fine).reshape(53, 10, 53, 10).mean((1, 3))
+        for low, high in ((0.08, 0.12), (0.12, 0.18), (0.18, 0.26), (0.26, 0.38)):
+            ring = (stars[k] > 0) & (far > low) & (far < high)
+            assert stars[k][ring].sum() == pytest.approx(expected[ring].sum(), rel=rel)
+        if not shift_mm:
+            ring = (far > 0.12) & (far < 0.36)
+            beyond = 2 * 8.0 * nm[k] * 1e-6 / math.pi**2 * (1 / 0.12 - 1 / 0.36)
+            assert stars[k][ring].sum() * pixel**2 / light_of(pupil, p.outline(middle)) == pytest.approx(
+                beyond, rel=0.04
+            )
+
+
 def test_picture_is_in_units_of_a_white_card() -> None:
     """The layer's sum is the light of the star over the card's; nothing is negative at one wavelength's grey."""
     lens, raster = double_gauss(22.0, Aperture(blades=6)), Raster((12.0, 8.0), 96, 64)

@@ -105,15 +105,6 @@ def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
     assert files[1].stat().st_mtime_ns == kept and files[2].read_bytes() == before
 
 
-def test_noise_is_that_of_the_seed_in_every_frame(tmp_path: Path) -> None:
-    out = tmp_path / "a.exr"
-    words = ["flare", *SMALL, "--light", "7,4", "--photons", "20000", "-o", str(out)]
-    assert main([*words, "--frames", "1:2"]) == 0
-    assert main([*words, "--seed", "3"]) == 0
-    first, second, other = (read_exr(tmp_path / name)[0] for name in ("a.0001.exr", "a.0002.exr", "a.exr"))
-    assert first.any() and np.array_equal(first, second) and not np.array_equal(first, other)
-
-
 def test_gains_and_tints(tmp_path: Path) -> None:
     """The gains of a ghost and of the layer multiply, and the layer stays the sum of its parts."""
     found = []

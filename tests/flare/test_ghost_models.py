@@ -195,6 +195,49 @@ def test_pictures_are_those_of_traced_ghosts(model: GhostModel, distance_m: floa
     assert np.abs(blocks[1] - blocks[0]).sum() < 0.04 * blocks[0].sum()
 
 
+@pytest.mark.whole  # another kind of lens
+def test_lenses_with_cylinders(tmp_path: Path) -> None:
+    """Against the exact ghosts of a light that the fit never saw, also stopped down; compiled for one direction and for
+    any, from the file and in onnxruntime; mirrored light is a mirrored ghost, light turned by 90 degrees another."""
+    lens = set_lens(read_lens(LENS.with_name("schneider_anamorphic_31.toml")), focus_m=math.inf)
+    settings = replace(SETTINGS, angle_deg=15.0, keep=0.15, film_radius_mm=12.0)
+    fitted = fit_ghosts(lens, settings)
+    stored = read_ghosts(write_ghosts(fitted, tmp_path / "anamorphic.onnx"))
+    session = onnxruntime.InferenceSession(str(tmp_path / "anamorphic.onnx"))
+    assert len(fitted.pairs) >= 3 and fitted.report["film_rms_um"] < 120
+    for f_number in (None, 8.0):
+        closed = replace(fitted, lens=lens if f_number is None else set_lens(lens, f_number=f_number))
+        tracer = GhostTracer(closed.lens, fitted.pairs)
+        rays, _ = light_rays(lens, Light(7.0, -5.0), 0, 20_000)
+        exact, found = tracer.trace(rays, 520.0), closed.trace(rays, 520.0)
+        there = np.hypot(*np.moveaxis(exact.film_xy_mm, 1, 0)) < settings.film_radius_mm
+        light = [np.where(there, r.power, 0).sum(1, dtype=np.float64) for r in (exact, found)]
+        assert light[1] == pytest.approx(light[0], rel=0.06, abs=0.01 * light[0].max())
+        both = there & (exact.power > 0) & (found.power > 0)
+        off = np.hypot(*np.moveaxis(found.film_xy_mm - exact.film_xy_mm, 1, 0))[both]
+        assert np.sqrt((off**2).mean()) < 0.3
+    for number, pair in enumerate(fitted.pairs[:2]):
+        start = lit_rays(fitted, number, 200)
+        general = fitted.follow_each(start, [480.0], pair)[0]
+        lit = general[3] < 1
+        alike = np.stack([fitted.follow_each(one[:, None], [480.0], pair)[0, :, 0] for one in start[:, :60].T], -1)
+        given = np.concatenate([start, np.full((1, 200), 480.0)]).astype(np.float32)
+        radius = np.array([fitted.stop_radius_mm], np.float32)
+        onnx_found = session.run([output_of(pair)], {"entering": given, "stop_radius_mm": radius})[0]
+        assert 0.05 < lit.mean() < 1
+        drawn = in_glsl(fitted, number, np.concatenate([given, np.full((1, 200), radius[0])]), tmp_path)
+        more = [] if drawn is None else [drawn]
+        for other in (alike, stored.follow_each(start, [480.0], pair)[0], onnx_found, *more):
+            here = lit[: other.shape[1]]
+            np.testing.assert_allclose(other[:2, here], general[:2, : len(here)][:, here], rtol=1e-4, atol=5e-3)
+            np.testing.assert_allclose(other[2, here], general[2, : len(here)][here], rtol=1e-3, atol=1e-7)
+        for flip in ([-1, 1], [1, -1]):
+            mirrored = fitted.follow_each(start * np.array(flip * 2)[:, None], [480.0], pair)[0]
+            np.testing.assert_allclose(mirrored[:2], general[:2] * np.array(flip)[:, None], rtol=1e-5, atol=1e-4)
+        turned = fitted.follow_each(start[[1, 0, 3, 2]], [480.0], pair)[0]
+        assert np.abs(turned[[1, 0]] - general[:2])[:, lit].max() > 0.1
+
+
 def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "flare.exr"
     small = ["--light", "9,4", "--width", "36", "--bins", "2", "--blades", "6", "--f-number", "8", "--json"]

@@ -69,6 +69,14 @@ def test_disc_light_on_its_axis(radius: float, height: float) -> None:
     assert not above.any() and np.allclose(below, 3)
 
 
+def test_disc_reflects_and_ends_at_its_rim() -> None:
+    disc = {"centre_m": [1, 0, -2], "normal": [0, 0, 1], "radius_m": 0.5, "material": "grey"}
+    made = world(materials=MATERIALS, environment={"colour": [1, 1, 1]}, discs=[disc])
+    for x, expected in ((1.0, 0.5), (1.49, 0.5), (1.51, 1.0), (0.49, 1.0)):
+        values = radiance(made, [x, 0, 0], [x, 0, -2], samples=64, max_depth=1)
+        assert np.allclose(values, expected, rtol=1e-3)
+
+
 def test_direction_table_draws_what_it_says() -> None:
     random = np.random.default_rng(3)
     weights = random.random((8, 16)) + 0.1
@@ -176,6 +184,19 @@ def test_aiming_at_lights_changes_the_noise_and_not_the_mean(floor: str) -> None
         assert_aimed(made, [0.1, 0, 0], noise, error)
 
 
+def box_of_lights(half: float, emission: float) -> list[dict[str, Any]]:
+    """Six squares that look inwards."""
+    quads = []
+    for axis in range(3):
+        for side in (-1, 1):
+            u, v = np.roll(np.eye(3), axis, axis=1)[[1, 2]] * 2 * half
+            corner = -(u + v) / 2 + side * half * np.roll(np.eye(3), axis, axis=1)[0]
+            if side > 0:
+                u, v = v, u
+            quads.append({"corner_m": corner.tolist(), "edge_u_m": u.tolist(), "edge_v_m": v.tolist()})
+    return [q | {"material": "grey", "emission": [emission] * 3} for q in quads]
+
+
 def coat(roughness: float, specular: float = 0.04) -> dict[str, Any]:
     """A coat over white, or white metal."""
     base = 1 if specular < 1 else 0
@@ -197,6 +218,12 @@ def test_what_absorbs_nothing_vanishes_in_uniform_light(material: dict[str, Any]
         values = radiance(made, [0, 0.3, 5], [0, height, 0], samples=8192, max_depth=300)
         # The directions that a smooth normal sends below the surface are the only loss.
         assert abs(values.mean() - 1) < 5e-3 + 4 * values.std() / math.sqrt(8192)
+
+
+def test_closed_box_of_glowing_walls_reaches_the_geometric_sum() -> None:
+    made = world(materials=MATERIALS, quads=box_of_lights(1.0, 0.75))
+    values = radiance(made, [0.2, 0.1, 0], [0.3, -1, 0.4], samples=8192, max_depth=40)
+    assert values.mean() == pytest.approx(0.75 / (1 - 0.5), rel=0.01)
 
 
 def test_a_closed_furnace_of_all_kinds_reaches_the_light_of_its_lamp() -> None:
@@ -255,6 +282,17 @@ def test_glass_absorbs_by_beer_and_lambert(lanes: int) -> None:
     back = r + (1 - r) ** 2 * r * left**2 / (1 - (r * left) ** 2)
     values = radiance(made, [0, 0, 1], [sin, 0, 0.2], samples=16384, max_depth=40, lanes=lanes)
     assert np.allclose(values.reshape(lanes, -1).mean(axis=1), through + back, rtol=0.02)
+
+
+def test_absorption_is_coloured_as_the_transmittance_says() -> None:
+    tint = [0.9, 0.5, 0.2]
+    tables = {
+        "materials": {"glass": {"kind": "glass", "n_d": 1.0001, "transmittance": tint, "transmittance_depth_m": 0.2}},
+        "boxes": [{"min_m": [-9, -9, -0.2], "max_m": [9, 9, 0], "material": "glass"}],
+    }
+    seen = radiance(world(environment=WHITE, **tables), [0, 0, 1], [0, 0, 0], samples=1024, max_depth=10)
+    colour = radiance(world(environment={"colour": tint}), [0, 0, 1], [0, 0, 0], samples=1024)
+    assert np.allclose(seen, colour, rtol=2e-3)
 
 
 def test_a_measured_reflectance_is_what_is_reflected() -> None:

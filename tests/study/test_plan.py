@@ -154,7 +154,7 @@ def test_a_pupil_s_outline_serves_any_plane_and_tells_what_passes_beside_it() ->
 def test_what_a_shot_needs_falls_with_its_stop() -> None:
     lens = set_lens(read_lens(LENS))
     wide, small = (
-        {e.name: e.worth for e in effects_of(probe(scene_from_tables(wall(4.0, n)), lens, across=6), 0.25)}
+        {e.name: e.worth for e in effects_of(probe(scene_from_tables(wall(4.0, n)), lens, across=4), 0.25)}
         for n in (None, 16.0)
     )
     assert (
@@ -261,7 +261,7 @@ def shader_of(name: str, zoom: str | None) -> tuple[str, OslLens, list[str]]:
 
 @cache
 def garden() -> Probe:
-    return probe(load_scene(Path("experiments/scenes/garden.toml")), set_lens(read_lens(GAUSS)), across=6)
+    return probe(load_scene(Path("experiments/scenes/garden.toml")), set_lens(read_lens(GAUSS)), across=4)
 
 
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,7 +346,7 @@ def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) 
 
 def test_models_have_the_blades_of_the_lens_file() -> None:
     shaped = read_lens(GAUSS).with_aperture(Aperture(blades=5, rotation_deg=20.0))
-    found = probe(scene_from_tables(wall(1.0, 4.0)), shaped, across=6)
+    found = probe(scene_from_tables(wall(1.0, 4.0)), shaped, across=3)
     model = Path("models/laikin_double_gauss_50.ols-60.onnx")
     asked = replace(found.asked, shot=replace(found.asked.shot, aperture=None))
     own, bare = (

@@ -20,7 +20,6 @@ from neurolens.setting.pupils import camera_rays, image_radius_mm
 from neurolens.setting.states import set_lens
 from neurolens.study.rays import (
     angles_deg,
-    deciding_rim_ratio,
     focused_vergence,
     frame_width_mm,
     local_jacobian,
@@ -312,14 +311,3 @@ def test_illumination_of_a_small_hole_is_cos4() -> None:
     assert result.model == pytest.approx([0.9 * e for e in expected], rel=1e-4)
     assert result.max_difference == pytest.approx(0.1, rel=1e-4)
     assert result.film_radius_mm[-1] == FILM_RADIUS
-
-
-def test_the_deciding_rim_agrees_with_the_tracer() -> None:
-    lens = set_lens(read_lens(LENSES / "laikin_double_gauss_50.toml"))
-    domain = domain_of(lens)
-    rays = trace_pairs(lens, sample_domain(domain, 20000, 1), domain.pupil_z_mm)
-    ratio = deciding_rim_ratio(lens, rays)
-    passed, by_rim = rays.status == st.PASSED, rays.status % 4 == st.RIM
-    assert bool((ratio[passed] <= 1).all())
-    assert bool((ratio[by_rim] > 1).all())
-    assert int(by_rim.sum()) > 1000

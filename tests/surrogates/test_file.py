@@ -116,17 +116,6 @@ def test_nodes_of_a_strangers_file_are_never_run(tmp_path: Path) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_file_of_the_first_schema_is_read_and_its_angle_traced(tmp_path: Path) -> None:
-    whole = read_model(lens_models.exported("invariants"))
-
-    def as_before(data: dict) -> None:
-        data.update(data.pop("nodes")[0], schema=1)
-        del data["angle"]
-
-    old = read_model(lens_models.edited(whole.path, tmp_path / "old.onnx", as_before, MODEL_KEY))
-    assert old.nodes[0].angle == pytest.approx(whole.nodes[0].angle, rel=1e-12)
-
-
 @pytest.mark.parametrize(("many", "degree"), [(20_000, 8), (200, 64)])
 def test_hostile_terms_end_soon(many: int, degree: int, tmp_path: Path) -> None:
     """Many terms take memory for every ray, and a writer compares all products that a term of high degree may be."""

@@ -18,11 +18,11 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.cores import InvariantPolynomial
+from neurolens.surrogates.cores import STOP, InvariantPolynomial
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.fits.boundaries import GateFit
+from neurolens.surrogates.fits.boundaries import GateFit, invariant_core
 from neurolens.surrogates.fits.polynomial import fit_polynomial
 from neurolens.surrogates.gates import boundary_rays, gate_reach, gate_values
 from neurolens.surrogates.lightfield import LightField
@@ -215,6 +215,23 @@ def test_gates_block_far_rays_of_which_no_value_is_known() -> None:
     known = GateFit(features, value[None], torch.ones((1, 400), dtype=torch.float64))
     known.block(beyond, nothing - 1, torch.ones((1, 50), dtype=torch.bool))
     assert (known.coefficients()[0] @ beyond < 0).all()
+
+
+def test_rims_take_fewer_terms_and_clip_as_well() -> None:
+    """Beside the same polynomial with all terms in its tests, stop crossing and transmittance."""
+    model = fit_model(lens_models.prepared(), ModelSettings("ols", terms=28))
+    data, core = replace(lens_models.prepared(), encoding=model.encoding), model.core
+    assert isinstance(core, InvariantPolynomial)
+    of = [k for k, used in enumerate(core.ab[:STOP].reshape(2, -1).any(0)) if used]
+    every = invariant_core(data, core.exponents, of, torch.from_numpy(core.ab[:STOP].reshape(2, -1)[:, of]))
+    assert np.count_nonzero(core.scalars) < 0.7 * every.scalars.size
+    assert np.count_nonzero(core.ab[STOP]) < every.ab[STOP].size
+    rays = sample_domain(model.domain, 40_000, seed=5)
+    passes = trace_pairs(model.lens, rays, model.domain.pupil_z_mm).status == st.PASSED
+    wrong, dense = (
+        int(((m.predict(rays).status == st.PASSED) != passes).sum()) for m in (model, replace(model, core=every))
+    )
+    assert wrong < 1.3 * dense + 10 and wrong < 2e-3 * len(passes)
 
 
 # ---- rays that cannot tell all terms apart ----

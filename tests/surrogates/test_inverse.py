@@ -20,7 +20,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.model import load_model
-from neurolens.cameras.onnxmaps import load_inverse
+from neurolens.cameras.onnxlens import load_inverse
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.loworder import with_film_derivatives
 from neurolens.surrogates.card import MODEL_KEY

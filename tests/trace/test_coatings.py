@@ -221,7 +221,7 @@ def normal_reflectance(coating: Any, n_before: float, n_after: float, lam_nm: fl
 
 @pytest.mark.parametrize("glass", [1.46, 1.52, 1.7, 1.904, 2.0])
 def test_quarter_wave_closed_form(glass: float):
-    coating = designs.quarter_wave(600.0)
+    coating = designs.design("quarter-wave 600", 1.0, glass)
     expected = ((glass - 1.38**2) / (glass + 1.38**2)) ** 2
     assert normal_reflectance(coating, 1.0, glass, 600.0) == pytest.approx(expected, abs=1e-15)
     assert normal_reflectance(coating, glass, 1.0, 600.0) == pytest.approx(expected, abs=1e-15)
@@ -232,21 +232,21 @@ def test_quarter_wave_closed_form(glass: float):
 @pytest.mark.parametrize("at_nm", [450.0, 550.0])
 def test_v_coat_reflects_nothing_at_its_wavelength_from_either_side(glass: float, at_nm: float):
     for media in ((1.0, glass), (glass, 1.0)):
-        coating = designs.v_coat(*media, at_nm)
+        coating = designs.design(f"v-coat {at_nm:g}", *media)
         assert normal_reflectance(coating, *media, at_nm) < 1e-28
         assert all(0 < thickness < at_nm / 2 for _, thickness in coating.layers)
         assert normal_reflectance(coating, *media, at_nm * 1.3) > 1e-3
 
 
 def test_v_coat_between_glasses():
-    assert normal_reflectance(designs.v_coat(1.6, 1.7), 1.6, 1.7) < 1e-28
+    assert normal_reflectance(designs.design("v-coat", 1.6, 1.7), 1.6, 1.7) < 1e-28
     with pytest.raises(InputError, match=r"v-coat: media: got \(1.5 to 1.52\).*1.38 over 2.1 or 1.38 over 1.63"):
-        designs.v_coat(1.5, 1.52)
+        designs.design("v-coat", 1.5, 1.52)
 
 
 @pytest.mark.parametrize("media", [(1.0, 1.52), (1.52, 1.0), (1.0, 1.75)])
 def test_broadband_stays_low_over_the_visible(media: tuple[float, float]):
-    broad, single = designs.broadband(*media), designs.quarter_wave()
+    broad, single = designs.design("broadband", *media), designs.design("quarter-wave", *media)
     assert normal_reflectance(broad, *media, 510.0) < 1e-28
     lam_nm = torch.linspace(420, 670, 26, dtype=torch.float64)
     r_broad, r_single = (reflectance(torch.ones_like(lam_nm), *media, c.layers, lam_nm) for c in (broad, single))
@@ -290,7 +290,7 @@ def test_eras_reflect_what_makers_state(glass: float):
 def test_films_that_disperse_are_films_of_their_index():
     lam_nm = torch.tensor([420.0, 550.0, 690.0], dtype=torch.float64)
     cos_i = cosines(0, 35, 60)
-    layers = designs.multi_layer(1.0, 1.62).layers
+    layers = designs.design("multi-layer", 1.0, 1.62).layers
     at_once = powers(cos_i, 1.0, 1.62, layers, lam_nm)
     for k, nm in enumerate(lam_nm.tolist()):
         plain = tuple((index_at(n_d, V_d, nm), thickness) for n_d, thickness, V_d in layers)
@@ -309,15 +309,11 @@ def test_films_of_low_index_lie_towards_the_air():
 
 
 def test_designs_by_name():
-    media = 1.0, 1.52
     assert designs.design("bare", 1.52, 1.52).layers == ()
-    for name, made in (
-        ("quarter-wave", designs.quarter_wave()),
-        ("quarter-wave 500", designs.quarter_wave(at_nm=500.0)),
-        ("v-coat 500", designs.v_coat(*media, 500.0)),
-        ("broadband 500", designs.broadband(*media, 500.0)),
-    ):
-        assert designs.design(name, *media).layers == made.layers and designs.design(name, *media).name == name
+    for name, usual in (("quarter-wave", 550), ("v-coat", 550), ("broadband", 510)):
+        here, there = designs.design(name, 1.0, 1.52), designs.design(f"{name} {usual}", 1.0, 1.52)
+        assert here.layers == there.layers != designs.design(f"{name} 500", 1.0, 1.52).layers
+        assert (here.name, there.name) == (name, f"{name} {usual}")
 
 
 @pytest.mark.parametrize(

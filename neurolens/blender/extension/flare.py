@@ -120,6 +120,16 @@ def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, 
     return len(known), words
 
 
+def shining_materials(scene: Any) -> list[str]:
+    """Names of the materials that emit light on objects of a scene: they are no lights of the list."""
+    shine = {"EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}
+    slots = (slot.material for item in scene.objects if not item.hide_render for slot in item.material_slots)
+    return sorted({
+        m.name for m in slots if m and m.node_tree
+        for node in m.node_tree.nodes if (name := shine.get(node.type)) and node.inputs[name].default_value > 0
+    })  # fmt: skip
+
+
 class NEUROLENS_OT_write_lights(_Operator):
     """Write the scene's lights in all frames, and how much of each shows, for `neurolens flare --lights`"""
 
@@ -133,6 +143,11 @@ class NEUROLENS_OT_write_lights(_Operator):
         path = Path(bpy.path.abspath(self.filepath)).with_suffix(".json")
         count, words = write_lights(context, found, path, self.rays)
         self.report({"INFO"}, f"{count} lights in {path}: neurolens flare {words} -o flare.exr")
+        if names := shining_materials(context.scene):
+            text = (
+                f"Left out, as the world is: the emission of {', '.join(names[:9])}; flare --image finds it in a plate"
+            )
+            self.report({"WARNING"}, text)
 
 
 CLASSES = (NEUROLENS_OT_write_lights,)

@@ -35,6 +35,10 @@ from neurolens.surrogates.terms import (
 GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
+# Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
+# those errors, or by hardly more than with all terms. At a quarter as many rays were clipped wrongly as with all;
+# networks clipped more, and keep all.
+NEEDED_SHARE, _NEARLY = 0.25, 1.1
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
@@ -79,27 +83,40 @@ def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
 
 
 def invariant_core(
-    data: Prepared, exponents: Exponents, columns: Sequence[int], coefficients: Tensor
+    data: Prepared, exponents: Exponents, columns: Sequence[int], coefficients: Tensor, *, sparse: bool = False
 ) -> InvariantPolynomial:
     """The polynomial on these monomials with all that is fitted on them after position and direction.
 
     Args:
         columns: places of the chosen ones among m p (first M) and m u (M more).
         coefficients: [2, C] of those, of position and direction.
+        sparse: whether the rest has only the terms that it needs.
     """
-    ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
+    ab, features = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64), features_of(exponents)
     ab[:STOP, list(columns)] = coefficients
-    ab[STOP] = fit_stop(data, features_of(exponents))
-    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
+    rest = fit_sparse(data, features) if sparse else (fit_stop(data, features), solve_scalars(data, features))
+    ab[STOP], scalars = rest
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), scalars.numpy())
 
 
-def fit_scalars(data: Prepared, exponents: Exponents) -> Tensor:
-    """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
-    return solve_scalars(data, features_of(exponents))
+def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
+    """[2 M] and [1 + G, M] as `fit_stop` and `solve_scalars` give them, with the features that each needs."""
+    stop, *gates = (fit.needed() for fit in _boundary_fits(data, features))
+    crossing, weight = stop_crossing(data)
+    rows = vector_columns(features(data.boundary_field), data.boundary_field)
+    found = rows.new_zeros(len(rows))
+    found[stop] = solve(rows[stop], crossing.reshape(1, -1), weight.repeat(2))[0]
+    rays = data.pairs.train
+    seen, wanted = features(data.encoding(rays.inputs)), rays.transmittance[None]
+    through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), TRANSMITTANCE_ERROR**-2 / len(rays), len(seen))
+    return found, solve_scalars(data, features, [through.needed(), *gates])
 
 
-def solve_scalars(data: Prepared, features: Features) -> Tensor:
-    """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
+def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] | None = None) -> Tensor:
+    """[1 + G, M]: transmittance on the passing rays, each gate on those that get as far, most on those that it decides.
+
+    Args:
+        kept: the features that the transmittance and each gate has; all without.
 
     Raises:
         InputError: no more rays near the boundaries than terms.
@@ -108,9 +125,13 @@ def solve_scalars(data: Prepared, features: Features) -> Tensor:
     train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
     if len(data.boundary) <= len(train):
         raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
-    fit = GateFit(near, gate_values(pairs.lens, data.gates, data.boundary), data.boundary_weights[0])
+    through, *gates = kept or [list(range(len(train)))]
+    values = gate_values(pairs.lens, data.gates, data.boundary)
+    fit = GateFit(near, values, data.boundary_weights[0], gates if kept else None)
     fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
-    return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
+    transmittance = torch.zeros((1, len(train)), dtype=torch.float64)
+    transmittance[:, through] = solve(train[through], pairs.train.transmittance[None])
+    return torch.cat([transmittance, fit.coefficients()])
 
 
 def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidden: Features | None = None) -> Exponents:
@@ -124,20 +145,18 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidde
         hidden: the features of a network's last hidden layer, which are held to a share of the errors.
     """
     added = further(invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive), exponents)
-    field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
     allowed, most, share = 1.0, MOST_BOUNDARY_TERMS, 1.0
     if hidden is not None:
         allowed, most = NETWORK_SHARE**2, MOST_NETWORK_TERMS
     if not np.array_equal(first, exponents[: len(first)]):
-        stop = _boundary_fits(data, field, features_of(first)(field), which=[0])[0]
+        stop = _boundary_fits(data, features_of(first), which=[0])[0]
         share = min(max(stop.error, STOP_KEPT), 1.0)
-    features = features_of(exponents, hidden)(field)
-    fits = _boundary_fits(data, field, features, stop_share=share)
+    fits = _boundary_fits(data, features_of(exponents, hidden), stop_share=share)
     bad = [k for k, fit in enumerate(fits) if fit.error > allowed]
     if not bad:
         return added[:0]
-    start, features = len(features), features_of(np.concatenate([exponents, added]), hidden)(field)
-    fits = _boundary_fits(data, field, features, start, bad, share)
+    start, features = fits[0].terms, features_of(np.concatenate([exponents, added]), hidden)
+    fits = _boundary_fits(data, features, start, bad, share)
     return added[[k - start for k in _selected(fits, min(most, len(added)), allowed)]]
 
 
@@ -181,6 +200,13 @@ class _BoundaryFit:
             if self.sweep.scores("ols")[column] > 0:
                 self.sweep.add(column)
 
+    def needed(self) -> list[int]:
+        """The columns left when the cheapest are dropped one by one, as long as the error allows it."""
+        sweep, most = self.sweep, max(NEEDED_SHARE**2, _NEARLY * self.error)
+        while len(sweep.chosen) > 1 and self.error + float((costs := sweep.costs()).min()) * self.scale <= most:
+            sweep.drop(sweep.chosen[int(costs.argmin())])
+        return sorted(sweep.chosen)
+
     def scores(self) -> np.ndarray:
         return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
 
@@ -201,12 +227,7 @@ def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: f
 
 
 def _boundary_fits(
-    data: Prepared,
-    field: LightField,
-    features: Tensor,
-    start: int | None = None,
-    which: list[int] | None = None,
-    stop_share: float = 1.0,
+    data: Prepared, features: Features, start: int | None = None, which: list[int] | None = None, stop_share: float = 1
 ) -> list[_BoundaryFit]:
     """The fits of the stop crossing and of every gate, or some `which` of them, with the first `start` terms in.
 
@@ -214,33 +235,34 @@ def _boundary_fits(
     """
     crossing, weight = stop_crossing(data)
     values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
-    rays, terms, fits = features.shape[1], len(features), []
+    field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
+    seen, fits = features(field), []
+    terms, rays = seen.shape
     for k in range(1 + len(values)) if which is None else which:
         w = (weights[k - 1] if k else weight)[:rays]
         if k:
-            sweep = Sweep.of_columns(features * w, (values[k - 1, :rays] * w)[None])
+            sweep = Sweep.of_columns(seen * w, (values[k - 1, :rays] * w)[None])
         else:
             weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
-            sweep = Sweep.of_vectors(features, weighed, (crossing[:, :rays] * w)[None])
+            sweep = Sweep.of_vectors(seen, weighed, (crossing[:, :rays] * w)[None])
         allowed = (GATE_ERROR**2 if k else STOP_ERROR**2 * stop_share) * max(float((w * w).sum()), 1e-300)
         fits.append(_BoundaryFit(sweep, terms, 1 / allowed, terms if start is None else start))
     return fits
 
 
 class GateFit:
-    """Gates [G] on common features [M, N], each with weights of its own."""
+    """Gates [G] on features [M, N], each with weights, and features, of its own."""
 
-    def __init__(self, features: Tensor, values: Tensor, weights: Tensor) -> None:
-        """Fit values [G, N] with weights [G, N]."""
-        # In orthogonal columns, so that normal equations keep their digits; what depends on others is left out.
-        norms = features.norm(dim=1).clamp_min(1e-300)
-        _, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1], full_matrices=False)
-        kept = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
-        self._turn = (right[kept] / sizes[kept, None]).T / norms[:, None] * math.sqrt(features.shape[1])  # [M, K]
-        columns = features.T @ self._turn
-        self._grams, self._moments = [], []
-        for value, weight in zip(values, weights, strict=True):
-            rows = columns * weight[:, None]
+    def __init__(
+        self, features: Tensor, values: Tensor, weights: Tensor, kept: Sequence[list[int]] | None = None
+    ) -> None:
+        """Fit values [G, N] with weights [G, N]; `kept`: the features that each gate has, all without."""
+        self._terms = len(features)
+        all_of_them = [_turn(features, list(range(self._terms)))] * len(values) if kept is None else []
+        self._turns = all_of_them or [_turn(features, columns) for columns in kept or ()]
+        self._grams, self._moments = list[Tensor](), list[Tensor]()
+        for turn, value, weight in zip(self._turns, values, weights, strict=True):
+            rows = features.T @ turn * weight[:, None]
             self._grams.append(rows.T @ rows)
             self._moments.append(rows.T @ (value * weight))
         self._solutions = [self._solve(g) for g in range(len(values))]
@@ -252,9 +274,8 @@ class GateFit:
 
     def coefficients(self) -> Tensor:
         """[G, M]."""
-        if not self._solutions:
-            return torch.empty((0, len(self._turn)), dtype=torch.float64)
-        return torch.stack(self._solutions) @ self._turn.T
+        found = [turn @ solution for turn, solution in zip(self._turns, self._solutions, strict=True)]
+        return torch.stack(found) if found else torch.empty((0, self._terms), dtype=torch.float64)
 
     def block(self, features: Tensor, values: Tensor, reached: Tensor) -> None:
         """Fit again until rays that do not pass are blocked by one gate at least.
@@ -267,8 +288,8 @@ class GateFit:
         blocks = (values > 0) | ~reached
         if not values.numel():
             return
-        columns = features.T @ self._turn
-        fitted = torch.stack([columns @ solution for solution in self._solutions])
+        columns = [features.T @ turn for turn in self._turns]
+        fitted = torch.stack([c @ solution for c, solution in zip(columns, self._solutions, strict=True)])
         weight = torch.zeros_like(values)
         for _ in range(_ROUNDS):
             passing = (fitted <= 0).all(0) & blocks.any(0)
@@ -286,8 +307,20 @@ class GateFit:
                 more = torch.sqrt(heavier**2 - weight[g, at] ** 2)
                 weight[g, at] = heavier
                 target = torch.where(reached[g, at], values[g, at].clamp(_TARGET, _MOST_TARGET), _TARGET)
-                rows = columns[at] * more[:, None]
+                rows = columns[g][at] * more[:, None]
                 self._grams[g] = self._grams[g] + rows.T @ rows
                 self._moments[g] = self._moments[g] + rows.T @ (target * more)
                 self._solutions[g] = self._solve(g)
-                fitted[g] = columns @ self._solutions[g]
+                fitted[g] = columns[g] @ self._solutions[g]
+
+
+def _turn(features: Tensor, kept: list[int]) -> Tensor:
+    """[M, K] that makes orthogonal columns of some of the features [M, N], so that normal equations keep their digits;
+    what depends on others is left out."""
+    norms = features[kept].norm(dim=1).clamp_min(1e-300)
+    _, triangle = torch.linalg.qr((features[kept] / norms[:, None]).T)
+    _, sizes, right = torch.linalg.svd(triangle, full_matrices=False)
+    large = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
+    found = features.new_zeros((len(features), int(large.sum())))
+    found[kept] = (right[large] / sizes[large, None]).T / norms[:, None] * math.sqrt(features.shape[1])
+    return found

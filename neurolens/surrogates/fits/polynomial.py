@@ -23,17 +23,10 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.surrogates.cores import (
-    DIRECTION,
-    POSITION,
-    STOP,
-    InvariantPolynomial,
-    MirrorPolynomial,
-)
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, MirrorPolynomial
 from neurolens.surrogates.fits.boundaries import (
     boundary_terms,
     features_of,
-    fit_scalars,
     fit_stop,
     invariant_core,
     solve_scalars,
@@ -82,8 +75,7 @@ _TRIAL_RAYS, _TRIAL_DEGREE = 2500, 7
 _START = tuple(product((-0.6, -0.3, 0.0, 0.3), (-0.2, 0.0, 0.2, 0.4)))
 _STEPS, _FARTHEST = (0.12, 0.06, 0.03), 1.5
 _MIRROR_METHODS = ("omp", "ols")  # and networks (`mlp`)
-# Gram matrices are made of so many rays at a time; more candidates than this would take too long to choose from.
-_CHUNK, _MOST_CANDIDATES = 4096, 2500
+_MOST_CANDIDATES = 2500  # more would take too long to choose from
 
 
 def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomial:
@@ -122,7 +114,7 @@ def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     exponents = np.concatenate([exponents, boundary_terms(data, exponents, first)])
     exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
     columns = [c if c < own else c - own + len(exponents) for c in columns]
-    return invariant_core(data, exponents, columns, coefficients)
+    return invariant_core(data, exponents, columns, coefficients, sparse=True)
 
 
 def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
@@ -202,7 +194,7 @@ def fit_paraxial(data: Prepared, method: ParaxialMethod) -> InvariantPolynomial:
     ab = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     ab[[POSITION, DIRECTION], :, 0] = ideal_map(data.pairs.lens, data.encoding, method)
     ab[STOP, :, 0] = fit_stop(data, features_of(exponents[:1]))
-    return InvariantPolynomial(exponents, ab.numpy(), fit_scalars(data, exponents).numpy())
+    return InvariantPolynomial(exponents, ab.numpy(), solve_scalars(data, features_of(exponents)).numpy())
 
 
 # ---- the planes of the light field ----
@@ -331,6 +323,7 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
         raise InputError("fit", "train", len(pairs.train), f"more training rays than the {terms} terms")
     dispersive = data.encoding.dispersive
     outputs = film_equivalent(pairs.lens, pairs.domain, train.vectors)
+    field = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field))
     supports: list[Exponents] = []
     sides = []  # of every column chosen, whether it is one of u
     for axis in (0, 1):
@@ -339,7 +332,7 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
             for e in (mirror_exponents(d, axis, dispersive=dispersive) for d in range(degree, -1, -1))
             if 2 * len(e) <= _MOST_CANDIDATES
         )
-        sweep = Sweep(*_normal_equations(candidates, axis, train.field, outputs[:, axis]))
+        sweep = Sweep.of_columns(_mirror_columns(candidates, axis, field), outputs[:, axis, :_CHOICE_RAYS])
         forward(sweep, terms // 2, "ols" if method == "ols" else "omp")
         if method == "ols":
             replace_terms(sweep)
@@ -366,17 +359,3 @@ def _scalar_terms(*, dispersive: bool) -> Exponents:
     w = units[6]
     plain = [w * k for k in range(8 if dispersive else 1)]
     return np.array([*plain, *(e + w * k for e in units[:6] for k in range(3 if dispersive else 1))])
-
-
-def _normal_equations(
-    exponents: Exponents, axis: int, field: LightField, outputs: Tensor
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gram matrix [2 M, 2 M], products with the outputs [R, N], and the outputs' squared norms [R]."""
-    size = 2 * len(exponents)
-    gram, moments = (torch.zeros((size, count), dtype=torch.float64) for count in (size, len(outputs)))
-    for start in range(0, outputs.shape[1], _CHUNK):
-        part = slice(start, start + _CHUNK)
-        columns = _mirror_columns(exponents, axis, LightField(*(c[..., part] for c in field)))
-        gram += columns @ columns.T
-        moments += columns @ outputs[:, part].T
-    return gram.numpy(), moments.numpy(), (outputs**2).sum(1).numpy()

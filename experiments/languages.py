@@ -1,5 +1,7 @@
 """Programs run in shading languages by the compilers that are here: Slang's on the processor, naga with Vulkan in
-software, glslang for HLSL, g++ for CUDA, and for VEX that is rewritten as C++."""
+software, glslang for HLSL, g++ for CUDA, and for VEX that is rewritten as C++. A text is compiled once."""
+
+from __future__ import annotations
 
 import ctypes
 import itertools
@@ -8,12 +10,12 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from neurolens.graph.c import Signature, literal
@@ -35,11 +37,24 @@ inline int clamp(int x, int low, int high) { return x < low ? low : x > high ? h
 """
 
 
-class Given:
-    """What a call takes: rows of rays, tables of the caller, the band or the numbers of the state."""
+class Missing(Exception):
+    """A compiler, or what runs its results, is not on this machine; the message says which."""
 
-    def __init__(self, program: Program, rays: Mapping[str, Any], band: int = 0, state: Sequence[float] = ()) -> None:
-        self.program, s = program, Signature.of(program, "lens")
+
+def _package(name: str, language: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError:
+        raise Missing(f"{language} is not run here: no {name} (pip install '.[shading]')") from None
+
+
+class Given:
+    """What a call takes: rows of rays, tables of the caller, the band or the numbers of the state; flags for g++."""
+
+    def __init__(
+        self, program: Program, rays: Mapping[str, Any], band: int = 0, state: Sequence[float] = (), flags: str = "-O0"
+    ) -> None:
+        self.program, self.flags, s = program, flags.split(), Signature.of(program, "lens")
         self.count = max(np.size(rays[i]) for i in s.inputs)
         self.rays = np.stack([np.broadcast_to(np.float32(rays[i]), self.count) for i in s.inputs])
         self.tables = {t: np.ascontiguousarray(rays[t], np.float32) for t in s.tables}
@@ -71,11 +86,11 @@ class Given:
 
 @cache
 def _webgpu() -> Any:
-    wgpu = pytest.importorskip("wgpu", reason="WGSL is not run here: no wgpu (pip install '.[shading]')")
+    wgpu = _package("wgpu", "WGSL")
     try:
         return wgpu.gpu.request_adapter_sync().request_device_sync()
     except RuntimeError as reason:
-        pytest.skip(f"WGSL is not run here: {reason} (Debian: mesa-vulkan-drivers)")
+        raise Missing(f"WGSL is not run here: {reason} (Debian: mesa-vulkan-drivers)") from None
 
 
 def in_wgsl(given: Given) -> Rows:
@@ -96,6 +111,12 @@ def in_wgsl(given: Given) -> Rows:
     return _run_webgpu(code, given)
 
 
+@lru_cache(8)
+def _pipeline(code: str | bytes) -> Any:
+    module = {"module": _webgpu().create_shader_module(code=code), "entry_point": "run"}
+    return _webgpu().create_compute_pipeline(layout="auto", compute=module)
+
+
 def _run_webgpu(code: str | bytes, given: Given) -> Rows:
     device, size = _webgpu(), 4 * given.count * len(given.names)
     rays = device.create_buffer_with_data(data=given.rays.tobytes(), usage="STORAGE")
@@ -107,8 +128,7 @@ def _run_webgpu(code: str | bytes, given: Given) -> Rows:
         layout = {"bytes_per_row": 4 * width}
         device.queue.write_texture({"texture": texture}, table.tobytes(), layout, (width, height, 1))
         resources.append(texture.create_view())
-    module = {"module": device.create_shader_module(code=code), "entry_point": "run"}
-    pipeline = device.create_compute_pipeline(layout="auto", compute=module)
+    pipeline = _pipeline(code)
     entries = [{"binding": k, "resource": r} for k, r in enumerate(resources)]
     encoder = device.create_command_encoder()
     work = encoder.begin_compute_pass()
@@ -144,20 +164,32 @@ def in_hlsl(given: Given) -> Rows:
     _webgpu()
     glslang = shutil.which("glslangValidator")
     if glslang is None:
-        pytest.skip("HLSL is not compiled here: no glslangValidator (Debian: glslang-tools)")
+        raise Missing("HLSL is not compiled here: no glslangValidator (Debian: glslang-tools)")
+    return _run_webgpu(_spirv(glslang, _compute_shader("hlsl", given, "", "[[vk::binding({}, 0)]]")), given)
+
+
+@lru_cache(8)
+def _spirv(glslang: str, code: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         text, binary = Path(folder) / "lens.hlsl", Path(folder) / "lens.spv"
-        text.write_text(_compute_shader("hlsl", given, "", "[[vk::binding({}, 0)]]"))
-        command = [glslang, "-D", "-V", "-S", "comp", "-e", "run", text, "-o", binary]
+        text.write_text(code)
+        command: list[Any] = [glslang, "-D", "-V", "-S", "comp", "-e", "run", text, "-o", binary]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout
-        return _run_webgpu(binary.read_bytes(), given)
+        return binary.read_bytes()
 
 
 @cache
 def _slang() -> Any:
-    slangpy = pytest.importorskip("slangpy", reason="Slang is not compiled here: no slangpy (pip install '.[shading]')")
+    slangpy = _package("slangpy", "Slang")
     return slangpy, slangpy.Device(type=slangpy.DeviceType.cpu, enable_debug_layers=False)
+
+
+@lru_cache(8)
+def _kernel(text: str) -> Any:
+    _, device = _slang()
+    module = device.load_module_from_source(f"lens_{next(_NUMBER)}", text)
+    return device.create_compute_kernel(device.link_program([module], [module.entry_point("run")]))
 
 
 def in_slang(given: Given, language: str = "slang") -> Rows:
@@ -167,9 +199,7 @@ def in_slang(given: Given, language: str = "slang") -> Rows:
     def buffer(values: NDArray[np.float32]) -> Any:
         return device.create_buffer(element_count=values.size, struct_size=4, usage=usage, data=values.reshape(-1))
 
-    text = _compute_shader(language, given, '[shader("compute")]', "")
-    module = device.load_module_from_source(f"lens_{next(_NUMBER)}", text)
-    kernel = device.create_compute_kernel(device.link_program([module], [module.entry_point("run")]))
+    kernel = _kernel(_compute_shader(language, given, '[shader("compute")]', ""))
     found = buffer(np.zeros(given.count * len(given.names), np.float32))
     tables = {f"{t}_here": buffer(values) for t, values in given.tables.items()}
     kernel.dispatch([given.count, 1, 1], {"rays": buffer(given.rays), "found": found, **tables})
@@ -179,7 +209,7 @@ def in_slang(given: Given, language: str = "slang") -> Rows:
 def in_slang_as_hlsl(given: Given) -> Rows:
     """HLSL by Slang's compiler; the processor has no textures there."""
     if given.tables:
-        pytest.skip("Slang has no textures on the processor")
+        raise Missing("Slang has no textures on the processor")
     return in_slang(given, "hlsl")
 
 
@@ -208,11 +238,23 @@ def vex_as_cpp(text: str) -> str:
     return _VEX + text
 
 
-def _run_cpp(text: str, before: str, body: str, result: str, given: Given, *flags: str) -> Rows:
-    """Run a statement for each ray in a function of arrays."""
+@lru_cache(8)
+def _compiled(text: str, flags: tuple[str, ...]) -> Any:
     compiler = shutil.which("g++")
     if compiler is None:
-        pytest.skip("CUDA and VEX are not compiled here: no g++")
+        raise Missing("CUDA and VEX are not compiled here: no g++")
+    command = [compiler, "-x", "c++", "-std=c++14", "-Wall", "-Wextra", "-Werror", *flags]
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "lens.so"
+        done = subprocess.run(
+            [*command, "-fPIC", "-shared", "-", "-o", library], input=text, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return ctypes.CDLL(str(library)).run
+
+
+def _run_cpp(text: str, before: str, body: str, result: str, given: Given, *flags: str) -> Rows:
+    """Run a statement for each ray in a function of arrays."""
     tables = "".join(f", const float *{t}" for t in given.tables)
     text += f"""
 #include <cstddef>
@@ -222,14 +264,7 @@ extern "C" void run(size_t n, const float *rays, float *found{tables})
 {body}{given.stored("found[{} * n + i]", result, "(float)({})")}    }}
 }}
 """
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "lens.so"
-        command = [compiler, "-x", "c++", "-std=c++14", "-O0", "-Wall", "-Wextra", "-Werror", *flags]
-        done = subprocess.run(
-            [*command, "-fPIC", "-shared", "-", "-o", library], input=text, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        function = ctypes.CDLL(str(library)).run
+    function = _compiled(text, (*given.flags, *flags))
     found = np.empty((len(given.names), given.count), np.float32)
     arrays = [given.rays, found, *given.tables.values()]
     function.argtypes = [ctypes.c_size_t] + [ctypes.c_void_p] * len(arrays)
