@@ -5,13 +5,14 @@ passes with seeds of their own, so that its squared error, mean over the pixels,
 pictures I_i of the passes and the halves R_1, R_2, the products <I_i - R_1, I_j - R_2> have the mean bias^2 for i != j,
 and bias^2 + V for i = j: the bias alone, free of the reference's own noise. With the exact lens's passes J_i of the
 same random numbers, <I_i - J_i, I_j - J_j> for i != j has the mean bias^2 between the two, and most noise cancels
-first: the paired bias. Needs the extra "train" (torch, flip-evaluator) and a C compiler. Writes equal_time.md and
-equal_time.json after each scene (some ten minutes); scenes that these have are kept.
+first: the paired bias. Needs the extra "train" (torch, flip-evaluator) and a C compiler. Writes equal_time.md,
+equal_time.json and equal_time.png after each scene (some ten minutes); scenes that these have are kept.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -23,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from experiments import lab
 from experiments.lab import Row
+from neurolens.analysis.plots import drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.onnxlens import load_model
@@ -281,8 +283,23 @@ def page(rows: Sequence[Row]) -> str:
             lab.table(_law_columns(row), row["cameras"]),
             lab.table(_equal_columns(row), row["cameras"]),
         ]
+    parts.append("![Error against time, a line a camera, a panel a scene](equal_time.png)")
     machine = f"{about['processor']}, {about['cores']} cores, Python {about['python']}, numpy {about['numpy']}."
     return lab.page(*parts, machine)
+
+
+def draw(rows: Sequence[Row], file: Path) -> None:
+    """Draw the relative RMSE over seconds, both logarithmic: a panel a scene, a line a camera."""
+    with drawing(file, 4.2 * len(rows), 4.0) as figure:
+        for axes, row in zip(figure.subplots(1, len(rows), squeeze=False)[0], rows, strict=True):
+            for camera in row["cameras"]:
+                levels = [level for level in camera["levels"] if level["rel_mse"] > 0]
+                errors = [100 * math.sqrt(level["rel_mse"]) for level in levels]
+                axes.loglog([level["seconds_min"] for level in levels], errors, ".-", label=camera["name"])
+            axes.set(title=row["scene"], xlabel="seconds of one thread", ylabel="relative RMSE, %")
+            plain_log_ticks(axes.xaxis, axes.yaxis)
+            axes.grid(alpha=0.3)
+        figure.axes[0].legend(fontsize=8)
 
 
 def error_after(camera: Row, seconds: float) -> float:
@@ -355,3 +372,4 @@ def run(args: argparse.Namespace) -> None:
         lambda row: row["scene"], page, listed="scenes", again=args.restart, maker="experiments equal-time",
         seconds=200.0,
     )  # fmt: skip
+    draw(json.loads((args.out / "equal_time.json").read_text(encoding="utf-8"))["scenes"], args.out / "equal_time.png")
