@@ -110,7 +110,9 @@ def _facts(cell: Cell) -> dict[str, Any]:
 
 def _text(data: dict[str, Any]) -> str:
     columns, rows = data["fields"]
-    lines = [f"{len(data['files'])} pictures of {columns} x {rows} kernels, {data['kernel_px']} pixels a side each"]
+    count = len(data["files"])
+    start = f"{count} picture{'s' * (count > 1)} of {columns} x {rows} kernels"
+    lines = [f"{start}, {data['kernel_px']} pixels a side each"]
     for k, file in enumerate(data["files"]):
         cells = data["kernels"][k * columns * rows : (k + 1) * columns * rows]
         widths, light = ([row[name] for row in cells] for name in ("width_px", "light"))

@@ -40,7 +40,7 @@ def assert_printed(text: str, expected: Sequence[float]) -> None:
         )
 
 
-FUSED = {2: "mlp-5x1, C", 7: "mlp-8x1, C", 12: "ols-40, C", 33: "ols-28, C"}  # the fastest within 1 um
+FUSED = {2: "ols-32, C", 7: "ols-36, C", 12: "ols-40, C", 33: "ols-28, C"}  # the fastest within 1 um
 
 
 def fused(refractions: int, name: str) -> Any:
