@@ -220,7 +220,7 @@ def test_any_number_of_workers_and_an_interruption_give_the_same_picture(
     all_of_it = render(made, camera, **options)
     assert all_of_it.stats["wavelengths"] == "companions"
     assert same(render(made, camera, **options | {"threads": 3}), all_of_it)
-    calls = iter([False] * 3)
+    calls = iter([False])
     watch = Watch(checkpoint=part, stop=lambda: next(calls, True))
     first = render(made, camera, **options | {"threads": 2}, watch=watch)
     assert not first.stats["complete"]
