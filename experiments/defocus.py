@@ -42,7 +42,8 @@ SCENES = ("room", "garden", "lights", "chess", "studio", "lamps")
 F_NUMBER, WIDTH, SAMPLES = 1.4, 480, {"pinhole": 128, "fused": 256, "thin": 256}
 _LARGE = 3840, 2160
 _FLOOR_SEED = 1000
-# Of points of light: the film, its pixels per mm, focus, the ball's radius in pixels, and kernel pixels in one.
+# A render of a point of light has this film, pixels per mm, focus and radius of the ball in pixels; its kernel has so
+# many pixels across each pixel of the render.
 _STRIP_MM, _PER_MM, _STRIP_FOCUS_M, _BALL_PX, _FINER = (4.5, 30.0), 10.0, 1.2, 1, 8
 
 

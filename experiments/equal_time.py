@@ -272,8 +272,8 @@ def page(rows: Sequence[Row]) -> str:
     """The tables of scenes in Markdown."""
     counts, about = rows[0]["counts"], lab.machine()
     (width, height), samples = counts["size"], {k: counts[k] for k in ("pass_samples", "passes")}
-    told = {"lens": LENS, "reference": 2 * counts["reference"], "threads": rows[0]["threads"]}
-    parts = [_INTRO.format(width=width, height=height, **told, **samples)]
+    about_run = {"lens": LENS, "reference": 2 * counts["reference"], "threads": rows[0]["threads"]}
+    parts = [_INTRO.format(width=width, height=height, **about_run, **samples)]
     for row in rows:
         noise = 100 * math.sqrt(row["reference_variance"])
         parts += [

@@ -160,7 +160,7 @@ def _compute_shader(language: str, given: Given, entry: str, at: str) -> str:
 
 
 def in_hlsl(given: Given) -> Rows:
-    """By glslang to SPIR-V, which naga reads."""
+    """Compile the text by glslang to SPIR-V, which naga reads."""
     _webgpu()
     glslang = shutil.which("glslangValidator")
     if glslang is None:

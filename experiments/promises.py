@@ -43,7 +43,8 @@ from neurolens.surrogates.source import fused_program
 COMPILED = "exact compiled"
 LENS, SCENE = "laikin_double_gauss_50", lab.SCENES / "room.toml"
 TRACER_MRAY_S = {"eager": 6.0, "compiled": 20.0}  # one core, float32, 12 refractions, stop, rims and dispersion
-# Of a polynomial within 1 um with stop, rims and transmittance: the README's ratios, less a quarter for other machines.
+# A polynomial within 1 um, with stop, rims and transmittance, must be so many times as fast as the exact lens as C:
+# three quarters of the README's ratios, since machines differ.
 RATIOS = {(2, 40): 3.0, (3, 28): 12.0}  # by the case and the terms of `fused_speed`
 RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
 

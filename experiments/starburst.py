@@ -1,7 +1,7 @@
 """Stars about lights: checks of the diffraction against closed forms, and the seconds that stars take.
 
-The lens is a double Gauss 50 mm f/1.8 on 36 x 24 mm. Seconds are told with those of a core, for others work on the
-machine. Writes starburst.md and starburst.json.
+The lens is a double Gauss 50 mm f/1.8 on 36 x 24 mm. Seconds of the clock stand beside
+seconds of a core, since other programs share the machine. Writes starburst.md and starburst.json.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The picture that a camera takes of a plate: its rays, followed to what the plate shows.
 
-The picture gets the camera's blur, distortion, vignetting and colour fringes. The camera is asked for its rays only at
-nodes, a sixtieth of the film apart, and for one set of points of the pupil; the rays of a pixel lie between those of
+The picture gets the camera's blur, distortion, vignetting and colour fringes. The camera traces rays only at
+nodes, a sixtieth of the film apart, through one set of pupil points; the rays of a pixel lie between those of
 the four nodes around it. Each channel has its own wavelengths, those that make its light from white surfaces, so that
 colours blur apart but have no noise of their own. What a ray meets is found in the plate's depth (`gather.c`). A pixel
 takes the more samples, the wider the lens blurs there, and weighs them so that even light stays even: the mean of
