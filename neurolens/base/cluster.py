@@ -18,7 +18,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from contextlib import redirect_stdout, suppress
+from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -61,7 +61,7 @@ class Dask(ThreadPoolExecutor):
         super().__init__(_MOST)
         self._address, self._limit_s = address, limit_s
         self._cluster: _Cluster | None = None
-        self._lock = threading.Lock()
+        self._lock, self._suspected = threading.Lock(), threading.Lock()
         self._room, self._asked = 0, -math.inf
         self._sent: dict[Shared, Any] = {}
         self._ended = False
@@ -101,11 +101,15 @@ class Dask(ThreadPoolExecutor):
             return self._cluster.client
 
     def _on_worker(self, work: Callable[..., R], args: Any, named: Any) -> R:
-        """Wait for the answer of a task, which is sent again where its worker was killed, perhaps by another task."""
+        """Wait for the answer of a task, which is sent again where its worker was killed, perhaps by another task.
+
+        Tasks whose worker was killed go again one after the other, so that none of them fails for the fault of another.
+        """
         client = self._client()
-        for _ in range(2):
+        for before in (nullcontext(), self._suspected):
             try:
-                outcome = self._sent_and_awaited(client, work, args, named)
+                with before:
+                    outcome = self._sent_and_awaited(client, work, args, named)
             except (Exception, CancelledError) as error:
                 if not self._ended and client.status != "running":
                     raise Lost(_LOST) from None
