@@ -105,11 +105,13 @@ def _noise(bpy: Any, plan: dict[str, Any], cameras: list[dict[str, Any]], file: 
             exact[scene.camera.name] = picture(plan["reference"], 10_000, False)[0]
         for cycles.sampling_pattern in plan["patterns"]:
             for camera, scene.camera in made.items():
-                mean, noise = exact[camera].mean(), {}
+                mean, noise, median = exact[camera].mean(), {}, {}
                 for samples in plan["samples"]:
                     off = [picture(samples, seed, False)[0] / mean - exact[camera] / mean for seed in plan["seeds"]]
                     noise[samples] = [float(v) for v in np.sqrt(np.square(off).mean((0, 1, 2)))]
-                row = {"scene": name, "pattern": cycles.sampling_pattern, "camera": camera, "noise": noise}
+                    median[samples] = float(np.median(np.sqrt(np.square(off).mean((0, 3)))))
+                row = {"scene": name, "pattern": cycles.sampling_pattern, "camera": camera}
+                row |= {"noise": noise, "median": median}
                 for cycles.adaptive_threshold in plan["thresholds"]:
                     found = [picture(most, seed, True) for seed in plan["seeds"]]
                     off = [rgb / mean - exact[camera] / mean for rgb, _ in found]
@@ -142,11 +144,14 @@ def _flicker(bpy: Any) -> None:
         setattr(patch, f"visible_{way}", False)
     paint = _paint(bpy, (0.0, 0.0, 0.0), 1.0, 1.0)
     nodes, links = paint.node_tree.nodes, paint.node_tree.links
-    noise, place, power = (nodes.new(f"ShaderNode{kind}") for kind in ("TexWhiteNoise", "NewGeometry", "Math"))
+    noise, place = (nodes.new(f"ShaderNode{kind}") for kind in ("TexWhiteNoise", "NewGeometry"))
+    power, bright = (nodes.new("ShaderNodeMath") for _ in range(2))
     power.operation, power.inputs[1].default_value = "POWER", 100.0
+    bright.operation, bright.inputs[1].default_value = "MULTIPLY", 1e6
     links.new(place.outputs["Position"], noise.inputs["Vector"])
     links.new(noise.outputs["Value"], power.inputs[0])
-    links.new(power.outputs[0], nodes["Principled BSDF"].inputs["Emission Strength"])
+    links.new(power.outputs[0], bright.inputs[0])
+    links.new(bright.outputs[0], nodes["Principled BSDF"].inputs["Emission Strength"])
     nodes["Principled BSDF"].inputs["Emission Color"].default_value = (1.0, 1.0, 1.0, 1.0)
 
 

@@ -2,8 +2,9 @@
 
 A polynomial of a 50 mm double Gauss at f/1.8 as a shader, focused on 2 m, before a white sky and before meshes and
 lamps at 1 to 5 m, most of them out of focus. Noise is the root of the mean squared difference from a picture of many
-samples, over the picture's mean, of the mean channel and of the worst one. Cycles stops at a pixel when half of its
-samples agree with all within the noise threshold. Writes osl_noise.md and osl_noise.json.
+samples over pixels and channels, over the picture's mean; at 16 samples that of the worst channel and of the median
+pixel, too. Cycles stops at a pixel when half of its samples agree with all within the noise threshold. Writes
+osl_noise.md and osl_noise.json.
 """
 
 from __future__ import annotations
@@ -94,6 +95,7 @@ def _page(data: Mapping[str, Any]) -> str:
     for n in SAMPLES:
         columns.append(lab.Column(f"{n} samples, %", lambda r, n=n: f"{100 * noise(r, n):.2f}"))
     columns.append(lab.Column("worst channel at 16, %", lambda r: f"{100 * max(r['noise']['16']):.2f}"))
+    columns.append(lab.Column("median pixel at 16, %", lambda r: f"{100 * r['median']['16']:.2f}"))
     for t in thresholds:
         columns.append(lab.Column(f"adaptive samples at {t:g}", lambda r, t=t: f"{r[_taken(t)]:.0f}"))
         columns.append(lab.Column("noise then, %", lambda r, t=t: f"{100 * r[f'noise {t:.3g}']:.2f}"))
