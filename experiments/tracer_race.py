@@ -188,9 +188,9 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
     for name in (c.name for c in field):
         timing, ratio = timed.timing(name), timed.speedup(name, "exact C")
         count = sum(programs[name].count().values()) if name in programs else None
-        known = None if timing is None else dict(timing), timed.unavailable.get(name), other.get(name)
-        known = *known, ratio["min"] if ratio else None, timed.load
-        rows.append(Row(case.file, lens.name, lens.refractions, name, count, *known))
+        ns, why, gain = None if timing is None else dict(timing), timed.unavailable.get(name), ratio and ratio["min"]
+        about = case.file, lens.name, lens.refractions, name, count
+        rows.append(Row(*about, ns, why, other.get(name), gain, timed.load))
     return rows
 
 
@@ -226,7 +226,7 @@ def page(rows: Sequence[Row], known: dict[str, Any]) -> str:
 def run(args: argparse.Namespace) -> None:
     """Measure lens by lens; rows of other lenses from this machine are kept."""
     lab.quiet_glasses()
-    machine = {"machine": lab.machine(), "flags": " ".join(FLAGS)}
+    machine: dict[str, Any] = {"machine": lab.machine(), "flags": " ".join(FLAGS)}
     known = machine | {"rounds": int(args.rounds or 20), "rays": max(FUSED_BATCHES), "cores": os.cpu_count()}
     chosen, text = lab.chosen(CASES, lambda c: c.file, args.only, "tracer"), ""
     kept = [Row(**row) for row in lab.earlier_rows(args.out / "tracer_race.json", machine)]
