@@ -188,9 +188,9 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
     for name in (c.name for c in field):
         timing, ratio = timed.timing(name), timed.speedup(name, "exact C")
         count = sum(programs[name].count().values()) if name in programs else None
-        ns, why, gain = None if timing is None else dict(timing), timed.unavailable.get(name), ratio and ratio["min"]
+        ns, gain = None if timing is None else dict(timing), ratio["min"] if ratio else None
         about = case.file, lens.name, lens.refractions, name, count
-        rows.append(Row(*about, ns, why, other.get(name), gain, timed.load))
+        rows.append(Row(*about, ns, timed.unavailable.get(name), other.get(name), gain, timed.load))
     return rows
 
 
