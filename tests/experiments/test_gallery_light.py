@@ -75,20 +75,6 @@ def test_every_effect_reads_and_its_thin_lens_measures(name: str) -> None:
         assert found.get(key, value) == pytest.approx(value, rel=0.01, abs=0.2)
 
 
-@pytest.mark.whole
-def test_light_falls_off_faster_the_wider_the_stop() -> None:
-    """A Tessar: rims alone at f/1, stop and rims at f/4, at f/8 the cosine law of its exit pupil and no more."""
-    wide, four = (relative(camera("brendel_tessar_100.toml", n, MEDIUM, 10.0), 41.0)[-1] for n in (1.0, 4.0))
-    model_four, eight = (
-        relative(camera("brendel_tessar_100.mlp-16x2.onnx", n, MEDIUM, 10.0), 41.0)[-1] for n in (4.0, 8.0)
-    )
-    assert (wide, four, eight) == pytest.approx((0.37, 0.63, 0.80), abs=0.02)
-    assert model_four == pytest.approx(four, abs=2e-3)
-    thin = camera("thin", 8.0, MEDIUM, 10.0, 100.0)
-    law = (1 + (np.linspace(0, 41, 5) / thin.image_distance_mm) ** 2) ** -2
-    assert relative(thin, 41.0) == pytest.approx(law, rel=2e-3)
-
-
 @pytest.mark.parametrize(("lens", "least"), [("brendel_tessar_100", 0.08), ("hudson_double_gauss_100", 0.16)])
 def test_no_post_process_has_the_falloff_of_a_lens(lens: str, least: float) -> None:
     """With centre and corner met, the lens is brighter in between, by what the cosine law cannot bend."""
