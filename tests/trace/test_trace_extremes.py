@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,6 +194,24 @@ def test_no_nan_gradient_where_most_rays_are_lost(towards: str) -> None:
     assert isinstance(total, Tensor)
     for grad in torch.autograd.grad(total, [first.radius_mm, *start]):
         assert torch.isfinite(grad).all()
+
+
+@pytest.mark.parametrize(
+    "shape", [{}, {"radius_mm": math.inf}, {"conic": -0.4}, {"conic": -0.4, "asphere": ((4, -2e-5), (6, 1e-8))}]
+)
+def test_a_ray_that_runs_backwards_spoils_no_gradient(shape: dict[str, Any]) -> None:
+    """At the first surface its cosine of incidence is below 0, for which Fresnel's shares are 0 / 0 on the axis."""
+    values, gradients = VALUES[:3].clone().requires_grad_(), []
+    front = replace(Surface(values[0], values[1], 22, values[2], V_d=60.0), **shape)
+    lens = Lens("singlet", "", (front, Surface(-45.0, 50.0, 22, stop=True)), 4.0)
+    for bundle in (BUNDLE[:4], [*BUNDLE[:4], [0.0, 0.0, -20.0, 0.0, 0.0, -1.0]]):
+        start = Rays(*(c.requires_grad_() for c in rays(bundle)))
+        out = trace(lens, start, 550.0, towards="film", transmittance=True)
+        assert out.transmittance is not None and (out.status[:4] == 0).all() and (out.status[4:] != 0).all()
+        total = out.transmittance[:4].sum() + sum(c[:4].sum() for c in out.rays)
+        gradients.append(torch.autograd.grad(total, [values, *start], allow_unused=True, materialize_grads=True))
+    for alone, beside in zip(*gradients, strict=True):
+        torch.testing.assert_close(beside[:4], alone)
 
 
 @pytest.mark.parametrize(("y_mm", "nm"), [(0.0, math.nan), (0.0, 0.0), (0.0, -500.0), (1e200, 550.0)])
