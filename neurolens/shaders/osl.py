@@ -98,11 +98,6 @@ class OslCamera:
     margin: float
     unit: bool
 
-    @property
-    def pupil_z_mm(self) -> float:
-        """z of the plane of pupil points."""
-        return self.lens.table.pupil_z_mm
-
     @cached_property
     def per_exposure(self) -> Array:
         """See `_per_exposure`."""
@@ -281,7 +276,7 @@ class _Call:
     def weighting(self) -> dict[str, Value]:
         """The numbers of `weight_graph`."""
         g, camera = self.g, self.camera
-        per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
+        per_distance = 1.0 / (self.film_z - camera.lens.table.pupil_z_mm)
         middle, half = _film_position(camera)
         per_share = _in_turn(g, camera.per_exposure, self.share, (self.film_z - middle) * (1 / half))
         per_lens, nominal = per_share * (1.0 / (self.share * self.share)), 4 * camera.lens.f_number**2 / math.pi
@@ -331,7 +326,7 @@ def _per_exposure(camera: OslCamera) -> Array:
     positions = np.linspace(low, high, 3) if high > low else np.array([low])
     rows, values = [], []
     for z, share in itertools.product(positions, (0.1, 0.3, 0.5, 0.7, 0.85, 1.0)):
-        per_distance = 1 / (z - camera.pupil_z_mm)
+        per_distance = 1 / (z - camera.lens.table.pupil_z_mm)
         call = {"film_z_mm": z, "stop_radius_mm": share * camera.lens.stop_radius_mm}
         call |= {"per_distance": per_distance, "scale": per_distance**2}
         inputs: dict[str, Any] = {k: np.array([[v]]) for k, v in call.items()}

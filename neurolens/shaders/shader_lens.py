@@ -153,7 +153,7 @@ def light(range_nm: tuple[float, float], numbers: Value, in_colour: Value) -> tu
     choose one of sixteen parts of the spectrum: the first of either number, whether the second ones differ, and the
     third of the first number. Its lowest bits choose the wavelength within the part, and the other bits are left. So
     sixteen samples of a pixel hold each eighth of the spectrum twice, once in either half by which adaptive sampling
-    judges noise. A half holds the samples in whose index the bits 1, 3, 5... have an odd sum: the second bit of a
+    judges noise. A half holds the samples whose index has an odd number of the bits 2, 8, 32...: the second bit of a
     number is uneven there, and the first ones, and whether the second ones differ, are even. The weights are
     Bernstein's polynomials of second order: never negative, of mean 1 each.
     """
@@ -168,7 +168,6 @@ def light(range_nm: tuple[float, float], numbers: Value, in_colour: Value) -> tu
     part = (eighth + third + fine - fine.floor()) * (1 / _PARTS)
     rest = 1.0 - part
     grey = in_colour <= 0.5
-    reference = min(max(LINE_D_NM, short), long)
-    nanometres = g.select(grey, reference, part * (short - long) + long)
+    nanometres = g.select(grey, min(max(LINE_D_NM, short), long), part * (short - long) + long)
     colour = g.concat(rest * rest * 3.0, part * rest * 6.0, part * part * 3.0)
     return nanometres, g.select(grey, 1.0, colour), g.select(grey, numbers, g.concat(first, left[1]))
