@@ -160,14 +160,12 @@ def light(range_nm: tuple[float, float], numbers: Value, in_colour: Value) -> tu
     g, (short, long) = numbers.graph, range_nm
     halves = numbers * 2.0
     left = halves - halves.floor()
-    quarters = (left * 2.0).floor()
-    many = left[0] * 4.0
+    quarters, many = (left * 2.0).floor(), left[0] * 4.0
     first, third = many - many.floor(), many.floor() - quarters[0] * 2.0
     fine = first * _LOW_BITS
     eighth = halves[0].floor() * 8.0 + halves[1].floor() * 4.0 + (quarters[0] - quarters[1]).abs() * 2.0
     part = (eighth + third + fine - fine.floor()) * (1 / _PARTS)
-    rest = 1.0 - part
-    grey = in_colour <= 0.5
+    rest, grey = 1.0 - part, in_colour <= 0.5
     nanometres = g.select(grey, min(max(LINE_D_NM, short), long), part * (short - long) + long)
     colour = g.concat(rest * rest * 3.0, part * rest * 6.0, part * part * 3.0)
     return nanometres, g.select(grey, 1.0, colour), g.select(grey, numbers, g.concat(first, left[1]))
