@@ -11,45 +11,30 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-
-bpy = pytest.importorskip("bpy", reason="Blender as a module (bpy) is not installed: make test-blender runs these")
-
-import numpy as np  # noqa: E402
-from test_extension import packed  # noqa: E402
-
-from neurolens.blender.pack import write_pack  # noqa: E402
+from in_blender import bpy, first_scene, installed_pack, rendered, surface, surroundings
+from test_extension import packed
 
 sys.path.append(str(Path(__file__).parents[2]))  # experiments
-MODULE = "bl_ext.user_default.neurolens"
 
 
 @pytest.fixture(scope="module", autouse=True)
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    out = tmp_path_factory.mktemp("pack") / "neurolens.zip"
-    write_pack(out, [packed()])
-    bpy.ops.extensions.package_install_files(filepath=str(out), repo="user_default", enable_on_install=True)
-    yield out
-    bpy.ops.preferences.addon_disable(module=MODULE)
+    with installed_pack(tmp_path_factory.mktemp("pack"), [packed()]) as out:
+        yield out
 
 
 @pytest.fixture
 def scene() -> Any:
     """A camera at the origin that looks along -z, of 36 x 36 mm and f/2; 8 x 8 pixels, black surroundings."""
-    bpy.ops.wm.read_homefile(app_template="", use_factory_startup=True)
-    scene = bpy.context.scene
-    for found in list(bpy.data.objects):
-        bpy.data.objects.remove(found)
-    camera = added(scene, bpy.data.cameras.new("camera"))
-    scene.camera = camera
+    scene = first_scene(camera=False)
+    scene.camera = camera = added(scene, bpy.data.cameras.new("camera"))
     camera.data.dof.use_dof, camera.data.dof.aperture_fstop = True, 2.0
-    scene.cycles.use_denoising = False
     scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 64, 0
     scene.render.resolution_x = scene.render.resolution_y = 8
-    scene.render.resolution_percentage = 100
     scene.frame_start = scene.frame_end = 1
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0, 0, 0, 1)
-    scene.view_settings.view_transform = "Raw"
+    surroundings(scene, 0, 0, 0)
     return scene
 
 
@@ -82,14 +67,7 @@ def rows(tmp_path: Path, rays: int = 64) -> list[dict[str, Any]]:
 
 def pixel(scene: Any, folder: Path, frame: int = 1) -> np.ndarray[Any, Any]:
     """Colour of a render, mean over its pixels."""
-    scene.frame_set(frame)
-    scene.render.filepath = str(folder / "render.exr")
-    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    colour = np.array(image.pixels[:]).reshape(-1, 4)[:, :3].mean(0)
-    bpy.data.images.remove(image)
-    return colour
+    return np.asarray(rendered(scene, folder, frame)[..., :3].mean((0, 1)))
 
 
 ACROSS = {"POINT": {}, "SPOT": {"spot_size": math.radians(50), "spot_blend": 0.6},
@@ -122,12 +100,8 @@ def test_irradiance_is_what_a_white_card_shows(kind: str, settings: dict[str, An
     assert row["azimuth_deg"] == pytest.approx(math.degrees(math.atan2(way[0], -way[2])), abs=1e-4)
     assert row["elevation_deg"] == pytest.approx(math.degrees(math.asin(way[1] / np.linalg.norm(way))), abs=1e-4)
     card = wall(scene, (-0.001, 0.001), 0.0, 0.001)
-    material = bpy.data.materials.new("white")
-    nodes = material.node_tree.nodes
-    nodes.clear()
-    diffuse, out = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeOutputMaterial")
+    material, diffuse = surface("BsdfDiffuse")
     diffuse.inputs["Color"].default_value = (1, 1, 1, 1)
-    material.node_tree.links.new(diffuse.outputs[0], out.inputs[0])
     card.data.materials.append(material)
     towards = way / np.linalg.norm(way)
     turned = type(scene.camera.location)(towards).to_track_quat("Z", "Y")
@@ -224,8 +198,8 @@ def test_materials_that_shine_are_named_as_left_out(
 ) -> None:
     light(scene, "POINT", (0, 0, -4.0))
     for name, strength in (("neon tube", 5.0), ("paint", 0.0)):
-        material = bpy.data.materials.new(name)
-        material.node_tree.nodes["Principled BSDF"].inputs["Emission Strength"].default_value = strength
+        material, node = surface("BsdfPrincipled", name)
+        node.inputs["Emission Strength"].default_value = strength
         wall(scene, (1, 2), -5.0).data.materials.append(material)
     rows(tmp_path)
     said = capfd.readouterr().out
@@ -277,13 +251,14 @@ def test_layers_are_added_in_the_compositor_by_their_gains(scene: Any, tmp_path:
         }
         channels = {f"{name}.{c}": frame * v for name, rgb in layers.items() for c, v in zip("RGB", rgb, strict=True)}
         write_exr(tmp_path / f"flare.{frame:04d}.exr", channels | {"R": 9.0, "G": 9.0, "B": 9.0})
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 2.0, 3.0, 1)
+    surroundings(scene, 1, 2, 3)
     assert tool.add_layers(scene, tmp_path / "flare.0003.exr") == ["g07-03", "glare", "rest"]
     for frame in (3, 4):
         assert pixel(scene, tmp_path, frame) == pytest.approx(
             np.array([1 + 0.6 * frame, 2 + 0.7 * frame, 3 + 0.9 * frame]), rel=1e-3
         )
-    group = next(n for n in scene.compositing_node_group.nodes if n.bl_idname == "CompositorNodeGroup")
+    tree = scene.compositing_node_group if hasattr(scene, "compositing_node_group") else scene.node_tree
+    group = next(n for n in tree.nodes if n.bl_idname == "CompositorNodeGroup")
     group.inputs["glare"].default_value, group.inputs["rest"].default_value = 0.0, 2.0
     assert pixel(scene, tmp_path, 3) == pytest.approx(np.array([1.3, 3.2, 3 + 0.3 + 1.8]), rel=1e-3)
     write_exr(tmp_path / "still.exr", {"R": 1.0, "G": 1.0, "B": 1.0})
