@@ -70,6 +70,22 @@ def pixel(scene: Any, folder: Path, frame: int = 1) -> np.ndarray[Any, Any]:
     return np.asarray(rendered(scene, folder, frame)[..., :3].mean((0, 1)))
 
 
+def card(scene: Any, way: Any, folder: Path) -> Any:
+    """Colour of a small white card at the origin across the way of a light."""
+    card = wall(scene, (-0.001, 0.001), 0.0, 0.001)
+    material, diffuse = surface("BsdfDiffuse")
+    diffuse.inputs["Color"].default_value = (1, 1, 1, 1)
+    card.data.materials.append(material)
+    towards = way / np.linalg.norm(way)
+    turned = type(scene.camera.location)(towards).to_track_quat("Z", "Y")
+    for thing in (card, scene.camera):
+        thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turned
+    scene.camera.location = tuple(0.05 * towards)
+    scene.camera.data.sensor_width, scene.camera.data.lens, scene.camera.data.dof.use_dof = 0.5, 50.0, False
+    scene.camera.data.clip_start = 0.001
+    return pixel(scene, folder)
+
+
 ACROSS = {"POINT": {}, "SPOT": {"spot_size": math.radians(50), "spot_blend": 0.6},
           "AREA": {"shape": "RECTANGLE", "size": 0.2, "size_y": 0.4}, "SUN": {"angle": 0.1}}  # fmt: skip
 
@@ -99,19 +115,56 @@ def test_irradiance_is_what_a_white_card_shows(kind: str, settings: dict[str, An
         assert row["distance_m"] == pytest.approx(np.linalg.norm(way), rel=1e-5)
     assert row["azimuth_deg"] == pytest.approx(math.degrees(math.atan2(way[0], -way[2])), abs=1e-4)
     assert row["elevation_deg"] == pytest.approx(math.degrees(math.asin(way[1] / np.linalg.norm(way))), abs=1e-4)
-    card = wall(scene, (-0.001, 0.001), 0.0, 0.001)
-    material, diffuse = surface("BsdfDiffuse")
-    diffuse.inputs["Color"].default_value = (1, 1, 1, 1)
-    card.data.materials.append(material)
-    towards = way / np.linalg.norm(way)
-    turned = type(scene.camera.location)(towards).to_track_quat("Z", "Y")
-    for thing in (card, scene.camera):
-        thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turned
-    scene.camera.location = tuple(0.05 * towards)
-    scene.camera.data.sensor_width, scene.camera.data.lens, scene.camera.data.dof.use_dof = 0.5, 50.0, False
-    scene.camera.data.clip_start = 0.001
-    shown = pixel(scene, tmp_path)
+    shown = card(scene, way, tmp_path)
     assert shown == pytest.approx(np.array([row["r"], row["g"], row["b"]]) / math.pi, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["Emission", "BsdfPrincipled"])
+@pytest.mark.parametrize("shape", ["sphere", "circle", "cube"])
+def test_a_mesh_that_shines_is_a_light(shape: str, kind: str, scene: Any, tmp_path: Path) -> None:
+    """Irradiance is what a white card shows of it, which stands where the camera is; a wall hides it."""
+    material, node = surface(kind)
+    names = ("Color", "Strength") if kind == "Emission" else ("Emission Color", "Emission Strength")
+    node.inputs[names[0]].default_value, node.inputs[names[1]].default_value = (1.0, 0.5, 0.25, 1), 40.0
+    place, size = (0.9, 0.5, -5.0), 0.2
+    if shape == "sphere":
+        bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32, radius=size, location=place)
+    elif shape == "circle":
+        bpy.ops.mesh.primitive_circle_add(vertices=64, radius=size, fill_type="NGON", location=place)
+    else:
+        bpy.ops.mesh.primitive_cube_add(size=size, location=place, rotation=(0.4, 0.7, 0.2))
+    bpy.context.object.data.materials.append(material)
+    (row,) = rows(tmp_path)
+    way = np.array(place)
+    assert row["visible"] == 1 and row["light"] == bpy.context.object.name
+    assert row["distance_m"] == pytest.approx(np.linalg.norm(way), abs=size)
+    assert row["azimuth_deg"] == pytest.approx(math.degrees(math.atan2(way[0], -way[2])), abs=0.2)
+    if shape == "sphere":
+        assert row["diameter_deg"] == pytest.approx(math.degrees(2 * math.asin(size / np.linalg.norm(way))), rel=0.01)
+    screen = wall(scene, (-9, 9), -2.0)
+    assert rows(tmp_path)[0]["visible"] == 0
+    bpy.data.objects.remove(screen)
+    assert card(scene, way, tmp_path) == pytest.approx(np.array([row["r"], row["g"], row["b"]]) / math.pi, rel=0.01)
+
+
+def test_a_screen_does_not_shine_through_its_back(scene: Any, tmp_path: Path) -> None:
+    bpy.ops.mesh.primitive_cube_add(size=0.5, location=(0, 0, -4))
+    box = bpy.context.object
+    box.data.materials.append(surface("BsdfDiffuse")[0])
+    box.data.materials.append(surface("Emission")[0])
+    front = max(box.data.polygons, key=lambda face: face.center.z)
+    front.material_index = 1
+    (row,) = rows(tmp_path)
+    assert row["visible"] == 1 and row["r"] == pytest.approx(0.25 / 3.75**2, rel=0.01)
+    box.rotation_euler = (0, math.pi, 0)
+    assert rows(tmp_path)[0]["visible"] == 0
+
+
+def test_a_dome_is_no_light(scene: Any, tmp_path: Path) -> None:
+    light(scene, "POINT", (0, 0, -4.0))
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=50)
+    bpy.context.object.data.materials.append(surface("Emission")[0])
+    assert [row["light"] for row in rows(tmp_path)] == ["point"]
 
 
 def test_a_light_dims_as_an_edge_passes_before_it(scene: Any, tmp_path: Path) -> None:
@@ -193,17 +246,21 @@ def test_keys_of_a_lens_go_with_its_lights(scene: Any, tmp_path: Path) -> None:
     ]
 
 
-def test_materials_that_shine_are_named_as_left_out(
+def test_materials_that_shine_by_a_texture_are_named_as_left_out(
     scene: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    light(scene, "POINT", (0, 0, -4.0))
-    for name, strength in (("neon tube", 5.0), ("paint", 0.0)):
+    for name, strength in (("neon tube", 5.0), ("paint", 0.0), ("screen", 5.0)):
         material, node = surface("BsdfPrincipled", name)
         node.inputs["Emission Strength"].default_value = strength
-        wall(scene, (1, 2), -5.0).data.materials.append(material)
-    rows(tmp_path)
+        if name == "screen":
+            picture = material.node_tree.nodes.new("ShaderNodeTexImage")
+            material.node_tree.links.new(picture.outputs[0], node.inputs["Emission Color"])
+        thing = wall(scene, (1, 2), -5.0, 0.1)
+        thing.name = name
+        thing.data.materials.append(material)
+    assert [row["light"] for row in rows(tmp_path)] == ["neon tube"]
     said = capfd.readouterr().out
-    assert "Left out" in said and "neon tube" in said and "paint" not in said
+    assert "Left out" in said and "screen" in said and "neon" not in said and "paint" not in said
 
 
 @pytest.mark.parametrize("case", ["no light", "no folder", "no camera"])
