@@ -249,7 +249,6 @@ def _aimed(
     (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(ahead, behind, strict=True))
     stretch = np.abs(xx * yy - xy * yx)
     known = np.all([found[1] > 0 for found in (*ahead, *behind)], axis=0) & (stretch > 0)
-    known &= np.hypot(*(place - np.array(table.size)[:, None] / 2)) > 1  # on the axis the pupil's outline turns over
     area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(film_by_plate))))
     close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
     light, kept = weight * area, np.where(close, weight, 0) * area
