@@ -94,7 +94,7 @@ examples:
             rows += (facts := [_facts(cell) for cell in cells])
             more = {"kernel_px": side, "fields": list(self.grid), "kernels": facts}
             write_channels(path, {c: picture[..., k] for k, c in enumerate("RGB")}, None, about | more)
-            write_png(path.with_suffix(".png"), as_preview(cells, self.grid[0], side))
+            write_png(path.with_suffix(".png"), as_preview(picture, side))
             files.append(str(path))
         data = {"kernel_px": side, "fields": list(self.grid), "kernels": rows, "files": files}
         return self.answer(data, lambda: _text(data))

@@ -184,22 +184,17 @@ def _points(count: int, numbers: int) -> FloatArray:
     return ((sobol(count, numbers) + 2.0**31 / count) / 2.0**32).astype(np.float32)
 
 
-def spread_of(row: FloatArray) -> NDArray[np.float64]:
-    """The variance of the places [nodes, 3] at which rays of a node see a point: of a, 2 covariances, of b; summed over
-    x and y, so that its root is the radius of an even disc over sqrt(2)."""
-    rays = row[..., :_NUMBERS].astype(np.float64)
-    weight = rays[..., 4:] / np.maximum(rays[..., 4:].sum(axis=1, keepdims=True), 1e-30)
-    a, b = (rays[..., k : k + 2] for k in (0, 2))
-    a, b = a - (weight * a).sum(axis=1, keepdims=True), b - (weight * b).sum(axis=1, keepdims=True)
-    terms = (a * a, 2 * a * b, b * b)
-    return np.stack([(weight * t).sum(axis=(1, 2)) for t in terms], axis=1)
-
-
 def spread_over(camera: Camera, pinhole: PlatePinhole, size: tuple[int, int]) -> NDArray[np.float64]:
-    """`spread_of` all nodes, [rows, columns, 3]."""
-    points = _points(_FEW, 3)
+    """The variance of the places at which rays of each node [rows, columns, 3] see a point: of a, 2 covariances, of b;
+    summed over x and y, so that its root is the radius of an even disc over sqrt(2)."""
+    points, found = _points(_FEW, 3), []
     table = RayTable(camera, pinhole, size, points[:2], points[2])
-    return np.stack([spread_of(table.row(j)) for j in range(table.cells[1] + 1)])
+    for j in range(table.cells[1] + 1):
+        rays = table.row(j)[..., :_NUMBERS].astype(np.float64)
+        weight = rays[..., 4:] / np.maximum(rays[..., 4:].sum(axis=1, keepdims=True), 1e-30)
+        a, b = (part - (weight * part).sum(axis=1, keepdims=True) for part in (rays[..., :2], rays[..., 2:4]))
+        found.append(np.stack([(weight * term).sum(axis=(1, 2)) for term in (a * a, 2 * a * b, b * b)], axis=1))
+    return np.stack(found)
 
 
 def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float64]:

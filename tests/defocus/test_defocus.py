@@ -410,6 +410,8 @@ def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
     [
         (None, [], "a channel Z with the depth"),
         (np.full(SIZE[::-1], -3.0), [], "--depth-scale -1"),
+        (np.full(SIZE[::-1], np.nan), [], "not a number in any pixel"),
+        (np.geomspace(1e-4, 3, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]), [], "not their inverse"),
         (np.linspace(0, 1, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]), [], "depth in metres"),
         (np.full(SIZE[::-1], 3.0), ["--depth", "W"], "one of: "),
         (np.full(SIZE[::-1], 3.0), ["--film", "36x36"], "a picture of the film's shape"),

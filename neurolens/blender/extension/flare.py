@@ -49,18 +49,16 @@ def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
 
 def _radiance(material: Any) -> Any:
     """How a material shines [3]; None where a texture, or more than one node, decides it."""
-    tree, shining = material and material.node_tree, dict[Any, Any]()
-    for node in tree.nodes if tree else ():
-        if node.type not in _SHINE:
-            continue
-        colour, strength = (node.inputs[name] for name in _SHINE[node.type])
-        if strength.is_linked or strength.default_value > 0:
-            linked = colour.is_linked or strength.is_linked
-            shining[node.name] = None if linked else strength.default_value * np.array(colour.default_value[:3])
-    if not shining:
+    nodes = material.node_tree.nodes if material and material.node_tree else ()
+    pairs = [[node.inputs[name] for name in _SHINE[node.type]] for node in nodes if node.type in _SHINE]
+    pairs = [(colour, strength) for colour, strength in pairs if strength.is_linked or strength.default_value > 0]
+    if not pairs:
         return np.zeros(3)
-    out = tree.get_output_node("CYCLES")
-    return shining.get(next((link.from_node.name for link in out.inputs["Surface"].links), "") if out else "")
+    colour, strength = pairs[0]
+    to = [link.to_node.type for output in colour.node.outputs for link in output.links]
+    if len(pairs) > 1 or colour.is_linked or strength.is_linked or to != ["OUTPUT_MATERIAL"]:
+        return None
+    return strength.default_value * np.array(colour.default_value[:3])
 
 
 def _shining_faces(thing: Any, frame: Any, radiance_of: Callable[[Any], Any]) -> tuple[Any, Any, set[int]] | None:
@@ -70,16 +68,11 @@ def _shining_faces(thing: Any, frame: Any, radiance_of: Callable[[Any], Any]) ->
     if not radiance.any():
         return None
     mesh.calc_loop_triangles()
-    count, place = len(mesh.loop_triangles), np.empty(3 * len(mesh.vertices))
-    corner, which, face = (np.empty(n * count, np.int32) for n in (3, 1, 1))
-    mesh.vertices.foreach_get("co", place)
-    mesh.loop_triangles.foreach_get("vertices", corner)
-    mesh.loop_triangles.foreach_get("material_index", which)
-    mesh.loop_triangles.foreach_get("polygon_index", face)
-    own = radiance[np.minimum(which, len(radiance) - 1)]
-    lit = own.any(1)
-    place = place.reshape(-1, 3) @ frame[:3, :3].T + frame[:3, 3]
-    return place[corner.reshape(-1, 3)[lit]], own[lit], set(face[lit].tolist())
+    own = [radiance[min(part.material_index, len(found) - 1)] for part in mesh.loop_triangles]
+    lit = [(part, one) for part, one in zip(mesh.loop_triangles, own, strict=True) if one.any()]
+    place = np.array([[mesh.vertices[k].co for k in part.vertices] for part, _ in lit]).reshape(-1, 3, 3)
+    place = place @ frame[:3, :3].T + frame[:3, 3]
+    return place, np.array([one for _, one in lit]).reshape(-1, 3), {part.polygon_index for part, _ in lit}
 
 
 def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float, light: Any, own: set[int]) -> bool:
