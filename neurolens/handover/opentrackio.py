@@ -20,7 +20,8 @@ from neurolens.handover.shot import FAR_M, Handed, Pinhole, falloff, film_points
 
 MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"
 _POINTS = 61, 41  # over the film, of light
-_GOOD_PX = 0.1  # a polynomial that leaves more gives way to a ratio of two, whose terms nearly cancel
+_GOOD_PX = 0.1  # a polynomial that leaves more gives way to a ratio of two
+_LEAST = 1e-5  # singular value over the largest: below it coefficients grow until they cancel, and the ratio has poles
 
 
 def sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | None, float]:
@@ -53,7 +54,7 @@ def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float
         ratio, fits = goal / start, []
         for terms in (powers, np.concatenate([powers, -ratio * powers])):
             k = np.zeros(6)
-            k[: len(terms)] = np.linalg.lstsq((start * terms).T, goal - start, rcond=None)[0]
+            k[: len(terms)] = np.linalg.lstsq((start * terms).T, goal - start, rcond=_LEAST)[0]
             missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) - ratio) * start
             by_mm = k.reshape(2, 3) / start[-1] ** np.array([2, 4, 6])
             fits.append((float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
