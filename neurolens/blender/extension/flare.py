@@ -50,13 +50,16 @@ def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
 def _radiance(material: Any) -> Any:
     """How a material shines [3]; None where a texture, or more than one node, decides it."""
     nodes = material.node_tree.nodes if material and material.node_tree else ()
-    pairs = [[node.inputs[name] for name in _SHINE[node.type]] for node in nodes if node.type in _SHINE]
-    pairs = [(colour, strength) for colour, strength in pairs if strength.is_linked or strength.default_value > 0]
-    if not pairs:
+    inputs = ((node.inputs[name] for name in _SHINE[node.type]) for node in nodes if node.type in _SHINE)
+    shining = [
+        (colour, strength) for colour, strength in inputs
+        if (strength.is_linked or strength.default_value > 0) and (colour.is_linked or any(colour.default_value[:3]))
+    ]  # fmt: skip
+    if not shining:
         return np.zeros(3)
-    colour, strength = pairs[0]
+    colour, strength = shining[0]
     to = [link.to_node.type for output in colour.node.outputs for link in output.links]
-    if len(pairs) > 1 or colour.is_linked or strength.is_linked or to != ["OUTPUT_MATERIAL"]:
+    if len(shining) > 1 or colour.is_linked or strength.is_linked or to != ["OUTPUT_MATERIAL"]:
         return None
     return strength.default_value * np.array(colour.default_value[:3])
 
