@@ -110,9 +110,7 @@ def _facts(cell: Cell) -> dict[str, Any]:
 
 def _text(data: dict[str, Any]) -> str:
     columns, rows = data["fields"]
-    count = len(data["files"])
-    start = f"{count} picture{'s' * (count > 1)} of {columns} x {rows} kernels"
-    lines = [f"{start}, {data['kernel_px']} pixels a side each"]
+    lines = [f"{columns} x {rows} kernels a picture, {data['kernel_px']} pixels a side each"]
     for k, file in enumerate(data["files"]):
         cells = data["kernels"][k * columns * rows : (k + 1) * columns * rows]
         widths, light = ([row[name] for row in cells] for name in ("width_px", "light"))

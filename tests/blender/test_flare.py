@@ -124,6 +124,7 @@ def test_irradiance_is_what_a_white_card_shows(kind: str, settings: dict[str, An
 def test_a_mesh_that_shines_is_a_light(shape: str, kind: str, scene: Any, tmp_path: Path) -> None:
     """Irradiance is what a white card shows of it, which stands where the camera is; a wall hides it."""
     material, node = surface(kind)
+    scene.cycles.samples = 1024
     names = ("Color", "Strength") if kind == "Emission" else ("Emission Color", "Emission Strength")
     node.inputs[names[0]].default_value, node.inputs[names[1]].default_value = (1.0, 0.5, 0.25, 1), 40.0
     place, size = (0.9, 0.5, -5.0), 0.2

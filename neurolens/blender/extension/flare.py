@@ -50,11 +50,8 @@ def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
 def _radiance(material: Any) -> Any:
     """How a material shines [3]; None where a texture, or more than one node, decides it."""
     nodes = material.node_tree.nodes if material and material.node_tree else ()
-    inputs = ((node.inputs[name] for name in _SHINE[node.type]) for node in nodes if node.type in _SHINE)
-    shining = [
-        (colour, strength) for colour, strength in inputs
-        if (strength.is_linked or strength.default_value > 0) and (colour.is_linked or any(colour.default_value[:3]))
-    ]  # fmt: skip
+    pairs = [[node.inputs[name] for name in _SHINE[node.type]] for node in nodes if node.type in _SHINE]
+    shining = [pair for pair in pairs if all(s.is_linked or np.atleast_1d(s.default_value)[:3].any() for s in pair)]
     if not shining:
         return np.zeros(3)
     colour, strength = shining[0]
@@ -104,15 +101,13 @@ def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[s
     pupil = across * (view[:3, :2] / np.linalg.norm(view[:3, :2], axis=0)).T
     radiance_of = cache(_radiance)
     for instance in graph.object_instances:
-        light = instance.object
-        if light.hide_render or light.type not in ("LIGHT", "MESH"):
+        light, place = instance.object, np.array(instance.matrix_world)
+        faces = _shining_faces(light, place, radiance_of) if light.type == "MESH" else None
+        if light.hide_render or not (faces or light.type == "LIGHT"):
             continue
-        place, own = np.array(instance.matrix_world), set[int]()
-        if light.type == "LIGHT":
-            seen, rgb = _seen(light.data, place, eye)
-        elif (faces := _shining_faces(light, place, radiance_of)) is not None:
-            seen, rgb, own = *lights.see_faces(*faces[:2], eye), faces[2]
-        if not (light.type == "LIGHT" or (own and seen.half_rad < _WIDEST)):
+        seen, rgb = lights.see_faces(*faces[:2], eye) if faces else _seen(light.data, place, eye)
+        own = faces[2] if faces else set[int]()
+        if faces and not (own and seen.half_rad < _WIDEST):
             continue
         number = "".join(f".{k}" for k in instance.persistent_id[:2]) if instance.is_instance else ""
         pairs = zip(*lights.ends(seen, eye, pupil, rays), strict=True)
