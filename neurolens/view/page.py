@@ -27,7 +27,7 @@ from neurolens.graph.c import Signature
 from neurolens.graph.osl import TEMPORARY, urgent
 from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
-SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
+SCRIPTS = ("packed.js", "gl.js", "wgsl.js", "webgpu.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this, or beyond so much for each lens, is left out.
 MOST_BYTES, MOST_A_LENS = 3_000_000, 40_000
