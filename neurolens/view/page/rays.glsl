@@ -19,7 +19,8 @@ float even(float step_) { return fract(next() + fract(float(sample_number) * ste
 void main() {
     ivec2 at_pixel = ivec2(gl_FragCoord.xy);
     seed_of(at_pixel, uint(seed));
-    vec2 film, pupil;
+    vec2 film;
+    vec2 pupil;
     float area = 1.0;
     float nm = wavelength_nm;
     if (task == 0 || task == 3) {
@@ -44,9 +45,13 @@ void main() {
         float part = task == 1 ? 0.5 : fract(float(point.x + grid.y * point.y) * 0.6180339887);
         if (nm <= 0.0) { nm = mix(light_nm.x, light_nm.y, part); }
     }
-    vec3 p, d, origin, to;
+    vec3 p;
+    vec3 d;
+    vec3 origin;
+    vec3 to;
     vec2 at;
-    float through, weight;
+    float through;
+    float weight;
     int status;
     LENS;
     WEIGH;

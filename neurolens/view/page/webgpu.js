@@ -4,14 +4,15 @@ class WebGpu {
   static async made(canvas, fail) {
     const adapter = await navigator.gpu?.requestAdapter(), blends = !!adapter?.features.has("float32-blendable");
     const device = await adapter?.requestDevice({ requiredFeatures: blends ? ["float32-blendable"] : [] }).catch(() => null);
-    return device ? new WebGpu(canvas, device, blends, fail) : null;
+    const context = device && canvas.getContext("webgpu");
+    return context ? new WebGpu(canvas, context, device, blends, fail) : null;
   }
 
-  constructor(canvas, device, blends, fail) {
-    Object.assign(this, { canvas, device, blends, name: "WebGPU", format: navigator.gpu.getPreferredCanvasFormat(), context: canvas.getContext("webgpu") });
-    this.context.configure({ device, format: this.format, alphaMode: "opaque" });
+  constructor(canvas, context, device, blends, fail) {
+    Object.assign(this, { canvas, context, device, blends, name: "WebGPU", format: navigator.gpu.getPreferredCanvasFormat() });
+    context.configure({ device, format: this.format, alphaMode: "opaque" });
     device.addEventListener("uncapturederror", ({ error }) => fail(error));
-    device.lost.then(({ message }) => fail(Error(`The GPU stopped: ${message}`)));
+    device.lost.then(({ message }) => fail(Error(`The GPU stopped: ${message} With ?gpu=webgl2 after its address the page uses WebGL2.`)));
     this.blank = this.target(1, 1);
   }
 
@@ -45,12 +46,12 @@ class WebGpu {
   draw(program, values, target, window = null, vertices = 3, adds = false) {
     const { device } = this, { uniforms, floats, wholes, buffer, bound } = program, entries = [{ binding: 0, resource: { buffer } }];
     floats[0] = target ? 0 : this.canvas.height;
-    for (const [name, { texture, size, count, at, whole }] of uniforms) {
+    for (const [name, { texture, size, at, step, whole }] of uniforms) {
       const value = values[name];
       if (value === undefined) throw Error(`uniform ${name} has no value`);
       if (texture) entries.push({ binding: texture, resource: (value ?? this.blank).texture.createView() });
       else {
-        const list = typeof value === "number" ? [value] : value, step = count ? 4 : size;
+        const list = typeof value === "number" ? [value] : value;
         for (let k = 0; k < list.length; k++) (whole ? wholes : floats)[at + Math.floor(k / size) * step + (k % size)] = list[k];
       }
     }

@@ -1,89 +1,98 @@
-// Shaders in WGSL. The page's own and those of lenses are written once, in a part of GLSL of which each line has one of
-// WGSL: one number with a value a declaration, braces around what an if or a loop does, "= a ? b : c;" as a whole
-// line, uniforms of no truth values, arguments that stay as they are. Words that WGSL reserves are no names.
+// Shaders in WGSL. The page's own and those of lenses are written once, in a part of GLSL each line of which has its like
+// in WGSL: a declaration is of one number, what an if or a loop does stands in braces, "= a ? b : c;" ends a line,
+// arguments keep their values, no uniform is a truth value, and no name is a word that WGSL reserves.
 const WORDS = { float: "f32", int: "i32", uint: "u32", vec2: "vec2f", vec3: "vec3f", vec4: "vec4f", ivec2: "vec2i",
   texelFetch: "textureLoad", textureSize: "textureDimensions", inversesqrt: "inverseSqrt", atan: "atan2" };
-const BUILT_IN = "var<private> gl_FragCoord: vec4f;\nvar<private> gl_Position: vec4f;\nvar<private> gl_VertexID: i32;\n";
+const LINES = [ // patterns of GLSL, where TYPE is any type, and what they become; types keep their words until all is done
+  ["^#define .*|\\buniform [^;]+;", ""],
+  ["\\w+_FMA\\(", "fma("],
+  [" = (.+) \\? (.+) : (.+);$", " = select($3, $2, $1);"],
+  ["^TYPE (\\w+);", "var<private> $2: $1;"],
+  ["^const TYPE (\\w+)\\[\\d+\\] = \\w+\\[(\\d+)\\]\\(", "var<private> $2 = array<$1, $3>("],
+  ["^const TYPE (\\w+) =", "const $2: $1 ="],
+  ["\\bTYPE (\\w+)\\[\\d+\\] = \\w+\\[(\\d+)\\]\\(", "var $2 = array<$1, $3>("],
+  ["\\bTYPE (\\w+)\\[(\\d+)\\];", "var $2: array<$1, $3>;"],
+  ["\\bTYPE (t\\d+) =", "let $2: $1 ="],
+  ["\\bTYPE (\\w+) =", "var $2: $1 ="],
+  ["\\bTYPE (\\w+);", "var $2: $1;"],
+];
 
 const bare = (text) => text.replace(/\/\*[^]*?\*\/|\/\/.*/g, "");
 
-/** The uniforms of shaders by name: textures with their number, others with their place in a buffer, in floats. */
+/** The uniforms of shaders by name: textures with their binding, others with their place in a buffer, in numbers. */
 function uniformsOf(...texts) {
   const found = new Map();
-  let end = 1, textures = 0; // the buffer's first number is the canvas's height, 0 for other targets
+  let end = 1, textures = 0; // the buffer begins with the height of a canvas, whose rows WebGPU counts from above, or 0
   for (const [, type, names] of bare(texts.join("\n")).matchAll(/\buniform (?:highp )?(\w+) ([^;]+);/g))
     for (const [, name, count] of names.matchAll(/(\w+)(?:\[(\d+)\])?/g)) {
       if (found.has(name)) continue;
       if (type === "sampler2D") found.set(name, { texture: ++textures });
       else {
-        const size = +type.at(-1) || 1, align = count ? 4 : [1, 2, 4, 4][size - 1], at = Math.ceil(end / align) * align;
-        found.set(name, { type, size, count, at, whole: type[0] === "i" });
+        const size = +type.at(-1) || 1, step = count || size === 3 ? 4 : size, at = Math.ceil(end / step) * step;
+        found.set(name, { type, size, count, at, step, whole: type.startsWith("i") });
         end = at + (count ? 4 * count : size);
       }
     }
-  return { found, length: Math.ceil(end / 4) * 4 };
+  return { found, length: 4 * Math.ceil(end / 4) };
 }
 
-/** A shader of GLSL in WGSL, with its entry point; `uniforms` of it and of the other shader of its program. */
-function wgslOf(glsl, uniforms, vertex) {
-  let text = bare(glsl).replace(/^#define .*/gm, "").replace(/\w+_FMA\(/g, "fma(").replace(/\buniform [^;]+;/g, "");
-  const places = [], own = (name) => `${name}: ${uniforms.found.get(name).type}`;
-  text = text.replace(/^\s*(?:layout\(.*\) )?(flat )?(in|out) (\w+) (\w+);/gm, (_, flat, way, type, name) => {
-    places.push({ way, name, said: `@location(${places.filter((p) => p.way === way).length}) ${flat ? "@interpolate(flat) " : ""}${name}: ${type}` });
-    return `var<private> ${name}: ${type};`;
-  });
-  const types = `(float|int|uint|bool|[ui]?vec[234]${[...text.matchAll(/struct (\w+)/g)].map(([, name]) => `|${name}`).join("")})`;
-  const matched = (pattern, flags = "gm") => new RegExp(pattern.replaceAll("TYPE", types), flags);
-  const typed = (list) => list.replace(matched("(?:in |out )?TYPE (\\w+)"), "$2: $1");
-  text = text.replace(/(struct \w+ \{)([^}]*)\};/g, (_, head, fields) => head + fields.replace(matched("TYPE (\\w+)\\[(\\d+)\\];"), "$2: array<$1, $3>,").replace(matched("TYPE (\\w+);"), "$2: $1,") + "}");
-  // The results of a function are a structure, of which its call takes them.
+/** Functions with results as arguments give a structure instead, from which calls take them. */
+function withResults(text, typed) {
   for (const [whole, name, list, body] of text.matchAll(/^void (\w+)\(([^)]*\bout [^)]*)\)\s*\{([^]*?)^\}/gm)) {
-    const given = list.split(",").map((a) => a.trim()), results = given.filter((a) => a.startsWith("out ")), names = results.map((a) => a.split(" ").at(-1));
-    const inputs = given.slice(0, given.length - results.length);
+    const all = list.split(",").map((a) => a.trim()), results = all.filter((a) => a.startsWith("out ")), inputs = all.slice(0, -results.length);
+    const names = results.map((a) => a.split(" ")[2]), call = new RegExp(`\\b${name}\\(((?:[^()]|\\([^()]*\\))*)\\);`, "g");
     text = text.replace(whole, () => `struct ${name}_ray { ${typed(results.join(", "))} }
 fn ${name}(${typed(inputs.join(", "))}) -> ${name}_ray {
 ${results.map((a) => `    ${a.slice(4)};\n`).join("")}${body}    return ${name}_ray(${names.join(", ")});
-}`).replace(new RegExp(`\\b${name}\\(((?:[^()]|\\([^()]*\\))*)\\);`, "g"), (_, call) => {
-      const places = call.split(", "), first = places.length - names.length;
-      return `{ let ray = ${name}(${places.slice(0, first).join(", ")}); ${names.map((n, k) => `${places[first + k]} = ray.${n};`).join(" ")} }`;
+}`).replace(call, (_, given) => {
+      const values = given.split(", "), places = values.splice(inputs.length);
+      return `{ let ray = ${name}(${values.join(", ")}); ${names.map((n, k) => `${places[k]} = ray.${n};`).join(" ")} }`;
     });
   }
-  text = text.replace(matched("^\\s*(?:void|TYPE) (\\w+)\\(([^)]*)\\)\\s*\\{"), (_, type, name, list) => `\nfn ${name}(${typed(list)})${type ? ` -> ${type}` : ""} {`)
-    .replace(/ = (.+) \? (.+) : (.+);$/gm, " = select($3, $2, $1);")
-    .replace(matched("^TYPE (\\w+);"), "var<private> $2: $1;")
-    .replace(matched("^const TYPE (\\w+)\\[\\d+\\] = \\w+\\[(\\d+)\\]\\("), "var<private> $2: array<$1, $3> = array<$1, $3>(")
-    .replace(matched("^const TYPE (\\w+) ="), "const $2: $1 =")
-    .replace(matched("\\bTYPE (\\w+)\\[\\d+\\] = \\w+\\[(\\d+)\\]\\("), "var $2 = array<$1, $3>(")
-    .replace(matched("\\bTYPE (\\w+)\\[(\\d+)\\];"), "var $2: array<$1, $3>;")
-    .replace(matched("\\bTYPE (t\\d+) ="), "let $2: $1 =")
-    .replace(matched("\\bTYPE (\\w+) ="), "var $2: $1 =")
-    .replace(matched("\\bTYPE (\\w+(?:, \\w+)*);"), (_, type, names) => names.split(", ").map((name) => `var ${name}: ${type};`).join(" "));
-  const fields = [], numbers = [];
+  return text;
+}
+
+/** A shader of GLSL in WGSL, with its entry point; `uniforms` are those of its program. */
+function wgslOf(glsl, uniforms, vertex) {
+  const types = ["float", "int", "uint", "bool", "vec2", "vec3", "vec4", "ivec2", ...[...glsl.matchAll(/^\s*struct (\w+)/gm)].map((m) => m[1])];
+  const pattern = (text) => new RegExp(text.replace("TYPE", `(${types.join("|")})`), "gm");
+  const typed = (list) => list.replace(pattern("(?:in |out )?TYPE (\\w+)"), "$2: $1");
+  const passed = { in: [], out: [] }; // from the vertices to the pixels, and results
+  let text = bare(glsl).replace(/^\s*(?:layout\(.*\) )?(flat )?(in|out) (\w+) (\w+);/gm, (_, flat, way, type, name) => {
+    passed[way].push({ name, place: `@location(${passed[way].length})${flat ? " @interpolate(flat)" : ""}`, type });
+    return `\n${type} ${name};`;
+  });
+  text = text.replace(/(struct \w+ \{)([^}]*)\};/g, (_, head, fields) =>
+    head + fields.replace(pattern("TYPE (\\w+)\\[(\\d+)\\];"), "$2: array<$1, $3>,").replace(pattern("TYPE (\\w+);"), "$2: $1,") + "}");
+  text = withResults(text, typed).replace(pattern("^\\s*(?:void|TYPE) (\\w+)\\(([^)]*)\\)\\s*\\{"), (_, type, name, list) => `\nfn ${name}(${typed(list)})${type ? ` -> ${type}` : ""} {`);
+  for (const [from, to] of LINES) text = text.replace(pattern(from), to);
+  const fields = ["rows_: f32"], copies = passed.in.map(({ name }) => `${name} = given_${name};`);
   let bound = "";
   for (const [name, { type, texture, count }] of uniforms.found)
     if (texture) bound += `@group(0) @binding(${texture}) var ${name}: texture_2d<f32>;\n`;
     else if (count) {
       fields.push(`${name}: array<${type}, ${count}>`);
       text = text.replace(new RegExp(`\\b${name}\\[`, "g"), `uniforms_.${name}[`);
-    } else {
-      fields.push(own(name));
-      numbers.push(name);
-      bound += `var<private> ${own(name)};\n`;
+    } else { // arguments of functions may have the same names
+      fields.push(`${name}: ${type}`);
+      copies.push(`${name} = uniforms_.${name};`);
+      bound += `var<private> ${name}: ${type};\n`;
     }
-  const lines = (way) => places.filter((p) => p.way === way), results = lines("out"), inputs = lines("in");
-  const said = [...vertex ? ["@builtin(position) position: vec4f"] : [], ...results.map((p) => p.said)].join(", ");
-  const values = [...vertex ? ["vec4f(gl_Position.x, -gl_Position.y, gl_Position.zw)"] : [], ...results.map((p) => p.name)].join(", ");
-  const first = vertex ? "@builtin(vertex_index) index_: u32" : "@builtin(position) at_: vec4f";
-  const known = vertex ? "gl_VertexID = i32(index_);" : "gl_FragCoord = vec4f(at_.x, abs(uniforms_.rows_ - at_.y), at_.zw);";
-  text = `struct Uniforms_ { ${["rows_: f32", ...fields].join(", ")} }
+  const stage = vertex ? "vertex" : "fragment", results = passed.out.map(({ name, place, type }) => `${place} ${name}: ${type}`);
+  const given = [vertex ? "@builtin(vertex_index) at_: u32" : "@builtin(position) at_: vec4f", ...passed.in.map(({ name, place, type }) => `${place} given_${name}: ${type}`)];
+  const known = vertex ? "gl_VertexID = i32(at_);" : "gl_FragCoord = vec4f(at_.x, abs(uniforms_.rows_ - at_.y), at_.zw);";
+  const values = passed.out.map(({ name }) => name);
+  if (vertex) results.unshift("@builtin(position) position_: vec4f"), values.unshift("vec4f(gl_Position.x, -gl_Position.y, gl_Position.zw)");
+  return `struct Uniforms_ { ${fields.join(", ")} }
 @group(0) @binding(0) var<uniform> uniforms_: Uniforms_;
-${bound}${BUILT_IN}${text}
-struct Results_ { ${said} }
-@${vertex ? "vertex" : "fragment"} fn entry_(${[first, ...inputs.map((p) => p.said.replace(`${p.name}:`, `given_${p.name}:`))].join(", ")}) -> Results_ {
-  ${known}
-  ${[...numbers.map((name) => `${name} = uniforms_.${name};`), ...inputs.map((p) => `${p.name} = given_${p.name};`)].join(" ")}
+var<private> gl_FragCoord: vec4f;
+var<private> gl_Position: vec4f;
+var<private> gl_VertexID: i32;
+${bound}${text}
+struct Results_ { ${results.join(", ")} }
+@${stage} fn entry_(${given.join(", ")}) -> Results_ {
+  ${known} ${copies.join(" ")}
   main();
-  return Results_(${values});
-}`;
-  return text.replace(/\b[a-zA-Z]\w*(?=[\s(),;>])/g, (word) => WORDS[word] ?? word);
+  return Results_(${values.join(", ")});
+}`.replace(/\b[a-z]\w*(?=[\s(),;>])/g, (word) => WORDS[word] ?? word);
 }
