@@ -127,29 +127,6 @@ def ours(
     return share @ result.rgb[..., 1].astype(float)
 
 
-def test_webgpu_draws_what_webgl2_draws(browser: Any, page_file: Path) -> None:
-    """Of the same shaders, which one GPU rounds alike or nearly so: where a ray meets an edge, a pixel may differ."""
-    pages = [Opened(browser, page_file, gpu) for gpu in GPUS]
-    kinds = [(LENS, kind) for kind in ("exact", "polynomial", "network", "thin")]
-    for key, kind in [*kinds, (ZOOM, "polynomial")]:
-        pictures, shown = [], []
-        for opened in pages:
-            opened.lens(key)
-            opened.set(still=True, view="one", scene="night", a=kind, width=WIDE, blades=6)
-            pictures.append(opened.picture(16))
-            png = opened.page.locator("#picture").screenshot()
-            shown.append(np.array(Image.open(io.BytesIO(png)).convert("RGB"), float))
-        assert pictures[0].std() > 0.1
-        apart = np.abs(pictures[0] - pictures[1]) > 1e-4 * (1 + pictures[0])
-        assert apart.mean() < 0.01, (key, kind)
-        assert pictures[1].mean() == pytest.approx(pictures[0].mean(), rel=1e-3)
-        assert (np.abs(shown[0] - shown[1]).max(-1) > 2).mean() < 0.01, (key, kind)
-    for opened, gpu in zip(pages, ("WebGL2", "WebGPU"), strict=True):
-        assert opened.number("neurolens.engine.gpu.name") == gpu
-        assert f"by {gpu} on" in opened.page.locator("#facts").inner_text()
-        assert opened.said == []
-
-
 OTHERS = "laikin_double_gauss_50", "isshiki_fisheye_10", "cooke_anamorphic_42"
 CAMERAS = {"polynomial": str(ROOT / "models" / f"{LENS}.ols-64.onnx"), "exact": str(ROOT / "lenses" / f"{LENS}.toml")}
 
@@ -207,13 +184,52 @@ def test_small_lights_lie_and_spread_as_in_our_renderer(
 
 
 @pytest.fixture(scope="module")
-def others(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
+def others_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("view") / "others.html"
     assert main(["view", *OTHERS, "--downloads", "glsl", "-o", str(out), "--json"]) == 0
-    found = Opened(browser, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def others(browser: Any, others_file: Path) -> Iterator[Opened]:
+    found = Opened(browser, others_file)
     found.set(still=True, view="one", a="polynomial", width=WIDE, wavelength=NM)
     yield found
     assert found.said == []
+
+
+@pytest.mark.parametrize(
+    ("file", "forms"),
+    [
+        ("page_file", [(LENS, "exact"), (LENS, "polynomial"), (LENS, "network"), (LENS, "thin"), (ZOOM, "polynomial")]),
+        ("others_file", [(key, "exact") for key in OTHERS]),
+    ],
+)
+def test_webgpu_draws_what_webgl2_draws(
+    browser: Any, file: str, forms: list[tuple[str, str]], request: pytest.FixtureRequest
+) -> None:
+    """Of the same shaders, which GPUs round alike or nearly so: where a ray meets an edge, a pixel may differ."""
+    pages = {}
+    for gpu in ("WebGL2", "WebGPU"):
+        pages[gpu] = Opened(browser, request.getfixturevalue(file), gpu.lower())
+        pages[gpu].set(still=True, view="one", scene="night", width=WIDE, blades=6)
+    for key, kind in forms:
+        pictures, shown = [], []
+        for opened in pages.values():
+            opened.lens(key)
+            opened.set(a=kind)
+            pictures.append(opened.picture(4))
+            png = opened.page.locator("#picture").screenshot()
+            shown.append(np.array(Image.open(io.BytesIO(png)).convert("RGB"), float))
+        assert pictures[0].std() > 0.1
+        apart = np.abs(pictures[0] - pictures[1]) > 1e-4 * (1 + pictures[0])
+        assert apart.mean() < 0.01, (key, kind)
+        assert pictures[1].mean() == pytest.approx(pictures[0].mean(), rel=1e-3)
+        assert (np.abs(shown[0] - shown[1]).max(-1) > 2).mean() < 0.01, (key, kind)
+    for gpu, opened in pages.items():
+        assert opened.number("neurolens.engine.gpu.name") == gpu
+        assert f"by {gpu} on" in opened.page.locator("#facts").inner_text()
+        assert opened.said == []
 
 
 @pytest.mark.parametrize("key", OTHERS)

@@ -36,14 +36,15 @@ function uniformsOf(...texts) {
   return { found, length: 4 * Math.ceil(end / 4) };
 }
 
-/** Functions with results as arguments give a structure instead, from which calls take them. */
-function withResults(text, typed) {
+/** Functions with results as arguments give a structure instead, from which calls take them; arguments of a uniform's name get another. */
+function withResults(text, typed, uniforms) {
   for (const [whole, name, list, body] of text.matchAll(/^void (\w+)\(([^)]*\bout [^)]*)\)\s*\{([^]*?)^\}/gm)) {
     const all = list.split(",").map((a) => a.trim()), results = all.filter((a) => a.startsWith("out ")), inputs = all.slice(0, -results.length);
     const names = results.map((a) => a.split(" ")[2]), call = new RegExp(`\\b${name}\\(((?:[^()]|\\([^()]*\\))*)\\);`, "g");
+    const own = (code) => inputs.map((a) => a.split(" ")[2]).filter((n) => uniforms.has(n)).reduce((t, n) => t.replace(new RegExp(`\\b${n}\\b`, "g"), `${n}_`), code);
     text = text.replace(whole, () => `struct ${name}_ray { ${typed(results.join(", "))} }
-fn ${name}(${typed(inputs.join(", "))}) -> ${name}_ray {
-${results.map((a) => `    ${a.slice(4)};\n`).join("")}${body}    return ${name}_ray(${names.join(", ")});
+fn ${name}(${own(typed(inputs.join(", ")))}) -> ${name}_ray {
+${results.map((a) => `    ${a.slice(4)};\n`).join("")}${own(body)}    return ${name}_ray(${names.join(", ")});
 }`).replace(call, (_, given) => {
       const values = given.split(", "), places = values.splice(inputs.length);
       return `{ let ray = ${name}(${values.join(", ")}); ${names.map((n, k) => `${places[k]} = ray.${n};`).join(" ")} }`;
@@ -64,19 +65,15 @@ function wgslOf(glsl, uniforms, vertex) {
   });
   text = text.replace(/(struct \w+ \{)([^}]*)\};/g, (_, head, fields) =>
     head + fields.replace(pattern("TYPE (\\w+)\\[(\\d+)\\];"), "$2: array<$1, $3>,").replace(pattern("TYPE (\\w+);"), "$2: $1,") + "}");
-  text = withResults(text, typed).replace(pattern("^\\s*(?:void|TYPE) (\\w+)\\(([^)]*)\\)\\s*\\{"), (_, type, name, list) => `\nfn ${name}(${typed(list)})${type ? ` -> ${type}` : ""} {`);
+  text = withResults(text, typed, uniforms.found).replace(pattern("^\\s*(?:void|TYPE) (\\w+)\\(([^)]*)\\)\\s*\\{"), (_, type, name, list) => `\nfn ${name}(${typed(list)})${type ? ` -> ${type}` : ""} {`);
   for (const [from, to] of LINES) text = text.replace(pattern(from), to);
   const fields = ["rows_: f32"], copies = passed.in.map(({ name }) => `${name} = given_${name};`);
   let bound = "";
   for (const [name, { type, texture, count }] of uniforms.found)
     if (texture) bound += `@group(0) @binding(${texture}) var ${name}: texture_2d<f32>;\n`;
-    else if (count) {
-      fields.push(`${name}: array<${type}, ${count}>`);
-      text = text.replace(new RegExp(`\\b${name}\\[`, "g"), `uniforms_.${name}[`);
-    } else { // arguments of functions may have the same names
-      fields.push(`${name}: ${type}`);
-      copies.push(`${name} = uniforms_.${name};`);
-      bound += `var<private> ${name}: ${type};\n`;
+    else {
+      fields.push(`${name}: ${count ? `array<${type}, ${count}>` : type}`);
+      text = text.replace(new RegExp(`(?<![.])\\b${name}\\b`, "g"), `uniforms_.${name}`);
     }
   const stage = vertex ? "vertex" : "fragment", results = passed.out.map(({ name, place, type }) => `${place} ${name}: ${type}`);
   const given = [vertex ? "@builtin(vertex_index) at_: u32" : "@builtin(position) at_: vec4f", ...passed.in.map(({ name, place, type }) => `${place} given_${name}: ${type}`)];
