@@ -104,7 +104,7 @@ globalThis.document = {{ getElementById: () => ({{ textContent: {json.dumps(stre
 const write = (name, fragment, vertex = VERTEX) => {{
   fs.writeFileSync(`${{name}}.frag`, HEAD + fragment);
   fs.writeFileSync(`${{name}}.vert`, HEAD + vertex);
-  const uniforms = uniformsOf(vertex, fragment);
+  const uniforms = uniformsOf(vertex, fragment).found;
   fs.writeFileSync(`${{name}}.wgsl`, wgslOf(fragment, uniforms, false));
   fs.writeFileSync(`${{name}}-vertices.wgsl`, wgslOf(vertex, uniforms, true));
 }};

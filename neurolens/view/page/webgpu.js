@@ -17,12 +17,12 @@ class WebGpu {
   }
 
   program(fragment, vertex = VERTEX) {
-    const { device } = this, uniforms = uniformsOf(vertex, fragment), visibility = GPUShaderStage.VERTEX | GPUShaderStage.FRAGMENT;
-    const [first, second] = [vertex, fragment].map((text, k) => device.createShaderModule({ code: wgslOf(text, uniforms, k === 0) }));
-    const textures = [...uniforms.found.values()].filter((u) => u.texture).map((u) => ({ binding: u.texture, visibility, texture: { sampleType: "unfilterable-float" } }));
+    const { device } = this, { found, length } = uniformsOf(vertex, fragment), visibility = GPUShaderStage.VERTEX | GPUShaderStage.FRAGMENT;
+    const [first, second] = [vertex, fragment].map((text, k) => device.createShaderModule({ code: wgslOf(text, found, k === 0) }));
+    const textures = [...found.values()].filter((u) => u.texture).map((u) => ({ binding: u.texture, visibility, texture: { sampleType: "unfilterable-float" } }));
     const bound = device.createBindGroupLayout({ entries: [{ binding: 0, visibility, buffer: {} }, ...textures] });
-    const floats = new Float32Array(uniforms.length), buffer = device.createBuffer({ size: floats.byteLength, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
-    return { uniforms: uniforms.found, floats, wholes: new Int32Array(floats.buffer), buffer, bound, first, second, pipelines: {} };
+    const floats = new Float32Array(length), buffer = device.createBuffer({ size: floats.byteLength, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
+    return { uniforms: found, floats, wholes: new Int32Array(floats.buffer), buffer, bound, first, second, pipelines: {} };
   }
 
   /** The program's pipeline for targets of a format. */
