@@ -33,8 +33,7 @@ class View(Glasses, Answering):
 
     LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
     model, shown with the lens of its name; fitted ghosts (`neurolens flare --fit`) are drawn where a lamp
-    is dragged. Without any, every lens of lenses/ with the best polynomial and
-    the best network of models/."""
+    is dragged. Without any, every lens of lenses/ with the best polynomial and the best network of models/."""
 
     about: ClassVar[str] = "write a page that runs lenses and models in a browser"
     epilog: ClassVar[str] = """\
