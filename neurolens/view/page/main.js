@@ -4,7 +4,7 @@ const shared = JSON.parse(textOf(new Unpacked($("data").textContent, +$("data").
 const NAMES = { exact: "exact", polynomial: "polynomial", network: "network", thin: "thin lens" };
 const set = { lens: shared.lenses[0], scene: "night", view: "wipe", a: "", b: "", tool: "focus", wipe: 0.5, focus: 1, f_number: 1,
   zoom: 0, blades: 0, roundness: 0, rotation: 0, wavelength: 0, width: 480, most: 256, clicked: null, lamp: null, irradiance: 0.5 };
-let engine, layout, ghosts, turn = 0, shows = 0, busy = Promise.resolve(), begun = performance.now();
+let engine, layout, ghosts, turn = 0, held = 0, busy = Promise.resolve(), begun = performance.now();
 const log = (low, high, share) => low * (high / low) ** share;
 const share = (low, high, value) => Math.log(value / low) / Math.log(high / low);
 
@@ -108,7 +108,7 @@ function facts() {
 /** Show the settings: the first sample is on the canvas when the promise is kept. Calls queue. */
 function show() {
   const mine = ++turn;
-  shows++;
+  held++;
   begun = performance.now();
   say();
   busy = busy.then(async () => {
@@ -121,7 +121,7 @@ function show() {
     facts();
     if (layout.lens !== set.lens) await layout.show(set.lens);
     if (set.clicked && set.tool === "rays") await rays();
-  }).catch(fail).finally(() => shows--);
+  }).catch(fail).finally(() => held--);
   return busy;
 }
 
@@ -173,7 +173,7 @@ let done = null, issued = 0, passes = 1;
 function frame(now) {
   requestAnimationFrame(frame);
   const side = engine.sides.a;
-  if (shows) return; // the sides are not all of one setting yet
+  if (held) return; // the sides are not all of one setting yet, or are timed
   if (done) {
     if (!done()) return;
     done = null;
@@ -264,10 +264,12 @@ function listen() {
 
 /** Time the forms that are seen. */
 async function measure() {
+  held++;
   for (const side of set.view === "one" ? ["a"] : ["a", "b"]) {
-    const s = engine.sides[side];
-    s.cost = { ...s.cost, [`${set.lens.key}/${set[side]}`]: await engine.cost(side) };
+    const s = engine.sides[side], key = `${set.lens.key}/${set[side]}`;
+    s.cost = { ...s.cost, [key]: await engine.cost(side) };
   }
+  held--;
   facts();
 }
 
