@@ -160,16 +160,12 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
 def _facts(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
     """What the controls and the first picture of a lens need, which the page unpacks when the lens is chosen."""
     found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section", "ghosts")}
-    forms = [
-        {"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": _kept(f, kinds)}
-        for f in lens.forms
-    ]
+    forms = []
+    for f in lens.forms:
+        files = [kind for kind in kinds if kind == "glsl" or kind in f.files]
+        forms.append({"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": files})
     ghosts = None if lens.ghosts is None else asdict(replace(lens.ghosts, functions=()))
     return found | {"forms": forms, "paths": lens.path is not None, "ghosts": ghosts}
-
-
-def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
-    return [kind for kind in kinds if kind == "glsl" or kind in form.files]
 
 
 def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
