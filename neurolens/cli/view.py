@@ -27,13 +27,13 @@ def _kinds(text: str) -> list[str]:
 @dataclass(frozen=True, kw_only=True)
 class View(Glasses, Answering):
     """Write one page for a browser, which needs neither server nor network: lenses traced exactly and their
-    models as GLSL in a path tracer of WebGL2, side by side or as their difference, at any focus, stop,
-    blades and wavelength; their layout with the rays of a pixel, their error and what a ray costs there.
+    models as GLSL in a path tracer of WebGPU, or of WebGL2 where the browser has no WebGPU, side by side or
+    as their difference, at any focus, stop, blades and wavelength; their layout with the rays of a pixel,
+    their error and what a ray costs there.
 
     LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
     model, shown with the lens of its name; fitted ghosts (`neurolens flare --fit`) are drawn where a lamp
-    is dragged. Without any, every lens of lenses/ with the best polynomial and
-    the best network of models/."""
+    is dragged. Without any, every lens of lenses/ with the best polynomial and the best network of models/."""
 
     about: ClassVar[str] = "write a page that runs lenses and models in a browser"
     epilog: ClassVar[str] = """\

@@ -27,7 +27,7 @@ from neurolens.graph.c import Signature
 from neurolens.graph.osl import TEMPORARY, urgent
 from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
-SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
+SCRIPTS = ("packed.js", "gl.js", "wgsl.js", "webgpu.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this, or beyond so much for each lens, is left out.
 MOST_BYTES, MOST_A_LENS = 3_000_000, 40_000
@@ -160,16 +160,12 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
 def _facts(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
     """What the controls and the first picture of a lens need, which the page unpacks when the lens is chosen."""
     found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section", "ghosts")}
-    forms = [
-        {"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": _kept(f, kinds)}
-        for f in lens.forms
-    ]
+    forms = []
+    for f in lens.forms:
+        files = [kind for kind in kinds if kind == "glsl" or kind in f.files]
+        forms.append({"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": files})
     ghosts = None if lens.ghosts is None else asdict(replace(lens.ghosts, functions=()))
     return found | {"forms": forms, "paths": lens.path is not None, "ghosts": ghosts}
-
-
-def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
-    return [kind for kind in kinds if kind == "glsl" or kind in form.files]
 
 
 def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:

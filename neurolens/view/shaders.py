@@ -28,7 +28,7 @@ _PLACES = {
     **{name: name for name in ("distance_mm", "per_depth", "per_distance", "scale", "roundness", "weight", "inside")},
     **{name: name for name in ("half_cos", "half_sin", "edge_cos", "edge_sin")}, "count": "blades",
     "area_mm2": "area", "lens_status": "float(status)",
-    **dict(zip((f"seen_{k}" for k in range(6)), ("from.x", "from.y", "from.z", "to.x", "to.y", "to.z"), strict=True)),
+    **{f"seen_{k}": f"{'origin' if k < 3 else 'to'}.{'xyz'[k % 3]}" for k in range(6)},
 }  # fmt: skip
 _ENTERING = {"dx": "d.x", "dy": "d.y", "x_mm": "at.x", "y_mm": "at.y", WAVELENGTH: "nm", STOP_RADIUS: "stop_radius"}
 _ARRIVING = ("arriving.x", "arriving.y", "arriving.z", "arriving.w")  # as `program.ARRIVING`

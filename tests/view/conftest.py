@@ -6,12 +6,16 @@ from typing import Any
 
 import pytest
 
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+FLAGS = [
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--use-vulkan=swiftshader",
+    "--enable-features=Vulkan",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    """The browser, with WebGL in software."""
+    """The browser, with WebGL and WebGPU in software."""
     path = os.environ.get("NEUROLENS_BROWSER")
     if not path:
         pytest.skip("no browser is named (NEUROLENS_BROWSER, see make test-web)")

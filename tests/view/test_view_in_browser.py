@@ -1,9 +1,12 @@
-"""The page in a browser with software WebGL2: its pictures against those of the renderer, every control, no request.
+"""The page in a browser with software WebGL2 and WebGPU: its pictures against those of the renderer and of each other,
+every control, no request.
 
 Run by `make test-web`, which sets NEUROLENS_BROWSER to a Chromium, and NEUROLENS_ORT to the files of onnxruntime-web.
 """
 
+import io
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -12,13 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
-from neurolens.flare.ghostmodel import write_ghosts
+from neurolens.flare.ghostmodel import GhostModel, write_ghosts
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import ghost_picture
 from neurolens.lens.shot import Shot
@@ -34,6 +38,7 @@ LENS = "petzval_portrait_100"
 ZOOM = "nikon_zoom_80_200"
 WIDE, HIGH = 240, 135  # of compared pictures
 NM = 550.0
+GPUS = "webgl2", "webgpu"
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +52,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Opened:
     """A page with what it said and asked for."""
 
-    def __init__(self, browser: Any, file: Path, **options: Any) -> None:
+    def __init__(self, browser: Any, file: Path, gpu: str = "webgl2", **options: Any) -> None:
         self.page = browser.new_page(**options)
         self.said: list[str] = []
         self.asked: list[str] = []
@@ -55,7 +60,8 @@ class Opened:
         self.page.on("console", lambda m: None if "GPU stall due to ReadPixels" in m.text else self.said.append(m.text))
         self.page.on("pageerror", lambda e: self.said.append(str(e)))
         self.page.on("request", lambda r: self.asked.append(r.url))
-        self.page.goto(file.as_uri())
+        self.address = f"{file.as_uri()}?gpu={gpu}"
+        self.page.goto(self.address)
         self.page.evaluate("neurolens.ready")
 
     def set(self, **settings: Any) -> None:
@@ -70,9 +76,10 @@ class Opened:
 
     def picture(self, samples: int) -> np.ndarray:
         """[HIGH, WIDE] green of the left side, the first row on top."""
-        script = (
-            "n => { for (let k = 1; k < n; k++) neurolens.pass(); return Array.from(neurolens.engine.picture('a')); }"
-        )
+        script = """async (n) => {
+          for (let k = 1; k < n; k++) neurolens.pass();
+          return [...await neurolens.engine.picture("a")];
+        }"""
         rows = np.array(self.page.evaluate(script, samples)).reshape(HIGH, WIDE, 4)
         return rows[::-1, :, 1]
 
@@ -87,7 +94,7 @@ def opened(browser: Any, page_file: Path) -> Iterator[Opened]:
     found.set(still=True, view="one", a="polynomial", width=WIDE, wavelength=NM)
     yield found
     assert found.said == []
-    assert found.asked == [page_file.as_uri()]
+    assert found.asked == [found.address]
 
 
 BALLS = """b => {
@@ -177,13 +184,52 @@ def test_small_lights_lie_and_spread_as_in_our_renderer(
 
 
 @pytest.fixture(scope="module")
-def others(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
+def others_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("view") / "others.html"
     assert main(["view", *OTHERS, "--downloads", "glsl", "-o", str(out), "--json"]) == 0
-    found = Opened(browser, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def others(browser: Any, others_file: Path) -> Iterator[Opened]:
+    found = Opened(browser, others_file)
     found.set(still=True, view="one", a="polynomial", width=WIDE, wavelength=NM)
     yield found
     assert found.said == []
+
+
+@pytest.mark.parametrize(
+    ("file", "forms"),
+    [
+        ("page_file", [(LENS, "exact"), (LENS, "polynomial"), (LENS, "network"), (LENS, "thin"), (ZOOM, "polynomial")]),
+        ("others_file", [(key, "exact") for key in OTHERS]),
+    ],
+)
+def test_webgpu_draws_what_webgl2_draws(
+    browser: Any, file: str, forms: list[tuple[str, str]], request: pytest.FixtureRequest
+) -> None:
+    """Of the same shaders, which GPUs round alike or nearly so: where a ray meets an edge, a pixel may differ."""
+    pages = {}
+    for gpu in ("WebGL2", "WebGPU"):
+        pages[gpu] = Opened(browser, request.getfixturevalue(file), gpu.lower())
+        pages[gpu].set(still=True, view="one", scene="night", width=WIDE, blades=6)
+    for key, kind in forms:
+        pictures, shown = [], []
+        for opened in pages.values():
+            opened.lens(key)
+            opened.set(a=kind)
+            pictures.append(opened.picture(4))
+            png = opened.page.locator("#picture").screenshot()
+            shown.append(np.array(Image.open(io.BytesIO(png)).convert("RGB"), float))
+        assert pictures[0].std() > 0.1
+        apart = np.abs(pictures[0] - pictures[1]) > 1e-4 * (1 + pictures[0])
+        assert apart.mean() < 0.01, (key, kind)
+        assert pictures[1].mean() == pytest.approx(pictures[0].mean(), rel=1e-3)
+        assert (np.abs(shown[0] - shown[1]).max(-1) > 2).mean() < 0.01, (key, kind)
+    for gpu, opened in pages.items():
+        assert opened.number("neurolens.engine.gpu.name") == gpu
+        assert f"by {gpu} on" in opened.page.locator("#facts").inner_text()
+        assert opened.said == []
 
 
 @pytest.mark.parametrize("key", OTHERS)
@@ -218,12 +264,23 @@ def test_other_lenses_too(others: Opened, key: str) -> None:
     assert areas[:, 0].mean() == pytest.approx(areas[:, 1].mean(), rel=0.02)
 
 
-def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: Any, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def flare(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GhostModel]:
+    """A page with fitted ghosts, and these."""
+    folder = tmp_path_factory.mktemp("flare")
     lens = set_lens(read_lens(ROOT / "lenses" / "brendel_tessar_100.toml"), focus_m=np.inf)
     model = fit_ghosts(lens, GhostSettings(angle_deg=25.0, keep=0.8, rays=2000, target_um=60.0))
-    words = ["brendel_tessar_100", str(write_ghosts(model, tmp_path / "ghosts.onnx")), "--downloads", "glsl"]
-    assert main(["view", *words, "-o", str(tmp_path / "view.html"), "--json"]) == 0
-    opened = Opened(browser, tmp_path / "view.html")
+    words = ["brendel_tessar_100", str(write_ghosts(model, folder / "ghosts.onnx")), "--downloads", "glsl"]
+    assert main(["view", *words, "-o", str(folder / "view.html"), "--json"]) == 0
+    return folder / "view.html", model
+
+
+@pytest.mark.parametrize("gpu", GPUS)
+def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(
+    browser: Any, flare: tuple[Path, GhostModel], gpu: str
+) -> None:
+    file, model = flare
+    opened = Opened(browser, file, gpu)
     opened.set(view="one", tool="lamp", width=WIDE, wavelength=NM, focus=np.inf, most=1)
     box = opened.page.locator("#picture").bounding_box()
     assert box is not None
@@ -234,7 +291,7 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: 
     drawn = f"neurolens.ghosts.shown === {len(model.pairs)} ? done() : setTimeout(look, 20)"
     opened.page.evaluate(f"new Promise((done) => {{ const look = () => {drawn}; look(); }})")
     assert opened.number("neurolens.set.lamp") == pytest.approx([0.7, 0.7], abs=0.01)
-    found = opened.number("Array.from(neurolens.engine.gpu.read(neurolens.ghosts.film))")
+    found = opened.number("(async () => [...await neurolens.engine.gpu.read(neurolens.ghosts.film)])()")
     picture = np.array(found).reshape(HIGH, WIDE, 4)[::-1, :, 1]
     x, y, z = opened.number("neurolens.ghosts.lamp.towards")
     rgb = (opened.number("neurolens.set.irradiance"),) * 3
@@ -250,8 +307,9 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: 
     assert opened.said == []
 
 
-def test_every_control_changes_the_picture(browser: Any, page_file: Path) -> None:
-    opened = Opened(browser, page_file)
+@pytest.mark.parametrize("gpu", GPUS)
+def test_every_control_changes_the_picture(browser: Any, page_file: Path, gpu: str) -> None:
+    opened = Opened(browser, page_file, gpu)
     page = opened.page
     opened.set(still=True)
     page.select_option("#lens", LENS)
@@ -277,12 +335,15 @@ def test_every_control_changes_the_picture(browser: Any, page_file: Path) -> Non
         assert now != last, place
         last = now
     assert opened.said == []
-    assert opened.asked == [page_file.as_uri()]
+    assert opened.asked == [opened.address]
 
 
-def test_clicks_focus_and_draw_rays_by_mouse_and_by_keys(opened: Opened) -> None:
+@pytest.mark.parametrize("gpu", GPUS)
+def test_clicks_focus_and_draw_rays_by_mouse_and_by_keys(browser: Any, page_file: Path, gpu: str) -> None:
+    opened = Opened(browser, page_file, gpu)
     page = opened.page
-    opened.set(scene="chart", tool="focus", focus=10.0, a="polynomial")
+    opened.lens(LENS)
+    opened.set(still=True, view="one", width=WIDE, scene="chart", tool="focus", focus=10.0, a="polynomial")
     page.locator("#picture").click(position={"x": 300, "y": 100})
     page.evaluate("neurolens.idle()")
     framing = opened.number("neurolens.framing()")
@@ -294,6 +355,10 @@ def test_clicks_focus_and_draw_rays_by_mouse_and_by_keys(opened: Opened) -> None
     assert page.locator("#layout .ray").count() == 9
     page.locator("#picture").press("[")
     assert opened.number("neurolens.set.wipe") < 0.5
+    opened.page.evaluate("neurolens.measure()")
+    said = page.locator("#facts").inner_text()
+    assert re.search(rf"a ray by {gpu} on this GPU\s+[\d.]+ ns", said, re.I)
+    assert opened.said == []
 
 
 def test_downloads_are_the_files(browser: Any, tmp_path: Path) -> None:
@@ -338,7 +403,7 @@ def test_it_says_what_is_missing(browser: Any, page_file: Path) -> None:
         page = browser.new_page()
         owner = "HTMLCanvasElement" if lacking == "getContext" else "WebGL2RenderingContext"
         page.add_init_script(f"{owner}.prototype.{lacking} = () => null;")
-        page.goto(page_file.as_uri())
+        page.goto(f"{page_file.as_uri()}?gpu=webgl2")
         page.evaluate("neurolens.ready")
         assert word in page.locator("#missing").inner_text()
         page.close()

@@ -86,27 +86,61 @@ def test_it_fetches_nothing(view: Path) -> None:
     assert policy is not None and policy.startswith("default-src 'none'")
 
 
-@pytest.mark.skipif(not (GLSLANG and NODE), reason="no glslangValidator or no node")
-def test_shaders_compile(view: Path, tmp_path: Path) -> None:
-    """As the page's own script puts them together."""
+@pytest.fixture(scope="module")
+def written(view: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the shaders in GLSL and WGSL, as the page's own script puts them together."""
+    if not NODE:
+        pytest.skip("no node")
+    folder = tmp_path_factory.mktemp("shaders")
     text = view.read_text(encoding="utf-8")
     data = data_of(text)
     (stream,) = re.findall(r'id="lenses-0">([^<]*)<', text)
-    scripts = "\n".join(text_of(name) for name in ("packed.js", "gl.js", "scene.js", "engine.js"))
+    scripts = "\n".join(
+        text_of(name) for name in ("packed.js", "gl.js", "wgsl.js", "scene.js", "engine.js", "ghosts.js")
+    )
     script = f"""{scripts}
 const data = {json.dumps(data)}, fs = require("fs");
 globalThis.document = {{ getElementById: () => ({{ textContent: {json.dumps(stream)} }}) }};
-fs.writeFileSync("scene.frag", HEAD + sceneShader(data));
-fs.writeFileSync("thin.frag", HEAD + raysShader(data, data.functions.thin.text, data.functions.thin.call));
+const write = (name, fragment, vertex = VERTEX) => {{
+  fs.writeFileSync(`${{name}}.frag`, HEAD + fragment);
+  fs.writeFileSync(`${{name}}.vert`, HEAD + vertex);
+  const uniforms = uniformsOf(vertex, fragment).found;
+  fs.writeFileSync(`${{name}}.wgsl`, wgslOf(fragment, uniforms, false));
+  fs.writeFileSync(`${{name}}-vertices.wgsl`, wgslOf(vertex, uniforms, true));
+}};
+write("scene", sceneShader(data));
+write("show", SHOW);
+write("ghosts", GHOST_FRAGMENT, GHOST_VERTEX);
+write("thin", raysShader(data, data.functions.thin.text, data.functions.thin.call));
 const [lens] = data.lenses;
 for (const form of lens.forms)
-  fs.writeFileSync(form.kind + ".frag", HEAD + raysShader(data, partOf(lens, `${{form.kind}}/glsl`), form.call));
+  write(form.kind, raysShader(data, partOf(lens, `${{form.kind}}/glsl`), form.call));
 """
-    subprocess.run([str(NODE), "-e", script], check=True, cwd=tmp_path, capture_output=True)
-    files = sorted(tmp_path.glob("*.frag"))
-    assert len(files) == 5
+    subprocess.run([str(NODE), "-e", script], check=True, cwd=folder, capture_output=True)
+    return folder
+
+
+@pytest.mark.skipif(not GLSLANG, reason="no glslangValidator")
+def test_shaders_compile(written: Path) -> None:
+    files = sorted([*written.glob("*.frag"), *written.glob("*.vert")])
+    assert len(files) == 14
     done = subprocess.run([str(GLSLANG), *map(str, files)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+
+
+def test_shaders_compile_as_wgsl(written: Path) -> None:
+    """By naga, the compiler of Firefox."""
+    wgpu = pytest.importorskip("wgpu", reason="no wgpu (pip install '.[shading]')")
+    try:
+        device = wgpu.gpu.request_adapter_sync().request_device_sync()
+    except RuntimeError as error:
+        pytest.skip(f"no adapter of Vulkan: {error}")
+    files = sorted(written.glob("*.wgsl"))
+    assert len(files) == 14
+    for file in files:
+        device.create_shader_module(label=file.name, code=file.read_text())
+    with pytest.raises(wgpu.GPUValidationError):
+        device.create_shader_module(code=files[0].read_text().replace("main();", "main(1);"))
 
 
 CODE = """\

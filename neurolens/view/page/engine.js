@@ -7,8 +7,8 @@ function functionOf(text) {
   const packed = (_, n) => `state_c[${n >> 2}].${"xyzw"[n & 3]}`;
   const count = Number(text.match(/struct \w+_state \{[^}]*float c\[(\d+)\]/)?.[1] ?? 0);
   const own = text.match(/^#define .*$/m)[0] + text.slice(text.lastIndexOf("\nvoid ")).replace(/\s*in \w+_state state,/, "");
-  const state = count ? `uniform vec4 state_c[${(count + 3) >> 2}];\nuniform bool state_inside;\n` : "";
-  return { count, text: state + own.replace(/state\.c\[(\d+)\]/g, packed).replaceAll("state.inside", "state_inside") };
+  const state = count ? `uniform vec4 state_c[${(count + 3) >> 2}];\nuniform int state_inside;\n` : "";
+  return { count, text: state + own.replace(/state\.c\[(\d+)\]/g, packed).replace("!state.inside", "state_inside == 0") };
 }
 
 /** The shader of rays with the function of a lens. */
@@ -60,14 +60,16 @@ class Engine {
     const form = this.form(lens, kind), names = Object.keys(form.values);
     const made = await this.once(`${lens.key}/${kind}/numbers`, async () => {
       const text = await this.text(lens, kind), { count } = functionOf(text);
-      const values = names.map((name, i) => `if (i == ${i}) v = ${form.values[name]};`).join("\n");
+      const values = names.map((name, i) => `if (i == ${i}) { v = ${form.values[name]}; }`).join("\n");
       const state = count ? `${form.name}_state s = ${form.name}_at(zoom);
-        if (i == ${names.length}) v = s.inside ? 1.0 : 0.0; else if (i > ${names.length}) v = s.c[i - ${names.length + 1}];` : "";
+        if (i == ${names.length}) { v = float(s.inside); }
+        if (i > ${names.length}) { v = s.c[i - ${names.length + 1}]; }` : "";
       const program = this.gpu.program(`${text.slice(0, text.lastIndexOf("\nvoid "))}
         uniform float zoom, focus, stop_share;
         out vec4 result;
         void main() {
-          float v = 0.0, stop_radius = stop_share * ${form.values.stop_radius_max_mm};
+          float v = 0.0;
+          float stop_radius = stop_share * ${form.values.stop_radius_max_mm};
           int i = int(gl_FragCoord.x);
           ${values}
           ${state}
@@ -77,7 +79,7 @@ class Engine {
     });
     const share = Math.min(1, wideOf(lens, set.zoom) / set.f_number);
     this.gpu.draw(made.program, { zoom: set.zoom, focus: Math.min(set.focus, 1e7), stop_share: share }, made.target);
-    const found = this.gpu.read(made.target).filter((_, i) => i % 4 === 0);
+    const found = (await this.gpu.read(made.target)).filter((_, i) => i % 4 === 0);
     const numbers = Object.fromEntries(names.map((name, i) => [name, found[i]]));
     const state_c = new Float32Array(((made.count + 3) >> 2) * 4);
     state_c.set(found.subarray(names.length + 1));
@@ -119,7 +121,7 @@ class Engine {
     const side = AIM_FILM * AIM_PUPIL, target = this.once("aim", () => this.gpu.target(side, side, null, 2));
     const aim = [-radius, -radius, 2 * radius, 2 * radius], step = (2 * radius) / AIM_PUPIL;
     this.run(await this.program(lens, kind), { ...values, task: 1, aim, grid: [AIM_FILM, AIM_PUPIL] }, target);
-    const passed = this.gpu.read(target), spans = [];
+    const passed = await this.gpu.read(target), spans = [];
     for (let n = 0; n < AIM_FILM * AIM_FILM; n++) {
       const [cx, cy] = [n % AIM_FILM, Math.floor(n / AIM_FILM)].map((v) => v * AIM_PUPIL);
       const span = [Infinity, Infinity, -Infinity, -Infinity];
@@ -151,7 +153,7 @@ class Engine {
     const axis = this.once("axis", () => this.gpu.target(AXIS, AXIS, null, 2));
     const task = { ...values, scale: values.per_distance ** 2, task: 2, aim: [...boxes.subarray(0, 4)], grid: [1, AXIS] };
     this.run(program, task, axis);
-    const weights = this.gpu.read(axis);
+    const weights = await this.gpu.read(axis);
     let exposure = 0;
     for (let i = 3; i < weights.length; i += 4) exposure += weights[i] / (AXIS * AXIS);
     return { boxes, exposure };
@@ -222,36 +224,36 @@ class Engine {
   }
 
   /** Mean of the samples of a side: RGB and the share of rays that pass, rows from below. */
-  picture(side) {
-    const s = this.sides[side];
-    return this.gpu.read(s.film).map((v) => v / s.samples);
+  async picture(side) {
+    const { film, samples } = this.sides[side];
+    return (await this.gpu.read(film)).map((v) => v / samples);
   }
 
   /** Distance (m, from the film along the axis) of what a place of the picture shows; Infinity for the sky. */
-  distance(side, place) {
+  async distance(side, place) {
     const s = this.sides[side], target = this.once("probe", () => this.gpu.target(1, 1)), ray = this.once("ray", () => this.gpu.target(1, 1, null, 2));
     this.run(s.program, { ...s.values, task: 3, probe: place, boxes: s.boxes }, ray);
     this.meet({ ...s.values, measures: 1 }, ray, target);
-    const far = this.gpu.read(target)[0];
+    const [far] = await this.gpu.read(target);
     return far > 0 && far < 1e6 ? far : Infinity;
   }
 
   /** The direction, in the camera's frame, that a place of the picture looks in. */
-  direction(side, place) {
+  async direction(side, place) {
     const s = this.sides[side], ray = this.once("ray", () => this.gpu.target(1, 1, null, 2));
     this.run(s.program, { ...s.values, task: 3, probe: place, boxes: s.boxes }, ray);
-    return [...this.gpu.read(ray, 0, 0, 1, 1, 1).subarray(0, 3)];
+    return [...(await this.gpu.read(ray, 0, 0, 1, 1, 1)).subarray(0, 3)];
   }
 
   /** Nanoseconds a ray of a side's lens: its function and weight, no scene; the least of some runs. */
-  cost(side) {
+  async cost(side) {
     const s = this.sides[side], target = this.once("bench", () => this.gpu.target(FREE_BENCH, FREE_BENCH, null, 2));
     const given = { ...s.values, task: 2, scale: s.values.per_distance ** 2, aim: [0, 0, 1, 1], grid: [1, FREE_BENCH] };
     let best = Infinity, repeats = 1;
     for (let turn = 0; turn < 6; turn++) {
       const start = performance.now();
       for (let k = 0; k < repeats; k++) this.run(s.program, given, target);
-      this.gpu.read(target, 0, 0, 1, 1); // waits for the GPU
+      await this.gpu.read(target, 0, 0, 1, 1); // waits for the GPU
       const took = performance.now() - start;
       if (turn) best = Math.min(best, took / repeats);
       if (took < 30) repeats = Math.min(64, repeats * 4);
@@ -273,18 +275,20 @@ uniform vec2 counts;
 uniform int view;
 uniform float wipe, gain, flared;
 out vec4 result;
-vec3 mapped(vec3 x) {
-  x = clamp(x, 0.0, 1.0);
-  return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x));
+vec3 mapped(vec3 light) {
+  vec3 x = clamp(light, vec3(0.0), vec3(1.0));
+  return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(vec3(0.0031308), x));
 }
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
-  vec3 left = texelFetch(a, at, 0).rgb / counts.x, right = texelFetch(b, at, 0).rgb / counts.y;
+  vec3 left = texelFetch(a, at, 0).rgb / counts.x;
+  vec3 right = texelFetch(b, at, 0).rgb / counts.y;
   float edge = floor(wipe * float(textureSize(a, 0).x));
   vec3 seen = view == 1 && float(at.x) >= edge ? right : left;
-  if (flared > 0.0) seen += flared * texelFetch(ghosts, at, 0).rgb;
-  if (view == 2) { result = vec4(mapped(1000.0 * abs(left - right)), 1.0); return; }
-  result = vec4(mapped(gain > 1.0 ? 1.0 - exp(-gain * seen) : seen), 1.0); // of the night, lights keep their colour
+  if (flared > 0.0) { seen += flared * texelFetch(ghosts, at, 0).rgb; }
+  if (gain > 1.0) { seen = 1.0 - exp(-gain * seen); } // of the night, lights keep their colour
+  if (view == 2) { seen = 1000.0 * abs(left - right); }
+  result = vec4(mapped(seen), 1.0);
 }`;
 
 /** The widest f-number at a zoom position. */

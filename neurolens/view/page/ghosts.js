@@ -23,7 +23,7 @@ class GhostView {
    * `known`: how many of the brightest. Returns how many there are.
    */
   async draw(lens, side, towards, irradiance, width, height, known) {
-    const { gl } = this.gpu, { values } = side, { ghosts } = lens, all = await this.functions(lens);
+    const { values } = side, { ghosts } = lens, all = await this.functions(lens);
     const { film_mm, stop_radius, wavelength_nm, light_nm, exposure } = values;
     const key = JSON.stringify([lens.key, width, towards, [...film_mm], stop_radius, wavelength_nm, light_nm, exposure]);
     if (this.film?.width !== width) {
@@ -31,10 +31,7 @@ class GhostView {
       this.film = this.gpu.target(width, height, null, 1, !this.gpu.blends);
     }
     if (key !== this.kept?.key || known < this.kept.count || !this.kept.irradiance) {
-      gl.bindFramebuffer(gl.FRAMEBUFFER, this.film.frame);
-      gl.disable(gl.SCISSOR_TEST);
-      gl.clearColor(0, 0, 0, 0);
-      gl.clear(gl.COLOR_BUFFER_BIT);
+      this.gpu.clear(this.film);
       this.kept = { key, irradiance, count: 0 };
     }
     this.dimmed = irradiance && irradiance / this.kept.irradiance;
@@ -45,10 +42,7 @@ class GhostView {
         stop_radius: Math.min(values.stop_radius, ghosts.stop_radius_mm), film_mm: values.film_mm, one_colour: values.wavelength_nm ? 1 : 0,
         nodes: this.nodes, cell_light: (Math.abs(d[2]) * this.kept.irradiance * (2 / GHOST_CELLS) ** 2 * ghost.scale_mm[0] * ghost.scale_mm[1]) / 2 / values.exposure };
       this.gpu.draw(this.program(lens, ghost), given, this.nodes);
-      gl.enable(gl.BLEND);
-      gl.blendFunc(gl.ONE, gl.ONE);
-      this.gpu.draw(this.cells, given, this.film, null, 6 * GHOST_CELLS ** 2 * GHOST_NM);
-      gl.disable(gl.BLEND);
+      this.gpu.draw(this.cells, given, this.film, null, 6 * GHOST_CELLS ** 2 * GHOST_NM, true);
     }
     this.kept.count = known;
     return inside ? all.length : 0;
@@ -64,7 +58,7 @@ out vec4 arriving;
 void main() {
   ivec2 node = ivec2(gl_FragCoord.xy);
   int band = node.x / ${GHOST_CELLS + 1};
-  vec2 at = chief * p + size * (2.0 * vec2(node.x - band * ${GHOST_CELLS + 1}, node.y) / ${GHOST_CELLS}.0 - 1.0);
+  vec2 at = chief * p + size * (2.0 * vec2(ivec2(node.x - band * ${GHOST_CELLS + 1}, node.y)) / ${GHOST_CELLS}.0 - 1.0);
   float nm = mix(span_nm.x, span_nm.y, (float(band) + 0.5) / ${GHOST_NM}.0);
   GHOST;
 }`;
@@ -77,16 +71,21 @@ uniform int one_colour;
 out float worst;
 flat out vec3 light;
 vec4 corner(int cell, int band, int which) {
-  ivec2 step_ = which == 0 ? ivec2(0) : which == 1 ? ivec2(1, 0) : which == 2 ? ivec2(0, 1) : ivec2(1);
-  return texelFetch(nodes, ivec2(band * ${GHOST_CELLS + 1} + cell % ${GHOST_CELLS}, cell / ${GHOST_CELLS}) + step_, 0);
+  return texelFetch(nodes, ivec2(band * ${GHOST_CELLS + 1} + cell % ${GHOST_CELLS}, cell / ${GHOST_CELLS}) + ivec2(which & 1, which >> 1), 0);
 }
 void main() {
-  int part = gl_VertexID / 3, half_ = part & 1, cell = (part >> 1) % ${GHOST_CELLS ** 2}, band = (part >> 1) / ${GHOST_CELLS ** 2};
-  vec4 a = corner(cell, band, half_ == 0 ? 0 : 3), b = corner(cell, band, 1), c = corner(cell, band, 2);
+  int part = gl_VertexID / 3;
+  int cell = (part >> 1) % ${GHOST_CELLS ** 2};
+  int band = (part >> 1) / ${GHOST_CELLS ** 2};
+  int first = 3 * (part & 1);
+  vec4 a = corner(cell, band, first);
+  vec4 b = corner(cell, band, 1);
+  vec4 c = corner(cell, band, 2);
   float lit = float(a.w <= 1.0) + float(b.w <= 1.0) + float(c.w <= 1.0);
   float area = 0.5 * abs((b.x - a.x) * (c.y - a.y) - (c.x - a.x) * (b.y - a.y));
   int k = gl_VertexID % 3;
-  vec4 own = k == 0 ? a : k == 1 ? b : c;
+  int which = k == 0 ? first : k;
+  vec4 own = corner(cell, band, which);
   worst = min(own.w, 4.0);
   float t = (float(band) + 0.5) / ${GHOST_NM}.0;
   vec3 colour = one_colour == 1 ? vec3(1.0) : vec3(3.0 * t * t, 6.0 * t * (1.0 - t), 3.0 * (1.0 - t) * (1.0 - t)) / vec3(0.9722222, 1.0555556, 0.9722222);
@@ -98,6 +97,6 @@ in float worst;
 flat in vec3 light;
 out vec4 result;
 void main() {
-  if (worst > 1.0) discard;
+  if (worst > 1.0) { discard; }
   result = vec4(min(light, vec3(100.0)), 0.0);
 }`;

@@ -1,4 +1,4 @@
-// WebGL2 in the few calls that the page needs.
+// WebGL2 in the few calls that the page needs; webgpu.js has the same ones.
 class Gpu {
   /** Throws a sentence for the reader where something is missing. */
   constructor(canvas) {
@@ -6,7 +6,7 @@ class Gpu {
     if (!gl) throw Error("This browser has no WebGL2, which the pictures need.");
     if (!gl.getExtension("EXT_color_buffer_float"))
       throw Error("WebGL2 is here, but this GPU cannot draw into float textures (EXT_color_buffer_float), in which pictures add up.");
-    this.gl = gl;
+    Object.assign(this, { gl, name: "WebGL2" });
     this.blends = !!gl.getExtension("EXT_float_blend"); // into 32 bits, which software does twice as fast as into 16
     this.blank = this.target(1, 1);
     gl.bindVertexArray(gl.createVertexArray());
@@ -55,8 +55,8 @@ class Gpu {
     this.gl.deleteFramebuffer(target.frame);
   }
 
-  /** Run a program; `target` null is the canvas, `window` [x, y, width, height] the part that is drawn. */
-  draw({ program, uniforms }, values, target, window = null, vertices = 3) {
+  /** Run a program; `target` null is the canvas, `window` [x, y, width, height] the part that is drawn; `adds` to what is there. */
+  draw({ program, uniforms }, values, target, window = null, vertices = 3, adds = false) {
     const gl = this.gl;
     gl.useProgram(program);
     let unit = 0;
@@ -78,7 +78,29 @@ class Gpu {
     gl.viewport(0, 0, width, height);
     if (window) gl.scissor(...window);
     gl[window ? "enable" : "disable"](gl.SCISSOR_TEST);
+    gl[adds ? "enable" : "disable"](gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE);
     gl.drawArrays(gl.TRIANGLES, 0, vertices);
+  }
+
+  /** Nothing in a target. */
+  clear(target) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+
+  /** A question, whether the GPU is done with all that it has been given so far. */
+  fence() {
+    const { gl } = this, sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return () => {
+      const done = gl.getSyncParameter(sync, gl.SYNC_STATUS) === gl.SIGNALED;
+      if (done) gl.deleteSync(sync);
+      return done;
+    };
   }
 
   /** The floats of a part of a target, four a pixel, rows from below. */
@@ -91,5 +113,5 @@ class Gpu {
   }
 }
 
-const VERTEX = "void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
+const VERTEX = "void main() { gl_Position = vec4(vec2(4 * ivec2(gl_VertexID & 1, gl_VertexID >> 1) - 1), 0.0, 1.0); }";
 const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n";

@@ -29,7 +29,6 @@ class LayoutView {
 
   /** Draw the rays of a film height (mm) at the setting of a side; returns how many of them pass. */
   async rays(height, side) {
-    this.svg.querySelectorAll(".ray").forEach((ray) => ray.remove());
     if (!this.outputs?.length || !this.box) return null;
     const { gpu } = this.engine, names = this.outputs, count = names.length + 1;
     const program = await this.engine.once(`${this.lens.key}/path`, () => gpu.program(`${partOf(this.lens, "path")}
@@ -47,7 +46,8 @@ class LayoutView {
     const given = { film_y: height, pupil_low: -v.pupil_radius, pupil_step: (2 * v.pupil_radius) / (tries - 1),
       nm: v.wavelength_nm || 550, film_z: v.film_z, stop_radius: v.stop_radius };
     gpu.draw(program, given, target);
-    const found = gpu.read(target).filter((_, i) => i % 4 === 0);
+    const found = (await gpu.read(target)).filter((_, i) => i % 4 === 0);
+    this.svg.querySelectorAll(".ray").forEach((ray) => ray.remove());
     const all = Array.from({ length: tries }, (_, k) => [...found.subarray(k * count, (k + 1) * count)]);
     const passing = all.filter((ray) => ray[count - 1] === 0);
     const chosen = passing.length <= RAYS ? passing : Array.from({ length: RAYS }, (_, k) => passing[Math.round((k * (passing.length - 1)) / (RAYS - 1))]);

@@ -4,7 +4,7 @@ const shared = JSON.parse(textOf(new Unpacked($("data").textContent, +$("data").
 const NAMES = { exact: "exact", polynomial: "polynomial", network: "network", thin: "thin lens" };
 const set = { lens: shared.lenses[0], scene: "night", view: "wipe", a: "", b: "", tool: "focus", wipe: 0.5, focus: 1, f_number: 1,
   zoom: 0, blades: 0, roundness: 0, rotation: 0, wavelength: 0, width: 480, most: 256, clicked: null, lamp: null, irradiance: 0.5 };
-let engine, layout, ghosts, turn = 0, busy = Promise.resolve(), begun = performance.now();
+let engine, layout, ghosts, turn = 0, held = 0, busy = Promise.resolve(), begun = performance.now();
 const log = (low, high, share) => low * (high / low) ** share;
 const share = (low, high, value) => Math.log(value / low) / Math.log(high / low);
 
@@ -96,7 +96,7 @@ function facts() {
       text = `RMS ${num(rms)} µm (${num(rms / pixel_um)} px) at ${where}; 99 % within ${num(form.card.errors.p99_um ?? NaN)} µm`;
     }
     rows.push([`${NAMES[form.kind]}: error on the film`, text]);
-    rows.push([`${NAMES[form.kind]}: a ray on this GPU`, known ? `${known.toPrecision(3)} ns` : "not measured"]);
+    rows.push([`${NAMES[form.kind]}: a ray by ${engine.gpu.name} on this GPU`, known ? `${known.toPrecision(3)} ns` : "not measured"]);
   }
   $("facts").replaceChildren(...rows.map(([name, value]) => {
     const row = document.createElement("div");
@@ -108,6 +108,7 @@ function facts() {
 /** Show the settings: the first sample is on the canvas when the promise is kept. Calls queue. */
 function show() {
   const mine = ++turn;
+  held++;
   begun = performance.now();
   say();
   busy = busy.then(async () => {
@@ -120,7 +121,7 @@ function show() {
     facts();
     if (layout.lens !== set.lens) await layout.show(set.lens);
     if (set.clicked && set.tool === "rays") await rays();
-  }).catch(fail);
+  }).catch(fail).finally(() => held--);
   return busy;
 }
 
@@ -128,7 +129,7 @@ function show() {
 async function flare(far, unit, sides) {
   ghosts.shown = 0;
   if (!set.lamp) return;
-  const lamp = { towards: engine.direction("a", set.lamp), irradiance: set.irradiance };
+  const lamp = { towards: await engine.direction("a", set.lamp), irradiance: set.irradiance };
   await engine.prepare(set.lens, sides, set, sceneUniforms(set.scene, far, unit, lamp));
   const { width } = set, known = ghosts.known.get(set.lens) ?? 1;
   Object.assign(ghosts, { lamp, shown: known, all: await ghosts.draw(set.lens, engine.sides.a, lamp.towards, lamp.irradiance, width, (width * 9) / 16, known) });
@@ -167,23 +168,22 @@ function paint() {
   $("said").textContent = `${samples} of ${set.most} samples a pixel${flared}`;
 }
 
-let fence = null, issued = 0, passes = 1;
+let done = null, issued = 0, passes = 1;
 /** Samples while the GPU keeps up: none before it is done with the last ones, as many at a time as it takes in 25 ms. */
 function frame(now) {
   requestAnimationFrame(frame);
-  const { gl } = engine.gpu, side = engine.sides.a;
-  if (fence) {
-    if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return;
-    gl.deleteSync(fence);
-    fence = null;
+  const side = engine.sides.a;
+  if (held) return; // the sides are not all of one setting yet, or are timed
+  if (done) {
+    if (!done()) return;
+    done = null;
     passes = now - issued < 20 ? Math.min(16, passes + 1) : now - issued > 40 ? Math.max(1, passes >> 1) : passes;
   }
   if (side?.film && ghosts.shown && ghosts.shown < ghosts.all) busy = busy.then(moreGhosts).catch(fail);
   if (!side?.film || set.still || side.samples >= set.most) return;
   for (let k = 0; k < passes && side.samples < set.most; k++) sample();
   paint();
-  fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-  gl.flush();
+  done = engine.gpu.fence();
   issued = now;
 }
 
@@ -201,7 +201,7 @@ async function click(place) {
   if (set.tool === "rays") { say(); return rays(); }
   if (set.tool === "lamp") { set.lamp = place; set.clicked = null; return show(); }
   const side = set.view === "wipe" && place[0] > set.wipe ? "b" : "a";
-  const far = engine.distance(side, place), [near] = focusEnds();
+  const far = await engine.distance(side, place), [near] = focusEnds();
   set.focus = Number.isFinite(far) ? Math.max(near, far) : Infinity;
   return show();
 }
@@ -263,11 +263,13 @@ function listen() {
 }
 
 /** Time the forms that are seen. */
-function measure() {
+async function measure() {
+  held++;
   for (const side of set.view === "one" ? ["a"] : ["a", "b"]) {
-    const s = engine.sides[side];
-    s.cost = { ...s.cost, [`${set.lens.key}/${set[side]}`]: engine.cost(side) };
+    const s = engine.sides[side], key = `${set.lens.key}/${set[side]}`;
+    s.cost = { ...s.cost, [key]: await engine.cost(side) };
   }
+  held--;
   facts();
 }
 
@@ -276,7 +278,8 @@ async function begin() {
   $("lens").replaceChildren(...shared.lenses.map((l) => new Option(l.name, l.key)));
   if (shared.lenses.length === 1) $("lens").disabled = true;
   try {
-    engine = new Engine(new Gpu($("picture")), shared);
+    const canvas = $("picture"), wanted = new URLSearchParams(location.search).get("gpu");
+    engine = new Engine((wanted !== "webgl2" && (await WebGpu.made(canvas, fail))) || new Gpu(canvas), shared);
   } catch (error) {
     $("controls").inert = true;
     return fail(error);

@@ -1,5 +1,6 @@
 // Random numbers of a pixel.
-uint mixed(uint x) {
+uint mixed(uint number) {
+    uint x = number;
     x ^= x >> 16; x *= 0x7feb352du; x ^= x >> 15; x *= 0x846ca68bu; x ^= x >> 16;
     return x;
 }
