@@ -52,7 +52,6 @@ NAMES = {
     "starburst": ("starburst", "stars by diffraction: checks against closed forms, seconds"),
     "flare": ("flare_speed", "ghosts: nanoseconds a ray, compiled and path by path"),
     "flare-gallery": ("flare_gallery", "pictures of flare: suns, headlights, coatings, stops, an animation"),
-    "ghosts": ("ghosts", "ghosts drawn in several ways: error and time a picture"),
     "dask": ("cluster", "a Dask cluster: speed-up, overhead a task, 100,000 tasks by simulation"),
     "transmittance": ("transmittance", "what averaging over polarisation at every surface would cost"),
     "photographs": ("photographs", "that collection against photographs: distortion, colour, light, fitted rims"),

@@ -161,11 +161,6 @@ def _of_model(chance: Chance, folder: Path) -> Words:
     )
 
 
-def _of_ghosts(chance: Chance, folder: Path) -> Words:
-    hurt(chance, folder, "ghosts.onnx")
-    return _flare("ghosts.onnx", "--light", "5,3")
-
-
 def _of_listing(chance: Chance, folder: Path) -> Words:
     """A damaged model in a folder that `models` lists."""
     (folder / "models").mkdir()
@@ -259,7 +254,7 @@ def _of_words(chance: Chance, folder: Path) -> Words:
 
 
 # Their value may be any amount of work, or of a network; help is no work at all.
-_LONG = ("--help", "-h", "--samples", "--max-depth", "--dask", "--rays", "--photons", "--glare", "--fit", "--models")
+_LONG = ("--help", "-h", "--samples", "--max-depth", "--dask", "--rays", "--photons", "--glare", "--models")
 
 
 @cache
@@ -324,7 +319,6 @@ KINDS: dict[str, tuple[float, Callable[[Chance, Path], Words]]] = {
     "mesh": (6, _of_mesh),
     "picture": (6, _of_picture),
     "model": (6, _of_model),
-    "ghosts": (1, _of_ghosts),
     "listing": (1, _of_listing),
     "experiment": (5, _of_experiment),
     "tile": (6, _of_tile),
@@ -433,8 +427,6 @@ def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple
     for k in (1, 2):
         done(_render("thin", "--tile", f"{k}/2", "-o", "tile.exr"))
     done(["survey", "fold", "--no-fit", "-o", "done", "--quiet"])
-    if "ghosts" in kinds:
-        done(["flare", "lens.toml", "--fit", "ghosts.onnx", "--within", "1000um", "--angle", "10", "--quiet"])
     if "long runs" in kinds:
         done(["train", "experiment.toml", "-o", "run", "--rounds", "0", "--quiet"])
     for made in (*folder.glob("out.*"), *folder.glob("tile*.png")):

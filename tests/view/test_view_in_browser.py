@@ -17,8 +17,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.flare.canvas import Raster
-from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
-from neurolens.flare.ghostmodel import write_ghosts
+from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import ghost_picture
 from neurolens.lens.shot import Shot
@@ -220,8 +219,8 @@ def test_other_lenses_too(others: Opened, key: str) -> None:
 
 def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: Any, tmp_path: Path) -> None:
     lens = set_lens(read_lens(ROOT / "lenses" / "brendel_tessar_100.toml"), focus_m=np.inf)
-    model = fit_ghosts(lens, GhostSettings(angle_deg=25.0, keep=0.8, rays=2000, target_um=60.0))
-    words = ["brendel_tessar_100", str(write_ghosts(model, tmp_path / "ghosts.onnx")), "--downloads", "glsl"]
+    tracer = GhostTracer(lens)
+    words = ["brendel_tessar_100", "--ghosts", "--downloads", "glsl"]
     assert main(["view", *words, "-o", str(tmp_path / "view.html"), "--json"]) == 0
     opened = Opened(browser, tmp_path / "view.html")
     opened.set(view="one", tool="lamp", width=WIDE, wavelength=NM, focus=np.inf, most=1)
@@ -231,7 +230,7 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: 
     opened.page.mouse.down()
     opened.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
     opened.page.mouse.up()
-    drawn = f"neurolens.ghosts.shown === {len(model.pairs)} ? done() : setTimeout(look, 20)"
+    drawn = f"neurolens.ghosts.shown === {len(tracer.pairs)} ? done() : setTimeout(look, 20)"
     opened.page.evaluate(f"new Promise((done) => {{ const look = () => {drawn}; look(); }})")
     assert opened.number("neurolens.set.lamp") == pytest.approx([0.7, 0.7], abs=0.01)
     found = opened.number("Array.from(neurolens.engine.gpu.read(neurolens.ghosts.film))")
@@ -240,7 +239,7 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: 
     rgb = (opened.number("neurolens.set.irradiance"),) * 3
     light = Light(np.degrees(np.arctan2(x, -z)), np.degrees(np.arcsin(y)), rgb)
     raster = Raster(tuple(opened.number("neurolens.engine.sides.a.values.film_mm")), WIDE, HIGH)
-    wanted = ghost_picture(model, [light], raster, wavelength_nm=(NM - 1, NM + 1), wavelengths=1, cell_px=4)[0, ..., 1]
+    wanted = ghost_picture(tracer, [light], raster, wavelength_nm=(NM - 1, NM + 1), wavelengths=1, cell_px=4)[0, ..., 1]
     assert picture.sum() == pytest.approx(wanted.sum(), rel=0.02)
     coarse = [p.reshape(27, 5, 48, 5).mean((1, 3)) for p in (picture, wanted)]
     assert np.abs(coarse[0] - coarse[1]).sum() < 0.1 * coarse[1].sum()
