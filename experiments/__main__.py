@@ -58,6 +58,7 @@ NAMES = {
     "photographs-faults": ("photographs_faults", "lens tables broken on purpose: faults found, changes named"),
     "collection": ("collection", "a public collection of lens files: read, refused, agreement with ray-optics"),
     "named-lenses": ("named_lenses", "write the lens files of real lenses by name from that collection"),
+    "library": ("library_pages", "a page for each lens, with every analysis drawn, and an index of all"),
     "usd-lights": ("usd_lights", "the lights of a USD stage as a list for `neurolens flare --lights`"),
 }
 _DESCRIPTION = """\
