@@ -9,11 +9,10 @@ compiler and the extra "train" (torch). Writes fused_speed.md and fused_speed.js
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -289,16 +288,6 @@ def page(rows: Sequence[Row], rounds: int) -> str:
     )
 
 
-def earlier(folder: Path, names: Collection[str]) -> list[Row]:
-    """Rows of other lenses than these that stand in a folder's fused_speed.json, if it was made on this machine."""
-    try:
-        data = json.loads((folder / "fused_speed.json").read_text(encoding="utf-8"))
-        same = data["machine"] == lab.machine() and list(data["flags"]) == list(FLAGS)
-        return [Row(**row) for row in data["rows"] if same and row["lens"] not in names]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
-
-
 OPTIONS = (
     lab.option("--quick", action="store_true", help="without the tracer compiled by torch, few rounds"),
     lab.ONLY,
@@ -313,9 +302,11 @@ def run(args: argparse.Namespace) -> None:
     find_compiler()
     rounds = args.rounds or (5 if args.quick else 20)
     cases = lab.chosen(CASES, lambda c: c.file, args.only, "fused")
-    rows, text = earlier(args.out, [Path(c.file).stem for c in cases]), ""
+    known = {"machine": lab.machine(), "flags": list(FLAGS)}
+    names, text = [Path(c.file).stem for c in cases], ""
+    rows = [Row(**row) for row in lab.earlier_rows(args.out / "fused_speed.json", known) if row["lens"] not in names]
     for case, report in lab.stages(cases, lambda c: c.file, args.quiet):
         rows += measure(case, rounds=rounds, torch_compiled=not args.quick, report=report)
-        data = {"machine": lab.machine(), "rounds": rounds, "flags": FLAGS, "goals": goals(rows), "rows": rows}
+        data = {**known, "rounds": rounds, "goals": goals(rows), "rows": rows}
         text = lab.write_results(args.out, "fused_speed", page(rows, rounds), data)
     print(text)

@@ -40,10 +40,7 @@ CONDITIONS = {
 _PATCH_MM, _WITHIN_MM, _WIDEST_DEG, _COLOURS = 6.0, 5.0, 85.0, (450.0, 550.0, 650.0)
 _AT_ONCE = 1 << 16
 
-OPTIONS = [
-    lab.count("photons", 4_000_000, "of each case (default: 4 million)"),
-    lab.out(),
-]
+OPTIONS = [lab.count("photons", 4_000_000, "of each case (default: 4 million)"), lab.out()]
 
 
 @dataclass(frozen=True)

@@ -360,6 +360,15 @@ def kept_rows(path: Path, maker: str, key: Callable[[Row], Hashable], listed: st
         raise InputError(path, "file", f"({type(error).__name__})", f"rows of {maker}") from error
 
 
+def earlier_rows(path: Path, same: Row) -> list[Row]:
+    """The rows of an earlier run if these values of its file, such as its machine, are the same; else none."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return list(data["rows"]) if {key: data[key] for key in same} == same else []
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
 # ---- The machine. ----------------------------------------------------------------------------------------------------
 
 

@@ -17,7 +17,6 @@ import importlib.util
 import math
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -31,7 +30,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from experiments.tracer_race import Hand, by_figures
+from experiments.tracer_race import Hand, by_figures, compiled
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens
 from neurolens.study.speed import Unavailable
@@ -327,7 +326,7 @@ extern "C" __attribute__((visibility("default"))) void run(size_t n, size_t face
 }
 """
 _FLAGS = (
-    "-std=gnu++14 -O3 -march=native -w -shared -fPIC -fvisibility=hidden -ffunction-sections -fdata-sections "
+    "-std=gnu++14 -O3 -march=native -w -fvisibility=hidden -ffunction-sections -fdata-sections "
     "-Wl,--gc-sections -DPBRT_CONSTEXPR=constexpr -DPBRT_THREAD_LOCAL=thread_local -DPBRT_NOINLINE= "
     "-DPBRT_HAVE_ALLOCA_H -DPBRT_HAVE_HEX_FP_CONSTANTS -DPBRT_HAVE_POSIX_MEMALIGN -DPBRT_HAVE_CONSTEXPR"
 )
@@ -345,13 +344,7 @@ def _pbrt() -> Any:
     with tempfile.TemporaryDirectory(prefix="neurolens-pbrt-") as folder:
         (Path(folder) / "glog").mkdir()
         (Path(folder) / "glog" / "logging.h").write_text(logger, encoding="utf-8")
-        library = Path(folder) / "pbrt.so"
-        command = ["g++", *_FLAGS.split(), *(f"-I{p}" for p in (folder, source, source / "core")), "-x", "c++", "-"]
-        command += ["-o", str(library)]
-        done = subprocess.run(command, input=_CAMERA, text=True, capture_output=True, check=False)
-        if done.returncode:
-            raise Unavailable(next((line for line in done.stderr.splitlines() if "error" in line), "g++ fails"))
-        run = ctypes.CDLL(str(library)).run
+        run = compiled([*_FLAGS.split(), *(f"-I{p}" for p in (folder, source, source / "core"))], _CAMERA)
     run.argtypes, run.restype = [ctypes.c_size_t, ctypes.c_size_t, *[ctypes.c_void_p] * 3], None
     return run
 

@@ -28,10 +28,7 @@ from neurolens.setting.states import set_lens
 LENS, NM, FILM_MM = "laikin_double_gauss_50", 550.0, (36.0, 24.0)
 STOPS, LARGE = (1.8, 4.0, 8.0, 16.0, 45.0), (960, 640)
 
-OPTIONS = [
-    lab.count("threads", 2, "default: 2"),
-    lab.out(),
-]
+OPTIONS = [lab.count("threads", 2, "default: 2"), lab.out()]
 
 
 @dataclass(frozen=True)

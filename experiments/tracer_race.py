@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import math
 import os
 import shutil
@@ -46,7 +45,7 @@ CASES = (
 OURS = {"exact C": True, "exact C, mean of polarisations": False}
 WAYS = {"Newton's steps": (), "the machine's roots": ("-DNOFAST",)}
 VECTORS = (1, 2, 3)
-_COMPILER = ("g++", "-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-x", "c++", "-")
+_FLAGS = ("-std=c++17", "-O3", "-march=native")
 _RUN = """
 extern "C" void run(size_t n, float fz, float sr, void **a)
 {
@@ -98,6 +97,20 @@ def has_avx512() -> bool:
     return file.is_file() and "avx512f" in file.read_text(encoding="utf-8")
 
 
+def compiled(flags: Sequence[str], text: str) -> Any:
+    """The function `run` of a C++ text, by g++.
+
+    Raises:
+        Unavailable: g++ fails.
+    """
+    with tempfile.TemporaryDirectory(prefix="neurolens-peer-") as folder:
+        command = ["g++", *flags, "-shared", "-fPIC", "-x", "c++", "-", "-o", f"{folder}/run.so"]
+        done = subprocess.run(command, input=text, text=True, capture_output=True, check=False)
+        if done.returncode:
+            raise Unavailable(next((line for line in done.stderr.splitlines() if "error" in line), "g++ fails"))
+        return ctypes.CDLL(f"{folder}/run.so").run
+
+
 class Hand:
     """The hand-written tracer for a lens, compiled.
 
@@ -112,18 +125,7 @@ class Hand:
         text = (REFERENCE / "hand2.hpp").read_text(encoding="utf-8").replace("#pragma once", "")
         text = text.replace(two, three) + prescription(lens) + _RUN % f"{pupil_z_mm:.9e}"
         avx2 = () if has_avx512() else ("-DUSE256", "-Dvsqrt1=vsqrt", "-Dvsqrt2=vsqrt")
-        with tempfile.TemporaryDirectory(prefix="neurolens-hand-") as folder:
-            library = Path(folder) / "hand.so"
-            done = subprocess.run(
-                [*_COMPILER, *avx2, *options, "-o", str(library)],
-                input=text,
-                text=True,
-                capture_output=True,
-                check=False,
-            )
-            if done.returncode:
-                raise Unavailable(next((line for line in done.stderr.splitlines() if "error" in line), "g++ fails"))
-            self.run = ctypes.CDLL(str(library)).run
+        self.run = compiled([*_FLAGS, *avx2, *options], text)
         self.run.argtypes = [ctypes.c_size_t, ctypes.c_float, ctypes.c_float, ctypes.c_void_p]
 
     def prepared(self, rays: FilmRays, stop_radius_mm: float) -> tuple[Call, list[np.ndarray[Any, Any]]]:
@@ -186,12 +188,9 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
     for name in (c.name for c in field):
         timing, ratio = timed.timing(name), timed.speedup(name, "exact C")
         count = sum(programs[name].count().values()) if name in programs else None
-        known = None if timing is None else dict(timing), timed.unavailable.get(name), other.get(name)
-        rows.append(
-            Row(
-                case.file, lens.name, lens.refractions, name, count, *known, ratio["min"] if ratio else None, timed.load
-            )
-        )
+        ns, gain = None if timing is None else dict(timing), ratio["min"] if ratio else None
+        about = case.file, lens.name, lens.refractions, name, count
+        rows.append(Row(*about, ns, timed.unavailable.get(name), other.get(name), gain, timed.load))
     return rows
 
 
@@ -227,22 +226,13 @@ def page(rows: Sequence[Row], known: dict[str, Any]) -> str:
 def run(args: argparse.Namespace) -> None:
     """Measure lens by lens; rows of other lenses from this machine are kept."""
     lab.quiet_glasses()
-    known: dict[str, Any] = {
-        "rounds": int(args.rounds or 20),
-        "rays": max(FUSED_BATCHES),
-        "cores": os.cpu_count(),
-        "flags": " ".join(FLAGS),
-    }
-    known |= {"machine": lab.machine()}
-    kept, text = dict[str, list[Row]](), ""
-    file = args.out / "tracer_race.json"
-    earlier = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    for row in earlier.get("rows", []) if earlier.get("machine") == known["machine"] else []:
-        kept.setdefault(row["file"], []).append(Row(**row))
-    for case, report in lab.stages(
-        lab.chosen(CASES, lambda c: c.file, args.only, "tracer"), lambda c: c.file, args.quiet
-    ):
-        kept[case.file] = measure(case, known["rounds"], report)
-        rows = [row for case in CASES for row in kept.get(case.file, [])]
+    machine: dict[str, Any] = {"machine": lab.machine(), "flags": " ".join(FLAGS)}
+    known = machine | {"rounds": int(args.rounds or 20), "rays": max(FUSED_BATCHES), "cores": os.cpu_count()}
+    chosen, text = lab.chosen(CASES, lambda c: c.file, args.only, "tracer"), ""
+    kept = [Row(**row) for row in lab.earlier_rows(args.out / "tracer_race.json", machine)]
+    order = [case.file for case in CASES]
+    for case, report in lab.stages(chosen, lambda c: c.file, args.quiet):
+        kept = [row for row in kept if row.file != case.file] + measure(case, known["rounds"], report)
+        rows = sorted(kept, key=lambda row: order.index(row.file))
         text = lab.write_results(args.out, "tracer_race", page(rows, known), {**known, "rows": rows})
     print(text)

@@ -64,6 +64,7 @@ class Medium(NamedTuple):
 
 
 AIR = Medium(1.0, 1.0, 1.0)
+_FARTHEST = 1e6  # parameter of a meeting, from the point of the ray nearest to the vertex
 
 
 class Hit(NamedTuple):
@@ -230,6 +231,8 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int
             if n == figure.steps - 1:
                 deciding = step
             t = t + step
+        if o.guard:
+            t = o.select(o.abs(t), _FARTHEST, t, 0.0)  # rays that meet nothing, as backwards: no NaN in the normal
     at = _along(o, m, o.fixed(t), r)
     step, p = _last_step(o, at, r, figure), (r.dx, r.dy, r.dz)
     x, y, z = _along(o, at, step, r)
@@ -280,10 +283,10 @@ def _last_step(o: Arithmetic, at: Quadric, r: Rays, figure: Figure) -> Any:
     """Return Newton's step, which by then is Euler's."""
     if figure.across:
         value, gradient, *_ = crossed(o, figure, at, (r.dx, r.dy, r.dz))
-        return -value / o.dot(gradient, r[3:])
+        return -value / o.nonzero(o.dot(gradient, r[3:]))
     sag, slope, *_ = depth(o, figure, height2(o, figure, at[0], at[1]), order=0)
     along = _weighted(o, at, r[3:], (*map(float, figure.bent), 0.0))
-    return (at[2] - sag) / o.fma(slope, along, -r.dz)
+    return (at[2] - sag) / o.nonzero(o.fma(slope, along, -r.dz))
 
 
 def normal_at(o: Arithmetic, met: Hit, curvature: Any) -> Quadric:

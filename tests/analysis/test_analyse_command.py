@@ -92,7 +92,6 @@ def test_an_anamorphic_lens_in_both_planes(tmp_path: Path, capsys: pytest.Captur
         (["spot"], "spots, fans"),
         (["spots", "--full"], "only with --json"),
         (["mtf", "--field-points", "-3"], "degrees from 0"),
-        (["mtf", "--wavelengths", "0"], "wavelengths in nm from 100"),
         (["mtf", "-o", str(TESSAR)], "a folder"),
         (["mtf", "--zoom", "wide"], "zoom"),
         (["mtf-height", "--frequencies", "-5"], "cycles per mm from 0"),

@@ -11,7 +11,7 @@ from analysis_lenses import INF, cartesian, grid, library, scene, thin
 from path_difference import opd_mm
 from shipped import pinhole, whole
 
-from neurolens.analysis.bundles import Pattern, bundle, hexapolar, points
+from neurolens.analysis.bundles import bundle, hexapolar, points
 from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
@@ -55,14 +55,6 @@ def test_all_rays_of_a_field_come_from_one_object_point(focus_m: float) -> None:
     t = (given.object_z_mm - start.z) / start.dz
     x, y = start.x + t * start.dx, start.y + t * start.dy
     assert float(y.max() - y.min()) < 1e-8 and float(x.abs().max()) < 1e-8 and float(y.min()) > 400
-
-
-@pytest.mark.parametrize("pattern", [hexapolar(3), hexapolar(9), grid(9), grid(40)])
-def test_weights_are_shares_of_the_disc(pattern: Pattern) -> None:
-    r2 = pattern.tangential**2 + pattern.sagittal**2
-    assert float(pattern.weight.sum()) == pytest.approx(1) and float(r2.max()) <= 1
-    # The mean of r^2 over a disc is a half.
-    assert float((pattern.weight * r2).sum()) == pytest.approx(0.5, abs=0.6 / len(r2) ** 0.5)
 
 
 def test_energy_is_the_area_of_the_beam() -> None:

@@ -13,9 +13,8 @@ from test_bundles import D, moved
 from neurolens.analysis.bundles import Bundle, Filled, bundle
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.spots import diffraction_image, diffraction_mtf, mtf, mtf_over_height, spots, working_f_number
-from neurolens.cli.analyse import _three
 from neurolens.readers.lensfile import read_lens
-from neurolens.setting.pupil_nodes import LEVELS, converged, lit_nodes, lit_part
+from neurolens.setting.pupil_nodes import LEVELS, lit_nodes, lit_part
 
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"
 Tensor = torch.Tensor
@@ -41,20 +40,6 @@ def test_area_of_two_discs_overlap_and_of_a_ring() -> None:
     # What is dark inside the outline is left out ray by ray: an annular pupil.
     assert area(lambda u, v: ((u * u + v * v) - 0.6).abs() <= 0.4, LEVELS - 1) == pytest.approx(0.8 * math.pi, rel=0.02)
     assert area(lambda u, v: u > 10, 0) == 0
-
-
-def test_levels_end_where_two_agree_and_tell_by_how_much_they_differ() -> None:
-    asked: list[tuple[int, list[int]]] = []
-
-    def compute(level: int, fields: list[int]) -> list[np.ndarray]:
-        asked.append((level, fields))
-        return [np.array([1 + 0.1 * (k / 10) ** level for k in fields])]
-
-    (found,), spread = converged(compute, lambda a: {"x": (a[0], 1.0)}, 4)
-    assert asked == [(0, [0, 1, 2, 3]), (1, [0, 1, 2, 3]), (2, [0, 1, 2, 3]), (3, [1, 2, 3])]
-    assert found.tolist() == pytest.approx([1, 1.0001, 1.0008, 1.0027])
-    assert spread["x"].tolist() == pytest.approx([0, 0.0009, 0.0032, 0.0063])
-    assert (_three(95.68, 1e-3), _three(95.68, 0.01), _three(140.3, 0.5)) == ("95.7", "96", "100")
 
 
 def rms_um(rays: Bundle) -> float:

@@ -154,14 +154,6 @@ def test_an_achromat_has_two_colours_in_one_focus() -> None:
     assert abs(found.focus_shift_mm[1, 0]) == pytest.approx(0, abs=0.1)
 
 
-def test_sums_scale_with_the_lens_and_the_aperture() -> None:
-    given = GENERAL[0]
-    one, two = seidel(given, image_height_mm=5.0), seidel(slower(given, 0.5), image_height_mm=5.0)
-    assert (two.total / one.total).tolist() == pytest.approx([1 / 16, 1 / 8, 1 / 4, 1 / 4, 1 / 2, 1 / 4, 1 / 2])
-    large = replace(given, lens=given.lens.scaled(3.0))
-    assert seidel(large, image_height_mm=15.0).total == pytest.approx(3 * one.total)
-
-
 def test_an_anamorphic_lens_is_refused() -> None:
     with pytest.raises(InputError, match="symmetric"):
         seidel(library("cooke_anamorphic_42"))

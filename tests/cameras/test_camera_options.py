@@ -38,22 +38,6 @@ def test_a_white_card_without_vignetting_is_white(name: str, tmp_path: Path) -> 
     assert card[0, 0].mean() < card[4, 6].mean() - 0.04
 
 
-def test_the_field_of_a_fisheye_is_a_circle(tmp_path: Path) -> None:
-    picture = white(tmp_path, "fisheye-equisolid", "--field", "180")
-    assert (picture[:, :1] == 0).all() and picture[3:5, 4:8].mean() == pytest.approx(1, abs=0.03)
-
-
-def test_the_film_moves_away_from_the_lens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # Irradiance through a thin lens goes with the inverse square of its distance to the film; exposure is for the film
-    # where it stands, so it is the angles that tell: the field of 36 mm shrinks, and so does what cos^4 takes.
-    near, far = (white(tmp_path, "thin", "--vignetting", "natural", "--film-offset", mm) for mm in ("0", "40"))
-    corner, place = (near[0, 0] / near[3:5, 5:7].mean((0, 1))).mean(), (far[0, 0] / far[3:5, 5:7].mean((0, 1))).mean()
-    assert place > corner + 0.04
-    out = ("-o", str(tmp_path / "b.exr"), "--quiet")
-    assert main(["render", str(SCENE), "--camera", "pinhole", "--film-offset", "1", *out]) != 0
-    assert "film_offset_mm" in capsys.readouterr().err and not (tmp_path / "b.exr").exists()
-
-
 FILM = (36.0, 24.0)
 STAR = Aperture(mask=np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 1, 0, 1, 0]]))
 SHAPES = {"five": Aperture(5, 15.0), "curved": Aperture(7, 0.0, 0.5), "star": STAR}
@@ -99,12 +83,6 @@ def test_exact_lens_and_model_pass_the_same_share(name: str, point: tuple[float,
 def test_a_shape_keeps_the_exposure_on_the_axis(kind: str) -> None:
     _, weight = sample(shaped(kind, "five"), (0.0, 0.0))
     assert weight.mean() == pytest.approx(1, abs=0.02)
-
-
-def test_the_thin_lens_s_share_is_that_of_the_shape() -> None:
-    for name, shape in SHAPES.items():
-        status, _ = sample(shaped("thin", name), (3.0, 4.0))
-        assert (status == 0).mean() == pytest.approx(shape.area_share, abs=0.01)
 
 
 def test_a_shot_shapes_every_camera_but_a_point() -> None:

@@ -15,9 +15,9 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, DifferentialCamera
 from neurolens.cameras.field import field_of, frame_of
 from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.sampling import concentric_disk, stratified
+from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
-from neurolens.defocus.gather import gather, spread_over, turned
+from neurolens.defocus.gather import gather, spread_over
 from neurolens.defocus.highlights import spread_highlights, take_highlights
 from neurolens.defocus.kernels import kernel_at
 from neurolens.defocus.plate import Layer, PlatePinhole
@@ -72,13 +72,6 @@ def in_focus(camera: ThinLens) -> float:
 def disc_px(camera: ThinLens, w: float, size: tuple[int, int] = SIZE) -> float:
     """The radius of the blur of a point, in pixels: similar triangles."""
     return camera.radius_mm * camera.image_distance_mm * abs(w - in_focus(camera)) / 1000 * size[0] / FILM[0]
-
-
-def test_points_of_the_square_turn_as_their_places_on_the_disk() -> None:
-    random = np.random.default_rng(1)
-    square, angle = random.random((2, 500)).astype(np.float32), random.uniform(-9, 9, 500)
-    before, after = concentric_disk(square), concentric_disk(turned(square, angle))
-    np.testing.assert_allclose(after[0] + 1j * after[1], (before[0] + 1j * before[1]) * np.exp(1j * angle), atol=1e-6)
 
 
 def test_even_light_takes_the_falloff_of_the_thin_lens_and_nothing_else() -> None:

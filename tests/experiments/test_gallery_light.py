@@ -24,8 +24,6 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.lens.apertures import Aperture
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot, StopShape
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.images import make_aperture
@@ -77,20 +75,6 @@ def test_every_effect_reads_and_its_thin_lens_measures(name: str) -> None:
         assert found.get(key, value) == pytest.approx(value, rel=0.01, abs=0.2)
 
 
-@pytest.mark.whole
-def test_light_falls_off_faster_the_wider_the_stop() -> None:
-    """A Tessar: rims alone at f/1, stop and rims at f/4, at f/8 the cosine law of its exit pupil and no more."""
-    wide, four = (relative(camera("brendel_tessar_100.toml", n, MEDIUM, 10.0), 41.0)[-1] for n in (1.0, 4.0))
-    model_four, eight = (
-        relative(camera("brendel_tessar_100.mlp-16x2.onnx", n, MEDIUM, 10.0), 41.0)[-1] for n in (4.0, 8.0)
-    )
-    assert (wide, four, eight) == pytest.approx((0.37, 0.63, 0.80), abs=0.02)
-    assert model_four == pytest.approx(four, abs=2e-3)
-    thin = camera("thin", 8.0, MEDIUM, 10.0, 100.0)
-    law = (1 + (np.linspace(0, 41, 5) / thin.image_distance_mm) ** 2) ** -2
-    assert relative(thin, 41.0) == pytest.approx(law, rel=2e-3)
-
-
 @pytest.mark.parametrize(("lens", "least"), [("brendel_tessar_100", 0.08), ("hudson_double_gauss_100", 0.16)])
 def test_no_post_process_has_the_falloff_of_a_lens(lens: str, least: float) -> None:
     """With centre and corner met, the lens is brighter in between, by what the cosine law cannot bend."""
@@ -104,72 +88,6 @@ def test_no_post_process_has_the_falloff_of_a_lens(lens: str, least: float) -> N
     assert (ours - theirs).min() > -1e-3
     curve = relative(thin, corner)
     assert post_process(np.linspace(0, corner, 5), strength_for(corner, curve[-1])) == pytest.approx(curve, abs=1e-3)
-
-
-def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0) -> float:
-    """First-order diameter of the disc of a light on the axis: D m |d - s| / d.
-
-    D is the diameter of the entrance pupil, d and s the distances from it of the light and of what is in focus, m the
-    magnification there: the pupil's cone cut by the plane in focus, and that plane's picture.
-
-    Args:
-        lens: focused, its film in place. distance_m: from film to light.
-    """
-    data: Any = first_order(lens, wavelength_nm)
-    assert lens.film_z_mm is not None
-    light_z = lens.film_z_mm - 1e3 * distance_m
-    behind = lens.film_z_mm - float(data.rear_principal_z_mm)
-    efl = float(data.efl_mm)
-    focus_z = float(data.front_principal_z_mm) - 1 / (1 / efl - 1 / behind)
-    to_light, to_focus = (float(data.entrance_pupil_z_mm) - z for z in (light_z, focus_z))
-    magnification = (behind - efl) / efl
-    return float(data.entrance_pupil_diameter_mm) * magnification * abs(to_light - to_focus) / to_light
-
-
-@pytest.mark.whole  # test_two_stops_halve_the_blur is of its physics
-def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
-    efl_mm = 75.0
-    lens = set_lens(
-        read_lens(ROOT / "lenses" / "tronnier_double_gauss_100.toml"),
-        focal_length_mm=efl_mm,
-        f_number=11.0,
-        focus_m=1.4,
-    )
-    exact = camera("tronnier_double_gauss_100.toml", 11.0, (24.0, 16.0), 1.4, efl_mm)
-    thin = camera("thin", 11.0, (24.0, 16.0), 1.4, efl_mm)
-    behind = thin.image_distance_mm
-    s = 1400 - behind
-    for distance in (1.0, 2.0):
-        assert blur_mm(exact, distance) == pytest.approx(paraxial_blur_mm(lens, distance), rel=0.05)
-        closed = efl_mm / 11 * behind / s * abs(1e3 * distance - 1400) / (1e3 * distance - behind)
-        assert blur_mm(thin, distance) == pytest.approx(closed, rel=5e-3)
-    assert blur_mm(exact, 1.4) < 0.1 * blur_mm(exact, 1.0)
-    # Perspective is a matter of place: the ratio of sizes is that of the distances from the entrance pupil.
-    ratio = scale(exact, 1.0) / scale(exact, 2.0)
-    assert ratio == pytest.approx((2000 - 1.1 * efl_mm) / (1000 - 1.1 * efl_mm), rel=0.01)
-    assert ratio == pytest.approx(scale(thin, 1.0) / scale(thin, 2.0), rel=0.01)
-
-
-@pytest.mark.whole  # cameras/test_ideal.py frames them
-@pytest.mark.parametrize(("name", "panel"), [("depth-of-field", 5), ("series-focal-length", 0), ("pinhole", 0)])
-def test_the_ideal_cameras_of_a_panel_are_framed_as_its_lens(name: str, panel: int) -> None:
-    """What is in focus has one size in all columns."""
-    chosen = read_effect(GALLERY / f"{name}.toml").panel[panel]
-    shot = shot_of(chosen, load_scene(chosen.scene))
-    exact, thin, hole = (CAMERAS[column](shot, None) for column in ("exact", "thin", "pinhole"))
-    assert isinstance(thin, ThinLens) and isinstance(hole, Pinhole)
-    assert scale(thin, shot.focus_m) == pytest.approx(scale(exact, shot.focus_m), rel=2e-3)
-    assert hole.settings["efl_mm"] == pytest.approx(thin.image_distance_mm, rel=1e-9)
-
-
-@pytest.mark.whole
-def test_open_blur_of_lens_and_surrogate_agree_and_leave_first_order() -> None:
-    """A shipped model, focused at 1.5 m: wide open its blur in focus is what the thin lens does not have."""
-    film = (24.0, 16.0)
-    exact, model = (camera(f"tronnier_double_gauss_100.{e}", 2.0302, film, 1.5) for e in ("toml", "mlp-16x2.onnx"))
-    for distance in (1.1, 1.5, 2.0):
-        assert blur_mm(model, distance) == pytest.approx(blur_mm(exact, distance), rel=0.01)
-    assert blur_mm(exact, 1.5) > 0.05 > 1e3 * blur_mm(camera("thin", 2.0302, film, 1.5, 100.7), 1.5)
 
 
 def test_two_stops_halve_the_blur_and_quarter_the_light() -> None:

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import uniform_filter, uniform_filter1d
+from scipy.ndimage import uniform_filter
 from scipy.stats import qmc
 from shipped import whole
 
 from neurolens.flare.canvas import Raster, Smear
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs, ghost_table
-from neurolens.flare.lights import CELLS, Light, light_towards, patches, sides_across, with_disc
+from neurolens.flare.lights import CELLS, Light, light_towards, sides_across, with_disc
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import ghost_picture, photon_picture
 from neurolens.flare.sources import SceneLights
@@ -88,30 +88,6 @@ def test_ghosts_of_a_disc_are_the_integral_over_it() -> None:
     assert off < 0.03 and off_of_point > 0.1
 
 
-@pytest.mark.whole
-@pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
-def test_a_softbox_is_no_lattice_of_points() -> None:
-    """The case's softbox, 11.5 by 7.8 degrees: ghosts as by 16 x 16 points, 2.4% of their light
-    elsewhere, and 40 times as smooth as by the 4 x 4 points of before."""
-    scene, lens = load_scene(CASE), hexagonal("laikin_double_gauss_50", focus_m=3.0)
-    (light,) = SceneLights(scene).seen(scene, lens.film_z_mm)
-    assert light.about["shape"] == pytest.approx([11.5, 7.8], abs=0.1)
-    tracer, raster = brightest(lens, light, 10), Raster((36.0, 20.25), 120, 68)
-
-    def light_of(lights: list[Light]) -> np.ndarray:
-        return ghost_picture(tracer, lights, raster, wavelengths=1, threads=1)[0].sum(-1)
-
-    corners, cells = light.shape.corners, patches(light, 1e-9, CELLS)
-    right = light_of([point for cell in cells for point in points_of(cell.light, cell.sides, 2, False)])
-    sides = np.stack([corners[-1, 4] - corners[0, 4], corners[4, -1] - corners[4, 0]])
-    lattice, smooth = light_of(points_of(light, sides, 4, False)), light_of([light])
-    # One ghost is in focus: the points are seen in it, 5 pixels apart.
-    off, off_of_lattice = (np.abs(uniform_filter(v - right, 5)).sum() / right.sum() for v in (smooth, lattice))
-    assert off < 0.03 and off_of_lattice > 0.09
-    rough, rough_lattice = (np.abs(np.diff(np.diff(v, axis=0), axis=1)).sum() for v in (smooth, lattice))
-    assert rough < 0.05 * rough_lattice
-
-
 def ghost_by_chance(lens: Lens, light: Light, pair: Pair, raster: Raster, count: int) -> np.ndarray:
     """The picture [H, W] of a ghost at 550 nm, of any exposure, by rays from random points of a near light's cells to
     random points of the plane of the front vertex: without patches, smears or grids."""
@@ -140,26 +116,6 @@ def ghost_by_chance(lens: Lens, light: Light, pair: Pair, raster: Raster, count:
         weight = power * light.shape.weights[i, j] * way[2] / far**3  # cosine over squared distance
         film += np.histogram2d(y[lit], -x[lit], bins=edges, weights=weight[lit])[0]
     return film
-
-
-@pytest.mark.whole  # the same oracle holds the patches of a large ghost below
-@pytest.mark.slow
-@pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
-@pytest.mark.parametrize(("name", "most"), [("g12-08", 0.02), *whole(("g11-09", 0.03))])
-def test_ghosts_in_focus_show_no_seams(name: str, most: float) -> None:
-    """The case's softbox in the two ghosts that it draws sharply, a point as 0.15 and 0.17 mm: the means of columns and
-    of rows, held against rays at random, have no lines; patches that ended at their cells' edges made some of 5%."""
-    scene, lens = load_scene(CASE), hexagonal("laikin_double_gauss_50", focus_m=3.0)
-    (light,) = SceneLights(scene).seen(scene, lens.film_z_mm)
-    (pair,), raster = [pair for pair in ghost_pairs(lens) if pair.name == name], Raster((36.0, 20.25), 160, 90)
-    right = ghost_by_chance(lens, light, pair, raster, 1 << 21)
-    found = ghost_picture(GhostTracer(lens, [pair]), [light], raster, wavelengths=1, threads=1)[0].sum(-1)
-    rows, columns = (np.flatnonzero((right > 0.3 * right.max()).any(axis))[4:-4] for axis in (1, 0))
-    inside = np.ix_(rows, columns)
-    for axis in (0, 1):
-        off = found[inside].mean(axis) / right[inside].mean(axis) * right[inside].sum() / found[inside].sum()
-        lines = np.abs(off - uniform_filter1d(off, 5))[2:-2]
-        assert lines.max() < most and np.abs(off - 1).max() < 0.07
 
 
 def test_streaks_of_the_sun_are_as_wide_as_its_disc() -> None:

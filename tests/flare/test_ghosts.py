@@ -12,12 +12,11 @@ from film_light import film_light
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.canvas import Raster, axis_irradiance
-from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_layout, ghost_pairs, ghost_table
+from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_layout, ghost_pairs
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import ghost_picture
 from neurolens.lens.apertures import Aperture
-from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
@@ -136,17 +135,6 @@ def test_masks_are_those_of_their_lens() -> None:
     assert 0.3 * found[1].sum() < through < found[1].sum()  # twelve bare surfaces
 
 
-def test_energy_of_a_point_is_irradiance_times_pupil() -> None:
-    """Light that gets through is that of the entrance pupil, pi (f / 2 N)^2."""
-    lens = set_lens(double_gauss(), f_number=4.0)
-    rays, area = light_rays(lens, Light(0.0, 0.0), 0, 100_000)
-    found = GhostTracer(lens, []).trace(rays, 587.6, direct=True)
-    lit = found.power[0] > 0
-    efl = float(first_order(lens).efl_mm)
-    assert area * lit.mean() == pytest.approx(math.pi * (efl / 8) ** 2, rel=0.01)
-    assert 0.3 < found.power[0][lit].mean() < 0.7  # twelve bare surfaces
-
-
 def test_the_exposure_is_the_integral_of_the_pupil() -> None:
     lens = double_gauss()
     assert axis_irradiance(lens, 550.0) == pytest.approx(
@@ -170,16 +158,6 @@ def test_a_picture_holds_the_light_that_falls_on_it() -> None:
     found = tracer.trace(rays, 550.0)
     assert places == pytest.approx(60 - 2 * np.average(found.film_xy_mm[0, 0], weights=found.power[0]), abs=0.1)
     assert places > 61
-
-
-def test_what_coatings_are_for() -> None:
-    lens, light = double_gauss(), Light(15.0, 8.0)
-    bare = ghost_table(GhostTracer(lens), light, 550.0)
-    few = ghost_table(GhostTracer(coated(lens, "quarter-wave")), light, 550.0)
-    total = [sum(g.energy for g in rows) for rows in (bare, few)]
-    assert total[1] < 0.2 * total[0]
-    assert len(ghost_pairs(lens)) == 66
-    assert bare == sorted(bare, key=lambda g: -g.energy)
 
 
 @pytest.mark.parametrize("name", ["panavision_anamorphic_zoom_21", "shimizu_fisheye_220"])

@@ -64,14 +64,7 @@ def test_a_program_that_waits_does_its_rays_in_parts(tmp_path: Path) -> None:
     for k in range(20):
         value = p.op("sqrt", p.fma(value, value, y * (k + 1.0))) / (value + s * s)
         status = p.select(p.fma(value, 0.01, x), 0.2 * k, status, k + 1.0)
-    p.outputs = {
-        "value": value,
-        "early": x * s,
-        "same": s * 2.0,
-        "given": y,
-        "three": p.literal(3.0),
-        "status": status,
-    }
+    p.outputs = {"value": value, "early": x * s, "same": s * 2.0, "given": y, "three": p.literal(3.0), "status": status}
     assert p.waits() and not program().waits()
     parts, free = p.in_parts(10), p.same_for_all()
     assert sorted(k for part in parts for k in part) == sorted(

@@ -54,14 +54,6 @@ def test_white_is_white_and_a_wall_in_it_keeps_its_colour(camera: Any, colour: A
     assert rgb.mean(axis=(0, 1)) == pytest.approx(colour or (1, 1, 1), abs=5e-3)
 
 
-def test_uniform_light_falls_off_with_the_fourth_power_of_the_cosine() -> None:
-    rgb = render(scene(environment=WHITE), Pinhole(20.0, FILM), **SIZE, samples=256).rgb
-    x, y = np.meshgrid(np.arange(36) - 17.5, np.arange(24) - 11.5)
-    cos4 = (20**2 / (20**2 + x**2 + y**2)) ** 2
-    assert np.abs(rgb.mean(axis=2) - cos4).max() < 0.05
-    assert np.abs((rgb - cos4[..., None]).mean()) < 2e-3
-
-
 def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neurolens.render.film.BATCH", 1024)
     made, camera, options = lit_scene(), THIN, SIZE | {"samples": 40}

@@ -62,18 +62,6 @@ def test_upsampling_conserves_energy_and_reciprocates_over_the_cube() -> None:
     assert np.allclose(spectral.spectrum(cube) + spectral.spectrum(1 - cube), 1, rtol=0, atol=1e-6)
 
 
-def test_the_importance_is_the_response_times_the_light() -> None:
-    flat, spike = SpectralRange(400, 700, light=FLAT), SpectralRange(400, 700, light=SPIKE)
-    density = 1 / np.diff(flat.edges_nm)
-    assert 10 * density[0] < density.max() and 10 * density[-1] < density.max()
-    near = np.abs(spike.centres_nm - 500) < 1.5
-    assert near.sum() > 3 * (np.abs(flat.centres_nm - 500) < 1.5).sum()
-    # Equal bins everywhere would be the optimum of the defensive mixture: response over density is bounded.
-    strongest = np.sqrt(np.sum(flat.response.astype(float) ** 2, axis=0))
-    assert strongest.max() < 1.2 * strongest.mean() / 0.9
-    assert np.array_equal(SpectralRange(540, 560, light=FLAT).edges_nm, SpectralRange(540, 560).edges_nm)
-
-
 def test_the_light_of_a_scene() -> None:
     lamp = {"corner_m": [-1, -1, -3], "edge_u_m": [2, 0, 0], "edge_v_m": [0, 2, 0], "emission": [2, 2, 2]}
     nm, white = expected_light(scene(quads=[lamp]))
@@ -162,12 +150,6 @@ def test_roulette_and_many_reflections_in_dispersive_glass_lose_nothing() -> Non
     for mode in ("one", "hero"):
         pictures = renders(made, Pinhole(400.0, FILM), mode, 1, width=48, height=32, samples=96, max_depth=200)
         assert pictures.mean(axis=(0, 1, 2)) == pytest.approx(np.ones(3), abs=8e-3)
-
-
-def test_companions_are_as_probable_as_the_hero() -> None:
-    table, turned = np.arange(256.0), SpectralRange(400, 700, lanes=4).rotated(np.arange(256.0))
-    assert turned.shape == (4, 256) and np.all(np.sort(turned, axis=1) == table)
-    assert turned[:, 3].tolist() == [3, 67, 131, 195] and turned[:, 200].tolist() == [200, 8, 72, 136]
 
 
 class Prism(Pinhole):

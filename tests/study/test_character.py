@@ -76,12 +76,6 @@ def test_spherical_aberration_brightens_or_dims_the_rim(cubic: float) -> None:
     assert np.sign(expected - 1) == pytest.approx(-np.sign(cubic)) or cubic == 0
 
 
-def test_a_ring_counts_five() -> None:
-    ring = uneven(0.0)
-    ring.place_mm[0] /= np.sqrt((ring.place_mm[0] ** 2).sum(0))
-    assert char.bubble(ring) == pytest.approx(5)
-
-
 def test_an_undercorrected_singlet_has_soft_discs_behind_the_focus() -> None:
     """Its edge rays meet first: behind the focus they go far out, and the rim is dim."""
     found, _ = char.character(read_any("lenses/thorlabs_lb1471_biconvex_50.toml"))

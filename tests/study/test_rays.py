@@ -127,21 +127,6 @@ def test_a_ray_from_one_micrometre_beside_is_an_error_of_one_micrometre(
         assert getattr(errors, key) == pytest.approx(1.0, rel=1e-3)
 
 
-def test_the_jacobian_on_the_axis_is_paraxial() -> None:
-    for focus_m in (math.inf, 0.7):
-        lens, domain = lens_and_domain("laikin_double_gauss_50", None, focus_m)
-        zero = torch.zeros(1, dtype=torch.float64)
-        assert lens.film_z_mm is not None
-        rays = FilmRays(zero, zero, zero + lens.film_z_mm, zero, zero, zero + 587.5618)
-        vergence = focused_vergence(lens, rays.film_z)
-        data = first_order(lens)
-        expected = 1 / data.efl_mm
-        if not math.isinf(focus_m):  # object size / distance
-            expected = data.efl_mm / (lens.film_z_mm - data.rear_focal_z_mm) * float(vergence)
-        for value in local_jacobian(lens, domain, rays, vergence):
-            assert float(value) == pytest.approx(expected, rel=1e-5)
-
-
 def test_angles_have_no_floor_and_no_ceiling() -> None:
     zero, one = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
     ahead = Rays(zero, zero, zero, zero, zero, -one)

@@ -241,10 +241,7 @@ def fixed(kind: str) -> tuple[Program, Fix]:
 WAVES_NM = (450.0, 550.0, 650.0)
 
 
-@pytest.mark.parametrize(
-    ("form", "kind"),
-    [("c", "network"), ("glsl", "invariants"), *whole(("c", "invariants"))],
-)
+@pytest.mark.parametrize(("form", "kind"), [("c", "network"), ("glsl", "invariants"), *whole(("c", "invariants"))])
 def test_wavelengths_film_and_stop_fixed(form: str, kind: str) -> None:
     model, (steps, at), free = lens_models.model(kind), fixed(kind), sum(program(kind).count().values())
     signature = Signature.of(steps, "lens")

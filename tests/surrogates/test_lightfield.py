@@ -63,14 +63,6 @@ def test_the_start_may_move_along_the_ray() -> None:
             torch.testing.assert_close(a, b, rtol=0, atol=1e-13)
 
 
-def test_wavelength_ends_at_one_and_unknown_dispersion_at_zero() -> None:
-    ends = [1e6 / 700**2, 1e6 / 400**2]
-    encoding = replace(ENCODING, w_middle=sum(ends) / 2, w_half=(ends[1] - ends[0]) / 2)
-    rays = replace(some_rays(2), wavelength_nm=torch.tensor([400.0, 700.0], dtype=torch.float64))
-    torch.testing.assert_close(encoding(rays).w, torch.tensor([1.0, -1.0], dtype=torch.float64))
-    assert torch.equal(replace(ENCODING, w_middle=3.0, w_half=0.0)(rays).w, torch.zeros(2, dtype=torch.float64))
-
-
 def directions(count: int = 2000, most_degrees: float = 125.0) -> Tensor:
     """[3, count] unit camera directions from the axis to `most_degrees`, the axis and tiny angles among them."""
     theta = torch.cat([torch.tensor([0.0, 1e-300, 1e-15, 1e-8, 1e-4]), torch.linspace(0, most_degrees, count - 5)])
@@ -89,14 +81,6 @@ def test_directions_come_back_from_angle_vectors_and_from_slopes() -> None:
     d, near = directions(), directions(most_degrees=85.0)
     torch.testing.assert_close(decoded(DirectionSeries.exact(), angle_vector(*d)), d, rtol=0, atol=1e-13)
     torch.testing.assert_close(decoded(DirectionSeries(1.0), near[:2] / -near[2]), near, rtol=0, atol=1e-13)
-
-
-def test_angle_vectors_are_angles() -> None:
-    d = directions()
-    v = angle_vector(*d)
-    torch.testing.assert_close(v.norm(dim=0), torch.atan2(d[:2].norm(dim=0), -d[2]), rtol=0, atol=1e-15)
-    turned = angle_vector(*turn(d[:2], 1.0, True), d[2])
-    torch.testing.assert_close(turned, turn(v, 1.0, True), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("degrees", [1.0, 20.0, 60.0, 112.0])

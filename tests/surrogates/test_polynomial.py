@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 
 import lens_models
-import numpy as np
 import pytest
 import torch
 from lens_models import anamorphic
@@ -25,7 +24,7 @@ from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import fit_model
 from neurolens.surrogates.fits import polynomial
 from neurolens.surrogates.fits.boundaries import stop_crossing
-from neurolens.surrogates.fits.polynomial import ParaxialMethod, fit_paraxial, fit_polynomial, mirror_exponents
+from neurolens.surrogates.fits.polynomial import ParaxialMethod, fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
@@ -251,19 +250,6 @@ def test_mirrored_rays_have_mirrored_images(either: LensModel, axis: int) -> Non
         sign = -1 if name.endswith("xy"[axis]) else 1
         assert torch.equal(getattr(a.rays, name), sign * getattr(b.rays, name))
     assert torch.equal(a.transmittance, b.transmittance) and torch.equal(a.status, b.status)
-
-
-def test_candidates_of_lenses_with_cylinders_are_all_different() -> None:
-    # The columns of one component's candidates must be independent functions: no monomial of the raw coordinates twice.
-    for axis in (0, 1):
-        seen = set()
-        for row in mirror_exponents(3, axis):
-            squares = [(2 * row[0] + row[1], 2 * row[2] + row[1]), (2 * row[3] + row[4], 2 * row[5] + row[4])]
-            for side in (0, 1):
-                own = np.array(squares[axis]) + np.eye(2, dtype=int)[side]
-                key = (*own.tolist(), *squares[1 - axis], int(row[6]))
-                assert key not in seen
-                seen.add(key)
 
 
 @pytest.mark.slow

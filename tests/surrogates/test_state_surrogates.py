@@ -25,7 +25,7 @@ from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.focusing import best_focus_z_mm
 from neurolens.setting.states import set_lens
-from neurolens.study.check import check_states, random_states, space_of_card
+from neurolens.study.check import check_states, space_of_card
 from neurolens.study.rays import ray_errors
 from neurolens.surrogates.axes import Axis, product, weights
 from neurolens.surrogates.domain import FilmRays, sample_domain
@@ -131,13 +131,6 @@ def test_axes_of_lens_files() -> None:
         zoom_axis(lens_models.lens())
     with pytest.raises(InputError, match="focus"):
         focus_axis(lens_models.lens())
-
-
-def test_states_to_check_at_are_one_in_each_part_of_every_range() -> None:
-    states = random_states((ZOOM, FOCUS), 10, seed=4)
-    assert states == random_states((ZOOM, FOCUS), 10, seed=4) != random_states((ZOOM, FOCUS), 10, seed=5)
-    for k, (low, high) in enumerate(axis.range for axis in (ZOOM, FOCUS)):
-        assert sorted(int(10 * (s[k] - low) / (high - low)) for s in states) == list(range(10))
 
 
 def test_structures_that_differ_are_no_state_model() -> None:

@@ -144,21 +144,6 @@ def test_nearly_parallel_variables_do_not_spoil_the_table(seed: int) -> None:
     assert found == sorted(found, reverse=True)
 
 
-def test_omp_looks_at_correlation_and_ols_at_what_is_left() -> None:
-    """The candidate that correlates best with the residual may hardly be new: OLS divides by what is left of it."""
-    e = np.eye(4)
-    first = e[0]
-    nearly_chosen = np.sqrt(1 - 0.09) * e[0] + 0.3 * e[1]  # only 0.3 of it is new, but all of that is wanted
-    fresh = 0.6 * e[2] + 0.8 * e[3]  # all new, half of it wanted
-    columns, outputs = np.vstack([first, nearly_chosen, fresh]), (10 * e[0] + e[1] + 0.9 * e[2])[None]
-    picks = {}
-    for rule in ("omp", "ols"):
-        sweep = sweep_of(columns, outputs)
-        forward(sweep, 2, rule)
-        picks[rule] = sweep.chosen
-    assert picks == {"omp": [0, 2], "ols": [0, 1]}
-
-
 # ---- bases ----
 
 

@@ -148,17 +148,6 @@ def beam(degrees: float = 0.0) -> Rays:
     return Rays(*(torch.tensor([v], dtype=torch.float64) for v in (0.0, 0.0, -1.0, math.sin(a), 0.0, math.cos(a))))
 
 
-def test_a_plate_reflects_twice() -> None:
-    out = follow(plate(), beam(20.0), ghost(3, 0, 1))
-    sin_t = math.sin(math.radians(20)) / 1.5
-    # Three crossings of the plate instead of one.
-    assert float(out.points[3][0]) == pytest.approx(math.tan(math.radians(20)) + 3 * 4.0 * math.tan(math.asin(sin_t)))
-    assert float(out.rays.dx) == pytest.approx(math.sin(math.radians(20)), abs=1e-15)
-    normal = follow(plate(), beam(), ghost(3, 0, 1))
-    r = (0.5 / 2.5) ** 2
-    assert float(normal.power) == pytest.approx((1 - r) ** 2 * r**2, rel=1e-13)
-
-
 def test_light_that_is_not_reflected_is_the_plain_trace() -> None:
     lens = oracle.own(oracle.OWN[0]).lens
     rays = oracle.launched(oracle.OWN[0]["rays"], torch.float64)
@@ -168,13 +157,6 @@ def test_light_that_is_not_reflected_is_the_plain_trace() -> None:
     ok = plain.status == 0
     torch.testing.assert_close(torch.stack(out.rays)[:, ok], torch.stack(plain.rays)[:, ok], rtol=0, atol=1e-13)
     torch.testing.assert_close(out.power[ok], plain.transmittance[ok], rtol=1e-13, atol=0)
-
-
-def test_a_perfect_coating_kills_the_ghost() -> None:
-    index = math.sqrt(1.5)
-    film = Coating("perfect", ((index, 550 / (4 * index)),))
-    assert float(follow(plate(coating=film), beam(), ghost(3, 0, 1), 550.0).power) < 1e-28
-    assert float(follow(plate(coating=film), beam(), ghost(3, 0, 1), 700.0).power) > 1e-8
 
 
 def test_total_reflection_is_not_a_loss_where_light_is_reflected() -> None:
@@ -224,16 +206,3 @@ def test_light_goes_the_same_way_back(polarised: bool) -> None:
             torch.testing.assert_close(-a[ok], b[ok], rtol=0, atol=1e-11)
         torch.testing.assert_close(again.power[ok], there.power[ok], rtol=1e-11, atol=0)
     assert arrived > 10
-
-
-def test_polarised_ghost_of_a_plate() -> None:
-    """Its power is the mean over the two polarisations of T^2 R^2, which the average at each surface is not."""
-    angle = 50.0
-    cos_i = math.cos(math.radians(angle))
-    cos_t = math.sqrt(1 - (math.sin(math.radians(angle)) / 1.5) ** 2)
-    r_s = ((cos_i - 1.5 * cos_t) / (cos_i + 1.5 * cos_t)) ** 2
-    r_p = ((1.5 * cos_i - cos_t) / (1.5 * cos_i + cos_t)) ** 2
-    exact, mean = (sum(((1 - r) * r) ** 2 for r in (r_s, r_p)) / 2, (r_s + r_p) / 2)
-    polarised = follow(plate(), beam(angle), ghost(3, 0, 1), polarised=True)
-    assert float(polarised.power) == pytest.approx(exact, rel=1e-12)
-    assert float(follow(plate(), beam(angle), ghost(3, 0, 1)).power) == pytest.approx(((1 - mean) * mean) ** 2)

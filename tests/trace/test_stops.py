@@ -30,16 +30,6 @@ def plate(**fields: float) -> tuple[Surface, Surface]:
     return Surface(math.inf, PLATE_MM, 60.0, n_d=N_D, **fields), Surface(math.inf, 1.0, 60.0)
 
 
-def test_a_grey_filter_absorbs_by_beer_and_lambert() -> None:
-    ray = Rays(*(torch.tensor([v], dtype=torch.float64) for v in (0.0, 0.0, -1.0, 0.0, 0.0, 1.0)))
-    clear, grey = (
-        trace(before(pinhole(50.0, 1.0), *plate(absorption_per_mm=a)), ray, towards="film", transmittance=True)
-        for a in (0.0, math.log(8) / PLATE_MM)
-    )
-    assert clear.transmittance is not None and grey.transmittance is not None
-    assert float(grey.transmittance / clear.transmittance) == pytest.approx(1 / 8, rel=1e-12)
-
-
 def test_a_hood_cuts_the_field_at_its_geometric_angle() -> None:
     """A hole 60 mm behind a ring of radius 20 sees 18.4 degrees, the hole's own radius more or less."""
     hooded = before(pinhole(40.0, 0.05), Surface(math.inf, 60.0, 40.0))

@@ -27,10 +27,7 @@ from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.targets import fit_encoding, scales_of
 from neurolens.trace.rays import Rays, trace
 
-FAST = {
-    "dense": PublishedSettings("hanika", degree=3),
-    "sparse": PublishedSettings("schrade", degree=5, terms=12),
-}
+FAST = {"dense": PublishedSettings("hanika", degree=3), "sparse": PublishedSettings("schrade", degree=5, terms=12)}
 
 
 @given(some.floats(-0.9, 0.9), some.floats(-0.4, 0.4), some.floats(-1, 1), some.floats(-1, 1), some.floats(-0.99, 0.99))
