@@ -4,7 +4,7 @@
 #   make test     tests, then lint, format and types
 #   make test-whole the tests with all their sweeps: every lens, model, kind and setting of what `make test` tries on a few
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
-#                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
+#                       BLENDER=4.5.15 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
 #   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
 #                 `neurolens view` draws, scripts in every text; its models in onnxruntime-web where npm is
 #   make test-shading  shading languages by their compilers: Slang's, naga with Vulkan in software (Debian: mesa-vulkan-drivers),

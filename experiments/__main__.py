@@ -40,6 +40,7 @@ NAMES = {
     "dispersion": ("dispersion", "noise and time of lenses that disperse, beside a thin lens"),
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
+    "osl-noise": ("osl_noise", "noise of dispersion in Cycles, and what adaptive sampling takes"),
     "osl-pictures": ("osl_speed:pictures", "lenses in Cycles beside its own depth of field"),
     "view": ("view_speed", "the page of `neurolens view` in software WebGL: first picture, each change"),
     "promises": ("promises", "models against the speed that their index promises"),

@@ -1,4 +1,4 @@
-"""The layers of a picture of `neurolens flare` added in Blender's compositor; for Blender's own Python, from 5.0 on.
+"""The layers of a picture of `neurolens flare` added in Blender's compositor; for the Python of Blender 4.5 and later.
 
 In Blender: open this file in the text editor, write the picture's path into PICTURE, and run it. From a shell:
 
@@ -23,10 +23,8 @@ def add_layers(scene: Any, path: Path) -> list[str]:
     A group does it, whose inputs are a gain for each layer. Returns the names of the layers.
 
     Raises:
-        ValueError: an earlier Blender, or no such picture.
+        ValueError: no such picture.
     """
-    if bpy.app.version < (5, 0, 0):
-        raise ValueError("the compositor takes the layers from Blender 5.0 on")
     try:
         image = bpy.data.images.load(str(path))
     except RuntimeError:
@@ -64,11 +62,15 @@ def add_layers(scene: Any, path: Path) -> list[str]:
 
 def splice(scene: Any, group: Any) -> None:
     """Put a group before the output of the scene's compositor, which is made where there is none."""
-    tree = scene.compositing_node_group
-    if tree is None:
-        tree = scene.compositing_node_group = bpy.data.node_groups.new("Compositing", "CompositorNodeTree")
-        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    end = next((n for n in tree.nodes if n.bl_idname == "NodeGroupOutput"), None) or tree.nodes.new("NodeGroupOutput")
+    if hasattr(scene, "compositing_node_group"):
+        tree, kind = scene.compositing_node_group, "NodeGroupOutput"
+        if tree is None:
+            tree = scene.compositing_node_group = bpy.data.node_groups.new("Compositing", "CompositorNodeTree")
+            tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    else:  # to Blender 4.5
+        scene.use_nodes = True
+        tree, kind = scene.node_tree, "CompositorNodeComposite"
+    end = next((n for n in tree.nodes if n.bl_idname == kind), None) or tree.nodes.new(kind)
     links = end.inputs[0].links
     source = links[0].from_socket if links else tree.nodes.new("CompositorNodeRLayers").outputs["Image"]
     added = tree.nodes.new("CompositorNodeGroup")

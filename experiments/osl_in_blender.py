@@ -3,7 +3,7 @@
 The plan holds `cameras`, each with `name`, `focal_mm`, `depth_of_field` and `shader`, the text of one in OSL or null
 for the camera that Blender has, and `scenes` by name, each with `size` (pixels), `samples`, `rounds` and names of
 `cameras`. Cameras of a scene render in turn; the result is, by scene and camera, `full` and `tiny`: seconds of CPU of
-the pictures, and of pictures of a few rays, which is what Cycles takes to begin.
+the pictures, and of pictures of a few rays, which is what Cycles takes to begin. `noise` is a plan of `osl_noise`.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ def main(plan_file: str, result_file: str) -> None:
         done += 1
         print(f"\nshare {done / total:.4f}", flush=True)
     result = {"blender": bpy.app.version_string, "scenes": found, "shots": seconds}
+    if "noise" in plan:
+        result["noise"] = _noise(bpy, plan["noise"], plan["cameras"], Path(result_file).with_suffix(".exr"))
     Path(result_file).write_text(json.dumps(result), encoding="utf-8")
 
 
@@ -67,6 +69,90 @@ def _blender() -> Any:
     import bpy
 
     return bpy
+
+
+def _noise(bpy: Any, plan: dict[str, Any], cameras: list[dict[str, Any]], file: Path) -> list[dict[str, Any]]:
+    """Rows of noise at equal samples and of what adaptive sampling takes, by scene, pattern of samples and camera."""
+    import numpy as np
+
+    rows, (width, height), most, edge = [], plan["size"], plan["most"], plan["edge"]
+    total, inside = len(plan["scenes"]) * len(plan["patterns"]) * len(cameras), np.s_[edge:-edge, edge:-edge]
+    for name in plan["scenes"]:
+        scene = _scene(bpy, name)
+        _flicker(bpy)
+        scene.view_layers[0].cycles.pass_debug_sample_count = True
+        settings, cycles = scene.render.image_settings, scene.cycles
+        if hasattr(settings, "media_type"):  # from Blender 5.0
+            settings.media_type = "MULTI_LAYER_IMAGE"
+        settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+        scene.render.filepath, cycles.pixel_filter_type = str(file), "BOX"
+
+        def picture(samples: int, seed: int, adaptive: bool, scene: Any = scene) -> tuple[Any, Any]:
+            scene.cycles.seed, scene.cycles.use_adaptive_sampling = seed, adaptive
+            _render(bpy, scene, (width, height, samples), write_still=True)
+            planes = _planes(file)
+            rgb = np.stack([planes[f"ViewLayer.Combined.{c}"] for c in "RGB"], 2).astype(float)[inside]
+            taken = (
+                planes.get("ViewLayer.Debug Sample Count.X", np.ones((height, width))) * most
+            )  # written as shares of the largest
+            if adaptive and np.abs(taken / 16 - np.rint(taken / 16)).max() > 0.01:  # Cycles looks at every 16th
+                raise SystemExit(f"no pixel took {most} samples")
+            return rgb, taken[inside]
+
+        made = {c["name"]: _camera(bpy, scene, c) for c in cameras}
+        exact = {}
+        for scene.camera in made.values():
+            exact[scene.camera.name] = picture(plan["reference"], 10_000, False)[0]
+        for cycles.sampling_pattern in plan["patterns"]:
+            for camera, scene.camera in made.items():
+                mean, noise, median = exact[camera].mean(), {}, {}
+                for samples in plan["samples"]:
+                    off = [picture(samples, seed, False)[0] / mean - exact[camera] / mean for seed in plan["seeds"]]
+                    noise[samples] = [float(v) for v in np.sqrt(np.square(off).mean((0, 1, 2)))]
+                    median[samples] = float(np.median(np.sqrt(np.square(off).mean((0, 3)))))
+                row = {"scene": name, "pattern": cycles.sampling_pattern, "camera": camera}
+                row |= {"noise": noise, "median": median}
+                for cycles.adaptive_threshold in plan["thresholds"]:
+                    found = [picture(most, seed, True) for seed in plan["seeds"]]
+                    off = [rgb / mean - exact[camera] / mean for rgb, _ in found]
+                    at = f"{cycles.adaptive_threshold:.3g}"
+                    row[f"samples {at}"] = float(np.mean([taken for _, taken in found]))
+                    row[f"noise {at}"] = float(np.sqrt(np.square(off).mean()))
+                rows.append(row)
+                print(f"\nshare {len(rows) / total:.4f}", flush=True)
+    return rows
+
+
+def _planes(file: Path) -> dict[str, Any]:
+    """The channels of all parts of an EXR, by name."""
+    import OpenImageIO  # of Blender
+
+    picture, planes, part = OpenImageIO.ImageInput.open(str(file)), {}, 0
+    while picture.seek_subimage(part, 0):
+        names = picture.spec().channelnames
+        planes |= zip(names, picture.read_image(part, 0, 0, len(names), "float").transpose(2, 0, 1), strict=True)
+        part += 1
+    picture.close()
+    return planes
+
+
+def _flicker(bpy: Any) -> None:
+    """A patch of noise in the picture's corner that lights nothing, and on which adaptive sampling does not end."""
+    bpy.ops.mesh.primitive_plane_add(size=0.16, location=(0.64, 0.41, -2.0))
+    patch = bpy.context.object
+    for way in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+        setattr(patch, f"visible_{way}", False)
+    paint = _paint(bpy, (0.0, 0.0, 0.0), 1.0, 1.0)
+    nodes, links = paint.node_tree.nodes, paint.node_tree.links
+    noise, place = (nodes.new(f"ShaderNode{kind}") for kind in ("TexWhiteNoise", "NewGeometry"))
+    power, bright = (nodes.new("ShaderNodeMath") for _ in range(2))
+    power.operation, power.inputs[1].default_value = "POWER", 100.0
+    bright.operation, bright.inputs[1].default_value = "MULTIPLY", 1e6
+    links.new(place.outputs["Position"], noise.inputs["Vector"])
+    links.new(noise.outputs["Value"], power.inputs[0])
+    links.new(power.outputs[0], bright.inputs[0])
+    links.new(bright.outputs[0], nodes["Principled BSDF"].inputs["Emission Strength"])
+    nodes["Principled BSDF"].inputs["Emission Color"].default_value = (1.0, 1.0, 1.0, 1.0)
 
 
 def _scene(bpy: Any, name: str) -> Any:

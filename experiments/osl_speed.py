@@ -163,11 +163,25 @@ def _shaders(quiet: bool) -> tuple[dict[str, str | None], dict[str, int]]:
 
     made = {name: shader_of(file, quiet=quiet) for name, file in SHADERS.items()}
     own: dict[str, str | None] = {BUILT_IN: None, DEPTH: None, THIN: THIN_LENS}
-    for grey, model in ((GREY, POLYNOMIAL), (GREY_NETWORK, NETWORK)):
-        own[grey] = made[model].text.replace("int dispersion = 1", "int dispersion = 0")
-        if own[grey] == made[model].text:
-            raise lab.Unmeasured(f"the shader of {model} has no dispersion to switch off")
+    own |= {grey: one_colour(made[model].text) for grey, model in ((GREY, POLYNOMIAL), (GREY_NETWORK, NETWORK))}
     return own | {k: s.text for k, s in made.items()}, {k: s.operations for k, s in made.items()}
+
+
+def one_colour(shader: str) -> str:
+    """A shader with its dispersion off.
+
+    Raises:
+        Unmeasured: it has none.
+    """
+    text = shader.replace("int dispersion = 1", "int dispersion = 0")
+    if text == shader:
+        raise lab.Unmeasured("the shader has no dispersion to switch off")
+    return text
+
+
+def camera(name: str, shader: str | None) -> lab.Row:
+    """A camera as `osl_in_blender` takes it."""
+    return {"name": name, "focal_mm": _FOCAL_MM, "depth_of_field": name != BUILT_IN, "shader": shader}
 
 
 def race(python: Path, texts: Mapping[str, str | None], stages: Mapping[str, Stage], report: Report) -> lab.Row:
@@ -176,10 +190,7 @@ def race(python: Path, texts: Mapping[str, str | None], stages: Mapping[str, Sta
     Raises:
         Unmeasured: Blender's Python fails.
     """
-    cameras = [
-        {"name": name, "focal_mm": _FOCAL_MM, "depth_of_field": name != BUILT_IN, "shader": text}
-        for name, text in texts.items()
-    ]
+    cameras = [camera(name, text) for name, text in texts.items()]
     return in_blender(python, {"cameras": cameras, "scenes": {n: asdict(stage) for n, stage in stages.items()}}, report)
 
 

@@ -3,8 +3,8 @@
 The hand-written tracer (shared/data/reference_tracer, beside this project; without it only ours is timed) is C++ with
 intrinsics for spheres: one to three vectors interleaved, with divisions and roots by estimates and Newton's steps, or
 by the machine's own. It takes the mean of both polarisations at each surface; ours follows the polarisation, and is
-timed with the mean, too, which is the same work. Glasses are by n_d and V_d. Writes tracer_race.md and
-tracer_race.json.
+timed with the mean, too, which is the same work, and in double precision. Glasses are by n_d and V_d; aspheres and
+cylinders of the longest lens are spheres here. Writes tracer_race.md and tracer_race.json.
 """
 
 from __future__ import annotations
@@ -41,8 +41,10 @@ CASES = (
     Case("laikin_double_gauss_50.toml", None, math.inf),
     Case("ogawa_zoom_70_200.toml", None, math.inf, configuration="72mm"),
     Case("canon_ef_70_200mm_f2_8l_is_ii_usm.toml", None, math.inf),
+    Case("panavision_anamorphic_zoom_21.toml", None, math.inf),
 )
 OURS = {"exact C": True, "exact C, mean of polarisations": False}
+DOUBLE = "exact C, double precision"
 WAYS = {"Newton's steps": (), "the machine's roots": ("-DNOFAST",)}
 VECTORS = (1, 2, 3)
 _FLAGS = ("-std=c++17", "-O3", "-march=native")
@@ -57,7 +59,8 @@ extern "C" void run(size_t n, float fz, float sr, void **a)
 
 
 def by_figures(surface: Surface) -> Surface:
-    """The surface with its glass by n_d and V_d."""
+    """The surface as a sphere with its glass by n_d and V_d."""
+    surface = replace(surface, conic=0.0, asphere=(), cylinder=None, across=None)
     if surface.glass is None:
         return surface
     d, f, c = (float(index_of(surface, nm)) for nm in (LINE_D_NM, LINE_F_NM, LINE_C_NM))
@@ -172,6 +175,9 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
     call = {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": domain.stop_radius_mm}
     ours = CompiledSource(programs["exact C"]).rays(columns | call)["status"]
     field, other = [program_candidate(name, p, domain) for name, p in programs.items()], dict.fromkeys(programs, 0)
+    programs[DOUBLE] = lower(exact_graph(lens, *wide, double=True))
+    field.append(program_candidate(DOUBLE, programs[DOUBLE], domain, double=True))
+    other[DOUBLE] = int((CompiledSource(programs[DOUBLE], double=True).rays(columns | call)["status"] != ours).sum())
     for way, options in WAYS.items():
         for vectors in VECTORS:
             name = f"by hand, {vectors} vector{'s' * (vectors > 1)}, {way}"
@@ -211,7 +217,8 @@ _COLUMNS = lab.columns(
 _NOTES = """\
 One thread, {wide}, float32, {rounds} rounds in turn in one process (best; median in brackets), each at its best batch.
 Rays uniform over film and pupil disc of the domain, blocked ones included; of {rays} of them those with another status
-than ours are counted. Load average meanwhile up to {load:.1f} on {cores} cores. Ours by {compiler} {flags}."""
+than ours are counted (in double precision: of the same rays before they are rounded). Load average meanwhile up to
+{load:.1f} on {cores} cores. Ours by {compiler} {flags}."""
 OPTIONS = (lab.ONLY, lab.ROUNDS, lab.out())
 
 

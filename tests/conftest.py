@@ -71,8 +71,8 @@ def quick_races() -> Iterator[None]:
         # What is compiled and searched for one test is there for the next, in both processes.
         patch.setattr(compiler, "_KEPT", 4096)
         patch.setattr("neurolens.cameras.exact._KEPT", 4096)
-        patch.setattr("neurolens.study.speed.CompiledSource.__init__.__defaults__", (flags,))
-        patch.setattr("neurolens.study.speed.program_candidate.__defaults__", (None, flags))
+        patch.setattr("neurolens.study.speed.CompiledSource.__init__.__defaults__", (flags, False))
+        patch.setattr("neurolens.study.speed.program_candidate.__defaults__", (None, flags, False))
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
         patch.setattr("neurolens.study.speed.POOL", 16384)
         patch.setattr("neurolens.study.speed._SAMPLES", 1)

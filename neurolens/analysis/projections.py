@@ -156,14 +156,13 @@ def fit(
     size: tuple[int, int],
     focal_px: tuple[float, float],
     source: str = "projection",
-    keep_focal: bool = False,
 ) -> Projection:
     """The projection of least mean squared distance of the pixels.
 
     Args:
         direction: [N, 3] unit vectors, and pixel [N, 2], where a lens shows them; spread evenly over the picture.
         size: of the picture. focal_px: paraxial fx and fy; equal: they stay equal.
-        source: what errors name. keep_focal: whether fx and fy stay the paraxial ones.
+        source: what errors name.
 
     Raises:
         InputError: a field too wide for this kind, fewer points than numbers.
@@ -175,7 +174,7 @@ def fit(
     if len(pixel) < 2 * len(NAMES[kind]) + 2:
         raise InputError(source, "picture", f"({len(pixel)} lit points)", "a picture that light reaches")
     start = Projection(kind, size, focal_px, (0.0,) * len(NAMES[kind]), widest)
-    return _adjusted(start, direction, pixel, focal_px[0] == focal_px[1], keep_focal)
+    return _adjusted(start, direction, pixel, focal_px[0] == focal_px[1])
 
 
 def _angle(direction: Array) -> Array:
@@ -203,15 +202,14 @@ def _rms(values: Array) -> float:
     return math.sqrt(np.mean(values**2))
 
 
-def _adjusted(start: Projection, direction: Array, pixel: Array, round_: bool, keep_focal: bool) -> Projection:
+def _adjusted(start: Projection, direction: Array, pixel: Array, round_: bool) -> Projection:
     """The projection whose numbers, found from the paraxial ones, have the least squares of distances."""
     theta = start.kind == "f-theta"
     first, tied = start.numbers, round_ and not theta
     if theta:
         first[:3] = start.focal_px[0] / start.focal_px[1], 1.0, start.focal_px[1]
     free = [k + 2 for k, name in enumerate(NAMES[start.kind]) if name not in _FIXED]
-    if not keep_focal:
-        free += ([] if theta and round_ else [0]) + ([] if theta or tied else [1])
+    free += ([] if theta and round_ else [0]) + ([] if theta or tied else [1])
 
     def numbers(x: NDArray[Any]) -> NDArray[Any]:
         whole = first.astype(x.dtype)

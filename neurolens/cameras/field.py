@@ -114,14 +114,9 @@ def _measured(camera: Any) -> Frame:
 
 
 def traced_light(
-    camera: Any,
-    point: Complex,
-    spectrum: Spectrum,
-    frame: Frame,
-    target: str,
-    distance_m: float,
+    camera: Any, point: Complex, spectrum: Spectrum, frame: Frame, target: str, distance_m: float,
     pupil: tuple[int, int] = _PUPIL,
-) -> Light:
+) -> Light:  # fmt: skip
     """The light of picture points [N]; see the module.
 
     Args:
@@ -332,14 +327,9 @@ class Field:
 
 
 def field_of(
-    camera: Any,
-    focus_m: float,
-    target: str = RECTILINEAR,
-    *,
-    frame: Frame | None = None,
-    spectrum: Spectrum | None = None,
-    distance_m: float | None = None,
-) -> Field:
+    camera: Any, focus_m: float, target: str = RECTILINEAR, *,
+    frame: Frame | None = None, spectrum: Spectrum | None = None, distance_m: float | None = None,
+) -> Field:  # fmt: skip
     """Trace a camera's field.
 
     Args:
@@ -387,10 +377,8 @@ def field_of(
 
 def film_edge(film_mm: tuple[float, float]) -> Complex:
     """Points round the edge of a film, mm."""
-    line, half = np.linspace(-1, 1, _EDGE), np.array(film_mm) / 2
-    sides = [line * half[0] + 1j * half[1], line * half[0] - 1j * half[1],
-             half[0] + 1j * half[1] * line, -half[0] + 1j * half[1] * line]  # fmt: skip
-    return np.concatenate(sides)
+    line, (x, y) = np.linspace(-1, 1, _EDGE), np.array(film_mm) / 2
+    return np.concatenate([x * line + 1j * y, x * line - 1j * y, x + 1j * y * line, -x + 1j * y * line])
 
 
 def end_of_light(lit: Callable[[float], bool], corner: float) -> float:

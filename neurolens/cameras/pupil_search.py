@@ -160,6 +160,7 @@ def frame_of(table: PupilTable, radius: Float64Array, passing: PassTest) -> Sear
     # A row whose lattice misses a small region takes what its neighbours have.
     rows, found = np.arange(radius.size), boxes[0] <= boxes[1]
     centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, *boxes))
+    centre[radius == 0] = 0.0  # the axis has no azimuth: pupil points must not jump as a film point passes it
     stretch = np.stack([(high - low) / 2, half])
     off_centre = np.abs(centre - (low + high) / 2) / stretch[0]
     return SearchFrame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))

@@ -94,7 +94,7 @@ examples:
             rows += (facts := [_facts(cell) for cell in cells])
             more = {"kernel_px": side, "fields": list(self.grid), "kernels": facts}
             write_channels(path, {c: picture[..., k] for k, c in enumerate("RGB")}, None, about | more)
-            write_png(path.with_suffix(".png"), as_preview(cells, self.grid[0], side))
+            write_png(path.with_suffix(".png"), as_preview(picture, side))
             files.append(str(path))
         data = {"kernel_px": side, "fields": list(self.grid), "kernels": rows, "files": files}
         return self.answer(data, lambda: _text(data))
@@ -110,9 +110,7 @@ def _facts(cell: Cell) -> dict[str, Any]:
 
 def _text(data: dict[str, Any]) -> str:
     columns, rows = data["fields"]
-    count = len(data["files"])
-    start = f"{count} picture{'s' * (count > 1)} of {columns} x {rows} kernels"
-    lines = [f"{start}, {data['kernel_px']} pixels a side each"]
+    lines = [f"{columns} x {rows} kernels a picture, {data['kernel_px']} pixels a side each"]
     for k, file in enumerate(data["files"]):
         cells = data["kernels"][k * columns * rows : (k + 1) * columns * rows]
         widths, light = ([row[name] for row in cells] for name in ("width_px", "light"))

@@ -30,7 +30,8 @@ class Export(Answering):
     """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
     arrays that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an
     ONNX file. Domain guard, stop, rims,
-    transmittance and status codes are those of the model; the card is a comment at the top. Constants
+    transmittance and status codes are those of the model; the card is a comment at the top. c-double is C in double
+    precision, with which a lens file's rays are those of the tracer within 1e-12 mm. Constants
     (planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
     (or of internal focus) the state is an argument. A lens file gives the exact lens.
     OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
@@ -65,7 +66,9 @@ examples:
         also="; a run folder with one model, a file of neurolens plan; of --to onnx models alone", models=True,
         cameras=True, positional=True, metavar="MODEL",
     )  # fmt: skip
-    to: Literal["c", "glsl", "slang", "hlsl", "wgsl", "cuda", "vex", "osl", "onnx"] = setting(..., "form to write")
+    to: Literal["c", "c-double", "glsl", "slang", "hlsl", "wgsl", "cuda", "vex", "osl", "onnx"] = setting(
+        ..., "form to write"
+    )
     out: Path = output_path("FILE", "file to write")
     fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE")
     only: str = setting(
@@ -179,7 +182,7 @@ examples:
         from neurolens.graph.c import Extras
         from neurolens.lens.shot import Shot
         from neurolens.shaders.source import CAMERA_FRAME, camera_program
-        from neurolens.surrogates.source import checked_name, lines_of, write_program
+        from neurolens.surrogates.source import DOUBLE, checked_name, lines_of, write_program
 
         shot = Shot(self.film, self.focus_m, self.f_number, zoom=self.zoom)
         camera: Any = make_camera(file, shot, Progress(quiet=self.json))
@@ -188,7 +191,7 @@ examples:
         name = checked_name(self.to, f"{lens['id']}_camera", self.name)
         graph = camera.lens_graph()
         # Compilers of shaders take minutes for an array of 43,000 constants: there the caller brings the table.
-        own_table = self.to in ("c", "cuda")
+        own_table = self.to in ("c", DOUBLE, "cuda")
         program = camera_program(camera.film, graph, self.derivatives, own_table=own_table)
         numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
         constants = {"film_width_mm": self.film[0], "film_height_mm": self.film[1], **numbers}

@@ -37,7 +37,7 @@ from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
-from neurolens.surrogates.source import Fix, Written, checked_name, fixed_models, lines_of, write_program
+from neurolens.surrogates.source import DOUBLE, Fix, Written, checked_name, fixed_models, lines_of, write_program
 from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 
@@ -75,7 +75,7 @@ def write_lens(
     if focus_states(lens):
         lines.append("Groups stand at infinity focus: the film focuses, for how groups move is no graph.")
     planes = pupil_planes_mm(nodes, axes)
-    program = lens_program(nodes, axes, planes)
+    program = lens_program(nodes, axes, planes, double=to == DOUBLE)
     constants, functions = followed(axes, numbers(nodes, planes))
     constants |= {**state_ranges(axes), "wavelength_min_nm": VISIBLE_NM[0], "wavelength_max_nm": VISIBLE_NM[1]}
     placed, said = _film(lens, nodes, axes, Progress(quiet=quiet))
@@ -121,9 +121,11 @@ def _film(
         return film_extras(focused[: len(nodes)], axes, checked)
 
 
-def lens_program(nodes: Sequence[Lens], axes: Sequence[Axis], planes_mm: Sequence[float]) -> Program:
+def lens_program(
+    nodes: Sequence[Lens], axes: Sequence[Axis], planes_mm: Sequence[float], *, double: bool = False
+) -> Program:
     """The lens at the nodes of a state, a table each: gaps, and planes of pupil points, follow the state."""
-    program = lower([exact_graph(n, z, VISIBLE_NM) for n, z in zip(nodes, planes_mm, strict=True)])
+    program = lower([exact_graph(n, z, VISIBLE_NM, double=double) for n, z in zip(nodes, planes_mm, strict=True)])
     program.mixture = mixture_of(axes) if axes else None
     return program
 

@@ -1,4 +1,4 @@
-"""`neurolens handover CAMERA --film WxH --size WxH -o FOLDER`: a lens as files of all that follows the render."""
+"""`neurolens handover CAMERA --film WxH --width PIXELS -o FOLDER`: a lens as files of all that follows the render."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Handover(StMap):
     epilog: ClassVar[str] = f"""{CAMERAS_HELP}
 
 examples:
-  neurolens handover laikin_double_gauss_50 --film 36x20.25 --size 3840x2160 --focus 2 --f-number 2.8 -o shot/
+  neurolens handover laikin_double_gauss_50 --film 36x20.25 --width 3840 --focus 2 --f-number 2.8 -o shot/
   neurolens handover models/NAME.onnx --film 36x20.25 --width 1920 --frames 1:48 --key focus=1:1.2,48:3 -o pull/
   neurolens handover isshiki_fisheye_10 --film 18x18 --width 2000 --projection equidistant -o fisheye/"""
 

@@ -76,24 +76,18 @@ def kernels_over(
             )
             field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
             cells.append(Cell(field, distance, place if kernel is None else kernel.middle_px, kernel))
-            _check_size(fields, cells[-1].width_px)
+            if max(fields) * (side := cells[-1].width_px) > _LARGEST:
+                got = f"({fields[0] * side} x {fields[1] * side} pixels)"
+                expected = f"at most {_LARGEST} pixels a side: fewer fields, or less blur"
+                raise InputError("kernels", "size", got, expected)
             report((number + len(cells) / len(places)) / len(distances_m))
         found.append(cells)
     return found
 
 
-def _check_size(fields: tuple[int, int], side: int) -> None:
-    """Refuse (InputError) an atlas of so many kernels of `side` pixels that no picture holds."""
-    if max(fields) * side > _LARGEST:
-        got = f"({fields[0] * side} x {fields[1] * side} pixels)"
-        raise InputError("kernels", "size", got, f"at most {_LARGEST} pixels a side: fewer fields, or less blur")
-
-
 def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
     """The atlas [rows side, columns side, 3] of the kernels of one distance, each of sum 1 in each channel."""
-    rows = len(cells) // columns
-    _check_size((columns, rows), side)
-    picture = np.zeros((rows * side, columns * side, 3), np.float32)
+    picture = np.zeros((len(cells) // columns * side, columns * side, 3), np.float32)
     for k, cell in enumerate(cells):
         j, i = divmod(k, columns)
         if cell.kernel is not None:
@@ -101,11 +95,10 @@ def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
     return picture
 
 
-def as_preview(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
-    """The atlas with each kernel as bright as the others, to be looked at."""
-    picture = as_picture(cells, columns, side)
-    for k in range(len(cells)):
-        part = picture[k // columns * side :, k % columns * side :][:side, :side]
-        if part.any():
-            part /= float(np.percentile(part[part > 0], 90))
-    return picture
+def as_preview(picture: FloatArray, side: int) -> FloatArray:
+    """An atlas with each kernel as bright as the others, to be looked at."""
+    found = picture.copy()
+    for j, i in itertools.product(range(0, len(found), side), range(0, found.shape[1], side)):
+        part = found[j : j + side, i : i + side]
+        part /= float(np.percentile(part[part > 0], 90)) if part.any() else 1.0
+    return found

@@ -59,15 +59,8 @@ class _Table(ctypes.Structure):
 
 @cache
 def compiled() -> ctypes.CDLL:
-    library = load_compiled(
-        c_source(
-            "defocus/gather.c",
-            NUMBERS=_NUMBERS,
-            WEIGHT=_NUMBERS - 1,
-            FINEST=FINEST.bit_length() - 1,
-            CLEAR=f"{_CLEAR}f",
-        )
-    )
+    defined = {"NUMBERS": _NUMBERS, "WEIGHT": _NUMBERS - 1, "FINEST": FINEST.bit_length() - 1, "CLEAR": f"{_CLEAR}f"}
+    library = load_compiled(c_source("defocus/gather.c", **defined))
     whole, pointer = ctypes.c_int, ctypes.c_void_p
     library.splat.argtypes = [pointer, whole, pointer, whole, pointer, *[whole] * 2, pointer, *[whole] * 2, pointer]
     library.splat.restype = None
@@ -105,10 +98,9 @@ def turns_pupil(camera: Camera) -> bool:
     film = np.repeat(np.array([[reach, 0.0], [0.0, reach]], np.float32), 2, axis=1)
     pupil = np.tile(np.array([[0.9, 0.5], [0.5, 0.9]], np.float32), 2)
     low, high = camera.wavelength_nm or LIGHT_NM
-    start = camera.sample(film, pupil, np.full(4, min(max(_MIDDLE_NM, low), high), np.float32)).origin_m[:2]
-    apart, across = start[:, 0] - start[:, 1], start[:, 2] - start[:, 3]
-    turned_by = np.array([-apart[1], apart[0]])
-    return bool(np.hypot(*(across - turned_by)) < np.hypot(*(across - apart)))
+    x, y, _ = camera.sample(film, pupil, np.full(4, min(max(_MIDDLE_NM, low), high), np.float32)).origin_m
+    first, second = (x + 1j * y)[::2] - (x + 1j * y)[1::2]
+    return bool(abs(second - 1j * first) < abs(second - first))
 
 
 class RayTable:
@@ -184,22 +176,17 @@ def _points(count: int, numbers: int) -> FloatArray:
     return ((sobol(count, numbers) + 2.0**31 / count) / 2.0**32).astype(np.float32)
 
 
-def spread_of(row: FloatArray) -> NDArray[np.float64]:
-    """The variance of the places [nodes, 3] at which rays of a node see a point: of a, 2 covariances, of b; summed over
-    x and y, so that its root is the radius of an even disc over sqrt(2)."""
-    rays = row[..., :_NUMBERS].astype(np.float64)
-    weight = rays[..., 4:] / np.maximum(rays[..., 4:].sum(axis=1, keepdims=True), 1e-30)
-    a, b = (rays[..., k : k + 2] for k in (0, 2))
-    a, b = a - (weight * a).sum(axis=1, keepdims=True), b - (weight * b).sum(axis=1, keepdims=True)
-    terms = (a * a, 2 * a * b, b * b)
-    return np.stack([(weight * t).sum(axis=(1, 2)) for t in terms], axis=1)
-
-
 def spread_over(camera: Camera, pinhole: PlatePinhole, size: tuple[int, int]) -> NDArray[np.float64]:
-    """`spread_of` all nodes, [rows, columns, 3]."""
-    points = _points(_FEW, 3)
+    """The variance of the places at which rays of each node [rows, columns, 3] see a point: of a, 2 covariances, of b;
+    summed over x and y, so that its root is the radius of an even disc over sqrt(2)."""
+    points, found = _points(_FEW, 3), []
     table = RayTable(camera, pinhole, size, points[:2], points[2])
-    return np.stack([spread_of(table.row(j)) for j in range(table.cells[1] + 1)])
+    for j in range(table.cells[1] + 1):
+        rays = table.row(j)[..., :_NUMBERS].astype(np.float64)
+        weight = rays[..., 4:] / np.maximum(rays[..., 4:].sum(axis=1, keepdims=True), 1e-30)
+        a, b = (part - (weight * part).sum(axis=1, keepdims=True) for part in (rays[..., :2], rays[..., 2:4]))
+        found.append(np.stack([(weight * term).sum(axis=(1, 2)) for term in (a * a, 2 * a * b, b * b)], axis=1))
+    return np.stack(found)
 
 
 def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float64]:
@@ -249,15 +236,9 @@ def _around(values: FloatArray, by: np.ufunc) -> FloatArray:
 
 
 def gather(
-    layers: list[Layer],
-    pinhole: PlatePinhole,
-    camera: Camera,
-    size: tuple[int, int],
-    spread: NDArray[np.float64],
-    samples: int = 64,
-    threads: int = 1,
-    report: Callable[[float], None] = lambda _: None,
-) -> Gathered:
+    layers: list[Layer], pinhole: PlatePinhole, camera: Camera, size: tuple[int, int], spread: NDArray[np.float64],
+    samples: int = 64, threads: int = 1, report: Callable[[float], None] = lambda _: None,
+) -> Gathered:  # fmt: skip
     """The picture of size (width, height) that a camera takes of a plate's layers, by at most `samples` a pixel.
 
     `spread`: `spread_over` of the camera.
@@ -283,7 +264,9 @@ def gather(
         compiled().gather(structs, len(layers), struct, width, first, stop - first, part.ctypes.data, sums.ctypes.data)
         weights = rays[..., _NUMBERS - 1 : len(table.nm) * _NUMBERS : _NUMBERS].mean(axis=2, dtype=np.float64)
         weights = weights[..., [1, 0, 2]] if len(table.nm) > 1 else weights
-        light = _between(weights, (np.arange(first, stop) + 0.5) / height * down - j, width)
+        x, share = (np.arange(width) + 0.5) / width * across, (np.arange(first, stop) + 0.5) / height * down - j
+        above, below = (np.stack([np.interp(x, np.arange(across + 1), c) for c in row.T], 1) for row in weights)
+        light = above + (below - above) * share[:, None, None]
         weight = sums[..., 3:6]
         rgb[first:stop] = light * np.divide(sums[..., :3], weight, out=np.zeros_like(weight), where=weight > 0)
         return sums[..., [4, 6, 7]].sum(axis=(0, 1), dtype=np.float64)
@@ -301,12 +284,3 @@ def gather(
     del kept
     filled, beyond = lost[1:] / max(lost[0], 1e-30)
     return Gathered(rgb, float(filled), float(beyond))
-
-
-def _between(light: NDArray[np.float64], rows: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Values [2, nodes, channels] of two rows of nodes at the pixels [rows, width]."""
-    cells = light.shape[1] - 1
-    x = (np.arange(width) + 0.5) / width * cells
-    i = np.minimum(x.astype(int), cells - 1)
-    along = light[:, i] + (light[:, i + 1] - light[:, i]) * (x - i)[:, None]
-    return along[0] + (along[1] - along[0]) * rows[:, None, None]

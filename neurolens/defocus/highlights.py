@@ -43,12 +43,9 @@ class Highlights:
 
 
 def take_highlights(
-    layer: Layer,
-    pinhole: PlatePinhole,
-    spread: NDArray[np.float64],
-    size: tuple[int, int],
+    layer: Layer, pinhole: PlatePinhole, spread: NDArray[np.float64], size: tuple[int, int],
     before: Sequence[Layer] = (),
-) -> Highlights:
+) -> Highlights:  # fmt: skip
     """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes.
 
     What the layers `before` show, too, at the same place and depth, is taken out and left to them.

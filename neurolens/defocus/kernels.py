@@ -42,14 +42,13 @@ class Kernel:
         light: [h, w, 3] the part of the radiance of one square pixel of the plate that arrives at each pixel.
         corner_px: column and row in the film, of its first pixel; whole numbers.
         film_by_plate: [2, 2] by how much the point's picture moves on the film as the point moves in the plate, pixels.
-        place_px: the point in the plate. sweep: [2, 3] how fast the ray from a film pixel to the point moves in the
-            plate as it comes nearer (pixels by 1/m): the constant, and the factors of column and row in the kernel.
+        sweep: [2, 3] how fast the ray from a film pixel to the point moves in the plate as it comes nearer (pixels by
+            1/m): the constant, and the factors of column and row in the kernel.
     """
 
     light: FloatArray
     corner_px: tuple[int, int]
     film_by_plate: Array
-    place_px: tuple[float, float]
     sweep: Array
 
     @property
@@ -121,9 +120,7 @@ def kernel_at(
     colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
     for k in range(nm.size):
         aimed.draw(light, k, corner, colour[[k // nm.shape[1]]] / nm.shape[1])
-    return Kernel(
-        np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.film_by_plate, place_px, aimed.sweep(corner)
-    )
+    return Kernel(np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.film_by_plate, aimed.sweep(corner))
 
 
 def _disk(side: NDArray[Any]) -> Array:
@@ -249,7 +246,6 @@ def _aimed(
     (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(ahead, behind, strict=True))
     stretch = np.abs(xx * yy - xy * yx)
     known = np.all([found[1] > 0 for found in (*ahead, *behind)], axis=0) & (stretch > 0)
-    known &= np.hypot(*(place - np.array(table.size)[:, None] / 2)) > 1  # on the axis the pupil's outline turns over
     area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(film_by_plate))))
     close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
     light, kept = weight * area, np.where(close, weight, 0) * area

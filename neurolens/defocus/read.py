@@ -93,7 +93,9 @@ def read_plate(
     ours = _pinhole(metadata_of(path, header))
     plate_mm = film_mm if ours is None else ours["film_mm"]
     if not math.isclose(size[0] / size[1], plate_mm[0] / plate_mm[1], rel_tol=_SAME + 1 / min(size)):
-        expected = f"a picture of the film's shape, {plate_mm[0]:g} x {plate_mm[1]:g} mm"
+        squeeze = frame.reach_mm[1] / frame.reach_mm[0]
+        more = "" if abs(squeeze - 1) < _SAME else f", squeezed: pixels {squeeze:.3g} times as wide as high"
+        expected = f"a picture of the film's shape, {plate_mm[0]:g} x {plate_mm[1]:g} mm{more}"
         raise InputError(path, "displayWindow", f"({size[0]} x {size[1]} pixels)", expected)
     reach, before = frame.reach_mm, frame.pupil_mm[1]
     if ours is not None:
@@ -242,6 +244,8 @@ def _inverse_depth(
     z = metres * np.float32(depth.scale_m or 1.0)
     solid = np.isfinite(z) & (z != 0) & (np.abs(z) < _SKY_M)
     if missing := int(np.isnan(metres).sum()):
+        if missing == z.size:
+            raise InputError(path, "depth", "(not a number in any pixel)", "depth in metres")
         warn(f"{path}: the depth of {missing} of {z.size} pixels is not a number; they count as sky")
     if solid.any():
         least, most = float(z[solid].min()), float(z[solid].max())
@@ -253,6 +257,7 @@ def _inverse_depth(
             raise InputError(path, "depth", f"({least:g} to {most:g} m)", expected)
     z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(pinhole_m)
     if (close := solid & (z <= 1e-3)).any():
-        raise InputError(path, "depth", f"({float(z[close].min()):g} m)", "more than 0 m before the pinhole")
+        least = float(z[close].min())
+        raise InputError(path, "depth", f"({least:g} m)", "metres from the pinhole on, over 0.001, not their inverse")
     w = np.divide(1, z, out=np.zeros_like(z), where=solid)
     return np.where(nothing, np.float32(-1), w).astype(np.float32), cosine

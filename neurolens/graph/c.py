@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -17,6 +18,7 @@ from neurolens.graph.program import Argument, Mixture, Program, Step
 
 BLOCK = 256  # rays
 PART, ROWS = 28, 128  # steps of a part, and rays that it does at a time: its numbers stay in the first cache
+_DOUBLE = ContextVar("_DOUBLE", default=False)  # whether literals are those of double precision
 
 
 @cache
@@ -38,7 +40,7 @@ def comment_of(lines: Sequence[str]) -> str:
 
 def literal(value: float) -> str:
     """A float32 number in nine digits, which give it back exactly; negative ones in brackets."""
-    text = f"{np.float32(value):.9g}"
+    text = repr(float(value)) if _DOUBLE.get() else f"{np.float32(value):.9g}"
     if "." not in text and "e" not in text:
         text += ".0"
     return f"({text}f)" if text.startswith("-") else f"{text}f"
@@ -305,6 +307,30 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     in_parts = program.waits() and signature.bands == 1 and not signature.state and "lookup" not in kinds
     runs = PartWriter(program, signature, macro).functions() if in_parts else None
     return text + _functions(signature, macro, body, results, runs)
+
+
+_IN_DOUBLE = {
+    r"\bfloat\b": "double", r"\bunsigned\b": "unsigned long long", r"\b(\d[\d.]*(?:e[+-]?\d+)?)f\b": r"\1",
+    r"\b(floor|__builtin_fma|__builtin_sqrt)f\b": r"\1", "0x80000000u": "0x8000000000000000u",
+    "0x7fffffffu": "0x7fffffffffffffffu", "0x5f375a86u": "0x5fe6eb50c7b537a9u",
+}  # fmt: skip
+
+
+def write_double(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
+    """The text of `write_c` in double precision; hyperbolic tangents, of absorption, keep the error of single."""
+    token = _DOUBLE.set(True)
+    try:
+        text = write_c(program, name, comment, extras)
+    finally:
+        _DOUBLE.reset(token)
+    return in_double(text)
+
+
+def in_double(text: str) -> str:
+    """C text with double in place of float."""
+    for pattern, new in _IN_DOUBLE.items():
+        text = re.sub(pattern, new, text)
+    return text
 
 
 def _numbers(name: str, rows: NDArray[np.float64]) -> str:

@@ -10,25 +10,25 @@ from __future__ import annotations
 
 import uuid
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
 from neurolens.analysis import projections
 from neurolens.base.html import html
-from neurolens.cameras.field import Array, Complex, Field
-from neurolens.handover.shot import FAR_M, Handed, Pinhole, falloff
+from neurolens.cameras.field import Complex, Field
+from neurolens.handover.shot import FAR_M, Handed, Pinhole, falloff, film_points
 
 MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"
-_POINTS = (61, 41), (50, 34)  # over the film: fitted, held out
-_GOOD_PX = 0.1  # a polynomial that leaves more gives way to a ratio of two, whose terms nearly cancel
+_POINTS = 61, 41  # over the film, of light
+_GOOD_PX = 0.1  # a polynomial that leaves more gives way to a ratio of two
+_LEAST = 1e-5  # singular value over the largest: below it coefficients grow until they cancel, and the ratio has poles
 
 
 def sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | None, float]:
     """The sample of one frame as JSON, and the worst that its formulae leave: pixels, share of light."""
     plane = field.field_deg <= projections.WIDEST_DEG and pinhole.squeeze == 1
     distortion, left_px = _distortions(field, shot) if plane else ([], None)
-    points = _lit(field, shot, _POINTS[0])
+    points = _lit(field, shot)
     light, share = falloff(field.relative_light(points), np.abs(points))
     squeeze = Fraction(pinhole.squeeze).limit_denominator(1000)
     values = {
@@ -45,36 +45,30 @@ def sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | N
 
 
 def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float]]], float]:
-    """Names of both directions with their coefficients, and the worst that they leave in pixels."""
-    focal, pixel, pairs = field.frame.reach_mm[0], shot.plates.pixel_mm[0], []
-    for counts in _POINTS:
-        point = _lit(field, shot, counts)
-        way = field.directions(point)
-        pairs.append([np.stack([point.real, point.imag], 1), focal * (way[:2] / way[2]).T])
-    found, worst = [], 0.0
-    for model, order in zip(MODELS, (1, -1), strict=True):
-        (source, goal), (tried, meant) = (pair[::order] for pair in pairs)
-        size, fits = focal / pixel, []
-        for kind in projections.PLANAR:  # the same formulae, of slopes and pixels
-            given = _ways(source / focal), goal / pixel - 0.5, (0, 0), (size, size), shot.lens
-            fitted = projections.fit(kind, *given, keep_focal=True)
-            left = projections.residual(fitted, _ways(tried / focal), meant / pixel - 0.5).worst_px
-            fits.append((left, (*fitted.coefficients, 0.0, 0.0, 0.0)[:8]))
-            if left < _GOOD_PX:
+    """Names of both directions with their coefficients, and the worst that they leave in pixels; of a round lens."""
+    points = film_points(field, shot.film_mm(shot.plates.picture), 257)
+    way = field.directions(points)
+    both, found, worst = (points.real, field.frame.reach_mm[0] * way[0] / way[2]), [], 0.0
+    for model, (start, goal) in zip(MODELS, (both, both[::-1]), strict=True):
+        powers = np.stack([(start / start[-1]) ** n for n in (2, 4, 6)])
+        ratio, fits = goal / start, []
+        for terms in (powers, np.concatenate([powers, -ratio * powers])):
+            k = np.zeros(6)
+            k[: len(terms)] = np.linalg.lstsq((start * terms).T, goal - start, rcond=_LEAST)[0]
+            missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) - ratio) * start
+            by_mm = k.reshape(2, 3) / start[-1] ** np.array([2, 4, 6])
+            fits.append((float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
+            if fits[-1][0] < _GOOD_PX:
                 break
-        left, (k1, k2, _, _, k3, k4, k5, k6) = min(fits)
-        found.append((model, [k / focal**n for k, n in ((k1, 2), (k4, 2), (k2, 4), (k5, 4), (k3, 6), (k6, 6))]))
+        left, radial = min(fits, key=lambda fit: fit[0])
+        found.append((model, radial.T.reshape(-1).tolist()))
         worst = max(worst, left)
     return found, worst
 
 
-def _lit(field: Field, shot: Handed, counts: tuple[int, int]) -> Complex:
+def _lit(field: Field, shot: Handed) -> Complex:
     """Points of the film that light reaches."""
     film = shot.film_mm(shot.plates.picture, squeezed=True)
-    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, n) * side for n, side in zip(counts, film, strict=True)))
+    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, n) * side for n, side in zip(_POINTS, film, strict=True)))
     points = np.asarray(x + 1j * y, np.complex128).reshape(-1)
     return points[field.lit(points)]
-
-
-def _ways(slope: Array) -> Any:
-    return np.concatenate([slope, np.ones_like(slope[:, :1])], 1)

@@ -168,7 +168,7 @@ def shader_cost(
     points, rays = places.film_mm.shape[1], _SIDE * _SIDE
     steps, rng = (np.arange(_SIDE) + 0.5) / _SIDE, np.random.default_rng(1)
     first, second = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
-    # Low bits of the first number tell the wavelength.
+    # Low bits of the first number tell the wavelength within a part of the spectrum.
     low = (rng.permuted(np.tile(np.arange(rays), (points, 1)), axis=1) + 0.5) / rays
     raster = 0.5 - places.film_mm / np.array(film_mm)[:, None]
     half = math.pi / 3

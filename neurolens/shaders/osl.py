@@ -9,10 +9,7 @@ This distance and the places of the rays are in units of the scene, which are `u
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
 the nodes of its axes as a model's numbers are: the zoom is an input, internal focus the distance in focus.
 
-Cycles gives two random numbers, which are most even in their high bits. The high bits of the first choose one of
-sixteen parts of the spectrum, its lowest bits the wavelength within that part, and the bits between are the number for
-the pupil. So sixteen samples of a pixel hold each part of the spectrum once. The colour weights of a wavelength are
-Bernstein's polynomials of second order: never negative, of mean 1 each.
+Cycles gives two random numbers for the wavelength and the pupil: see `light`.
 """
 
 from __future__ import annotations
@@ -45,16 +42,13 @@ from neurolens.lens.prescription import VISIBLE_NM
 from neurolens.shaders.lowtests import low_tests
 from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles, PupilDisc
 from neurolens.shaders.pupil_fit import fit_pupil
-from neurolens.shaders.shader_lens import ShaderLens, passing_share
+from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
 from neurolens.shaders.source import FOCUS, SMALLEST, Focusing, film_function, followed_rows, model_focusing
 from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_names, weights
 
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")
 _FAR_M = 1e-4  # Blender's focus distance below this means that depth of field is off
-# The high bits of a random number choose one of so many parts of the spectrum. Of the rest, the bits below 1 / 4096
-# choose the wavelength within the part.
-_PARTS, _LOW_BITS = 16.0, 4096.0
 _NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
 _LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it
 _QUADRATURE = 64  # points a side of the exposure on the axis
@@ -103,11 +97,6 @@ class OslCamera:
     entrance_mm: float
     margin: float
     unit: bool
-
-    @property
-    def pupil_z_mm(self) -> float:
-        """z of the plane of pupil points."""
-        return self.lens.table.pupil_z_mm
 
     @cached_property
     def per_exposure(self) -> Array:
@@ -225,8 +214,8 @@ def osl_graph(camera: OslCamera) -> Graph:
     g = Graph()
     call = _Call(g, camera)
     film = (0.5 - g.concat(g.input("raster_x"), g.input("raster_y"))) * call.sensor
-    nanometres, colour, first = _light(camera, g.input("first"), call.number("in_colour"))
-    square = g.concat(first, g.input("second"))
+    numbers = g.concat(g.input("first"), g.input("second"))
+    nanometres, colour, square = light(camera.lens.wavelength_nm, numbers, call.number("in_colour"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
     sampler = camera.pupil.sampler(Blades, camera.margin)
     pupil = g.inline(sampler, {"film_mm": film, "square": square, "wavelength_nm": nanometres, **per_call})
@@ -287,7 +276,7 @@ class _Call:
     def weighting(self) -> dict[str, Value]:
         """The numbers of `weight_graph`."""
         g, camera = self.g, self.camera
-        per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
+        per_distance = 1.0 / (self.film_z - camera.lens.table.pupil_z_mm)
         middle, half = _film_position(camera)
         per_share = _in_turn(g, camera.per_exposure, self.share, (self.film_z - middle) * (1 / half))
         per_lens, nominal = per_share * (1.0 / (self.share * self.share)), 4 * camera.lens.f_number**2 / math.pi
@@ -314,22 +303,6 @@ def _film_position(camera: OslCamera) -> tuple[float, float]:
     return (low + high) / 2, max((high - low) / 2, 1e-6)
 
 
-def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, Value, Value]:
-    """Wavelength and colour weights [3] of a ray, red to blue, and the random number that is left for its pupil."""
-    g, (short, long) = random.graph, camera.lens.wavelength_nm
-    many = random * _PARTS
-    cell = many.floor()
-    left = many - cell
-    fine = left * _LOW_BITS
-    part = (cell + fine - fine.floor()) * (1 / _PARTS)
-    rest = 1.0 - part
-    grey = in_colour <= 0.5
-    reference = min(max(LINE_D_NM, short), long)
-    nanometres = g.select(grey, reference, part * (short - long) + long)
-    colour = g.concat(rest * rest * 3.0, part * rest * 6.0, part * part * 3.0)
-    return nanometres, g.select(grey, 1.0, colour), g.select(grey, random, left)
-
-
 def _samples(lens: ShaderLens, pupil: PupilCircles | PupilDisc, count: int = 32768) -> dict[str, NDArray[np.float32]]:
     """Rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of samples."""
     rng = np.random.default_rng(0)
@@ -353,7 +326,7 @@ def _per_exposure(camera: OslCamera) -> Array:
     positions = np.linspace(low, high, 3) if high > low else np.array([low])
     rows, values = [], []
     for z, share in itertools.product(positions, (0.1, 0.3, 0.5, 0.7, 0.85, 1.0)):
-        per_distance = 1 / (z - camera.pupil_z_mm)
+        per_distance = 1 / (z - camera.lens.table.pupil_z_mm)
         call = {"film_z_mm": z, "stop_radius_mm": share * camera.lens.stop_radius_mm}
         call |= {"per_distance": per_distance, "scale": per_distance**2}
         inputs: dict[str, Any] = {k: np.array([[v]]) for k, v in call.items()}

@@ -14,7 +14,8 @@ from neurolens.base import status as st
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pupil_search import PupilTable, end_of_light, pass_test
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, Value
+from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.shaders.source import Focusing
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 _PART = 1 << 15  # rays that are evaluated together
+_PARTS, _LOW_BITS = 16.0, 4096.0  # of the spectrum; the bits of a number below 1 / 4096 choose the place within a part
 
 
 @dataclass(frozen=True)
@@ -142,3 +144,28 @@ def _sampled(
     sample = evaluate(pupil.graph, inputs | {"stop_radius_mm": stop})
     passed = lens.status(film, sample["pupil_mm"], nanometres, film_z, stop) == st.PASSED
     return np.asarray(passed & (sample["area_mm2"][0] > 0))
+
+
+def light(range_nm: tuple[float, float], numbers: Value, in_colour: Value) -> tuple[Value, Value, Value]:
+    """Wavelength and colour weights [3] of a ray, red to blue, and what its random numbers [2] leave for its pupil [2].
+
+    Cycles's numbers are the second and third dimension of Sobol's sequence, most even in their high bits. Four bits
+    choose one of sixteen parts of the spectrum: the first of either number, whether the second ones differ, and the
+    third of the first number. Its lowest bits choose the wavelength within the part, and the other bits are left. So
+    sixteen samples of a pixel hold each eighth of the spectrum twice, once in either half by which adaptive sampling
+    judges noise. A half holds the samples whose index has an odd number of the bits 2, 8, 32...: the second bit of a
+    number is uneven there, and the first ones, and whether the second ones differ, are even. The weights are
+    Bernstein's polynomials of second order: never negative, of mean 1 each.
+    """
+    g, (short, long) = numbers.graph, range_nm
+    halves = numbers * 2.0
+    left = halves - halves.floor()
+    quarters, many = (left * 2.0).floor(), left[0] * 4.0
+    first, third = many - many.floor(), many.floor() - quarters[0] * 2.0
+    fine = first * _LOW_BITS
+    eighth = halves[0].floor() * 8.0 + halves[1].floor() * 4.0 + (quarters[0] - quarters[1]).abs() * 2.0
+    part = (eighth + third + fine - fine.floor()) * (1 / _PARTS)
+    rest, grey = 1.0 - part, in_colour <= 0.5
+    nanometres = g.select(grey, min(max(LINE_D_NM, short), long), part * (short - long) + long)
+    colour = g.concat(rest * rest * 3.0, part * rest * 6.0, part * part * 3.0)
+    return nanometres, g.select(grey, 1.0, colour), g.select(grey, numbers, g.concat(first, left[1]))

@@ -30,7 +30,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.graph.c import Signature, write_blocks, write_c
+from neurolens.graph.c import Signature, in_double, write_blocks, write_c, write_double
 from neurolens.graph.compiler import FLAGS, compile_c, has_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
@@ -327,17 +327,23 @@ def time_model(model: OnnxLens, name: str, *, rounds: int) -> Timing | None:
 class CompiledSource:
     """A program as a shared library in its own temporary folder.
 
+    Args:
+        double: for double precision, which programs with lookups do not have.
+
     Raises:
         Unavailable: there is no compiler, or it fails; the message says how.
     """
 
-    def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS) -> None:
-        self.signature = Signature.of(program, "lens")
+    def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS, double: bool = False) -> None:
+        self.signature, self._real = Signature.of(program, "lens"), np.float64 if double else np.float32
         self._folder = TemporaryFolder()
         library = Path(self._folder.name) / "lens.so"
         blocks = bool(program.own_tables)  # lookups: loops of arrays have them apart
-        text = write_blocks(program, "lens") if blocks else write_c(program, "lens", ["A timed model."])
-        text += self._wrapper(blocks)
+        if double:
+            text = write_double(program, "lens", ["A timed model."]) + in_double(self._wrapper(False))
+        else:
+            text = write_blocks(program, "lens") if blocks else write_c(program, "lens", ["A timed model."])
+            text += self._wrapper(blocks)
         try:
             self.warnings = compile_c(text, library, flags)
         except InputError as error:
@@ -361,14 +367,14 @@ class CompiledSource:
 
     def outputs(self, count: int) -> dict[str, NDArray[Any]]:
         """Arrays for the results of so many rays."""
-        found: dict[str, NDArray[Any]] = {name: np.empty(count, np.float32) for name in self.signature.outputs}
+        found: dict[str, NDArray[Any]] = {name: np.empty(count, self._real) for name in self.signature.outputs}
         return {**found, "status": np.empty(count, np.int32)}
 
     def prepared(self, inputs: Mapping[str, ArrayLike], out: Mapping[str, NDArray[Any]], band: int = 0) -> Call:
         """A call that computes rays into `out`; inputs by name, arrays [N] or numbers; others are ignored."""
         s = self.signature
         count = len(out["status"])
-        arrays = [np.ascontiguousarray(inputs[name], np.float32) for name in (*s.per_ray, *s.per_call)]
+        arrays = [np.ascontiguousarray(inputs[name], self._real) for name in (*s.per_ray, *s.per_call)]
         if any(a.shape != (count,) for a in arrays[: len(s.per_ray)]):
             raise ValueError("inputs and outputs of one length expected")
         arrays += [np.array([band], np.int32)] if s.bands > 1 else []
@@ -393,10 +399,11 @@ FUSED_BATCHES = (2048, 4096, 8192, 16384)
 
 
 def program_candidate(
-    name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None, flags: tuple[str, ...] = FLAGS
-) -> Candidate:
+    name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None, flags: tuple[str, ...] = FLAGS,
+    double: bool = False,
+) -> Candidate:  # fmt: skip
     """A program of `surrogates.source`, compiled when the race prepares it; no stop radius: the domain's."""
-    compiled = cache(lambda: CompiledSource(program, flags))
+    compiled = cache(lambda: CompiledSource(program, flags, double))
 
     @cache
     def room(count: int) -> dict[str, NDArray[Any]]:

@@ -17,7 +17,7 @@ from typing import Any
 import neurolens
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
-from neurolens.graph.c import NOTHING, Extras, Signature, write_c
+from neurolens.graph.c import NOTHING, Extras, Signature, write_c, write_double
 from neurolens.graph.program import (
     FILM_Z,
     RAY,
@@ -37,8 +37,9 @@ from neurolens.surrogates.axes import mixture_of, state_names
 from neurolens.surrogates.card import DOMAIN_SLACK, axes_of
 from neurolens.surrogates.model import Domain, LensModel, with_one_angle
 
+DOUBLE = "c-double"
 WRITERS: Mapping[str, Callable[..., str]] = {
-    "c": write_c, **{name: partial(write_shading, kind) for name, kind in LANGUAGES.items()}
+    "c": write_c, DOUBLE: write_double, **{name: partial(write_shading, kind) for name, kind in LANGUAGES.items()}
 }  # fmt: skip
 OSL = "osl"  # of whole cameras: `shaders.osl`
 _WIDTH, _MOST_WAVELENGTHS = 110, 64

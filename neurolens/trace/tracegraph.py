@@ -29,7 +29,7 @@ _HALVINGS = 12  # of a phase, at most: films of 500 waves
 
 def exact_graph(
     lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True, path: bool = False,
-    polarised: bool = True,
+    polarised: bool = True, double: bool = False,
 ) -> Graph:  # fmt: skip
     """Film and pupil points in, scene ray and status out: inputs and outputs are those of a model's graph.
 
@@ -37,11 +37,11 @@ def exact_graph(
         pupil_z_mm: plane of the pupil points. wavelength_nm: range of the light, for coatings and absorption; a single
             wavelength fixes the indices.
         whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
-        polarised: as in `Passage`.
+        polarised: as in `Passage`. double: as in `Graphs`.
         path: an output more, `path` [2 K]: z and y of the crossing with each surface, that next to the film first.
     """
     g = Graph()
-    o = Graphs(g)
+    o = Graphs(g, double=double)
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
     stop_radius = g.input("stop_radius_mm", per_call=True) if whole else None
     stop_square = None if stop_radius is None else stop_radius * stop_radius

@@ -12,10 +12,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from in_blender import MODULE, bpy, first_scene, installed_pack, rendered, surroundings
 
-bpy = pytest.importorskip("bpy", reason="Blender as a module (bpy) is not installed: make test-blender runs these")
-
-from neurolens.blender.pack import Form, PackedLens, add_to_folder, user_folders, write_pack  # noqa: E402
+from neurolens.blender.pack import Form, PackedLens, add_to_folder, user_folders
 
 # A pinhole that shows its settings as a colour.
 SHADER = """
@@ -37,7 +36,6 @@ shader camera(
 """
 ZOOM = SHADER.replace("  int blades", "  float zoom_mm = 80.0 [[ float min = 80.0, float max = 200.0 ]],\n  int blades")
 BROKEN = "shader camera(output point position = 0.0) { nonsense; }"
-MODULE = "bl_ext.user_default.neurolens"
 
 
 def packed(lens_id: str = "gauss", osl: str = SHADER, picture: bytes | None = None) -> PackedLens:
@@ -70,46 +68,25 @@ def png() -> bytes:
 
 @pytest.fixture(scope="module", autouse=True)
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The zip, installed as from disk and enabled."""
-    out = tmp_path_factory.mktemp("pack") / "neurolens.zip"
-    write_pack(out, [packed(picture=png()), phone(), packed("broken", BROKEN), packed("zoom", ZOOM)])
-    bpy.ops.extensions.package_install_files(filepath=str(out), repo="user_default", enable_on_install=True)
-    yield out
-    bpy.ops.preferences.addon_disable(module=MODULE)
+    folder = tmp_path_factory.mktemp("pack")
+    with installed_pack(
+        folder, [packed(picture=png()), phone(), packed("broken", BROKEN), packed("zoom", ZOOM)]
+    ) as out:
+        yield out
 
 
 @pytest.fixture
 def scene() -> Any:
-    """Blender's first scene, of 32 by 18 pixels; white surroundings and nothing else."""
-    bpy.ops.wm.read_homefile(app_template="", use_factory_startup=True)
-    scene = bpy.context.scene
-    for found in list(bpy.data.objects):
-        if found.type != "CAMERA":
-            bpy.data.objects.remove(found)
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 32, 18, 100
-    scene.cycles.samples = 1
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    """A camera, 32 by 18 pixels, white surroundings and nothing else."""
+    scene = first_scene()
+    scene.render.resolution_x, scene.render.resolution_y, scene.cycles.samples = 32, 18, 1
+    surroundings(scene, 1, 1, 1)
     return scene
 
 
-def middle(scene: Any, folder: Path, frame: int = 1, views: tuple[str, ...] = ("",)) -> list[float]:
-    """Colour of the middle of a render, of the first of its views."""
-    scene.frame_set(frame)
-    scene.render.filepath = str(folder / "render.exr")
-    scene.render.image_settings.file_format = "OPEN_EXR"
-    scene.render.image_settings.color_depth = "32"
-    scene.view_settings.view_transform = "Raw"
-    bpy.ops.render.render(write_still=True)
-    return middle_of(folder / f"render{views[0]}.exr")
-
-
-def middle_of(file: Path) -> list[float]:
-    """Colour of the middle of a picture."""
-    image = bpy.data.images.load(str(file))
-    at = 4 * (9 * 32 + 16)
-    colour = list(image.pixels[at : at + 3])
-    bpy.data.images.remove(image)
-    return colour
+def middle(scene: Any, folder: Path, frame: int = 1, eye: str = "") -> list[float]:
+    """Colour of the middle of a render."""
+    return list(rendered(scene, folder, frame, eye)[9, 16, :3])
 
 
 def everything(scene: Any) -> dict[str, Any]:
@@ -338,18 +315,17 @@ def test_stereo_that_leaves_the_image_circle_is_told_by_what_cycles_shifts(
         throughput = color(camera_shader_raster_position()) + 1; }""")
     on_camera._compile(camera)
     render.use_multiview, render.image_settings.views_format = True, "INDIVIDUAL"
-    scene.cycles.samples, scene.cycles.use_denoising = 64, False
+    scene.cycles.samples = 64
     camera.sensor_width, camera.shift_x, camera.stereo.convergence_distance = 30.0, 0.05, 1.0
     for pivot, eyes in (("CENTER", (0.5, -0.5)), ("LEFT", (0.0, -1.0))):
         camera.stereo.pivot = pivot
-        middle(scene, tmp_path, views=("_L", "_R"))
-        seen = [middle_of(tmp_path / f"render{eye}.exr")[0] - 1.5 - 0.5 / 32 for eye in ("_L", "_R")]
+        seen = [middle(scene, tmp_path, eye=eye)[0] - 1.5 - 0.5 / 32 for eye in ("_L", "_R")]
         counted = on_camera.setting_of(scene, scene.camera).stereo
         assert counted == pytest.approx([share * 0.065 * camera.lens / 30.0 for share in eyes])
         assert seen == pytest.approx([0.05 + shift for shift in counted], abs=1e-3)
     assert "stereo" not in " ".join(panel(scene)) + capfd.readouterr().err
     camera.stereo.interocular_distance = 0.4
-    middle(scene, tmp_path, views=("_L", "_R"))
+    middle(scene, tmp_path, eye="_L")
     assert "Off-axis stereo takes a corner to" in " ".join(panel(scene))
     assert "frame 1: Off-axis stereo takes a corner to" in capfd.readouterr().err
     camera.stereo.convergence_mode = "PARALLEL"

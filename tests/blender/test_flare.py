@@ -11,45 +11,30 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-
-bpy = pytest.importorskip("bpy", reason="Blender as a module (bpy) is not installed: make test-blender runs these")
-
-import numpy as np  # noqa: E402
-from test_extension import packed  # noqa: E402
-
-from neurolens.blender.pack import write_pack  # noqa: E402
+from in_blender import bpy, first_scene, installed_pack, rendered, surface, surroundings
+from test_extension import packed
 
 sys.path.append(str(Path(__file__).parents[2]))  # experiments
-MODULE = "bl_ext.user_default.neurolens"
 
 
 @pytest.fixture(scope="module", autouse=True)
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    out = tmp_path_factory.mktemp("pack") / "neurolens.zip"
-    write_pack(out, [packed()])
-    bpy.ops.extensions.package_install_files(filepath=str(out), repo="user_default", enable_on_install=True)
-    yield out
-    bpy.ops.preferences.addon_disable(module=MODULE)
+    with installed_pack(tmp_path_factory.mktemp("pack"), [packed()]) as out:
+        yield out
 
 
 @pytest.fixture
 def scene() -> Any:
     """A camera at the origin that looks along -z, of 36 x 36 mm and f/2; 8 x 8 pixels, black surroundings."""
-    bpy.ops.wm.read_homefile(app_template="", use_factory_startup=True)
-    scene = bpy.context.scene
-    for found in list(bpy.data.objects):
-        bpy.data.objects.remove(found)
-    camera = added(scene, bpy.data.cameras.new("camera"))
-    scene.camera = camera
+    scene = first_scene(camera=False)
+    scene.camera = camera = added(scene, bpy.data.cameras.new("camera"))
     camera.data.dof.use_dof, camera.data.dof.aperture_fstop = True, 2.0
-    scene.cycles.use_denoising = False
     scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 64, 0
     scene.render.resolution_x = scene.render.resolution_y = 8
-    scene.render.resolution_percentage = 100
     scene.frame_start = scene.frame_end = 1
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0, 0, 0, 1)
-    scene.view_settings.view_transform = "Raw"
+    surroundings(scene, 0, 0, 0)
     return scene
 
 
@@ -82,14 +67,23 @@ def rows(tmp_path: Path, rays: int = 64) -> list[dict[str, Any]]:
 
 def pixel(scene: Any, folder: Path, frame: int = 1) -> np.ndarray[Any, Any]:
     """Colour of a render, mean over its pixels."""
-    scene.frame_set(frame)
-    scene.render.filepath = str(folder / "render.exr")
-    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    colour = np.array(image.pixels[:]).reshape(-1, 4)[:, :3].mean(0)
-    bpy.data.images.remove(image)
-    return colour
+    return np.asarray(rendered(scene, folder, frame)[..., :3].mean((0, 1)))
+
+
+def card(scene: Any, way: Any, folder: Path) -> Any:
+    """Colour of a small white card at the origin across the way of a light."""
+    card = wall(scene, (-0.001, 0.001), 0.0, 0.001)
+    material, diffuse = surface("BsdfDiffuse")
+    diffuse.inputs["Color"].default_value = (1, 1, 1, 1)
+    card.data.materials.append(material)
+    towards = way / np.linalg.norm(way)
+    turned = type(scene.camera.location)(towards).to_track_quat("Z", "Y")
+    for thing in (card, scene.camera):
+        thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turned
+    scene.camera.location = tuple(0.05 * towards)
+    scene.camera.data.sensor_width, scene.camera.data.lens, scene.camera.data.dof.use_dof = 0.5, 50.0, False
+    scene.camera.data.clip_start = 0.001
+    return pixel(scene, folder)
 
 
 ACROSS = {"POINT": {}, "SPOT": {"spot_size": math.radians(50), "spot_blend": 0.6},
@@ -121,23 +115,57 @@ def test_irradiance_is_what_a_white_card_shows(kind: str, settings: dict[str, An
         assert row["distance_m"] == pytest.approx(np.linalg.norm(way), rel=1e-5)
     assert row["azimuth_deg"] == pytest.approx(math.degrees(math.atan2(way[0], -way[2])), abs=1e-4)
     assert row["elevation_deg"] == pytest.approx(math.degrees(math.asin(way[1] / np.linalg.norm(way))), abs=1e-4)
-    card = wall(scene, (-0.001, 0.001), 0.0, 0.001)
-    material = bpy.data.materials.new("white")
-    nodes = material.node_tree.nodes
-    nodes.clear()
-    diffuse, out = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeOutputMaterial")
-    diffuse.inputs["Color"].default_value = (1, 1, 1, 1)
-    material.node_tree.links.new(diffuse.outputs[0], out.inputs[0])
-    card.data.materials.append(material)
-    towards = way / np.linalg.norm(way)
-    turned = type(scene.camera.location)(towards).to_track_quat("Z", "Y")
-    for thing in (card, scene.camera):
-        thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turned
-    scene.camera.location = tuple(0.05 * towards)
-    scene.camera.data.sensor_width, scene.camera.data.lens, scene.camera.data.dof.use_dof = 0.5, 50.0, False
-    scene.camera.data.clip_start = 0.001
-    shown = pixel(scene, tmp_path)
+    shown = card(scene, way, tmp_path)
     assert shown == pytest.approx(np.array([row["r"], row["g"], row["b"]]) / math.pi, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["Emission", "BsdfPrincipled"])
+@pytest.mark.parametrize("shape", ["sphere", "circle", "cube"])
+def test_a_mesh_that_shines_is_a_light(shape: str, kind: str, scene: Any, tmp_path: Path) -> None:
+    """Irradiance is what a white card shows of it, which stands where the camera is; a wall hides it."""
+    material, node = surface(kind)
+    scene.cycles.samples = 1024
+    names = ("Color", "Strength") if kind == "Emission" else ("Emission Color", "Emission Strength")
+    node.inputs[names[0]].default_value, node.inputs[names[1]].default_value = (1.0, 0.5, 0.25, 1), 40.0
+    place, size = (0.9, 0.5, -5.0), 0.2
+    if shape == "sphere":
+        bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32, radius=size, location=place)
+    elif shape == "circle":
+        bpy.ops.mesh.primitive_circle_add(vertices=64, radius=size, fill_type="NGON", location=place)
+    else:
+        bpy.ops.mesh.primitive_cube_add(size=size, location=place, rotation=(0.4, 0.7, 0.2))
+    bpy.context.object.data.materials.append(material)
+    (row,) = rows(tmp_path)
+    way = np.array(place)
+    assert row["visible"] == 1 and row["light"] == bpy.context.object.name
+    assert row["distance_m"] == pytest.approx(np.linalg.norm(way), abs=size)
+    assert row["azimuth_deg"] == pytest.approx(math.degrees(math.atan2(way[0], -way[2])), abs=0.2)
+    if shape == "sphere":
+        assert row["diameter_deg"] == pytest.approx(math.degrees(2 * math.asin(size / np.linalg.norm(way))), rel=0.01)
+    screen = wall(scene, (-9, 9), -2.0)
+    assert rows(tmp_path)[0]["visible"] == 0
+    bpy.data.objects.remove(screen)
+    assert card(scene, way, tmp_path) == pytest.approx(np.array([row["r"], row["g"], row["b"]]) / math.pi, rel=0.01)
+
+
+def test_a_screen_does_not_shine_through_its_back(scene: Any, tmp_path: Path) -> None:
+    bpy.ops.mesh.primitive_cube_add(size=0.5, location=(0, 0, -4))
+    box = bpy.context.object
+    box.data.materials.append(surface("BsdfDiffuse")[0])
+    box.data.materials.append(surface("Emission")[0])
+    front = max(box.data.polygons, key=lambda face: face.center.z)
+    front.material_index = 1
+    (row,) = rows(tmp_path)
+    assert row["visible"] == 1 and row["r"] == pytest.approx(0.25 / 3.75**2, rel=0.01)
+    box.rotation_euler = (0, math.pi, 0)
+    assert rows(tmp_path)[0]["visible"] == 0
+
+
+def test_a_dome_is_no_light(scene: Any, tmp_path: Path) -> None:
+    light(scene, "POINT", (0, 0, -4.0))
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=50)
+    bpy.context.object.data.materials.append(surface("Emission")[0])
+    assert [row["light"] for row in rows(tmp_path)] == ["point"]
 
 
 def test_a_light_dims_as_an_edge_passes_before_it(scene: Any, tmp_path: Path) -> None:
@@ -219,17 +247,24 @@ def test_keys_of_a_lens_go_with_its_lights(scene: Any, tmp_path: Path) -> None:
     ]
 
 
-def test_materials_that_shine_are_named_as_left_out(
+def test_materials_that_shine_by_a_texture_are_named_as_left_out(
     scene: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    light(scene, "POINT", (0, 0, -4.0))
-    for name, strength in (("neon tube", 5.0), ("paint", 0.0)):
-        material = bpy.data.materials.new(name)
-        material.node_tree.nodes["Principled BSDF"].inputs["Emission Strength"].default_value = strength
-        wall(scene, (1, 2), -5.0).data.materials.append(material)
-    rows(tmp_path)
+    for name, strength in (("neon tube", 5.0), ("paint", 0.0), ("black", 5.0), ("screen", 5.0)):
+        material, node = surface("BsdfPrincipled", name)
+        node.inputs["Emission Strength"].default_value = strength
+        node.inputs["Emission Color"].default_value = [float(name != "black")] * 4
+        if name == "black":  # as old files have them, here with a second node
+            material.node_tree.nodes.new("ShaderNodeEmission").inputs["Strength"].default_value = 0.0
+        if name == "screen":
+            picture = material.node_tree.nodes.new("ShaderNodeTexImage")
+            material.node_tree.links.new(picture.outputs[0], node.inputs["Emission Color"])
+        thing = wall(scene, (1, 2), -5.0, 0.1)
+        thing.name = name
+        thing.data.materials.append(material)
+    assert [row["light"] for row in rows(tmp_path)] == ["neon tube"]
     said = capfd.readouterr().out
-    assert "Left out" in said and "neon tube" in said and "paint" not in said
+    assert "Left out" in said and "screen" in said and not any(name in said for name in ("neon", "paint", "black"))
 
 
 @pytest.mark.parametrize("case", ["no light", "no folder", "no camera"])
@@ -277,13 +312,14 @@ def test_layers_are_added_in_the_compositor_by_their_gains(scene: Any, tmp_path:
         }
         channels = {f"{name}.{c}": frame * v for name, rgb in layers.items() for c, v in zip("RGB", rgb, strict=True)}
         write_exr(tmp_path / f"flare.{frame:04d}.exr", channels | {"R": 9.0, "G": 9.0, "B": 9.0})
-    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 2.0, 3.0, 1)
+    surroundings(scene, 1, 2, 3)
     assert tool.add_layers(scene, tmp_path / "flare.0003.exr") == ["g07-03", "glare", "rest"]
     for frame in (3, 4):
         assert pixel(scene, tmp_path, frame) == pytest.approx(
             np.array([1 + 0.6 * frame, 2 + 0.7 * frame, 3 + 0.9 * frame]), rel=1e-3
         )
-    group = next(n for n in scene.compositing_node_group.nodes if n.bl_idname == "CompositorNodeGroup")
+    tree = scene.compositing_node_group if hasattr(scene, "compositing_node_group") else scene.node_tree
+    group = next(n for n in tree.nodes if n.bl_idname == "CompositorNodeGroup")
     group.inputs["glare"].default_value, group.inputs["rest"].default_value = 0.0, 2.0
     assert pixel(scene, tmp_path, 3) == pytest.approx(np.array([1.3, 3.2, 3 + 0.3 + 1.8]), rel=1e-3)
     write_exr(tmp_path / "still.exr", {"R": 1.0, "G": 1.0, "B": 1.0})

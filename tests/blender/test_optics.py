@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,14 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_blender import FOLDER, bpy, first_scene, pixels_of, surface, surroundings, with_shots
+from measure import measures
 
-bpy = pytest.importorskip("bpy", reason="Blender as a module (bpy) is not installed: make test-blender runs these")
-
-from measure import measures  # noqa: E402
-
-FOLDER = os.environ.get("NEUROLENS_BLENDER_SHOTS")
-pytestmark = pytest.mark.skipif(FOLDER is None, reason="no numbers of tests/blender/expect.py: make test-blender")
-SHOTS = [] if FOLDER is None else json.loads((Path(FOLDER) / "shots.json").read_text(encoding="utf-8"))
+pytestmark = with_shots
+SHOTS = json.loads((FOLDER / "shots.json").read_text(encoding="utf-8")) if FOLDER.name else []
 _SAMPLES = 3e6  # of a crop
 
 
@@ -33,11 +29,7 @@ class Studio:
     """A dark scene with one sphere of light, and a camera at the origin that looks along -z."""
 
     def __init__(self, folder: Path) -> None:
-        bpy.ops.wm.read_homefile(app_template="", use_factory_startup=True)
-        self.folder, self.scene = folder, bpy.context.scene
-        for found in list(bpy.data.objects):
-            if found.type != "CAMERA":
-                bpy.data.objects.remove(found)
+        self.folder, self.scene = folder, first_scene()
         self.camera = self.scene.camera
         self.camera.matrix_world.identity()
         self.camera.data.clip_start = 1e-4
@@ -50,22 +42,16 @@ class Studio:
         ball.free()
         self.light = bpy.data.objects.new("light", mesh)
         self.scene.collection.objects.link(self.light)
-        glow = bpy.data.materials.new("glow")
-        mesh.materials.append(glow)
-        if glow.node_tree is None:  # to Blender 4.5
-            glow.use_nodes = True
-        nodes = glow.node_tree.nodes
-        nodes.clear()
-        emission, out = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
-        glow.node_tree.links.new(emission.outputs[0], out.inputs["Surface"])
-        self.world = self.scene.world.node_tree.nodes["Background"].inputs["Color"]
-        self.world.default_value = (0, 0, 0, 1)
+        mesh.materials.append(surface("Emission")[0])
+        self.white(False)
         self.scene.render.engine = "CYCLES"
         cycles = self.scene.cycles
-        cycles.max_bounces, cycles.pixel_filter_type = 0, "BOX"
-        cycles.use_denoising = cycles.use_adaptive_sampling = False
-        settings = self.scene.render.image_settings
-        settings.file_format, settings.color_depth = "OPEN_EXR", "32"
+        cycles.max_bounces, cycles.pixel_filter_type, cycles.use_adaptive_sampling = 0, "BOX", False
+
+    def white(self, is_on: bool) -> None:
+        """White surroundings in place of the light."""
+        surroundings(self.scene, *[float(is_on)] * 3)
+        self.light.hide_render = is_on
 
     def set(self, shot: dict[str, Any]) -> None:
         """Lens, sensor, size and settings of a shot."""
@@ -73,7 +59,7 @@ class Studio:
         text = bpy.data.texts.get(shot["lens"])
         if text is None:
             text = bpy.data.texts.new(shot["lens"])
-            text.from_string((Path(str(FOLDER)) / f"{shot['lens']}.osl").read_text(encoding="utf-8"))
+            text.from_string((FOLDER / f"{shot['lens']}.osl").read_text(encoding="utf-8"))
         if data.custom_shader != text:
             from cycles.osl import update_custom_camera_shader
 
@@ -113,8 +99,7 @@ class Studio:
                 bpy.ops.render.render(write_still=True)
         else:
             bpy.ops.render.render(write_still=True)
-        image, found = pixels_of(Path(render.filepath))
-        bpy.data.images.remove(image)
+        found = pixels_of(Path(render.filepath))
         assert found.shape[:2] == shape
         return found
 
@@ -185,11 +170,11 @@ def test_focus_is_pulled_by_keyframes(studio: Studio) -> None:
 @pytest.mark.parametrize("lens", ["rectilinear", "anamorphic", "fisheye"])
 def test_white_card_is_that_of_the_exact_lens(studio: Studio, lens: str) -> None:
     [shot] = named("card", lens)
-    studio.world.default_value, studio.light.hide_render = (1, 1, 1, 1), True
+    studio.white(True)
     try:
         picture = studio.picture(shot, 2048).mean(2)
     finally:
-        studio.world.default_value, studio.light.hide_render = (0, 0, 0, 1), False
+        studio.white(False)
     wanted = np.array(shot["found"])
     rows, columns = wanted.shape
     seen = picture.reshape(rows, picture.shape[0] // rows, columns, -1).mean((1, 3))
@@ -241,7 +226,7 @@ def test_alpha_and_cryptomatte_are_what_the_panel_and_the_documentation_say(stud
     nearly 1."""
     [shot] = named("card", "rectilinear")
     scene, layer = studio.scene, studio.scene.view_layers[0]
-    studio.world.default_value, studio.light.hide_render = (1, 1, 1, 1), True
+    studio.white(True)
     wall = bpy.data.objects.new("wall", bpy.data.meshes.new("wall"))
     wall.data.from_pydata([(-9, -9, -5), (9, -9, -5), (9, 9, -5), (-9, 9, -5)], [], [(0, 1, 2, 3)])
     scene.collection.objects.link(wall)
@@ -259,7 +244,7 @@ def test_alpha_and_cryptomatte_are_what_the_panel_and_the_documentation_say(stud
             coverage = studio.pixels(given, 128, matte="wall")[..., 0]
             assert coverage == pytest.approx(light, abs=0.03) and least < coverage.min() < most
     finally:
-        studio.world.default_value, studio.light.hide_render = (0, 0, 0, 1), False
+        studio.white(False)
         layer.use_pass_cryptomatte_object = scene.render.film_transparent = False
         bpy.data.objects.remove(wall)
         studio.camera.data.cycles_custom["vignetting"] = True
@@ -268,7 +253,9 @@ def test_alpha_and_cryptomatte_are_what_the_panel_and_the_documentation_say(stud
 def test_map_uv_reads_st_maps_as_they_are_written(studio: Studio) -> None:
     """A picture of its own pixels' places, led through both maps, holds what the maps say."""
     for kind, other in (("undistort", "redistort"), ("redistort", "undistort")):
-        (map_, planes), (_, read) = (pixels_of(Path(str(FOLDER)) / f"maps.{k}.exr") for k in (kind, other))
+        planes, read = (pixels_of(FOLDER / f"maps.{k}.exr") for k in (kind, other))
+        map_ = bpy.data.images.load(str(FOLDER / f"maps.{kind}.exr"))
+        map_.colorspace_settings.name = "Non-Color"
         height, width = read.shape[:2]
         rows, columns = np.mgrid[:height, :width].astype(np.float32)
         places = bpy.data.images.new("places", width, height, float_buffer=True)
@@ -282,15 +269,6 @@ def test_map_uv_reads_st_maps_as_they_are_written(studio: Studio) -> None:
         assert inside.mean() > 0.85
         assert np.abs(found[..., :2] - np.stack([x, y], 2))[inside].max() < reach
         assert not found[planes[..., 2] == 0].any()  # what the plate does not hold is clear
-
-
-def pixels_of(file: Path) -> tuple[Any, Any]:
-    """A picture, and its pixels [H, W, 4], the lowest row first."""
-    image = bpy.data.images.load(str(file))
-    image.colorspace_settings.name = "Non-Color"
-    found = np.empty(image.size[0] * image.size[1] * 4, np.float32)
-    image.pixels.foreach_get(found)
-    return image, found.reshape(image.size[1], image.size[0], 4).astype(float)
 
 
 @contextmanager
@@ -330,6 +308,5 @@ def composited(studio: Studio, picture: Any, map_: Any, width: int, height: int)
         render.resolution_x, render.resolution_y, render.use_border = width, height, False
         scene.cycles.samples, render.filepath = 1, str(studio.folder / "mapped.exr")
         render.image_settings.color_mode = "RGBA"
-        scene.view_settings.view_transform = "Raw"
         bpy.ops.render.render(write_still=True)
-    return pixels_of(Path(render.filepath))[1], 0.001 if bilinear else 0.501
+    return pixels_of(Path(render.filepath)), 0.001 if bilinear else 0.501

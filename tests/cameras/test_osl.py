@@ -30,7 +30,7 @@ from neurolens.shaders import lowtests, osl, pupil_fit, stop_image
 from neurolens.shaders.blender_shader import _smallest, exact_lens
 from neurolens.shaders.pupil import Blades, PupilCircles, PupilDisc
 from neurolens.shaders.pupil_fit import fit_pupil
-from neurolens.shaders.shader_lens import ShaderLens, passing_share
+from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
 from neurolens.surrogates import states
 from neurolens.surrogates.axes import Axis, product, weights
 from neurolens.trace.tracegraph import exact_graph
@@ -432,32 +432,75 @@ def lens_ray(film: np.ndarray, pupil: np.ndarray) -> np.ndarray:
     return evaluate(written().lens.graph, {"rays": rays, **call})["scene_ray"][3:]
 
 
-def light_of(random: np.ndarray, in_colour: float = 1.0) -> dict[str, np.ndarray]:
+def light_of(numbers: np.ndarray, in_colour: float = 1.0) -> dict[str, np.ndarray]:
+    """Wavelength, colour and left numbers of random numbers [2, N]."""
     g = Graph()
-    found = osl._light(written(), g.input("first"), g.input("in_colour", per_call=True))
+    found = light((400.0, 700.0), g.input("numbers", 2), g.input("in_colour", per_call=True))
     g.outputs = dict(zip(("nanometres", "colour", "left"), found, strict=True))
-    return evaluate(g, {"first": random[None], "in_colour": np.array([[in_colour]])})
+    return evaluate(g, {"numbers": numbers, "in_colour": np.array([[in_colour]])})
+
+
+def owen(whole: np.ndarray, bits: int, rng: np.random.Generator) -> np.ndarray:
+    """Whole numbers whose bits are each flipped by chance that the higher ones choose (Owen 1995)."""
+    out = np.zeros_like(whole)
+    for k in range(bits - 1, -1, -1):
+        above = whole >> (k + 1)
+        out |= (((whole >> k) & 1) ^ rng.integers(0, 2, int(above.max()) + 1)[above]) << k
+    return out
+
+
+def pixel(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Random numbers [2, N] of a pixel's samples as Cycles has them, and which of these are in one of its halves.
+
+    Sobol's second and third dimension (Joe and Kuo 2008), scrambled, the samples shuffled (Burley 2020); halves as of
+    section 10.2.1 of Christensen et al. 2018.
+    """
+    rng, bits = np.random.default_rng(seed), 10
+    index, numbers = owen(np.arange(count), count.bit_length() - 1, rng), []
+    for order, polynomial, first in ((1, 0, [1]), (2, 1, [1, 3])):
+        m = list(first)
+        while len(m) < bits:
+            new = m[-order] ^ (m[-order] << order)
+            for k in range(1, order):
+                new ^= (polynomial >> (order - 1 - k) & 1) * (m[-k] << k)
+            m.append(new)
+        point = np.zeros(count, int)
+        for k, value in enumerate(m):
+            point ^= ((index >> k) & 1) * (value << (bits - 1 - k))
+        numbers.append((owen(point, bits, rng) + rng.random(count)) / (1 << bits))
+    odd = [bin(k & 0xAAAA).count("1") % 2 == 1 for k in range(count)]
+    return np.array(numbers), np.array(odd)
 
 
 def test_colour_weights_are_white_and_never_negative() -> None:
-    colour = light_of((np.arange(1 << 20) + 0.5) / (1 << 20))["colour"]
+    side = (np.arange(1024) + 0.5) / 1024
+    fine = np.random.default_rng(1).random((2, 1 << 20)) / 1024
+    colour = light_of(np.stack(np.meshgrid(side, side)).reshape(2, -1) + fine - 0.5 / 1024)["colour"]
     assert colour.min() >= 0
     np.testing.assert_allclose(colour.mean(1), 1, atol=1e-3)
 
 
-@pytest.mark.parametrize("scrambled", range(3))
-def test_sixteen_even_numbers_hold_every_part_of_the_spectrum_and_leave_even_numbers(scrambled: int) -> None:
-    random = np.random.default_rng(scrambled)
-    even = (np.arange(1 << 16) + random.random(1 << 16)) / (1 << 16)
-    few = (random.permutation(16) + random.random(16)) / 16
-    nanometres = light_of(few)["nanometres"][0]
-    cells = np.floor((nanometres - 400) / 300 * 16)
-    assert sorted(cells) == list(range(16))
-    found = light_of(even)
-    np.testing.assert_allclose(np.histogram(found["left"], 64, (0, 1))[0], 1024, atol=1)
-    # The pupil's number tells nothing about the wavelength.
-    assert abs(np.corrcoef(found["left"][0], found["nanometres"][0])[0, 1]) < 0.01
-    assert np.array_equal(light_of(even, 0.0)["left"][0], even)  # without dispersion all bits are the pupil's
+@pytest.mark.parametrize("seed", range(4))
+def test_few_samples_of_a_pixel_and_either_half_hold_the_spectrum_evenly(seed: int) -> None:
+    numbers, half = pixel(64, seed)
+    eighth = np.floor((light_of(numbers)["nanometres"][0] - 400) / 300 * 8)
+    for start in range(0, 64, 16):
+        for few in (half, ~half):
+            assert sorted(eighth[start : start + 16][few[start : start + 16]]) == list(range(8))
+    # Eighths by the high bits of one number are not even in a half: which is why the parts are not those.
+    uneven = [np.ptp(np.histogram(n[0][h], 8, (0, 1))[0]) for n, h in (pixel(64, k) for k in range(20))]
+    assert np.mean(uneven) > 1
+
+
+def test_the_numbers_for_the_pupil_are_even_and_tell_nothing_about_the_wavelength() -> None:
+    side = (np.arange(256) + 0.5) / 256
+    numbers = np.stack(np.meshgrid(side, side)).reshape(2, -1) + 1e-4
+    found = light_of(numbers)
+    part = np.floor((found["nanometres"][0] - 400) / 300 * 16)
+    cells = np.stack([part, *np.floor(found["left"] * 8)])
+    counts = np.histogramdd(cells.T, (16, 8, 8), ((0, 16), (0, 8), (0, 8)))[0]
+    np.testing.assert_array_equal(counts, numbers.shape[1] / counts.size)
+    assert np.array_equal(light_of(numbers, 0.0)["left"], numbers)  # without dispersion all bits are the pupil's
 
 
 def test_nothing_beyond_the_domain_unless_a_warning_is_asked_for() -> None:

@@ -21,14 +21,18 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cli import export_lens, main
 from neurolens.cli.export_lens import lens_program, pupil_planes_mm
+from neurolens.graph.compiler import has_compiler
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot
+from neurolens.readers.any_format import read_any
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting import focusing
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
+from neurolens.setting.pupils import camera_rays
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
-from neurolens.surrogates.domain import sample_domain
+from neurolens.study.speed import CompiledSource
+from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
@@ -121,6 +125,8 @@ def test_the_exact_lens_as_a_function(tmp_path: Path, monkeypatch: pytest.Monkey
     film, placed = export_lens._film, list[Any]()  # the best focus of all distances and stops is sought once
     monkeypatch.setattr(export_lens, "_film", lambda *given: (placed or placed.append(film(*given)) or placed)[0])
     assert main(["export", str(LENS), "--to", "c", "-o", str(header)]) == 0
+    assert main(["export", str(LENS), "--to", "c-double", "-o", str(tmp_path / "d.h")]) == 0
+    assert not re.search(r"\bfloat\b|\df\b|sqrtf|fmaf", (tmp_path / "d.h").read_text().split("*/", 1)[1])
     assert main(["export", str(LENS), "--to", "glsl", "-o", str(shader)]) == 0
     assert "const float LAIKIN_DOUBLE_GAUSS_50_PUPIL_Z_MM = (-17.27" in shader.read_text()
     text = header.read_text()
@@ -146,6 +152,35 @@ def test_the_exact_lens_as_a_function(tmp_path: Path, monkeypatch: pytest.Monkey
     assert np.abs(found[:2] - wanted.scene_ray[:2])[:, passed].max() < 5e-4
     assert np.abs(found[2:4] - wanted.scene_ray[3:5])[:, passed].max() < 5e-6
     np.testing.assert_allclose(found[4][passed], wanted.transmittance[passed], rtol=1e-4)
+
+
+@pytest.mark.skipif(not has_compiler(), reason="no C compiler")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "horimoto_fisheye_16",
+        "sony_sonnar_55",
+        "cooke_anamorphic_42",
+        pytest.param("panavision_anamorphic_zoom_21", marks=pytest.mark.whole),
+    ],
+)
+def test_the_exact_lens_in_double_precision_is_the_tracer(name: str) -> None:
+    """A fisheye, aspheres, cylinders; cylinders and aspheres in 56 refractions."""
+    lens = set_lens(read_any(ROOT / "lenses" / f"{name}.toml"))
+    (plane,), domain = pupil_planes_mm([lens], ()), domain_of(lens)
+    rays = sample_domain(domain, 5000, seed=3)
+    columns = [*rays.columns()[:2], torch.full_like(rays.film_z, domain.film_z_mm[0]), *rays.columns()[3:5]]
+    places = dict(zip(("film_x_mm", "film_y_mm", "film_z_mm", "pupil_x_mm", "pupil_y_mm"), columns, strict=True))
+    given = {"wavelength_nm": rays.wavelength_nm, "film_z_mm": columns[2][0], "stop_radius_mm": lens.stop_radius_mm}
+    source = CompiledSource(lens_program([lens], (), [plane], double=True), double=True)
+    found = source.rays({key: np.asarray(value) for key, value in (places | given).items()})
+    wanted = trace(lens, camera_rays(*columns, plane), rays.wavelength_nm, transmittance=True)
+    passed = wanted.status.numpy() == st.PASSED
+    assert passed.sum() > 1000 and np.array_equal(found["status"], wanted.status.numpy())
+    assert wanted.transmittance is not None
+    for key, value in zip(("x_mm", "y_mm", "z_mm", "dx", "dy", "dz"), wanted.rays, strict=True):
+        assert np.abs(found[key] - value.numpy())[passed].max() < 1e-12
+    assert np.abs(found["transmittance"] - wanted.transmittance.numpy())[passed].max() < 1e-8
 
 
 @pytest.mark.whole  # as of a model

@@ -240,6 +240,23 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
         assert spread == pytest.approx(math.sqrt((weight * (theirs - expected) ** 2).sum()), rel=0.02, abs=0.1)
 
 
+def test_the_middle_of_a_disc_on_the_axis_is_smooth() -> None:
+    """By the parabola through its surroundings; one pixel beside the axis as much as on it."""
+    size = (3840, 2560)
+    camera = make_camera("fused:leica_summilux_m_35mm_f1_4_asph_v1", Shot((36.0, 24.0), focus_m=0.7, f_number=1.4))
+    for off in (0.0, 1.0):
+        place = size[0] / 2 + off, size[1] / 2
+        kernel = kernel_at(camera, pinhole_of(camera, size), size, place, 0.0, place)
+        assert kernel is not None
+        column, row = (int(m) - c for m, c in zip(place, kernel.corner_px, strict=True))
+        part = kernel.light[row - 10 : row + 10, column - 10 : column + 10, 1].astype(np.float64)
+        y, x = np.mgrid[-10:10, -10:10] + 0.5
+        beside = np.hypot(x, y) > 5
+        terms = np.stack([np.ones_like(x), x, y, x * x, y * y], 2)
+        found = np.linalg.lstsq(terms[beside], part[beside], rcond=None)[0]
+        assert np.abs(part / (terms @ found) - 1).max() < 0.02
+
+
 def test_highlights_behind_something_near_are_hidden() -> None:
     camera = thin()
     rgb, w = flat(0.0, 0.0)
@@ -386,6 +403,8 @@ def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
     [
         (None, [], "a channel Z with the depth"),
         (np.full(SIZE[::-1], -3.0), [], "--depth-scale -1"),
+        (np.full(SIZE[::-1], np.nan), [], "not a number in any pixel"),
+        (np.geomspace(1e-4, 3, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]), [], "not their inverse"),
         (np.linspace(0, 1, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]), [], "depth in metres"),
         (np.full(SIZE[::-1], 3.0), ["--depth", "W"], "one of: "),
         (np.full(SIZE[::-1], 3.0), ["--film", "36x36"], "a picture of the film's shape"),

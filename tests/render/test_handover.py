@@ -200,6 +200,26 @@ def test_opentrackio_samples_are_valid_and_their_formulas_undistort(case: Case) 
     assert light["R"].min() < 0.9 and (light["A"] == 1).all()
 
 
+def test_terms_of_a_wide_lens_s_distortion_do_not_cancel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ratio of two polynomials, which a reader with float32 evaluates as well, and of which none is near 0."""
+    monkeypatch.setattr(fields, "_ROUND", (97, 1))
+    camera = make_camera("fused:nikon_af_nikkor_20mm_f2_8d", Shot(film_mm=FILM, focus_m=FOCUS_M, f_number=4.0))
+    field = field_of(camera, FOCUS_M)
+    plates = plates_of([field], (3840, 2160), FILM)
+    pinhole = Pinhole.of("", field, camera.settings, FOCUS_M)
+    text, left_px, _ = opentrackio.sample(
+        field, pinhole, Handed({"cameraModel": "x"}, "0", (24, 1), (pinhole,), plates, ())
+    )
+    r, found = np.linspace(0, 20.6, 100, dtype=np.float32), json.loads(text)["lens"]["distortion"]
+    shown = field.directions(r.astype(complex))
+    goal = pinhole.focal_mm * shown[0] / shown[2]
+    for told, (start, end) in zip(found, ((r, goal), (goal.astype(np.float32), r)), strict=True):
+        k = np.array(told["radial"], np.float32)
+        above, below = (1 + sum(k[n + 2 * i] * start ** (2 * i + 2) for i in range(3)) for n in (0, 1))
+        assert k[1] != 0 and min(above.min(), below.min()) > 0.3
+        assert np.abs(start * above / below - end).max() / plates.pixel_mm[0] < left_px + 0.01 < 0.11
+
+
 def test_lensfun_corrects_distortion_colour_and_light(case: Case) -> None:
     lensfunpy = pytest.importorskip("lensfunpy", reason="lensfunpy (extra dev) is not installed")
     database = lensfunpy.Database(paths=[str(case.folder / "shot.lensfun.xml")], load_common=False, load_bundled=False)

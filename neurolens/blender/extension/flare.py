@@ -1,4 +1,4 @@
-"""The scene's lights in a list for `neurolens flare`, frame by frame.
+"""The scene's lamps, and its meshes that shine, in a list for `neurolens flare`, frame by frame.
 
 Irradiance is on the scale of the picture: in Cycles, too, a white card across the way of a light has the radiance
 irradiance / pi. How much of a light shows comes from rays, so that it dims smoothly as an edge passes before it.
@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from .library import LensError
 from .panel import _Operator
 
 _MOST_PASSED = 64  # surfaces that no camera sees, on the way of a ray
+_WIDEST = math.pi / 4  # half the angle beyond which a mesh that shines counts as the surroundings
+_SHINE = {"EMISSION": ("Color", "Strength"), "BSDF_PRINCIPLED": ("Emission Color", "Emission Strength")}
 _KINDS: dict[str, lights.Kind] = {"SUN": "distant", "AREA": "rectangle", "POINT": "sphere", "SPOT": "sphere"}
 
 
@@ -44,17 +47,46 @@ def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
     return seen, power * np.array(data.color) * np.array(data.temperature_color if data.use_temperature else 1.0)
 
 
-def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float) -> bool:
-    """Whether nothing that cameras see lies between two points, beyond `near` from the first."""
+def _radiance(material: Any) -> Any:
+    """How a material shines [3]; None where a texture, or more than one node, decides it."""
+    nodes = material.node_tree.nodes if material and material.node_tree else ()
+    pairs = [[node.inputs[name] for name in _SHINE[node.type]] for node in nodes if node.type in _SHINE]
+    shining = [pair for pair in pairs if all(s.is_linked or np.atleast_1d(s.default_value)[:3].any() for s in pair)]
+    if not shining:
+        return np.zeros(3)
+    colour, strength = shining[0]
+    to = [link.to_node.type for output in colour.node.outputs for link in output.links]
+    if len(shining) > 1 or colour.is_linked or strength.is_linked or to != ["OUTPUT_MATERIAL"]:
+        return None
+    return strength.default_value * np.array(colour.default_value[:3])
+
+
+def _shining_faces(thing: Any, frame: Any, radiance_of: Callable[[Any], Any]) -> tuple[Any, Any, set[int]] | None:
+    """The triangles [N, 3, 3] of a mesh that shine, their radiances [N, 3], and the numbers of their faces."""
+    found, mesh = [radiance_of(slot.material) for slot in thing.material_slots], thing.data
+    radiance = np.array([np.zeros(3) if one is None else one for one in found])
+    if not radiance.any():
+        return None
+    mesh.calc_loop_triangles()
+    own = [radiance[min(part.material_index, len(found) - 1)] for part in mesh.loop_triangles]
+    lit = [(part, one) for part, one in zip(mesh.loop_triangles, own, strict=True) if one.any()]
+    place = np.array([[mesh.vertices[k].co for k in part.vertices] for part, _ in lit]).reshape(-1, 3, 3)
+    place = place @ frame[:3, :3].T + frame[:3, 3]
+    return place, np.array([one for _, one in lit]).reshape(-1, 3), {part.polygon_index for part, _ in lit}
+
+
+def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float, light: Any, own: set[int]) -> bool:
+    """Whether nothing that cameras see, but the light's own faces, lies between two points, beyond `near` from the
+    first."""
     left = float(np.linalg.norm(end - start))
     way, done = (end - start) / left, near
     for _ in range(_MOST_PASSED):
         if done >= left:
             break
         from_ = start + done * way
-        hit, point, _normal, _face, thing, _frame = scene.ray_cast(graph, from_.tolist(), way, distance=left - done)
+        hit, point, _normal, face, thing, _frame = scene.ray_cast(graph, from_.tolist(), way, distance=left - done)
         if not hit or (thing.visible_camera and not thing.hide_render):
-            return not hit
+            return not hit or (face in own and thing.original == light.original)
         done += float(np.linalg.norm(np.array(point) - from_)) * (1 + 1e-5) + 1e-6 * left
     return True
 
@@ -67,17 +99,22 @@ def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[s
     opened = setting.f_number or (found.data.dof.aperture_fstop if found.data.dof.use_dof else math.inf)
     across = found.data.lens / (2000 * opened * setting.lens_unit_m)
     pupil = across * (view[:3, :2] / np.linalg.norm(view[:3, :2], axis=0)).T
+    radiance_of = cache(_radiance)
     for instance in graph.object_instances:
-        light = instance.object
-        if light.type != "LIGHT" or light.hide_render:
+        light, place = instance.object, np.array(instance.matrix_world)
+        faces = _shining_faces(light, place, radiance_of) if light.type == "MESH" else None
+        if light.hide_render or not (faces or light.type == "LIGHT"):
+            continue
+        seen, rgb = lights.see_faces(*faces[:2], eye) if faces else _seen(light.data, place, eye)
+        own = faces[2] if faces else set[int]()
+        if faces and not (own and seen.half_rad < _WIDEST):
             continue
         number = "".join(f".{k}" for k in instance.persistent_id[:2]) if instance.is_instance else ""
-        seen, rgb = _seen(light.data, np.array(instance.matrix_world), eye)
         pairs = zip(*lights.ends(seen, eye, pupil, rays), strict=True)
         lit = rgb.any() and (seen.middle - eye) @ view[:3, 2] < 0
-        free = sum(_is_free(scene, graph, *pair, found.data.clip_start) for pair in pairs) / rays if lit else 0.0
+        shown = [_is_free(scene, graph, *pair, found.data.clip_start, light, own) for pair in pairs] if lit else [False]
         rgb *= scene.cycles.film_exposure
-        yield lights.row(light.name + number, frame, seen, view, setting.lens_unit_m, rgb, free)
+        yield lights.row(light.name + number, frame, seen, view, setting.lens_unit_m, rgb, sum(shown) / len(shown))
 
 
 def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, str]:
@@ -120,14 +157,10 @@ def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, 
     return len(known), words
 
 
-def shining_materials(scene: Any) -> list[str]:
-    """Names of the materials that emit light on objects of a scene: they are no lights of the list."""
-    shine = {"EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}
+def left_out(scene: Any) -> list[str]:
+    """Names of the materials that shine by a texture or a mixture of nodes: they are no lights of the list."""
     slots = (slot.material for item in scene.objects if not item.hide_render for slot in item.material_slots)
-    return sorted({
-        m.name for m in slots if m and m.node_tree
-        for node in m.node_tree.nodes if (name := shine.get(node.type)) and node.inputs[name].default_value > 0
-    })  # fmt: skip
+    return sorted({material.name for material in slots if _radiance(material) is None})
 
 
 class NEUROLENS_OT_write_lights(_Operator):
@@ -143,11 +176,9 @@ class NEUROLENS_OT_write_lights(_Operator):
         path = Path(bpy.path.abspath(self.filepath)).with_suffix(".json")
         count, words = write_lights(context, found, path, self.rays)
         self.report({"INFO"}, f"{count} lights in {path}: neurolens flare {words} -o flare.exr")
-        if names := shining_materials(context.scene):
-            text = (
-                f"Left out, as the world is: the emission of {', '.join(names[:9])}; flare --image finds it in a plate"
-            )
-            self.report({"WARNING"}, text)
+        if names := left_out(context.scene):
+            why = f"emission of {', '.join(names[:9])}, which a texture or several nodes decide"
+            self.report({"WARNING"}, f"Left out, as the world is: {why}; flare --image finds it in a plate")
 
 
 CLASSES = (NEUROLENS_OT_write_lights,)

@@ -55,6 +55,26 @@ def see(kind: Kind, frame: Any, size: tuple[float, ...], normalized: bool, eye: 
     return Seen(middle, sides, half, (1.0 if normalized else area) * max(cos, 0.0) / far**2, cos)
 
 
+def see_faces(corners: Any, radiance: Any, eye: Any) -> tuple[Seen, Any]:
+    """Triangles [N, 3, 3] of radiances [N, 3] as an ellipse of their middle and moments, and their irradiance [3].
+
+    They shine on both sides; those that turn one side are seen, the outer side where both look equally large.
+    """
+    middles, areas = corners.mean(1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    far = np.linalg.norm(middles - eye, axis=1).clip(1e-9)
+    facing = ((eye - middles) * areas).sum(1) / far**3  # solid angles, with a sign
+    outer, inner = facing.clip(0), -facing.clip(None, 0)
+    solid = outer if outer.sum() > 0.99 * inner.sum() else inner
+    share = (solid * radiance.sum(1)) / max(float((solid * radiance.sum(1)).sum()), 1e-30)
+    middle = share @ middles
+    off = np.concatenate([corners, 3 * middles[:, None] - 2 * middle], 1) - middle  # whose squares have the moments
+    way = (middle - eye) / max(float(np.linalg.norm(middle - eye)), 1e-9)
+    off -= (off @ way)[..., None] * way
+    spread, axes = np.linalg.eigh(np.einsum("n,nki,nkj->ij", share, off, off) / 12)
+    sides = (2 * np.sqrt(spread.clip(0)) * axes).T[1:]
+    return Seen(middle, sides, math.atan(math.sqrt(solid.sum() / math.pi)), float(solid.sum()), 1.0), solid @ radiance
+
+
 def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
     """Starts and ends [count, 3] of rays from the pupil, half axes [2, 3] about `eye`, to the light.
 
