@@ -79,7 +79,7 @@ _RENDER = (
     *("render", "scene.toml", "--camera", "pinhole", "-o", "out.exr", "--width", "96", "--samples", "64"),
     *("--threads", "2", "--checkpoint-every", "0.02", "--quiet"),
 )
-_MERGE = ("render", "--merge", *(f"out.tile-{k}-of-3.exr" for k in (1, 2, 3)), "-o", "out.exr")
+_MERGE = ("merge", *(f"out.tile-{k}-of-3.exr" for k in (1, 2, 3)), "-o", "out.exr")
 _SURVEY = ("survey", "lenses", "--rays", "1000", "--terms", "16", "-o", "run", "--jobs", "1", "--quiet")
 _TRAIN = """title = "survive"
 lens = { file = "lens.toml" }

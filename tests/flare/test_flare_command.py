@@ -186,7 +186,7 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
     scene, out = tmp_path / "scene.toml", tmp_path / "a.exr"
     scene.write_text(SCENE)
     lens = "lenses/cooke_triplet_50.toml"
-    assert main(["render", str(scene), "--camera", lens, "-o", str(out), "--channels", "beauty", "--quiet"]) == 0
+    assert main(["render", str(scene), "--camera", lens, "-o", str(out), "--layers", "beauty", "--quiet"]) == 0
     found = read_layers(out)
     assert len(found) == 12 and not read_exr(out)[0].any()
     words = ["--lights", str(scene), "--coating", "single-layer", "--focus", "2", "--bins", "3"]
@@ -197,7 +197,7 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
     # One matrix, the white balance's, takes all pixels.
     matrix, *_ = np.linalg.lstsq(plain.reshape(-1, 3).astype(float), ghosts.reshape(-1, 3), rcond=None)
     np.testing.assert_allclose(plain @ matrix, ghosts, atol=1e-4 * ghosts.max())
-    assert main(["render", str(scene), "--camera", "pinhole", "-o", str(out), "--channels", "beauty"]) == 0
+    assert main(["render", str(scene), "--camera", "pinhole", "-o", str(out), "--layers", "beauty"]) == 0
     assert read_layers(out) == {} and "no flare of" in capsys.readouterr().err
     for table, said in (('coating = "velvet"', "velvet"), ("bins = 0", "flare.bins"), ('without = ["x"]', "without"),
                         ("speed = 2", "flare.speed")):  # fmt: skip
