@@ -70,6 +70,36 @@ def test_an_option_has_one_spelling_and_one_meaning_in_all_commands() -> None:
     assert {pair for pair in alike if commands[pair[0]] != commands[pair[1]]} == set()
 
 
+def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -> None:
+    parse = build_parser().parse_args
+    for command, old, new in (
+        ("train a.toml", "--out x", "-o x"),
+        ("train --lens cooke_triplet_50", "--target-px 0.5 --no-race", "--within 0.5px --rounds 0"),
+        ("analyse cooke_triplet_50", "--fields 0 9 --wavelengths 500 600", "--field-points 0 9 --wavelengths 500,600"),
+        ("survey lenses", "--again", "--restart"),
+        ("render a.toml -o a.exr --camera thin", "--layers beauty --wavelengths hero --configuration 70",
+         "--channels beauty --wavelength-mode hero --zoom 70"),
+        ("flare cooke_triplet_50 --light 5,3", "--out a.exr --preview --wavelengths 9", "-o a.exr --quick --bins 9"),
+        ("stmap thin --width 9 --film 36x24", "--out a --channels-nm 600,500,400", "-o a --wavelengths 600,500,400"),
+        ("export cooke_triplet_50 --to c -o a.h", "--camera", "--whole-camera"),
+        ("flare cooke_triplet_50 --light 5,3", "--wavelengths 9", "--bins 9"),
+        ("lens cooke_triplet_50 --derive-rims", "--vignetting 0.4", "--edge-pupil 0.4"),
+    ):  # fmt: skip
+        found, known = (vars(parse(f"{command} {words}".split())) for words in (old, new))
+        for args in (found, known):
+            if "field_points" in args:
+                args["wavelengths"] = [nm for some in args["wavelengths"] for nm in some]
+        assert found == known
+        shown = COMMANDS[f"neurolens {command.split()[0]}"].format_help()
+        for word in set(re.findall(r"--[a-z-]+", old)) - {"--wavelengths"}:
+            assert not re.search(rf"{word}(?![\w-])", shown), word
+    tiles = "a.tile-1-of-1.exr -o a.exr"
+    assert parse(f"merge {tiles}".split()) == parse(f"render --merge {tiles}".split())
+    assert parse("stmap thin --size 9x6 --film 36x24 -o a".split()).size == (9, 6)
+    words = "a.toml --lens cooke_triplet_50".split()
+    assert parse(["trade", *words]) == parse(["plan", *words, "--trade"])
+
+
 # Bad input
 
 
@@ -84,7 +114,7 @@ def test_an_option_has_one_spelling_and_one_meaning_in_all_commands() -> None:
         (["lens", GAUSS, "--focus", "near"], ["--focus", "near", "metres"]),
         (["lens", GAUSS, "--focus", "nan"], ["--focus", "metres"]),
         (["lens", GAUSS, "--focus", "0.1"], ["focus_m", "0.1", "four focal lengths"]),
-        (["lens", GAUSS, "--focal-length", "inf"], ["--focal-length", "mm"]),
+        (["lens", GAUSS, "--efl", "inf"], ["--focal-length", "mm"]),
         (["lens", GAUSS, "--f-number", "-2"], ["--f-number", "from 0.1 to 10000"]),
         (["lens", GAUSS, "--zoom", "wide"], ["zoom", "wide", "none in this file"]),
         (["lens", ZOOM, "--zoom", "wide"], ["zoom", "wide", "72mm"]),
@@ -93,12 +123,13 @@ def test_an_option_has_one_spelling_and_one_meaning_in_all_commands() -> None:
         (["lens", GAUSS, "--foc", "1"], ["--foc"]),
         (["lens", GAUSS, "-o", "a.toml"], ["-o"]),
         (["lens", GAUSS, "--derive-rims", "--layout", "a.png"], ["--layout"]),
-        (["lens", GAUSS, "lenses", "--focal-length", "20"], ["--focal-length", "one lens file"]),
+        (["lens", GAUSS, "lenses", "--efl", "20"], ["--focal-length", "one lens file"]),
         (["lens", GAUSS, "no_such_folder"], ["no_such_folder", "lens file"]),
         (["lens", "list", "--focus", "2", "--blades", "5", "--focal-length", "20"], ["--focus"]),
+        (["lens", "list", "--focusing", "paraxial"], ["--focus-mode"]),
         (["lens", PHONE, "--edge-pupil", "0.4"], ["--edge-pupil"]),
         (["lens", PHONE, "--derive-rims", "--f-number", "8"], ["--f-number"]),
-        (["lens", PHONE, "--focal-length", "1e300"], ["0.001 to 1e+06"]),
+        (["lens", PHONE, "--efl", "1e300"], ["0.001 to 1e+06"]),
         (["train"], ["EXPERIMENT.toml", "--lens"]),
         (["train", "a.toml", "--lens", GAUSS], ["both"]),
         (["train", "--lens", "no.toml"], ["no.toml"]),
@@ -128,8 +159,8 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "thin", "--blades", "2"], ["--blades", "from 3 to 100"]),
         (["--camera", "thin", "--blade-rotation", "10"], ["blades", "missing"]),
         (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "a picture that exists"]),
-        (["--camera", "thin", "--focus-mode", "internal"], ["focus", "lens files"]),
-        (["--camera", "thin", "--focal-length", "50", "--field", "40"], ["--field", "not allowed"]),
+        (["--camera", "thin", "--focusing", "internal"], ["focus", "lens files"]),
+        (["--camera", "thin", "--efl", "50", "--field", "40"], ["--field", "not allowed"]),
         (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
         (["--camera", "thin", "-o", "a.png"], ["--output", ".exr"]),
         (["--camera", "thin", "-o", "/no/such/folder/a.exr"], ["folder"]),
@@ -244,7 +275,7 @@ def test_lens_state_is_applied(capsys: pytest.CaptureFixture[str]) -> None:
     assert data["film_z_mm"] > data["rear_focal_z_mm"]
     # The working f-number grows with the magnification, f / (5 m - f).
     assert data["working_f_number"] > 5.6
-    assert run_json(capsys, "lens", GAUSS, "--focal-length", "35")["efl_mm"] == pytest.approx(35)
+    assert run_json(capsys, "lens", GAUSS, "--efl", "35")["efl_mm"] == pytest.approx(35)
 
 
 # render

@@ -30,7 +30,7 @@ def test_a_focus_state_is_focused_at_its_object(capsys: pytest.CaptureFixture[st
     assert near["focus_m"] == pytest.approx((207.03 + near["film_z_mm"]) / 1000)
     small = run_json(capsys, "lens", NIKON, "--zoom", "135mm near")
     assert small["focus_m"] == pytest.approx((750.55 + small["film_z_mm"]) / 1000)
-    large = run_json(capsys, "lens", NIKON, "--zoom", "135mm near", "--focal-length", 200)
+    large = run_json(capsys, "lens", NIKON, "--zoom", "135mm near", "--efl", 200)
     assert large["focus_m"] / small["focus_m"] == pytest.approx(large["efl_mm"] / small["efl_mm"])
 
 
@@ -51,7 +51,7 @@ def test_an_anamorphic_lens_is_described_in_both_planes(tmp_path: Path, capsys: 
 
 
 def test_breathing_is_no_other_f_number(capsys: pytest.CaptureFixture[str]) -> None:
-    state = ("--zoom", "135mm", "--focus", "2", "--focus-mode", "internal")
+    state = ("--zoom", "135mm", "--focus", "2", "--focusing", "internal")
     data = run_json(capsys, "lens", NIKON, *state)
     assert data["efl_mm"] < 130  # it does breathe
     assert not [w for w in data["warnings"] if "the stop gives" in w]
@@ -89,7 +89,7 @@ def test_the_picture_keeps_the_state_of_its_lens(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "a.exr"
-    state = ("--zoom", "100", "--focus-mode", "internal", "--focus", "2")
+    state = ("--zoom", "100", "--focusing", "internal", "--focus", "2")
     run_json(capsys, "render", scene, "--camera", NIKON, "-o", out, "--quiet", *state)
     camera = read_exr(out)[1]["camera"]
     assert (camera["zoom"], camera["focus_mode"], camera["rims"]) == ("100", "internal", "derived")

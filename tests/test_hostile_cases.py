@@ -21,7 +21,7 @@ from neurolens.surrogates.card import CARD_KEY
 HOSTILE = Path(__file__).parents[2] / "shared" / "data" / "cases" / "hostile"
 ROOT = Path(__file__).parents[1]
 GAUSS = ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx"
-FLARE = ("flare", "brendel_tessar_100", "--width", "64", "--bins", "2", "--quiet")
+FLARE = ("flare", "brendel_tessar_100", "--width", "64", "--wavelengths", "2", "--quiet")
 TILES = ("148", "234", "473", "795", "869")
 ZIPS = ("damaged", "deep", "enc", "kind", "var5", "varstr")
 
@@ -45,7 +45,7 @@ def lights(name: str, text: str) -> Callable[[], None]:
 MANY = json.dumps([{"azimuth_deg": 1 + k / 50000, "elevation_deg": 0.5} for k in range(200_000)])
 MERGE = ("render", "--merge", "-o", "o.exr")
 RENDER = ("render", "mesh_pabs.toml", "--camera", "thin", "-o", "o.exr", "--samples", "1", "--width", "16", "--quiet")
-ADD = ("blender", "add", GAUSS, "--extension")
+ADD = ("blender", "add", GAUSS, "--to")
 # Of each case the commands that are refused, by words of the message: what makes its file, the command.
 REFUSED: dict[str, list[tuple[str, Callable[[], object] | None, tuple[object, ...]]]] = {
     "metaint.exr": [
@@ -63,7 +63,7 @@ REFUSED: dict[str, list[tuple[str, Callable[[], object] | None, tuple[object, ..
         ("not a regular file", lambda: (os.mkdir("d"), os.mkfifo("d/lenses.json")), (*ADD, "d")),
     ],
     **{
-        model: [("card: transmittance: got (missing)", None, ("blender", "add", model, "--extension", "inner/folder"))]
+        model: [("card: transmittance: got (missing)", None, ("blender", "add", model, "--to", "inner/folder"))]
         for model in ("trav.onnx", "longmethod.onnx")
     },
     "many_lights": [
@@ -105,7 +105,7 @@ def test_a_models_method_is_part_of_a_safe_name(case: str, monkeypatch: pytest.M
 
     monkeypatch.setattr("neurolens.cli.blender_lenses.form_of", form_of)
     before = set(Path().rglob("*"))
-    assert main(["blender", "add", case, "--extension", "inner/folder", "--quiet"]) == 0
+    assert main(["blender", "add", case, "--to", "inner/folder", "--quiet"]) == 0
     made = set(Path().rglob("*")) - before
     assert made and all(path.is_relative_to("inner") and len(path.name) < 120 for path in made)
     assert len([path for path in made if path.suffix == ".osl"]) == 1

@@ -61,7 +61,8 @@ class Option:
         within: the smallest and the largest value of a number; the largest may be inf. unit: what the number is, for
             messages.
         option: name of the option ("reflections") and of the parsed argument, where it is not the field's.
-        short: a short name ("-o").
+        short: a short name ("-o"). old: earlier names, which still work and which help does not show; as a mapping,
+            with a function that converts the text of their value, or with the value for which they stand.
         metavar: placeholder of the value in the help.
         kind: converts the text of a value, where the type of the field does not.
         nargs: as argparse has it; without it a tuple is an option that may be repeated.
@@ -75,6 +76,7 @@ class Option:
     unit: str = "a number"
     option: str = ""
     short: str = ""
+    old: Sequence[str] | Mapping[str, Any] = ()
     metavar: str | tuple[str, ...] = ""
     kind: Callable[[str], Any] | None = None
     nargs: int | str | None = None
@@ -180,7 +182,15 @@ def add_options(
                 place = apart[option.apart] = apart.get(option.apart) or place.add_mutually_exclusive_group()
             default = defaults.get(f.name, None if unset else f.default)
             names_of, details = _details(f, option, hints[f.name], default, texts.get(f.name))
-            place.add_argument(*names_of, **details)
+            action = place.add_argument(*names_of, **details)
+            if not isinstance(option.old, Mapping):
+                parser._option_string_actions.update({f"--{word}": action for word in option.old})
+                continue
+            for word, value in option.old.items():
+                more = {"type": value} if callable(value) else {"action": "store_const", "const": value}
+                parser.add_argument(
+                    f"--{word}", dest=details["dest"], default=details["default"], help=argparse.SUPPRESS, **more
+                )
 
 
 def titled(parser: argparse._ActionsContainer, title: str) -> argparse._ActionsContainer | None:
@@ -337,6 +347,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
             `__post_init__` refuses.
     """
     known = {f.name: f for f in fields(cls) if f.init}  # type: ignore[arg-type]
+    data = _with_new_names(known, data, file, prefix)
     reject_unknown(file, prefix and f"{prefix}.", data, list(known))
     hints = get_type_hints(cls)
     values: dict[str, Any] = {}
@@ -350,6 +361,22 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
         return cls(**values)
     except InputError as error:
         raise InputError(file, _join(prefix, error.field), error.value, error.expected) from None
+
+
+def _with_new_names(
+    known: Mapping[str, dataclasses.Field[Any]], data: Mapping[str, Any], file: str | Path, prefix: str
+) -> Mapping[str, Any]:
+    """The data with keys that were renamed (the field's metadata `was`) under their new names."""
+    for name, f in known.items():
+        for old in f.metadata.get("was", ()):
+            if old not in data:
+                continue
+            values = [data[key] for key in (name, old) if data.get(key, "none") != "none"]
+            if len(values) > 1:
+                raise InputError(file, _join(prefix, old), data[old], f"left out beside {name}, its new name")
+            rest = {key: value for key, value in data.items() if key not in (name, old)}
+            data = {**rest, name: values[0] if values else "none"}
+    return data
 
 
 def _join(prefix: str, name: str) -> str:

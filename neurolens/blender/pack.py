@@ -186,7 +186,7 @@ def _of_folder(folder: Path) -> list[dict[str, Any]]:
     """The entries in the facts of a user folder, none if the folder is new."""
     file = folder / FACTS
     if folder.exists() and not folder.is_dir():
-        raise InputError(folder, "--extension", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
+        raise InputError(folder, "--to", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
     if not file.exists():
         return []
     data = read_bytes(file, _LARGEST, "a file of facts")

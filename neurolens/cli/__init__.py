@@ -25,6 +25,7 @@ _TRAIN_PACKAGES = {"torch", "scipy", "onnx", "matplotlib", "flip_evaluator", "mp
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
 # Names that commands had: they still work.
+_RENAMED: dict[tuple[str, ...], tuple[str, ...]] = {("merge",): ("render", "--merge"), ("trade",): ("plan", "--trade")}
 
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
 _EPILOG = """\
@@ -77,6 +78,7 @@ def build_parser() -> Parser:
         formatter_class=partial(Help, indent_increment=4),
     )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
+    parser.renamed = _RENAMED
     subparsers = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=Parser, prog="neurolens", help=argparse.SUPPRESS
     )

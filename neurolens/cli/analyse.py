@@ -86,7 +86,7 @@ examples:
     state: LensState = lens_state()
     field_points: tuple[float, ...] | None = setting(
         None, "angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",
-        kind=between(0, 179, "degrees"), nargs="+", metavar="DEG",
+        kind=between(0, 179, "degrees"), nargs="+", metavar="DEG", old=("fields",),
     )  # fmt: skip
     wavelengths: tuple[tuple[float, ...], ...] | None = setting(
         None, f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "

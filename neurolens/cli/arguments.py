@@ -59,6 +59,7 @@ class Parser(argparse.ArgumentParser):
 
     Attributes:
         intermixed: whether options may stand before and between the arguments of a list.
+        renamed: words at the start of a command line, and the words that replaced them.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -67,10 +68,14 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # no option: -12,3 is a value, as -12 is
         self.intermixed = False
+        self.renamed: dict[tuple[str, ...], tuple[str, ...]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse as argparse does; an intermixed one reports unknown arguments itself."""
+        """Parse as argparse does; old names of commands work; an intermixed one reports unknown arguments itself."""
         args = sys.argv[1:] if args is None else list(args)
+        for old, new in self.renamed.items():
+            if tuple(args[: len(old)]) == old:
+                args = [*new, *args[len(old) :]]
         if self.intermixed:
             self.intermixed = False  # argparse comes back here for its two passes
             try:
@@ -236,12 +241,13 @@ def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: b
 
 def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
     """-o and --output, the file or folder that a command writes."""
-    return setting(default, about, metavar=metavar, option="output", short="-o", kind=Path, title=title)
+    return setting(default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title)
 
 
 def within(about: str, default: Any = None, title: str = "") -> Any:
     """--within, an RMS error with its unit as `rms_error`."""
-    return setting(default, about, metavar="ERROR", kind=rms_error, title=title)
+    old = {f"target-{unit}": partial(lambda unit, text: rms_error(text + unit), unit) for unit in ("um", "px")}
+    return setting(default, about, metavar="ERROR", kind=rms_error, old=old, title=title)
 
 
 def dask(title: str = "") -> Any:

@@ -114,7 +114,9 @@ class Add(Reporting):
     called: ClassVar[str] = "neurolens blender add"
 
     file: Path = lens(models=True, positional=True)
-    extension: Path | None = setting(None, "a packed extension, or a user folder of one", metavar="ZIP|DIR")
+    extension: Path | None = setting(
+        None, "a packed extension, or a user folder of one", metavar="ZIP|DIR", old=("to",)
+    )
     zoom: str | None = setting(
         None, "state of a zoom, by name or focal length in mm; range: a setting", metavar="STATE"
     )

@@ -80,7 +80,7 @@ examples:
     inverse: bool = setting(
         False, "of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked"
     )
-    whole_camera: bool = setting(False, "the whole camera as source code", title=_CAMERA)
+    whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA)
     film: tuple[float, float] = setting(
         (36.0, 24.0), "film in mm (default: 36x24)", kind=film_size, metavar="WxH", title=_CAMERA
     )

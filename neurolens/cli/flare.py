@@ -127,11 +127,11 @@ examples:
     )  # fmt: skip
     quick: bool = setting(
         False, "at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
-        title=_PICTURE,
+        old=("preview",), title=_PICTURE,
     )  # fmt: skip
     gain: tuple[tuple[str, list[float]], ...] = setting(
         (), "factor of a layer (ghosts) or a ghost (g07-03), or one for each colour, NAME=R/G/B; repeatable, gains "
-        "multiply", kind=_gain, metavar="NAME=X", title=_LAYERS,
+        "multiply", kind=_gain, metavar="NAME=X", old=("tint",), title=_LAYERS,
     )  # fmt: skip
     threads: int = setting(2, "default: 2", within=(1, 256))
     frames: Frames = frames_group(

@@ -79,7 +79,7 @@ examples:
     )  # fmt: skip
     edge_pupil: float | None = setting(
         None, "share of the pupil's height that is kept at the edge of the field (default: 0.5)", within=(0.01, 1),
-        unit="a share", metavar="SHARE", title="rims",
+        unit="a share", metavar="SHARE", old=("vignetting",), title="rims",
     )  # fmt: skip
     half_field: float | None = setting(
         None, "edge of the field, in degrees from the axis (default: as the file states)", within=(0.01, 179),

@@ -45,7 +45,7 @@ examples:
   neurolens projection models/NAME.onnx --width 1920 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
 
     projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta"] = setting(
-        ..., "the projection to fit"
+        ..., "the projection to fit", old=("model",)
     )
     out: Path | None = output_path("NAME", "write NAME.json and, for OpenCV's, NAME.yaml", None)
 

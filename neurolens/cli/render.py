@@ -84,7 +84,7 @@ class Picture:
     exposure: float = exposure()
     channels: Literal["all", "beauty"] = setting(
         "all", "of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along "
-        "the axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
+        "the axis from the film) and blocked (share of camera rays that do not pass) (default: all)", old=("layers",),
     )  # fmt: skip
 
 

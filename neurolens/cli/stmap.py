@@ -171,7 +171,7 @@ examples:
     )
     wavelengths: tuple[float, float, float] = setting(
         _CHANNELS_NM, "those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
-        kind=channels_nm, metavar="NM",
+        kind=channels_nm, metavar="NM", old=("channels-nm",),
     )  # fmt: skip
     frames: Frames = frames_group(
         "maps of these frames, SHOT.undistort.0001.exr and so on, all of one overscan", LENS_KEYS

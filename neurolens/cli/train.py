@@ -88,7 +88,9 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         4000, "of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
         "4000: 9 um each for a radius of 21.6 mm)", within=(1, 10**6),
     )  # fmt: skip
-    rounds: int | None = setting(None, "of the race, 0 for none (default: the setting's)", kind=whole(0), metavar="N")
+    rounds: int | None = setting(
+        None, "of the race, 0 for none (default: the setting's)", kind=whole(0), metavar="N", old={"no-race": 0}
+    )
     named: bool = True  # whether the command line names `out`
 
     def run(self) -> int:
@@ -233,7 +235,7 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
     )  # fmt: skip
     jobs: int = setting(cores(), "files at a time, about 1 GB of memory each (default: all cores)", within=(1, 256))
     dask: str | None = dask()
-    restart: bool = setting(False, "do finished files again")
+    restart: bool = setting(False, "do finished files again", old=("again",))
 
     def run(self) -> int:
         """Survey a folder; 1 where a file met a fault of neurolens."""

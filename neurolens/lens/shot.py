@@ -57,12 +57,12 @@ class Shot:
     )  # fmt: skip
     focal_length_mm: float | None = setting(
         None, "scale the whole lens to this focal length (default: as tabled; 50 for thin and pinhole, 14 for "
-        "fisheyes; a model has its own)", within=FOCAL_MM, unit="a focal length in mm",
+        "fisheyes; a model has its own)", within=FOCAL_MM, unit="a focal length in mm", old=("efl",),
         apart="size",
     )  # fmt: skip
     zoom: str | float | None = setting(
         None, "state of the lens file by name, or a focal length in mm between its states (derived: its table and "
-        "interpolated gaps); default: the state of the table", metavar="STATE",
+        "interpolated gaps); default: the state of the table", old=("configuration",), metavar="STATE",
     )  # fmt: skip
     field_deg: float | None = setting(
         None, "scale the whole lens so that its image circle sees this full field of view, traced",
@@ -70,7 +70,7 @@ class Shot:
     )  # fmt: skip
     focus_mode: FocusMode = setting(
         "best", "the film where the spot on the axis is smallest at this aperture, in the paraxial image, or first the "
-        "groups moved as the focus states of the lens file do (default: best)",
+        "groups moved as the focus states of the lens file do (default: best)", old=("focusing",),
     )  # fmt: skip
     aperture: Any = None  # an `Aperture`, whose module loads numpy, which help of the command line does not
     wavelength_nm: tuple[float, float] = (400.0, 700.0)

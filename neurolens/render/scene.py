@@ -65,7 +65,7 @@ class CameraSettings(StopShape, Checked):
     film_mm: Annotated[tuple[float, float], _SIDES] = _FILM_MM
     wavelength_nm: Annotated[
         tuple[float, float], Rule(lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780")
-    ] = (400.0, 700.0)
+    ] = field(default=(400.0, 700.0), metadata={"was": ("wavelengths_nm",)})
     width: Annotated[int, between(1, 16384, "an integer")] = 320
     height: Annotated[int, between(1, 16384, "an integer")] = 180
     samples: Annotated[int, Rule(lambda v: 1 <= v <= 1 << 20, f"an integer from 1 to {1 << 20}")] = 64

@@ -35,7 +35,7 @@ class FilmSettings:
     )
     wavelengths: WavelengthMode = setting(
         "auto", "of a path: one; hero, four that share it; auto, hero where the camera can at little cost",
-        option="wavelength-mode",
+        option="wavelength-mode", old=("wavelengths",),
     )  # fmt: skip
     wavelength_sampling: WavelengthSampling = setting(
         "importance", "by importance (film response times light) or uniform"
@@ -157,6 +157,7 @@ class FlareSettings:
         "wavelengths of stars and photons, in equal steps over the range of light, 400 to 700 nm; ghosts take what "
         "their colours need, at most four times as many (default: 15)",
         within=(1, 256),
+        old=("wavelengths",),
     )
     cell_px: float = setting(
         8.0, "size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",

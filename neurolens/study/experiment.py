@@ -59,10 +59,10 @@ class LensChoice:
     """
 
     file: Path
-    focal_length_mm: float | None = None
-    zoom: str | float | None = None
+    focal_length_mm: float | None = field(default=None, metadata={"was": ("efl_mm",)})
+    zoom: str | float | None = field(default=None, metadata={"was": ("configuration",)})
     f_number: float | None = None
-    focus_mode: Literal["film", "internal"] = "film"
+    focus_mode: Literal["film", "internal"] = field(default="film", metadata={"was": ("focusing",)})
 
     @property
     def many_states(self) -> bool:

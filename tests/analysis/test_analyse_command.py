@@ -30,7 +30,7 @@ ANAMORPHIC = LENSES / "schneider_anamorphic_31.toml"
 
 
 def test_state_fields_and_wavelengths(capsys: pytest.CaptureFixture[str]) -> None:
-    options = ("--focus", 2, "--field-points", 0, 10, "--wavelengths", 587.5618, "--focus-mode", "best", "--full")
+    options = ("--focus", 2, "--field-points", 0, 10, "--wavelengths", 587.5618, "--focusing", "best", "--full")
     data = run_json(capsys, "analyse", TESSAR, "spots", *options)
     assert data["focus_m"] == 2 and data["spots"]["wavelength_nm"] == [587.5618]
     assert data["spots"]["field_deg"] == [0, 10] and len(data["spots"]["tangential_um"]) == 2

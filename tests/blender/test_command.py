@@ -77,7 +77,7 @@ def test_zip_holds_the_best_of_each_kind_and_takes_more(place: Path, capsys: pyt
     told = json.loads(capsys.readouterr().out)
     assert told["lenses"] == {LENS: ["ols-60", "mlp-10x1", "exact"]} and told["bytes"] == out.stat().st_size
     shutil.copy(place / "lenses" / f"{LENS}.toml", place / "own.toml")
-    assert main(["blender", "add", str(place / "own.toml"), "--extension", str(out), "--quiet"]) == 0
+    assert main(["blender", "add", str(place / "own.toml"), "--to", str(out), "--quiet"]) == 0
     with zipfile.ZipFile(out) as packed:
         names, facts = set(packed.namelist()), json.loads(packed.read("lenses.json"))
         picture = packed.read(f"thumbnails/{LENS}.png")
@@ -124,15 +124,15 @@ def test_bad_input_is_one_line(
     monkeypatch.setenv("BLENDER_USER_RESOURCES", str(place / "nobody"))
     assert "no Blender of this machine" in failed(capsys, "add", models / f"{LENS}.ols-36.onnx")
     with pytest.raises(SystemExit):
-        main(["blender", "add", str(place / "no.onnx"), "--extension", str(place / "user")])
+        main(["blender", "add", str(place / "no.onnx"), "--to", str(place / "user")])
     assert "(missing)" in capsys.readouterr().err
     (place / "a.txt").write_text("x")
     (place / "a.zip").write_text("no zip")
     with monkeypatch.context() as early:
         early.setattr(blender_lenses, "form_of", lambda *given, **options: pytest.fail("no shader is to be made"))
         for to, expected in (("a.zip", "a zip of `neurolens blender build`"), ("a.txt", "or a folder")):
-            assert expected in failed(capsys, "add", models / f"{LENS}.ols-36.onnx", "--extension", place / to)
-    assert "format" in failed(capsys, "add", place / "a.txt", "--extension", place / "user")
+            assert expected in failed(capsys, "add", models / f"{LENS}.ols-36.onnx", "--to", place / to)
+    assert "format" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
     assert not out.exists() and not (place / "user").exists()
 
 

@@ -33,7 +33,7 @@ def white(tmp_path: Path, camera_name: str, *options: str) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["thin", f"thick:{GAUSS}"])
 def test_a_white_card_without_vignetting_is_white(name: str, tmp_path: Path) -> None:
-    flat, card = (white(tmp_path, name, "--focal-length", "35", "--vignetting", left) for left in ("none", "natural"))
+    flat, card = (white(tmp_path, name, "--efl", "35", "--vignetting", left) for left in ("none", "natural"))
     assert flat.mean() == pytest.approx(1, abs=0.02) and np.ptp(flat.mean(2)) < 0.25  # noise of the spectrum
     assert card[0, 0].mean() < card[4, 6].mean() - 0.04
 

@@ -603,7 +603,7 @@ def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, mo
     told = json.loads(capsys.readouterr().out)
     assert told["function"] == "gauss" and told["inputs"][:2] == ["f_number", "focus_m"]
     assert min(told["passing"].values()) >= 0.95 and "shader gauss(" in out.read_text(encoding="utf-8")
-    for wrong in (["--focus", "2"], ["--fix", "stop=4"], ["--whole-camera"], ["--name", "color"], ["--name", "shader"]):
+    for wrong in (["--focus", "2"], ["--fix", "stop=4"], ["--camera"], ["--name", "color"], ["--name", "shader"]):
         other = tmp_path / "other.osl"
         assert main(["export", str(MODEL), "--to", "osl", "-o", str(other), *wrong]) == 2
         assert "neurolens" in capsys.readouterr().err and not other.exists()

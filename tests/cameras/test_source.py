@@ -228,7 +228,7 @@ def run_compiled(language: str, source: str, folder: Path, given: str = "", *arg
 def test_an_integrator_in_c_plus_plus_sees_what_the_camera_sees(tmp_path: Path) -> None:
     """Its picture of three spheres, pixel by pixel, against rays of the camera and the same spheres in numpy."""
     file, width, height, samples = lens_models.exported("invariants"), 48, 32, 4
-    command = ["export", str(file), "--to", "c", "--whole-camera", "--focus", str(FOCUS_M), "--name", "lens"]
+    command = ["export", str(file), "--to", "c", "--camera", "--focus", str(FOCUS_M), "--name", "lens"]
     assert main([*command, "-o", str(tmp_path / "lens_camera.h")]) == 0
     source = (ROOT / "experiments" / "integrator.cpp").read_text()
     printed = run_compiled("c++", source, tmp_path, "", str(width), str(samples)).encode("latin-1")
@@ -321,7 +321,7 @@ def test_the_state_of_a_zoom_is_an_argument(tmp_path: Path) -> None:
 
 def test_states_of_a_zoom_are_chosen_when_a_camera_is_written(tmp_path: Path) -> None:
     out = tmp_path / "zoom.h"
-    assert main(["export", str(ZOOM), "--to", "c", "--whole-camera", "--zoom", "120", "-o", str(out)]) == 0
+    assert main(["export", str(ZOOM), "--to", "c", "--camera", "--zoom", "120", "-o", str(out)]) == 0
     (efl,) = re.findall(r"_EFL_MM (\S+)f\n", out.read_text())
     assert float(efl) == pytest.approx(120, rel=2e-3)
 
@@ -329,11 +329,11 @@ def test_states_of_a_zoom_are_chosen_when_a_camera_is_written(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--to", "onnx", "--whole-camera"], "--to c, glsl ..."),
-        (["--to", "c", "--whole-camera", "--fix", "focus=2"], "without --fix"),
+        (["--to", "onnx", "--camera"], "--to c, glsl ..."),
+        (["--to", "c", "--camera", "--fix", "focus=2"], "without --fix"),
         (["--to", "c", "--derivatives"], "--to onnx"),
-        (["--to", "c", "--whole-camera", "--zoom", "20"], "zoom"),
-        (["--to", "c", "--whole-camera", "--name", "int"], "name"),
+        (["--to", "c", "--camera", "--zoom", "20"], "zoom"),
+        (["--to", "c", "--camera", "--name", "int"], "name"),
     ],
 )
 def test_what_does_not_go_together(
@@ -346,8 +346,7 @@ def test_what_does_not_go_together(
 
 def test_the_outline_of_a_camera_in_glsl_is_a_texture(tmp_path: Path) -> None:
     out = tmp_path / "a.glsl"
-    model = str(lens_models.exported("invariants"))
-    assert main(["export", model, "--to", "glsl", "--whole-camera", "-o", str(out)]) == 0
+    assert main(["export", str(lens_models.exported("invariants")), "--to", "glsl", "--camera", "-o", str(out)]) == 0
     text = out.read_text()
     wide, high = (int(n) for n in re.findall(r"texel, (\d+) wide, (\d+) high", text)[0])
     table = np.fromfile(tmp_path / "a.glsl.outline.f32", "<f4").reshape(high, wide)

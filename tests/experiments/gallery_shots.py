@@ -25,7 +25,7 @@ def shot(lens: str, *, focus_m: float, wavelengths_nm: tuple[float, float] = (55
         "position_m": [0, 0, 0],
         "look_at_m": [0, 0, -1],
         "focus_m": focus_m,
-        "wavelength_nm": list(wavelengths_nm),
+        "wavelengths_nm": list(wavelengths_nm),
     }
     panel.setdefault("film_mm", (36.0, 24.0))
     return shot_of(Panel("test", file, Path("scene"), **panel), scene_from_tables({"camera": camera}))

@@ -108,7 +108,7 @@ def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
 def test_gains_and_tints(tmp_path: Path) -> None:
     """The gains of a ghost and of the layer multiply, and the layer stays the sum of its parts."""
     found = []
-    gains = ["--gain", "g05-03=0.5", "--gain", "g05-03=1/0/2", "--gain", "ghosts=3"]
+    gains = ["--gain", "g05-03=0.5", "--tint", "g05-03=1/0/2", "--gain", "ghosts=3"]
     for words in ([], gains):
         out = tmp_path / "a.exr"
         assert main(["flare", *SMALL, "--light", "-10,5", "--layers", "15", *words, "-o", str(out)]) == 0
@@ -151,7 +151,8 @@ points = [{ position_m = [-0.3, 1.3, 0.0], intensity = [2.0, 1.0, 0.5], illumina
 position_m = [0.0, 1.0, 2.0]
 look_at_m = [0.0, 1.0, 0.0]
 focus_m = 2.0
-film_mm = [36.0, 24.0]
+film_width_mm = 36.0
+film_height_mm = 24.0
 width = 36
 height = 24
 samples = 1

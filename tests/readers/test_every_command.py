@@ -37,14 +37,14 @@ COMMANDS = {
     "stmap": "stmap {} --size 30x20 --film 24x16 -o NAME",
     "bokeh": "bokeh {} --width 30 --film 24x16 --distance inf --grid 1x1 -o NAME",
     "handover": "handover {} --size 30x20 --film 24x16 -o NAME",
-    "projection": "projection {} --size 30x20 --film 24x16 --projection opencv",
+    "projection": "projection {} --size 30x20 --film 24x16 --model opencv",
     "render": "render SCENE --camera {} -o NAME.exr",
     "render fused": "render SCENE --camera fused:{} -o NAME.exr",
     "render thick": "render SCENE --camera thick:{} -o NAME.exr",
     "export c": "export {} --to c -o NAME.h",
     "export osl": "export {} --to osl -o NAME.osl",
-    "export camera": "export {} --to glsl --whole-camera -o NAME.glsl",
-    "blender": "blender add {} --extension NAME",
+    "export camera": "export {} --to glsl --camera -o NAME.glsl",
+    "blender": "blender add {} --to NAME",
     "view": "view {} -o NAME.html",
     "train": "train --lens {} -o NAME",
     "experiment": "train EXPERIMENT -o NAME",
@@ -191,7 +191,6 @@ def test_what_a_file_lacks_is_asked_of_convert(tessar: Lens, tmp_path: Path) -> 
 def test_one_file_is_warned_of_once_in_a_command(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     text = files["zmx"].read_text().replace("MODE SEQ", "MODE SEQ\nQQQQ 1")
     files["zmx"].write_text(text)
-    out = str(files["toml"]) + ".h"
-    assert main(["export", str(files["zmx"]), "--to", "c", "--whole-camera", "-o", out, "--json"]) == 0
+    assert main(["export", str(files["zmx"]), "--to", "c", "--camera", "-o", str(files["toml"]) + ".h", "--json"]) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "QQQQ" in line]
     assert len(lines) == 1

@@ -234,7 +234,7 @@ def test_one_pixel_one_line_and_no_light_end_well() -> None:
     sizes: list[dict[str, Any]] = [{"width": 3, "height": 2}, {"width": 240, "height": 160}]
     for size in sizes:
         for light in ((550, 550), (400, 700)):
-            made = scene({"wavelength_nm": list(light)}, environment=WHITE)
+            made = scene({"wavelengths_nm": list(light)}, environment=WHITE)
             found = render(made, camera, samples=2, threads=1, **size)
             assert np.isfinite(found.rgb).all() and found.rgb.mean() > 0.2
     empty = camera.sample_spectrum(np.zeros((2, 0)), np.zeros((2, 0)), np.zeros((4, 0)))

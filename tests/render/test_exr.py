@@ -170,7 +170,7 @@ def test_preview_is_srgb_at_the_asked_exposure(tmp_path: Path) -> None:
 
 
 # One wavelength: the film is grey, and light of radiance 1 gives 1 whatever the sample.
-GREY: dict[str, Any] = {"wavelength_nm": [550, 550], "position_m": [0, 0, 0], "look_at_m": [0, 0, -1]}
+GREY: dict[str, Any] = {"wavelengths_nm": [550, 550], "position_m": [0, 0, 0], "look_at_m": [0, 0, -1]}
 
 
 class Coin(Pinhole):

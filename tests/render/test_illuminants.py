@@ -126,7 +126,7 @@ def test_a_measured_spectrum_of_lines(tmp_path: Path) -> None:
     (tmp_path / "lamp.csv").write_text(rows)
     path = tmp_path / "s.toml"
     path.write_text(
-        "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 2\nwavelength_nm = [380, 780]\n"
+        "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 2\nwavelengths_nm = [380, 780]\n"
         '[illuminants.lamp]\nfile = "lamp.csv"\n[environment]\ncolour = [1, 1, 1]\nilluminant = "lamp"\n'
     )
     from_file = render(load_scene(path), CAMERA, width=48, height=32, samples=256).rgb.mean(axis=(0, 1))
@@ -235,7 +235,7 @@ def test_the_command_line_chooses_space_and_white(
     white = 'illuminant = "3200 K"\n'
     scene.write_text(scene.read_text().partition("[materials]")[0] + white)
     out = tmp_path / "o.exr"
-    base = ("render", scene, "--camera", "pinhole", "--focal-length", 400, "--samples", 64, "-o", out, "--quiet")
+    base = ("render", scene, "--camera", "pinhole", "--efl", 400, "--samples", 64, "-o", out, "--quiet")
     data = run_json(capsys, *base, "--colour-space", "ACEScg", "--white-balance", "3200 K")
     assert data["white_balance"] == "3200 K"
     rgb, metadata = read_exr(out)

@@ -161,5 +161,5 @@ def test_errors_are_clear() -> None:
             render(made, PINHOLE, **(small | change))
     with pytest.raises(InputError, match="450-650 nm"):
         render(made, Prism(50.0, FILM), **small)
-    narrow = scene({"wavelength_nm": [460, 640]}, environment=WHITE)
+    narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
     assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)

@@ -260,9 +260,9 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         ({"-o": tmp_path / "none" / "a"}, "a folder that exists"),
         ({"camera": "lens.zmx"}, "a lens file of any format"),
         ({"camera": fisheye}, "degrees from the axis"),
-        ({"camera": "fisheye-equidistant", "--focal-length": "9"}, "to be laid on a plane"),
+        ({"camera": "fisheye-equidistant", "--efl": "9"}, "to be laid on a plane"),
         (
-            {"camera": "fisheye-equidistant", "--focal-length": "14.2", "--width": "9600", "--height": "5400"},
+            {"camera": "fisheye-equidistant", "--efl": "14.2", "--width": "9600", "--height": "5400"},
             "another --projection",
         ),
     ):

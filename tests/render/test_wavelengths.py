@@ -70,8 +70,8 @@ def test_the_light_of_a_scene() -> None:
     assert np.all(np.diff(warm[::64]) > 0)
     _, dark = expected_light(scene())
     assert np.all(dark == 1)
-    one = expected_light(scene({"wavelength_nm": [550, 550]}, environment=WHITE))
-    assert spectral_range(scene({"wavelength_nm": [550, 550]}), CAMERA, FilmSettings()).centres_nm[0] == 550
+    one = expected_light(scene({"wavelengths_nm": [550, 550]}, environment=WHITE))
+    assert spectral_range(scene({"wavelengths_nm": [550, 550]}), CAMERA, FilmSettings()).centres_nm[0] == 550
     assert np.all(np.isfinite(one[1]))
 
 

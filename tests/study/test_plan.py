@@ -194,7 +194,7 @@ def test_a_warped_picture_has_the_lens_s_light_in_its_corners() -> None:
 
 @cache
 def planned(budget: float, distance_m: float, f_number: float | None) -> Plan:
-    film = {"film_mm": [28.0, 15.75]}  # less than its circle of light, for the maps
+    film = {"film_width_mm": 28.0, "film_height_mm": 15.75}  # less than its circle of light, for the maps
     scene = scene_from_tables(wall(distance_m, f_number, **film))
     return plan(scene, set_lens(read_lens(LENS)), budget, target="c")
 
@@ -315,7 +315,7 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
     monkeypatch.setattr(plots, "plot_effects", lambda made, path, title: drawn.append(path.name))
     monkeypatch.setattr(tried, "TERMS", (6,))
     scene, folder = tmp_path / "scene.toml", tmp_path / "plan"
-    film = {"film_mm": [18.0, 10.125], "width": 64, "height": 36, "samples": 2}
+    film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "width": 64, "height": 36, "samples": 2}
     scene.write_text(format_toml(wall(4.0, 4.0, **film)))
     lens = tmp_path / "own.toml"  # no model of it ships
     lens.write_bytes(Path(LENS).read_bytes())

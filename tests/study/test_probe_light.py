@@ -159,7 +159,7 @@ def test_footprints_without_distortion_lie_where_a_thin_lens_has_them() -> None:
 EXTREMES: dict[str, dict[str, Any]] = {
     "distant": {"planes": []},
     "at the front glass": {"quads": [card(0.2, 0.0635, (-0.1, -0.1))]},  # 2 mm before it, 61.5 mm from the film
-    "one pixel": {"camera": {"width": 1, "height": 1, "film_mm": [0.01, 0.01]}},
+    "one pixel": {"camera": {"width": 1, "height": 1, "film_width_mm": 0.01, "film_height_mm": 0.01}},
     "dark": {"environment": {"colour": [0.0, 0.0, 0.0]}},
 }
 

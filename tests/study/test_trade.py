@@ -68,7 +68,7 @@ def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
 
 
 def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = scene_from_tables(scene(width=64, height=36, film_mm=[18.0, 10.125], samples=4))
+    shown = scene_from_tables(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4))
     seen, priced = {}, traded._priced(shown, read_lens(LENS), 0.0)
     monkeypatch.setattr(traded, "_priced", lambda *args: priced)  # once for all budgets
     for budget in (0.0, 0.05, 1.0):

@@ -27,7 +27,7 @@ SMALL = """
 title = "small"
 [lens]
 file = "ROOT/lenses/brendel_tessar_100.toml"
-focal_length_mm = 50
+efl_mm = 50
 [domain]
 wavelength_nm = [400, 700]
 [pairs]
@@ -147,10 +147,13 @@ QUICK = """--rounds 0 --quiet --set pairs.train=1000 --set pairs.held_out=500 --
 RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=false}]"
 
 
-@pytest.mark.parametrize(("asked", "within_um", "tried"), [("1e-6px", 1e-6 * 6.24, 3), *whole(("2um", 2.0, 2))])
+@pytest.mark.parametrize(("asked", "within_um", "tried"), [("px=1e-6", 1e-6 * 6.24, 3), *whole(("um=2", 2.0, 2))])
 @pytest.mark.usefixtures("no_plots")
 def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
-    code = main(["train", "--lens", SINGLET, "--output", str(tmp_path), "--within", asked, *QUICK, "--set", RUNGS])
+    kind, _, value = asked.partition("=")
+    code = main(
+        ["train", "--lens", SINGLET, "--output", str(tmp_path), f"--target-{kind}", value, *QUICK, "--set", RUNGS]
+    )
     found, said = json.loads((tmp_path / "results.json").read_text()), capsys.readouterr().out
     errors = [m["rms_um"] for m in found["models"]]
     assert found["target"]["within_um"] == pytest.approx(within_um, rel=1e-3)  # 15 mm: a frame of 24.96 mm
@@ -173,13 +176,13 @@ ZOOM = lens_models.LENSES / "nikon_zoom_70_200.toml"
 
 
 def test_experiments_ask_for_states() -> None:
-    both = default_experiment(ZOOM, ['lens.zoom="range"', 'lens.focus_mode="internal"'])
+    both = default_experiment(ZOOM, ['lens.zoom="range"', 'lens.focusing="internal"'])
     assert both.lens.many_states and [a.name for a in both.states().axes] == ["zoom", "focus"]
     zoom = default_experiment(ZOOM, ['lens.zoom="range"']).states()
     assert [a.name for a in zoom.axes] == ["zoom"]
     wide = zoom.domain_at((zoom.axes[0].range[0],))
     assert math.isinf(wide.focus_m[0]) and wide.film_z_mm[0] < wide.film_z_mm[1] and wide.film_radius_mm == 21.6
-    inside = default_experiment(ZOOM, ['lens.focus_mode="internal"', 'lens.zoom="135mm"']).states()
+    inside = default_experiment(ZOOM, ['lens.focusing="internal"', 'lens.configuration="135mm"']).states()
     near = inside.axes[0].range[1]
     # The groups focus: the film moves from where it stands to best focus at the widest aperture, no farther.
     (low, high), stands = inside.domain_at((near,)).film_z_mm, inside.lens_at((near,)).film_z_mm
@@ -190,9 +193,10 @@ def test_experiments_ask_for_states() -> None:
 @pytest.mark.parametrize(
     ("file", "overrides", "field"),
     [
-        (ZOOM, ['lens.zoom="range"', "lens.focal_length_mm=50"], "lens.focal_length_mm"),
+        (ZOOM, ['lens.zoom="range"', "lens.efl_mm=50"], "lens.focal_length_mm"),
+        (ZOOM, ['lens.zoom="range"', 'lens.configuration="135mm"'], "lens.configuration"),
         (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.zoom="range"'], "zoom"),
-        (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.focus_mode="internal"'], "focus"),
+        (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.focusing="internal"'], "focus"),
     ],
 )
 def test_states_that_cannot_be_asked_for(file: Path, overrides: list[str], field: str) -> None:

@@ -109,7 +109,7 @@ def ours(
     """[HIGH, WIDE] of our renderer, in the same light; its pixels are square, those of an anamorphic page are not."""
     shot = Shot(tuple(film_mm), settings["focus"], settings["f_number"], wavelength_nm=(NM, NM), clamp_f_number=True)
     place = {"position_m": [0.0, 0.0, 0.0], "look_at_m": [0.0, 0.0, -1.0], "focus_m": settings["focus"]}
-    sizes = {"film_mm": list(film_mm), "wavelength_nm": [NM, NM]}
+    sizes = {"film_width_mm": film_mm[0], "film_height_mm": film_mm[1], "wavelengths_nm": [NM, NM]}
     scene = scene_from_tables({"camera": {**place, **sizes}, **tables})
     height = round(WIDE * film_mm[1] / film_mm[0])
     result = render(scene, make_camera(camera, shot), width=WIDE, height=height, samples=samples, threads=1)
