@@ -53,13 +53,13 @@ NAMES = {
     "starburst": ("starburst", "stars by diffraction: checks against closed forms, seconds"),
     "flare": ("flare_speed", "ghosts: nanoseconds a ray, compiled and path by path"),
     "flare-gallery": ("flare_gallery", "pictures of flare: suns, headlights, coatings, stops, an animation"),
-    "ghosts": ("ghosts", "ghosts drawn in several ways: error and time a picture"),
     "dask": ("cluster", "a Dask cluster: speed-up, overhead a task, 100,000 tasks by simulation"),
     "transmittance": ("transmittance", "what averaging over polarisation at every surface would cost"),
     "photographs": ("photographs", "that collection against photographs: distortion, colour, light, fitted rims"),
     "photographs-faults": ("photographs_faults", "lens tables broken on purpose: faults found, changes named"),
     "collection": ("collection", "a public collection of lens files: read, refused, agreement with ray-optics"),
     "named-lenses": ("named_lenses", "write the lens files of real lenses by name from that collection"),
+    "library": ("library_pages", "a page for each lens, with every analysis drawn, and an index of all"),
     "usd-lights": ("usd_lights", "the lights of a USD stage as a list for `neurolens flare --lights`"),
 }
 _DESCRIPTION = """\

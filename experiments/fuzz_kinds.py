@@ -21,7 +21,6 @@ import numpy as np
 from experiments import lab
 from experiments.fuzz_damage import WORDS, damage
 from neurolens import cli
-from neurolens.base.files import write_kept
 from neurolens.cli.arguments import Parser
 
 SEEDS = Path(__file__).with_name("fuzz_seeds")
@@ -161,11 +160,6 @@ def _of_model(chance: Chance, folder: Path) -> Words:
     )
 
 
-def _of_ghosts(chance: Chance, folder: Path) -> Words:
-    hurt(chance, folder, "ghosts.onnx")
-    return _flare("ghosts.onnx", "--light", "5,3")
-
-
 def _of_listing(chance: Chance, folder: Path) -> Words:
     """A damaged model in a folder that `models` lists."""
     (folder / "models").mkdir()
@@ -224,10 +218,9 @@ def _of_kept(chance: Chance, folder: Path) -> Words:
     records = sorted(str(file.relative_to(folder)) for file in folder.glob("done/records/*.json"))
     commands = {
         "out.exr.part": _render("thin", "--samples", "16"),
-        "pages/cooke_triplet_50/record.json": ["library", "-o", "pages", "cooke_triplet_50", "--quiet"],
         **{name: ["survey", "fold", "--no-fit", "-o", "done", "--quiet"] for name in records},
     }
-    rare = [{"out.exr.part": 3, "pages": 0.1}.get(name.partition("/")[0], 0.5) for name in commands]
+    rare = [{"out.exr.part": 3}.get(name.partition("/")[0], 0.5) for name in commands]
     (name,) = chance.choices(list(commands), rare)
     (folder / "kept.part").rename(folder / "out.exr.part")
     hurt(chance, folder, name)
@@ -259,7 +252,7 @@ def _of_words(chance: Chance, folder: Path) -> Words:
 
 
 # Their value may be any amount of work, or of a network; help is no work at all.
-_LONG = ("--help", "-h", "--samples", "--max-depth", "--dask", "--rays", "--photons", "--glare", "--fit", "--models")
+_LONG = ("--help", "-h", "--samples", "--max-depth", "--dask", "--rays", "--photons", "--glare", "--models")
 
 
 @cache
@@ -306,7 +299,6 @@ def _of_long_runs(chance: Chance, folder: Path) -> Words:
             (1, ("plan", "scene.toml", *lens, "--trade", "--samples", "1")),
         ),
         "lens.toml": (
-            (1, ("library", "-o", "new", "lens.toml", "--quiet")),
             (1, ("view", "lens.toml", "--json")),
             (1, ("projection", "lens.toml", *_FILM, "--projection", "opencv", "-o", "shot")),
         ),
@@ -324,7 +316,6 @@ KINDS: dict[str, tuple[float, Callable[[Chance, Path], Words]]] = {
     "mesh": (6, _of_mesh),
     "picture": (6, _of_picture),
     "model": (6, _of_model),
-    "ghosts": (1, _of_ghosts),
     "listing": (1, _of_listing),
     "experiment": (5, _of_experiment),
     "tile": (6, _of_tile),
@@ -426,15 +417,12 @@ def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple
     shutil.copy(f"{models}.mlp-16x2.onnx", folder / "network.onnx")
     _plates(folder)
     _pack(folder)
-    _page(folder)
     done(["read", "experiment.toml"])
     done(_render("thin", "--keep-checkpoint", "--samples", "16"))
     (folder / "out.exr.part").rename(folder / "kept.part")
     for k in (1, 2):
         done(_render("thin", "--tile", f"{k}/2", "-o", "tile.exr"))
     done(["survey", "fold", "--no-fit", "-o", "done", "--quiet"])
-    if "ghosts" in kinds:
-        done(["flare", "lens.toml", "--fit", "ghosts.onnx", "--within", "1000um", "--angle", "10", "--quiet"])
     if "long runs" in kinds:
         done(["train", "experiment.toml", "-o", "run", "--rounds", "0", "--quiet"])
     for made in (*folder.glob("out.*"), *folder.glob("tile*.png")):
@@ -461,20 +449,3 @@ def _pack(folder: Path) -> None:
     lens = PackedLens("gauss", "Gauss", 50.0, 1.8, "US 2 1973", b"PNG", [form])
     write_pack(folder / "pack.zip", [lens])
     add_to_folder(folder / "user", lens)
-
-
-def _page(folder: Path) -> None:
-    """A page of `neurolens library` whose record is known, so that it is not drawn again."""
-    from neurolens import __version__
-    from neurolens.readers.lensfile import read_lens
-
-    record = {
-        "lens": "cooke_triplet_50", "page": "cooke_triplet_50", "sha256": read_lens(folder / "lens.toml").sha256,
-        "version": __version__, "name": "Triplet", "efl_mm": 50.0, "f_number": 2.8, "half_field_deg": 20.0,
-        "refractions": 6, "states": [], "ns": 5.0, "year": 1973, "designer": "", "rms_um": 1.0, "doubts": [],
-        "layout": "<svg></svg>",
-    }  # fmt: skip
-    place = folder / "pages" / "cooke_triplet_50"
-    place.mkdir(parents=True)
-    write_kept(place / "record.json", record)
-    (place / "index.html").write_text("<!DOCTYPE html>")

@@ -218,11 +218,6 @@ class _WithDifferentials:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._camera, name)
 
-    def for_worker(self) -> _WithDifferentials:
-        """The same about the camera of a worker."""
-        opener = getattr(self._camera, "for_worker", None)
-        return _WithDifferentials(opener() if opener else self._camera)
-
 
 # ---- The page. -------------------------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 480 x 270 pixels, one sample, headless Chromium with SwiftShader (the extra "web"; Debian: chromium): the time from a
 setting, the page at rest, to the first picture with it, and the processor's time that the GPU process of the browser
 took for it (Linux), which other work on the machine changes little: SwiftShader spreads it over the cores. The library
-is the page of all lenses with all downloads. Lamps: with every fitted ghost drawn, once all of them are.
+is the page of all lenses with all downloads. Lamps: with every ghost drawn, once all of them are.
 Writes view_speed.md and view_speed.json.
 """
 
@@ -67,9 +67,8 @@ def run(args: argparse.Namespace) -> int:
     from playwright.sync_api import sync_playwright
 
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
-        ghosts, files = str(Path(folder) / "ghosts.onnx"), [Path(folder) / f"{name}.html" for name in "alf"]
-        main(["flare", args.flare, "--fit", ghosts, "--within", "60um"])
-        for words, file in zip(([args.lens], [], [args.flare, ghosts]), files, strict=True):
+        files = [Path(folder) / f"{name}.html" for name in "alf"]
+        for words, file in zip(([args.lens], [], [args.flare, "--ghosts"]), files, strict=True):
             main(["view", *words, *(["--downloads", "glsl"] if words else []), "-o", str(file)])
         opened = play.chromium.launch(executable_path=browser, args=list(FLAGS))
         library = f"first picture, library ({files[1].stat().st_size / 1e6:.2f} MB)"

@@ -82,7 +82,7 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         ("flare cooke_triplet_50 --light 5,3", "--out a.exr --preview --wavelengths 9", "-o a.exr --quick --bins 9"),
         ("stmap thin --width 9 --film 36x24", "--out a --channels-nm 600,500,400", "-o a --wavelengths 600,500,400"),
         ("export cooke_triplet_50 --to c -o a.h", "--camera", "--whole-camera"),
-        ("flare cooke_triplet_50 --fit a.onnx", "--target-um 60 --wavelengths 9", "--within 60um --bins 9"),
+        ("flare cooke_triplet_50 --light 5,3", "--wavelengths 9", "--bins 9"),
         ("lens cooke_triplet_50 --derive-rims", "--vignetting 0.4", "--edge-pupil 0.4"),
     ):  # fmt: skip
         found, known = (vars(parse(f"{command} {words}".split())) for words in (old, new))
@@ -126,6 +126,7 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         (["lens", GAUSS, "lenses", "--efl", "20"], ["--focal-length", "one lens file"]),
         (["lens", GAUSS, "no_such_folder"], ["no_such_folder", "lens file"]),
         (["lens", "list", "--focus", "2", "--blades", "5", "--focal-length", "20"], ["--focus"]),
+        (["lens", "list", "--focusing", "paraxial"], ["--focus-mode"]),
         (["lens", PHONE, "--edge-pupil", "0.4"], ["--edge-pupil"]),
         (["lens", PHONE, "--derive-rims", "--f-number", "8"], ["--f-number"]),
         (["lens", PHONE, "--efl", "1e300"], ["0.001 to 1e+06"]),

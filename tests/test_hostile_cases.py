@@ -12,6 +12,7 @@ import pytest
 from command_line import failure
 from lens_models import edited
 
+from experiments.__main__ import main as experiment
 from neurolens.blender.pack import Form
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
@@ -113,7 +114,7 @@ def test_a_models_method_is_part_of_a_safe_name(case: str, monkeypatch: pytest.M
 
 def test_a_refused_lens_is_text_in_the_librarys_index(capsys: pytest.CaptureFixture[str]) -> None:
     """All lenses are refused here: the page is there, with the reason. In a browser: tests/view."""
-    assert main(["library", "-o", "new", "fault.toml", "--quiet"]) == 1
+    assert experiment(["library", "-o", "new", "fault.toml", "--quiet"]) == 1
     text = Path("new/index.html").read_text()
     assert "schema: got" in capsys.readouterr().out and "schema: got" in text
     assert "<img" not in text and "<script>document.documentElement" not in text

@@ -254,14 +254,6 @@ class Window:
         """The rays of film points [2, N] in mm, counted from the window's centre."""
         return self._camera.sample(film_mm + self._centre, pupil, wavelength_nm)
 
-    def for_worker(self) -> Window:
-        """The same window on a camera of the worker's own."""
-        opener = getattr(self._camera, "for_worker", None)
-        other = Window.__new__(Window)
-        other.__dict__.update(self.__dict__)
-        other._camera = self._camera if opener is None else opener()
-        return other
-
 
 def exact_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "trace") -> Camera:
     """The prescription itself, sampled over the surrogate's pupil: the same rays for the same random numbers."""

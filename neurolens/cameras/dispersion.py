@@ -7,7 +7,6 @@ polynomials in film point and wavelength still move the picture of every other o
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -146,12 +145,6 @@ class ReducedDispersion:
         found = self._tinted(self.camera.to_film(point_m, pupil, self._reference(point_m)), wavelength_nm)
         shift = self._shifts(found.film_mm, wavelength_nm[None])[0]
         return replace(found, film_mm=found.film_mm + shift * (found.weight > 0))
-
-    def for_worker(self) -> ReducedDispersion:
-        """This camera about the one that the camera has for a worker."""
-        other, opener = copy(self), getattr(self.camera, "for_worker", None)
-        other.camera = opener() if opener else self.camera
-        return other
 
     def _reference(self, rays: FloatArray) -> FloatArray:
         """The one wavelength, as often as there are rays [R, N]."""

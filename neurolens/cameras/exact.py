@@ -6,7 +6,6 @@ These are the only cameras that need torch. They sample the outline of the light
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache, cached_property
@@ -72,7 +71,6 @@ class ExactCamera(LensCamera):
         progress: Progress | None = None,
         runtime: Runtime = "trace",
     ) -> None:
-        self._pid = os.getpid()
         self.film_mm, self.path, self.name = shot.film_mm, Path(lens.path), lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = shot.wavelength_nm if self.dispersive else None
@@ -172,12 +170,6 @@ class ExactCamera(LensCamera):
         graph = exact_graph(self.lens, self._pupil_z_mm, self._range_nm)
         stopped = st.blocked(self.lens.stop_index, st.RIM)
         return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, stopped)
-
-    def for_worker(self) -> ExactCamera:
-        """This camera, in a render worker. A forked process must not enter torch's thread pool: it never returns."""
-        if os.getpid() != self._pid:
-            torch.set_num_threads(1)
-        return self
 
     def path_by_height(
         self, surfaces: list[int], film_mm: NDArray[Any], pupil_mm: NDArray[Any], wavelength_nm: NDArray[Any]

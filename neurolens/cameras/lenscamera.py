@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 from collections.abc import Callable
 from copy import copy
 from functools import cached_property
@@ -201,7 +202,7 @@ class LensCamera:
 
     def start(self, runtime: Runtime) -> None:
         """Choose what runs the camera; C is compiled at once. Raises InputError: no C compiler, or one that fails."""
-        self.runtime, self._runs = runtime, dict[tuple[Kind, int], GraphRun]()
+        self.runtime, self._runs = runtime, dict[tuple[int, Kind, int], GraphRun]()
         if runtime == "c":
             self.settings = self.settings | {"runtime": "fused"}
             self._run("rays")
@@ -252,10 +253,11 @@ class LensCamera:
         return film, square
 
     def _run(self, kind: Kind, companions: int = 0) -> GraphRun:
-        """The camera's graph in its runtime, made when it is first needed."""
-        if (kind, companions) not in self._runs:
-            self._runs[kind, companions] = self._made(kind, companions)
-        return self._runs[kind, companions]
+        """The camera's graph in its runtime, made when it is first needed; onnxruntime's in each process."""
+        key = 0 if self.runtime == "c" else os.getpid(), kind, companions
+        if key not in self._runs:
+            self._runs[key] = self._made(kind, companions)
+        return self._runs[key]
 
     def _made(self, kind: Kind, companions: int) -> GraphRun:
         lens = self.lens_graph(SCALARS if self.runtime == "c" else ONNX)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -155,18 +154,6 @@ class OnnxCamera(LensCamera):
                 raise InputError(self.model.path, "inverse", f"({error})", "a model exported with --inverse") from error
             self._inverse = inverse, front_aim(self.film, self.film_mm, self._light_nm, inverse.front)
         return self._inverse
-
-    def for_worker(self) -> OnnxCamera:
-        """The same camera with sessions of its own, for another process or thread; compiled code needs none."""
-        if self.runtime == "c":
-            return self
-        other = copy(self)
-        other.model, other.film = self.model.reopened(), copy(self.film)
-        other._inverse = None
-        other.start(self.runtime)
-        assert isinstance(self.film.scene, ModelScene)
-        other.film.scene = replace(self.film.scene, model=other.model)
-        return other
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ What runs is the graph that is built from the coefficients in a file, never the 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from copy import copy
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -146,7 +146,7 @@ class OnnxLens:
     def __init__(self, file: ModelFile) -> None:
         self.file, self.path, self.card = file, file.path, file.card
         self.axes, self.state = file.axes, default_state(file.card)
-        self._sessions: dict[tuple[str, ...], Any] = {}  # by the outputs that they compute; opened when they are needed
+        self._sessions: dict[tuple[Any, ...], Any] = {}  # by process and outputs; opened when they are needed
         self._graphs: dict[Form, Graph] = {}
 
     def at(self, *state: float) -> OnnxLens:
@@ -159,12 +159,6 @@ class OnnxLens:
             return self
         other = OnnxLens(self.file)
         other.card, other.state = card_at(self.file.card, self.axes, state), tuple(float(v) for v in state)
-        return other
-
-    def reopened(self) -> OnnxLens:
-        """The same model with sessions of its own, for another process or thread."""
-        other = copy(self)
-        other._sessions = {}
         return other
 
     @cached_property
@@ -240,12 +234,13 @@ class OnnxLens:
         return found
 
     def _session(self, outputs: tuple[str, ...]) -> Any:
-        if outputs not in self._sessions:
+        key = os.getpid(), *outputs  # a forked process opens its own
+        if key not in self._sessions:
             graph = self.graph(ONNX)
             wanted = pruned(graph, {name: graph.outputs[name] for name in outputs})
             shapes = {name: OUTPUTS[name] for name in outputs}
-            self._sessions[outputs] = open_session(self.path, write_onnx(wanted, {}), INPUTS, shapes)
-        return self._sessions[outputs]
+            self._sessions[key] = open_session(self.path, write_onnx(wanted, {}), INPUTS, shapes)
+        return self._sessions[key]
 
 
 def load_model(path: str | Path, lens: str | None = None) -> OnnxLens:

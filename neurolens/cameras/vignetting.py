@@ -18,7 +18,6 @@ on rings of the film, which are closer to each other towards the end of the ligh
 from __future__ import annotations
 
 import math
-from copy import copy
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -106,13 +105,6 @@ class Vignetted:
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """The camera's film points, weighed anew."""
         return self._weighed(found := self.camera.to_film(point_m, pupil, wavelength_nm), found.film_mm)
-
-    def for_worker(self) -> Vignetted:
-        """This camera about the one that the camera has for a worker."""
-        other = copy(self)
-        opener = getattr(self.camera, "for_worker", None)
-        other.camera = opener() if opener else self.camera
-        return other
 
     def _weighed(self, rays: Any, film_mm: FloatArray) -> Any:
         return replace(rays, weight=(rays.weight * self._factors(rays.weight > 0, film_mm)).astype(np.float32))

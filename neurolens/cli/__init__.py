@@ -57,7 +57,6 @@ def build_parser() -> Parser:
     from neurolens.cli.flare import Flare
     from neurolens.cli.handover import Handover
     from neurolens.cli.lens import Lens
-    from neurolens.cli.library import Library
     from neurolens.cli.mitsuba import Mitsuba
     from neurolens.cli.models import Models
     from neurolens.cli.photographs import Rims, Verify
@@ -69,7 +68,7 @@ def build_parser() -> Parser:
     from neurolens.cli.view import View
 
     groups: dict[str, tuple[type[Command], ...]] = {
-        "lenses": (Lens, Analyse, Verify, Rims, Convert, Glass, Library, Survey, View),
+        "lenses": (Lens, Analyse, Verify, Rims, Convert, Glass, Survey, View),
         "camera models of a lens": (Train, Models, Evaluate),
         "pictures": (Demo, Plan, Render, Flare),
         "compositing and other programs": (Defocus, Bokeh, Handover, StMap, Projection, Export, Blender, Mitsuba),

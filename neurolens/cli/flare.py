@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from neurolens.base.errors import InputError
-from neurolens.base.settings import add_options, between, from_options, positive, setting, titled
+from neurolens.base.settings import add_options, from_options, positive, setting, titled
 from neurolens.cli.arguments import (
     Glasses,
     LensState,
@@ -22,14 +22,13 @@ from neurolens.cli.arguments import (
     lens,
     lens_state,
     output_path,
-    within,
 )  # fmt: skip
 from neurolens.cli.keys import Frames, frames_group
 from neurolens.render.settings import ColourSpaceName, FlareSettings
 
 _COMMAND = "neurolens flare"
 _QUICK_WIDTH = 480  # pixels at most
-_LIGHTS, _PICTURE, _LAYERS, _FIT = "lights, at least one; all of them together", "picture", "layers", "fitted ghosts"
+_LIGHTS, _PICTURE, _LAYERS = "lights, at least one; all of them together", "picture", "layers"
 _SETTINGS = {  # the fields of `FlareSettings` by the titles of their options
     "": ["coating"],
     _LIGHTS: ["most"],
@@ -84,10 +83,9 @@ examples:
   neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,3/2.5/1.5 --layers 8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --blades 7 --f-number 11 --starburst -o flare.exr
-  neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr
-  neurolens flare laikin_double_gauss_50 --fit ghosts.onnx; neurolens flare ghosts.onnx --light 15,8 -o flare.exr"""
+  neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr"""
 
-    file: Path = lens(also="; a model is one of fitted ghosts", models=True, positional=True)
+    file: Path = lens(positional=True)
     light: tuple[str, ...] = setting(
         (), "degrees to the right of and above the axis, as the camera sees it; irradiance at the lens, radiance "
         "times solid angle in sr, as a number or R/G/B, of a point (default: the sun's disc with pi, which lights a "
@@ -136,22 +134,9 @@ examples:
         "multiply", kind=_gain, metavar="NAME=X", old=("tint",), title=_LAYERS,
     )  # fmt: skip
     threads: int = setting(2, "default: 2", within=(1, 256))
-    fit: Path | None = setting(
-        None, "fit polynomials to the ghosts, for lights in any direction and any smaller stop: OUT.onnx, which then "
-        "stands for the lens; of such a file OUT.h or OUT.glsl, a function a ghost", metavar="OUT", title=_FIT,
-    )  # fmt: skip
-    angle: float = setting(
-        35.0, "of --fit: largest angle between light and axis (default: 35)",
-        kind=between(0.1, 89, "degrees"), metavar="DEG", title=_FIT,
-    )  # fmt: skip
-    within: tuple[str, float] = within(
-        "of --fit: RMS on the film in um at which a ghost's degree is high enough (default: 10um)",
-        ("rms_um", 10.0),
-        _FIT,
-    )
     frames: Frames = frames_group(
         "flare of these frames to OUT.0001.exr and so on, of lights by their keys in lists, the lens, and the camera "
-        "of a scene of --lights by --key; a frame that exists is kept. Fitted ghosts keep their focus and zoom"
+        "of a scene of --lights by --key; a frame that exists is kept."
     )
     restart: bool = setting(False, "of --frames: make those that exist again")
     state: LensState = lens_state()
@@ -206,12 +191,6 @@ examples:
 
 def _check(args: argparse.Namespace) -> None:
     """Refuse options that exclude each other and files that cannot be written; raises InputError."""
-    for name in ("light", "lights", "image", "output", "path", "frames", "photons", "glare", "starburst"):
-        if args.fit is not None and getattr(args, name):
-            expected = f"no --{name} beside it: it writes the ghosts of one state, for any light"
-            raise InputError(_COMMAND, "--fit", args.fit, expected)
-    if args.within[0] != "rms_um":
-        raise InputError(_COMMAND, "--within", f"{args.within[1]:g}px", "micrometres, as 10um: a ghost has no pixels")
     if args.frames is not None and args.output is None:
         raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
     by_chance = args.photons or args.glare or args.barrel or args.sensor or args.dust or args.haze_per_mm

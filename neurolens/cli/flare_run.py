@@ -1,4 +1,4 @@
-"""What `neurolens flare` does: lights and lenses of all frames, ghosts fitted or traced, pictures and tables."""
+"""What `neurolens flare` does: lights and lenses of all frames, pictures of their ghosts, and tables."""
 
 from __future__ import annotations
 
@@ -15,26 +15,23 @@ import numpy as np
 from neurolens import __version__
 from neurolens.analysis.layout import lens_layout
 from neurolens.base.errors import InputError, warn
-from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.settings import changed
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.exact import ExactCamera, placed_settings
+from neurolens.cameras.exact import placed_settings
 from neurolens.cameras.field import Field, field_of
-from neurolens.cli.arguments import check_suffix, floats
+from neurolens.cli.arguments import floats
 from neurolens.cli.keys import frames_of
 from neurolens.cli.output import number, table
 from neurolens.flare.canvas import Raster
-from neurolens.flare.ghostmodel import GhostModel, read_ghosts, write_ghost_source, write_ghosts
 from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
 from neurolens.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
 from neurolens.flare.lights import SUN, Light, read_lights, with_disc
 from neurolens.flare.sources import KeptLights, SceneLights, chosen, highlights, keep_named
 from neurolens.frames.frame import Files, flare_channels
 from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Shot as CameraShot
 from neurolens.readers.any_format import read_any
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
 from neurolens.render.environment import SUN_RADIUS_RAD
@@ -47,7 +44,6 @@ from neurolens.render.pictures import (
     write_png,
 )
 from neurolens.render.scene import Scene, files_named, load_scene, seen_from
-from neurolens.setting.states import set_lens
 
 if TYPE_CHECKING:
     from neurolens.cli.flare import Flare
@@ -57,7 +53,6 @@ _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table; tables; ghosts of
 _FEWEST = 256  # rays behind a table
 _GHOST_FRAMES, _LIGHT_FRAMES = 16, 64  # at most; they decide which ghosts are the brightest, and which lights are kept
 _QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile of the lit pixels to this value
-_FREE = {"--f-number", "--blades", "--blade-rotation", "--blade-curvature"}  # options that fitted ghosts take
 
 
 class Shot(NamedTuple):
@@ -80,20 +75,15 @@ class Shot(NamedTuple):
 
 
 def run_flare(args: Flare) -> int:
-    """Trace the ghosts, print their table, and write the picture; or fit them."""
+    """Trace the ghosts, print their table, and write the picture."""
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
     if args.quick:
         settings = args.settings
         progress.note(f"quick: {args.width} pixels wide, {settings.bins} wavelengths, cells of {settings.cell_px:g}")
     states = list(_states(args))
-    model = _model(args, states)
-    tabled = read_any(args.file) if model is None else model.lens
-    if args.fit is not None:
-        return _fit(args, args.fit, progress, tabled, model, states[0])
-    shots = Shots(args, states, tabled, model, progress)
+    shots = Shots(args, states, read_any(args.file), progress)
     first = shots.at(states[0])
     results = {"lens": first.job.lens.name, "pairs": len(ghost_pairs(first.job.lens)), **first.metadata()}
-    results["fitted"] = 0 if model is None else len(model.pairs)
     if args.path is not None:
         _draw(first.job, args.path[0], Path(args.path[1]))
         results["path"] = args.path[1]
@@ -125,41 +115,13 @@ def _states(flare: Flare) -> Iterator[Flare]:
         yield replace(flare, state=replace(state, **of_lens), frame=frame, out=out, **place)
 
 
-def _model(args: Flare, states: Sequence[Flare]) -> GhostModel | None:
-    """The fitted ghosts, if the file holds these instead of a lens.
-
-    Raises:
-        InputError: options that need the lens itself, since the ghosts were fitted for one state.
-        ModelError: see `read_ghosts`.
-    """
-    if not is_model(args.file):
-        return None
-    wrong = [name for name in changed(args.state) if name not in _FREE]
-    wrong += [f"--{name}" for name in ("coating", "photons") if getattr(args.settings, name)]
-    wrong += ["--key focus"] * any(math.isfinite(s.focus_m) for s in states)
-    wrong += ["--key zoom"] * any(s.state.zoom is not None for s in states)
-    if wrong:
-        raise InputError(_COMMAND, wrong[0], args.file, "a lens: fitted ghosts have one state and two reflections")
-    model, half = read_ghosts(args.file), math.hypot(*args.film) / 2
-    if half > 1.001 * (known := float(model.report.get("film_radius_mm", math.inf))):
-        warn(f"{args.file}: fitted up to {known:.4g} mm from the axis, and the film's corners are at {half:.4g} mm")
-    return model
-
-
 class Shots:
     """The flare of each frame. Files are read once, and frames with the same focus, stop and zoom share the lens."""
 
-    def __init__(
-        self,
-        args: Flare,
-        states: Sequence[Flare],
-        tabled: Lens,
-        model: GhostModel | None,
-        progress: Progress,
-    ) -> None:
+    def __init__(self, args: Flare, states: Sequence[Flare], tabled: Lens, progress: Progress) -> None:
         if not (args.light or args.lights or args.image):
             raise InputError(_COMMAND, "--light", "(missing)", "--light, --lights or --image")
-        self._tabled, self._model, self._progress = tabled, model, progress
+        self._tabled, self._progress = tabled, progress
         self._fixed = [_light(text) for text in args.light]
         self._tracks = [t for path in args.lights if path.suffix.lower() != ".toml" for t in read_lights(path)]
         scenes = [(path, load_scene(path)) for path in args.lights if path.suffix.lower() == ".toml"]
@@ -167,14 +129,14 @@ class Shots:
         self._states = states[:: -(-len(states) // _LIGHT_FRAMES)] if args.frames.frames is not None else ()
         self._chosen: dict[Path, frozenset[int]] = {}
         self._fields: dict[tuple[Any, ...], Field] = {}
-        self._lenses: dict[tuple[Any, ...], tuple[Lens, GhostModel | None]] = {}
+        self._lenses: dict[tuple[Any, ...], Lens] = {}
         self._last: tuple[Flare, Shot] | None = None
 
     def at(self, args: Flare) -> Shot:
         """The flare of the frame with these arguments."""
         if self._last is None or self._last[0] is not args:
-            lens, model = self._lens(args)
-            lights, tracer = self._lights(args, lens), model or GhostTracer(lens)
+            lens = self._lens(args)
+            lights, tracer = self._lights(args, lens), GhostTracer(lens)
             raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
             job = FlareJob(lens, lights, raster, args.settings, threads=args.threads, ghosts=tracer)
             rays = max(_FEWEST, RANKED // max(len(lights), 1))
@@ -195,17 +157,11 @@ class Shots:
             return read_colour_space(plate) or SRGB
         return COLOUR_SPACES[self._scenes[0][1].settings.film.colour_space] if self._scenes else SRGB
 
-    def _lens(self, args: Flare) -> tuple[Lens, GhostModel | None]:
-        """The lens in its state, coated; or the fitted ghosts at the f-number and with the blades of the options."""
+    def _lens(self, args: Flare) -> Lens:
+        """The lens in its state, coated."""
         state = args.state.focus_m, args.state.f_number, args.state.zoom
-        if state not in self._lenses and self._model is not None:
-            lens = self._model.lens.with_aperture(args.state.aperture())
-            model = replace(
-                self._model, lens=lens if args.state.f_number is None else set_lens(lens, f_number=args.state.f_number)
-            )
-            self._lenses[state] = model.lens, model
-        elif state not in self._lenses:
-            self._lenses[state] = with_coating(args.state.set_lens(self._tabled), args.settings), None
+        if state not in self._lenses:
+            self._lenses[state] = with_coating(args.state.set_lens(self._tabled), args.settings)
         return self._lenses[state]
 
     def _lights(self, args: Flare, lens: Lens) -> list[Light]:
@@ -244,22 +200,16 @@ class Shots:
             raise InputError(path, "shape", f"({size})", "the film's, {:g}x{:g}".format(*args.film))
         try:
             fade = args.frame is not None and path != args.image
-            regions = highlights(picture, self._field(args, lens), args.film, args.threshold, args.settings.most, fade)
+            regions = highlights(picture, self._field(args), args.film, args.threshold, args.settings.most, fade)
         except InputError as error:
             raise InputError(path, error.field, error.value, error.expected) from None
         return _with_warning(regions, path)
 
-    def _field(self, args: Flare, lens: Lens) -> Field:
+    def _field(self, args: Flare) -> Field:
         """The directions that the film sees, which frames of one state share."""
         state = args.state.focus_m, args.state.f_number, args.state.zoom
         if state not in self._fields:
-            if self._model is not None:  # fitted ghosts, with their film
-                moved = (lens.film_z_mm or 0.0) - (set_lens(lens, focus_m=math.inf).film_z_mm or 0.0)
-                camera: Any = ExactCamera(
-                    lens, CameraShot(args.film, math.inf, film_offset_mm=moved), progress=self._progress
-                )
-            else:
-                camera = make_camera(args.file, args.state.shot(args.film), self._progress)
+            camera = make_camera(args.file, args.state.shot(args.film), self._progress)
             self._fields[state] = field_of(camera, args.focus_m, "equidistant")
         return self._fields[state]
 
@@ -361,8 +311,6 @@ def _draw(job: FlareJob, name: str, out: Path) -> None:
 
 def _text(shot: Shot, results: dict[str, Any]) -> str:
     lines = [f"{results['lens']}: {results['pairs']} pairs of surfaces"]
-    if results["fitted"]:
-        lines[0] += f", {results['fitted']} ghosts of them fitted: the table is of the fit"
     head = ("ghost", "energy of the image's", "x mm", "y mm", "RMS radius mm", "rays that arrive %")
     lights = shot.job.lights
     for light, ghosts in zip(lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
@@ -384,38 +332,3 @@ def _text(shot: Shot, results: dict[str, Any]) -> str:
     spans = [f"{names[0]} to {names[-1]}" if len(names) > 1 else names[0] for names in files]
     end = f"{spans[0]}, and the preview {spans[1]} at {results['exposure']:+g} stops" if spans else "done"
     return "\n\n".join([*lines, f"{end}: {results['seconds']:.1f} s"])
-
-
-def _fit(args: Flare, out: Path, progress: Progress, tabled: Lens, model: GhostModel | None, state: Flare) -> int:
-    """Fit and write a lens's ghosts, or write those of a model as source."""
-    from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
-
-    if model is not None:
-        check_suffix(out, "--fit", (".h", ".glsl"))
-        write_ghost_source(model, out)
-    else:
-        lens = with_coating(state.state.set_lens(tabled), args.settings)
-        check_suffix(out, "--fit", (".onnx",))
-        settings = GhostSettings(args.angle, film_radius_mm=math.hypot(*args.film) / 2, target_um=args.within[1])
-        with progress.stage("ghosts") as report:
-            model = fit_ghosts(lens, settings, report)
-        write_ghosts(model, out)
-    results = {"lens": model.lens.name, "out": str(out), **model.report}
-    return args.answer(results, lambda: _fit_text(results))
-
-
-def _fit_text(results: dict[str, Any]) -> str:
-    rows = [
-        [
-            r["ghost"], number(100 * r["energy"]), number(r["film_rms_um"]), number(100 * r["false_light"]),
-            number(100 * r["lost_light"]), str(r["degree"]), str(r["rims"]),
-        ]
-        for r in results["ghosts"][:_SHOWN]
-    ]  # fmt: skip
-    head = ("ghost", "energy %", "RMS um", "light too much %", "too little %", "degree", "rims")
-    energy, error = number(100 * results["kept_energy"]), number(results["film_rms_um"])
-    return (
-        f"{results['lens']}: {results['kept']} of {results['pairs']} ghosts, with {energy}% of their light; {error} um "
-        f"RMS on the film, by light; the brightest:\n\n{table(head, rows)}\n\n{results['out']}: fitted in "
-        f"{results['seconds']:.1f} s"
-    )

@@ -32,8 +32,8 @@ class View(Glasses, Answering):
     their error and what a ray costs there.
 
     LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
-    model, shown with the lens of its name; fitted ghosts (`neurolens flare --fit`) are drawn where a lamp
-    is dragged. Without any, every lens of lenses/ with the best polynomial and the best network of models/."""
+    model, shown with the lens of its name. Without any, every lens of lenses/ with the best polynomial and
+    the best network of models/."""
 
     about: ClassVar[str] = "write a page that runs lenses and models in a browser"
     epilog: ClassVar[str] = """\
@@ -41,7 +41,7 @@ examples:
   neurolens view -o view.html
   neurolens view petzval_portrait_100 laikin_double_gauss_50 -o two.html
   neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html
-  neurolens view laikin_double_gauss_50 ghosts.onnx -o flare.html"""
+  neurolens view laikin_double_gauss_50 --ghosts -o flare.html"""
     kept: ClassVar[str] = "nothing was written"
 
     lenses: tuple[Path, ...] = lens((), models=True, positional=True, metavar="LENS|MODEL", nargs="*")
@@ -51,6 +51,9 @@ examples:
         "a form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, or 40 kB a lens, "
         "exact lenses' first", kind=_kinds, metavar="KINDS",
     )  # fmt: skip
+    ghosts: bool = setting(
+        False, "a lamp that can be dragged draws its ghosts, the 24 brightest of each LENS; needs a C compiler"
+    )
     jobs: int = setting_of(Build, "jobs", Build.jobs)
 
     def run(self) -> int:

@@ -1,4 +1,4 @@
-"""What `neurolens view` does: it finds lenses with their models and ghosts, writes their code, and the page."""
+"""What `neurolens view` does: it finds lenses with their models, writes their code, and the page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
 from neurolens.base.bounds import RANGE
-from neurolens.base.errors import InputError, ModelError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
@@ -20,7 +20,6 @@ from neurolens.base.progress import Progress
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli.blender_lenses import forms_of, key_of, kind_of, library, squeeze_of
 from neurolens.cli.export_lens import write_lens
-from neurolens.flare.ghostmodel import KIND, GhostModel, read_ghosts
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import VISIBLE_NM, Lens
 from neurolens.readers import lensfile
@@ -28,7 +27,7 @@ from neurolens.readers.any_format import read_any
 from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import model_extras
-from neurolens.surrogates.card import card_in, read_card, read_metadata
+from neurolens.surrogates.card import read_card
 from neurolens.surrogates.source import Written, export_source
 from neurolens.view.page import Form, ViewLens, section_svg, write_page
 from neurolens.view.shaders import ghosts_glsl, path_glsl
@@ -50,12 +49,13 @@ class _Entry:
     models: Sequence[Path]
     lens: Lens | None
     zoom: str | None = None
-    ghosts: GhostModel | None = None
     file: Path | None = None
 
 
 def run_view(args: View) -> int:
     """Write the page."""
+    if args.ghosts and not args.lenses:
+        args.refuse("--ghosts", "(no lens)", "the lenses whose ghosts are wanted beside it")
     entries = list(_named(args.lenses) if args.lenses else _library())
     for entry in entries:
         own = [kind_of(read_card(file)) for file in entry.models]
@@ -69,7 +69,7 @@ def run_view(args: View) -> int:
         shaders = _shaders(entries, args.jobs, progress) if "osl" in kinds else {}
         with progress.stage(f"{len(entries)} lenses") as report:
             for entry in entries:
-                made.append(_view_lens(entry, Path(place), kinds, shaders))
+                made.append(_view_lens(entry, Path(place), kinds, shaders, args.ghosts))
                 report(len(made) / len(entries))
     about = write_page(args.out, made, kinds)
     left = about["left_out"]
@@ -115,12 +115,8 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
     lenses: dict[str, Lens | None] = {}
     models: dict[str, list[Path]] = {}
     from_library: dict[str, list[Path]] = {}
-    ghosts: dict[str, GhostModel] = {}
     for path in paths:
-        if is_model(path) and (model := _ghosts(path)):
-            if ghosts.setdefault(model.lens.lens_id, model) is not model:
-                raise InputError("neurolens view", f"ghosts of {model.lens.lens_id}", str(path), "one file a lens")
-        elif is_model(path):
+        if is_model(path):
             lens_id = str(read_card(path)["lens"]["id"])
             lenses.setdefault(lens_id, None)
             models.setdefault(lens_id, []).append(path)
@@ -130,24 +126,15 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
             ours = path.resolve().parent == (root / "lenses").resolve()  # a lens of the library brings its models
             if ours and any((root / "models").glob(f"{path.stem}.*.onnx")):
                 ((from_library[lens.lens_id], _),) = library(root / "models", root / "lenses", [path.stem])
-    for lens_id in ghosts.keys() - lenses.keys():
-        raise InputError("neurolens view", f"ghosts of {lens_id}", "(no such lens)", "the lens beside its ghosts")
     for lens_id, lens_or_none in lenses.items():
         own = models.get(lens_id) or from_library.get(lens_id, [])
         zoom = RANGE if any(read_card(m).get("states") for m in own) else None
-        yield _Entry(lens_id, own, lens_or_none, zoom, ghosts.get(lens_id))
+        yield _Entry(lens_id, own, lens_or_none, zoom)
 
 
-def _ghosts(file: Path) -> GhostModel | None:
-    """The ghosts of a file of fitted ghosts; None of a file of another kind."""
-    try:
-        card_in(file, read_metadata(file), KIND)
-    except ModelError:
-        return None
-    return read_ghosts(file)
-
-
-def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mapping[Path, str]) -> ViewLens:
+def _view_lens(
+    entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mapping[Path, str], with_ghosts: bool
+) -> ViewLens:
     """A lens of the page.
 
     Raises:
@@ -155,7 +142,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
     """
     forms = [_model_form(file, folder, kinds, shaders.get(file)) for file in entry.models]
     section: dict[str, Any] = {}
-    path, squeeze = None, 1.0
+    path, squeeze, ghosts = None, 1.0, None
     if entry.lens is not None and entry.file is not None:
         lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
         try:
@@ -165,14 +152,14 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
             if not forms:
                 raise  # a model of the lens stands in for it
         section, squeeze = section_svg(replace(layout_profile(Scene(lens, axis="y")), rays=())), squeeze_of(lens)
+        ghosts = ghosts_glsl(lens, image_radius_mm(lens)[0], _GHOSTS) if with_ghosts else None
     best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
     if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
         raise InputError("neurolens view", f"{entry.key}: efl_mm", focal_mm, "models of the lens file, in its state")
     return ViewLens(
         entry.key, str(best.card["name"]), str(best.card["source"]), float(best.card["efl_mm"]),
         min(float(f.card["film_radius_mm"]) for f in forms), squeeze, best.card["f_numbers"],
-        max(float(f.card["nearest_m"]) for f in forms), section, path, forms,
-        None if entry.ghosts is None else ghosts_glsl(entry.ghosts, _GHOSTS),
+        max(float(f.card["nearest_m"]) for f in forms), section, path, forms, ghosts,
     )  # fmt: skip
 
 

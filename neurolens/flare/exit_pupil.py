@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from contourpy import contour_generator
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from torch import Tensor
@@ -218,51 +219,24 @@ def _least(q: Array, r: Array, given: Array) -> Array:
     return np.asarray(np.linalg.solve(r, q.T @ given))
 
 
-# For the corners of a cell where light passes (1, 2, 4, 8, counterclockwise from the lower left): the edges (0 lower, 1
-# right, 2 upper, 3 left) from which and to which the outline goes, with the light on its left.
-_MARCH = {
-    1: ((0, 3),), 2: ((1, 0),), 3: ((1, 3),), 4: ((2, 1),), 5: ((0, 3), (2, 1)), 6: ((2, 0),), 7: ((2, 3),),
-    8: ((3, 2),), 9: ((0, 2),), 10: ((1, 0), (3, 2)), 11: ((1, 2),), 12: ((3, 1),), 13: ((0, 1),), 14: ((3, 0),),
-}  # fmt: skip
-
-
 def outline(pupil: ExitPupil) -> list[Array]:
     """The edge of the opening: closed lines [2, P] of points of the box, through a grid's cells, light on the left."""
     nodes = np.linspace(-1, 1, CELLS + 1)
     lit = pupil.passes((nodes, nodes))
     lit[[0, -1]] = lit[:, [0, -1]] = False
-    crossing: list[Array] = []
-    number: list[NDArray[np.int_]] = []
-    for axis in (0, 1):
-        where = np.nonzero(np.diff(lit, axis=axis))
-        first = np.stack([nodes[k] for k in where])
-        second = first.copy()
-        second[axis] += 2 / CELLS
-        inner, outer = np.where(lit[where], first, second), np.where(lit[where], second, first)
-        for _ in range(24):
-            middle = (inner + outer) / 2
-            passed = pupil.passes(middle)
-            inner, outer = np.where(passed, middle, inner), np.where(passed, outer, middle)
-        numbers = np.zeros((CELLS + 1, CELLS + 1), int)
-        numbers[where] = np.arange(len(where[0])) + sum(c.shape[1] for c in crossing)
-        crossing.append(inner)
-        number.append(numbers)
-    across, along = number
-    edges = (across[:, :-1], along[1:], across[:, 1:], along[:-1])
-    corners = lit[:-1, :-1] + 2 * lit[1:, :-1] + 4 * lit[1:, 1:] + 8 * lit[:-1, 1:]
-    following = np.zeros(sum(c.shape[1] for c in crossing), int)
-    for code, ways in _MARCH.items():
-        column, row = np.nonzero(corners == code)
-        for a, b in ways:
-            following[edges[a][column, row]] = edges[b][column, row]
-    places, left, lines = np.concatenate(crossing, 1), set(range(len(following))), []
-    while left:
-        line = [left.pop()]
-        while (after := int(following[line[-1]])) != line[0]:
-            line.append(after)
-        left.difference_update(line)
-        lines.append(_with_corners(places[:, line]))
-    return lines
+    # Half steps from the grid's corner: above 0.5 a cell whose lit nodes face each other keeps them apart.
+    found: Any = contour_generator(z=lit.T.astype(float)).lines(0.51)
+    closed = [np.rint(2 * line[:-1].T).astype(int) for line in found]
+    twice = np.concatenate(closed, 1) if closed else np.zeros((2, 0), int)
+    ends = twice // 2, (twice + 1) // 2  # the nodes of the grid's edge that the line crosses
+    first_lit = lit[tuple(ends[0])]
+    inner, outer = (nodes[np.where(first_lit == k, *ends)] for k in (True, False))
+    for _ in range(24):
+        middle = (inner + outer) / 2
+        passed = pupil.passes(middle)
+        inner, outer = np.where(passed, middle, inner), np.where(passed, outer, middle)
+    cuts = np.cumsum([line.shape[1] for line in closed])[:-1]
+    return [_with_corners(line) for line in np.split(inner, cuts, 1)] if closed else []
 
 
 def _with_corners(line: Array) -> Array:

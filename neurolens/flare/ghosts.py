@@ -14,7 +14,7 @@ import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -116,32 +116,6 @@ class GhostRays(NamedTuple):
         return np.stack([power, power * x, power * y, power * (x * x + y * y), power > 0], 1).sum(2)
 
 
-class GhostSource(Protocol):
-    """What traces the ghosts of a lens, exactly (`GhostTracer`) or fitted (`ghostmodel.GhostModel`)."""
-
-    @property
-    def lens(self) -> Lens:
-        """The lens, whose film is placed."""
-
-    @property
-    def pairs(self) -> tuple[Pair, ...]:
-        """The ghosts, in the order of all results."""
-
-    def start(self, rays: Floats) -> Floats:
-        """The form in which the other methods take rays [6, N]: points in mm and unit directions, lens frame."""
-
-    def follow(
-        self, start: Floats, wavelength_nm: float, *, only: Sequence[Pair] | None = None, reach: float = 1.0
-    ) -> GhostRays:
-        """Follow rays along the ghosts, or `only` some of them; rays whose `worst` exceeds `reach` may be given up."""
-
-    def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
-        """Follow rays along one ghost at several wavelengths, [W, 4, N]: rows as in `GhostRays`."""
-
-    def sums(self, rays: Floats, wavelength_nm: float) -> NDArray[np.float64]:
-        """`GhostRays.sums` of rays [6, N] for every ghost, then for the image, [P + 1, 5]."""
-
-
 class GhostTracer:
     """Traces ghosts of a set lens, and the direct light, as compiled code in float32.
 
@@ -239,12 +213,8 @@ class Ghost:
     passed: float
 
 
-def ghost_table(tracer: GhostSource, light: Light, wavelength_nm: float, count: int = RANKED) -> list[Ghost]:
-    """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first, by `count` rays.
-
-    Raises:
-        InputError: a model that is not made for this light or wavelength.
-    """
+def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: int = RANKED) -> list[Ghost]:
+    """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first, by `count` rays."""
     rays, _ = light_rays(tracer.lens, light, 0, count)
     *sums, (of_image, *_) = tracer.sums(rays, wavelength_nm).tolist()
     rows = []

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.flare.ghosts import GhostRays, GhostSource, Pair
+from neurolens.flare.ghosts import GhostRays, GhostTracer, Pair
 from neurolens.flare.lights import Light, Patch, light_towards, rays_across
 from neurolens.flare.steps import LOST, Floats
 from neurolens.lens.paraxial import first_order
@@ -64,7 +64,7 @@ class Grid:
 
 
 def grids_of(
-    tracer: GhostSource,
+    tracer: GhostTracer,
     light: Light,
     wavelength_nm: float,
     half_mm: tuple[float, float],
@@ -119,7 +119,7 @@ def grids_of(
 
 
 def ghost_moves(
-    tracer: GhostSource, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float
+    tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """How far the middle of a ghost's light moves on the film (mm) along the sides of a light's patch, [2, 2]; and how
     much of its light comes or goes along the side where that is most, and its light, [2].

@@ -17,7 +17,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
-from neurolens.flare.ghosts import GhostSource, GhostTracer, Pair, coated, ghost_pairs
+from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import PARTS, ghost_layers, ghost_picture, photon_picture
@@ -41,7 +41,7 @@ class FlareJob:
     Attributes:
         lens: its film must be placed (`set_lens`), and it must have the coating of the settings (`with_coating`).
         wavelength_nm: range of light. threads: of the work.
-        ghosts: traces the ghosts of the same lens and stop, exactly or fitted; None traces all of two reflections.
+        ghosts: traces the ghosts of the same lens and stop; None traces all of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".
         keep: picture beside which the photons of long work are kept until they are whole (see `kept_beside`).
     """
@@ -52,7 +52,7 @@ class FlareJob:
     settings: FlareSettings = FlareSettings()
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     threads: int = 2
-    ghosts: GhostSource | None = None
+    ghosts: GhostTracer | None = None
     single: tuple[str, ...] = ()
     keep: Path | None = None
 

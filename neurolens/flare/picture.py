@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from neurolens.base.kept import Kept
 from neurolens.flare.areas import Doubles, Floats, draw_edges, edges_of
 from neurolens.flare.canvas import Raster, Smear, axis_irradiance, enlarged, smear_of, smeared, spread
-from neurolens.flare.ghosts import GhostSource, Pair
+from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
 from neurolens.flare.lights import Light, Patch, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
@@ -56,7 +56,7 @@ class _Task(NamedTuple):
 
 
 def ghost_picture(
-    tracer: GhostSource, lights: Sequence[Light], raster: Raster, *, layers: Sequence[int] | None = None, **options: Any
+    tracer: GhostTracer, lights: Sequence[Light], raster: Raster, *, layers: Sequence[int] | None = None, **options: Any
 ) -> Floats:
     """The ghosts of lights, [layers, H, W, 3] linear sRGB, with the options of `ghost_layers`.
 
@@ -71,7 +71,7 @@ def ghost_picture(
 
 
 def ghost_layers(
-    tracer: GhostSource,
+    tracer: GhostTracer,
     lights: Sequence[Light],
     raster: Raster,
     layers: Sequence[int],
@@ -121,7 +121,7 @@ def ghost_layers(
 
 
 def _parts(
-    tracer: GhostSource, light: Light, nm: Sequence[float], middle_nm: float, half_mm: tuple[float, float], cell: float
+    tracer: GhostTracer, light: Light, nm: Sequence[float], middle_nm: float, half_mm: tuple[float, float], cell: float
 ) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
     """The patches of a light, and the ghosts of each with their grids and moves. Patches are finer for a ghost much of
     whose light comes or goes over a patch, because rims cut it differently there."""
@@ -145,7 +145,7 @@ def _parts(
         yield from (part for part in found if needs[part[1]] == most)
 
 
-def _draw(tracer: GhostSource, tasks: Sequence[_Task], canvas: Floats, per_mm: float, work: _Work) -> None:
+def _draw(tracer: GhostTracer, tasks: Sequence[_Task], canvas: Floats, per_mm: float, work: _Work) -> None:
     """Add ghosts to a picture of so many pixels per mm."""
     height, width, _ = canvas.shape
     high = max(1, _STRIP // (32 * width))

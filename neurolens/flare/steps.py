@@ -224,7 +224,7 @@ class Stack:
         most = {even: max([0, *(len(f.terms) for f in figures if f.even == even)]) for even in (True, False)}
         self._terms = {k: most[f.even] if f.terms else 0 for k, f in self._figures.items()}
         self.width = PLAIN + len(FIGURE) + ACROSS + max(most.values())
-        kinds = {place: self._kind(*place) for place in sorted(places)}
+        kinds = {place: self.kind(*place) for place in sorted(places)}
         self._kinds = tuple(dict.fromkeys(kinds.values()))
         self.functions = np.full((len(lens.surfaces), len(ACTIONS)), -1, np.int32)
         for place, kind in kinds.items():
@@ -257,7 +257,8 @@ class Stack:
         call.restype = None
         return call
 
-    def _kind(self, k: int, which: int) -> Kind:
+    def kind(self, k: int, which: int) -> Kind:
+        """What a step does at surface k by the action of this number."""
         lens, s, f = self.lens, self.lens.surfaces[k], self._figures.get(k)
         return Kind(
             ACTIONS[which][0],

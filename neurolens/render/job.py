@@ -145,7 +145,7 @@ class Job:
         size = {"width": self.grid.width, "height": self.grid.height}
         return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
-    def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
+    def render_tile(self, tile: int, part: int) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
         """Sums [pixels, columns] of one pass of one tile, what belongs to other pixels, and the seconds [2] spent in
         the camera, and in all."""
         began = time.perf_counter()
@@ -161,7 +161,7 @@ class Job:
         pupil = self.sampler.draw2(keys, PUPIL)
 
         called = time.perf_counter()
-        lens = self._hero_rays(camera, film_mm, pupil, hue)
+        lens = self._hero_rays(film_mm, pupil, hue)
         answered = time.perf_counter()
 
         bins, distance = self.spectral.bin_of(hue), np.full(len(hue), np.inf, np.float32)
@@ -222,27 +222,25 @@ class Job:
         sums[:, columns.DEPTH] = np.where(hit, depth, np.float32(0)).reshape(shape).sum(axis=1, dtype=np.float64)
         sums[:, columns.HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
 
-    def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> LensRays:
+    def _hero_rays(self, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> LensRays:
         """Rays of the hero wavelengths, with the weights of all lanes."""
         lanes = self.spectral.lanes
         used = lanes if self._tints is None or self.mode == "companions" else 1
         nm = np.stack([self._camera_wavelengths(_turned(hue, np.float32(k / lanes))) for k in range(used)])
         if self.mode == "companions":
-            return self._camera_rays(camera, film_mm, pupil, nm)
-        hero = self._camera_rays(camera, film_mm, pupil, nm[:1])
+            return self._camera_rays(film_mm, pupil, nm)
+        hero = self._camera_rays(film_mm, pupil, nm[:1])
         weight = np.repeat(hero.weight, lanes, axis=0)
         if self._tints is not None:  # nothing else depends on the wavelength
             weight *= self._tints.take(self.spectral.bin_of(hue), axis=-1)
-        elif camera.dispersive or not getattr(camera, "achromatic", False):
+        elif self.camera.dispersive or not getattr(self.camera, "achromatic", False):
             for lane in range(1, lanes):
-                weight[lane] = self._camera_rays(camera, film_mm, pupil, nm[lane : lane + 1]).weight
+                weight[lane] = self._camera_rays(film_mm, pupil, nm[lane : lane + 1]).weight
             weight *= hero.weight > 0  # the hero's ray must exist
         weight /= lanes
         return hero._replace(weight=weight)
 
-    def _camera_rays(
-        self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
-    ) -> LensRays:
+    def _camera_rays(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> LensRays:
         """Rays in the scene for wavelengths [lanes, N]; their weight is 0 where they do not pass."""
         lanes, count = wavelength_nm.shape
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
@@ -253,10 +251,10 @@ class Job:
             part = slice(start, start + at_once)
             film, square, nm = (np.ascontiguousarray(x[:, part]) for x in (film_mm, pupil, wavelength_nm))
             if places is None:
-                rays = camera.sample(film, square, nm[0])
+                rays = self.camera.sample(film, square, nm[0])
                 weight[0, part] = np.where(rays.status == 0, rays.weight, np.float32(0))
             else:
-                found = camera.sample_spectrum(film, square, nm)  # type: ignore[attr-defined]
+                found = self.camera.sample_spectrum(film, square, nm)  # type: ignore[attr-defined]
                 rays, weight[:, part], places[..., part] = found.rays, found.weight, found.film_mm
             np.add(self._axes @ rays.origin_m, self._position[:, None], out=origin[:, part])
             np.matmul(self._axes, rays.direction, out=direction[:, part])

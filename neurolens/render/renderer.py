@@ -202,7 +202,7 @@ def render(
         film: spectral sampling and white balance; left out, those of the scene.
         rows: the first row and the one after the last, of a part of the picture: its pixels are those of the whole
             one, bit for bit, and the result holds no others. Statistics are of these pixels, too.
-        threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open its own sessions.
+        threads: workers.
         progress: called with the fraction done and the estimated seconds left.
         watch: previews, checkpoints and an early end.
 
@@ -314,13 +314,11 @@ def _drive(film: Film, render: RenderTile) -> None:
 
 
 def _renderer(job: Job) -> RenderTile:
-    """Renders tiles where it is called, with a camera of its own; raises NeurolensError with one line."""
-    opener = getattr(job.camera, "for_worker", None)
-    camera = opener() if opener else job.camera
+    """Renders tiles where it is called; raises NeurolensError with one line."""
 
     def render(tile: int, part: int) -> tuple[Any, ...]:
         try:
-            return job.render_tile(camera, tile, part)
+            return job.render_tile(tile, part)
         except Exception as error:
             raise NeurolensError(_reason(error)) from error
 
@@ -366,6 +364,8 @@ def _serve(job: Job, pipe: Any, number: int, workers: int, parent: int) -> None:
     """The main function of a forked worker."""
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     _pin(number, workers)
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(1)  # a forked process must not enter torch's thread pool: it never returns
     try:
         render = _renderer(job)
         while True:

@@ -79,7 +79,7 @@ class ViewLens:
 
     Attributes:
         squeeze: of an anamorphic picture across. f_numbers: (focal length in mm, f-number of the widest stop) by zoom.
-        nearest_m: the nearest focus. section: from `section_svg`. path: from `shaders.path_glsl`. ghosts: fitted ones.
+        nearest_m: the nearest focus. section: from `section_svg`. path: from `shaders.path_glsl`. ghosts: of a lamp.
     """
 
     key: str

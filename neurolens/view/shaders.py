@@ -5,18 +5,20 @@ They are the weights of rays, the blades, a thin lens, the crossings of rays wit
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from neurolens.cameras.cameragraph import weight_graph
-from neurolens.flare.ghostmodel import GhostModel, ghost_graph
+from neurolens.flare.ghostgraph import entrances, ghost_graphs
+from neurolens.flare.ghosts import GhostTracer
 from neurolens.graph.c import Signature
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_glsl
-from neurolens.lens.prescription import Lens
+from neurolens.lens.prescription import VISIBLE_NM, Lens
 from neurolens.shaders.pupil import Blades
 from neurolens.trace.tracegraph import exact_graph
 
@@ -32,6 +34,7 @@ _PLACES = {
 }  # fmt: skip
 _ENTERING = {"dx": "d.x", "dy": "d.y", "x_mm": "at.x", "y_mm": "at.y", WAVELENGTH: "nm", STOP_RADIUS: "stop_radius"}
 _ARRIVING = ("arriving.x", "arriving.y", "arriving.z", "arriving.w")  # as `program.ARRIVING`
+_SINE = math.sin(math.radians(35.0))  # of the largest angle between the axis and a lamp that makes ghosts
 _COMMENT = re.compile(r"/\*.*?\*/\s*", re.DOTALL)
 
 
@@ -119,8 +122,8 @@ class GhostFunction:
 
 @dataclass(frozen=True)
 class Ghosts:
-    """Fitted ghosts, brightest first, for p = direction / sine and stops up to `stop_radius_mm`, and their share of all
-    ghosts' light."""
+    """Ghosts, brightest first, for p = direction / sine and stops up to `stop_radius_mm`; `light` is their share of the
+    light of all."""
 
     functions: Sequence[GhostFunction]
     sine: float
@@ -129,20 +132,22 @@ class Ghosts:
     light: float
 
 
-def ghosts_glsl(model: GhostModel, most: int) -> Ghosts:
-    """The brightest ghosts of a model, at most so many."""
-    of = {row["ghost"]: float(row["energy"]) for row in model.report["ghosts"]}
-    energy = [of[pair.name] for pair in model.pairs]
+def ghosts_glsl(lens: Lens, film_radius_mm: float, most: int) -> Ghosts:
+    """The brightest ghosts on the film of a lens, which must be placed; at most so many.
+
+    Raises:
+        InputError: as `GhostTracer` and `ghost_graphs`.
+    """
+    every = entrances(GhostTracer(lens), _SINE, film_radius_mm, 0.5 * sum(VISIBLE_NM))
     found = []
-    for pair, ghost in list(zip(model.pairs, model.ghosts, strict=True))[:most]:
-        name = f"ghost_{pair.name.replace('-', '_')}"
-        program = lower(ghost_graph(model, ghost))
+    for ghost, graph in zip(every[:most], ghost_graphs(lens, [g.pair for g in every[:most]], VISIBLE_NM), strict=True):
+        name, program = f"ghost_{ghost.pair.name.replace('-', '_')}", lower(graph)
         given = [_ENTERING[i] for i in Signature.of(program, name).inputs]
         call = f"{name}({', '.join([*given, *_ARRIVING])})"
         places = ghost.chief_mm.tolist(), ghost.scale_mm.tolist()
-        found.append(GhostFunction(pair.name, _text(program, name), call, *places))
-    light = sum(energy[:most]) / sum(energy)
-    return Ghosts(found, model.sine, model.wavelength_nm, model.stop_radius_mm, light)
+        found.append(GhostFunction(ghost.pair.name, _text(program, name), call, *places))
+    light = sum(g.light for g in every[:most]) / max(sum(g.light for g in every), 1e-300)
+    return Ghosts(found, _SINE, VISIBLE_NM, float(lens.stop_radius_mm), light)
 
 
 def _text(program: Program, name: str) -> str:

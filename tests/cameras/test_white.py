@@ -154,7 +154,7 @@ def test_natural_and_optical_are_what_an_integral_over_the_pupil_gives() -> None
 @pytest.mark.parametrize("kind", ["thin", "exact", "fisheye-orthographic"])
 def test_rays_stay_where_they_are_and_the_dark_stays_dark(kind: str) -> None:
     rays = film_rays(camera(kind), 3000)
-    before, after = camera(kind).sample(*rays), without(kind, "none").for_worker().sample(*rays)
+    before, after = camera(kind).sample(*rays), without(kind, "none").sample(*rays)
     assert np.array_equal(before.direction, after.direction) and np.array_equal(before.status, after.status)
     assert np.array_equal(before.weight > 0, after.weight > 0) and np.isfinite(after.weight).all()
     assert np.array_equal(without(kind, "both").sample(*rays).weight, before.weight)

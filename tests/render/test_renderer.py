@@ -148,23 +148,6 @@ def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
         assert kept["done"].min() >= 1 and kept["done"].max() == 2
 
 
-class Reopened(Pinhole):
-    """Works only where a worker has opened it."""
-
-    def for_worker(self) -> Pinhole:
-        return Pinhole(self.focal_length_mm, self.film_mm)
-
-    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
-        raise AssertionError("not opened")
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_each_worker_opens_its_own_camera(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
-    made = scene(environment=WHITE)
-    assert render(made, Reopened(50.0, FILM), **SIZE, samples=1, threads=threads).rgb.any()
-
-
 def test_errors_are_clear() -> None:
     made, small = scene(environment=WHITE), SIZE | {"samples": 1}
     for change, field in (

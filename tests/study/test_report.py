@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from report_results import Page, full_results
 
+from experiments import library_pages as library
+from experiments.__main__ import main as experiment
 from neurolens.base import records
 from neurolens.base.errors import InputError
 from neurolens.base.html import local_url
 from neurolens.base.records import Results, break_even_rays, pareto_front
-from neurolens.cli import library, main
 from neurolens.study.pages import write_report
 
 
@@ -129,14 +130,14 @@ def test_no_text_of_a_lens_runs_or_links_in_the_pages_of_a_library(
     bad = tmp_path / "bad.toml"
     bad.write_text('schema = 1\n"<img src=x onerror=alert(3)>" = 1\n')
     out = tmp_path / "new" / "pages"
-    assert main(["library", "-o", str(out), *map(str, [*files, bad]), "--quiet"]) == 1
+    assert experiment(["library", "-o", str(out), *map(str, [*files, bad]), "--quiet"]) == 1
     page = Page((out / "index.html").read_text(encoding="utf-8"))
     assert page.tags.count("script") == 1 and HOSTILE in page.text and "onerror=alert(3)" in page.text
     assert [link.rpartition("/")[2] for link in page.links] == ["index.html"] * 6
     assert len(set(page.links)) == 6 and all(re.fullmatch(r"\./[\w.-]+/index\.html", link) for link in page.links)
     assert all((out / link).parent.joinpath("record.json").is_file() for link in page.links)
     assert all(source.startswith("data:image/svg+xml,%3Csvg") for source in page.sources)
-    assert main(["library", "-o", str(tmp_path / "refused"), str(bad), "--quiet"]) == 1
+    assert experiment(["library", "-o", str(tmp_path / "refused"), str(bad), "--quiet"]) == 1
     said = capsys.readouterr().out
     assert said.count("bad.toml") == 2 and "onerror=alert(3)" in (tmp_path / "refused/index.html").read_text()
 

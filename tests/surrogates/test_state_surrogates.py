@@ -272,8 +272,7 @@ def test_cameras_zoom() -> None:
     square = np.random.default_rng(0).random((2, 500), np.float32)
     point = np.zeros((2, 500), np.float32)
     wavelength = np.full(500, 550, np.float32)
-    rays, again = camera.sample(point, square, wavelength), camera.for_worker().sample(point, square, wavelength)
-    assert np.array_equal(rays.direction, again.direction) and (rays.weight > 0).mean() > 0.9
+    assert (camera.sample(point, square, wavelength).weight > 0).mean() > 0.9
     # Through a small stop, rays of the film's centre meet where the camera is focused: 10 m from the film.
     rays = OnnxCamera(loaded(), Shot(film, 10.0, zoom=120.0, f_number=11)).sample(point, square, wavelength)
     t = (-10.0 - rays.origin_m[2]) / rays.direction[2]

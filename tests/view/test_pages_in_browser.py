@@ -127,14 +127,15 @@ def test_a_page_that_escapes_nothing_is_noticed(browser: Any, attack: str, tmp_p
 def test_library_and_the_pages_of_its_lenses(
     browser: Any, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from neurolens.cli import library
+    from experiments import library_pages as library
+    from experiments.__main__ import main as experiment
 
     def draw(path: Path) -> None:
         write_png(path, np.full((20, 30, 3), 0.5))
 
     monkeypatch.setattr(library, "_drawings", lambda lens: [("layout", ATTACK, draw)])  # all take ten seconds a lens
     files = sorted((folder / "lenses").iterdir())
-    assert main(["library", "-o", str(tmp_path / "out"), *map(str, files), "--quiet"]) == 1
+    assert experiment(["library", "-o", str(tmp_path / "out"), *map(str, files), "--quiet"]) == 1
     index = opened(browser, tmp_path / "out" / "index.html")
     assert ATTACKS[0] in index and "schema: got" in index
     pages = sorted(tmp_path.glob("out/*/index.html"))

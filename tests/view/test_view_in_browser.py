@@ -21,8 +21,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.flare.canvas import Raster
-from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
-from neurolens.flare.ghostmodel import GhostModel, write_ghosts
+from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import ghost_picture
 from neurolens.lens.shot import Shot
@@ -264,23 +263,13 @@ def test_other_lenses_too(others: Opened, key: str) -> None:
     assert areas[:, 0].mean() == pytest.approx(areas[:, 1].mean(), rel=0.02)
 
 
-@pytest.fixture(scope="module")
-def flare(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GhostModel]:
-    """A page with fitted ghosts, and these."""
-    folder = tmp_path_factory.mktemp("flare")
-    lens = set_lens(read_lens(ROOT / "lenses" / "brendel_tessar_100.toml"), focus_m=np.inf)
-    model = fit_ghosts(lens, GhostSettings(angle_deg=25.0, keep=0.8, rays=2000, target_um=60.0))
-    words = ["brendel_tessar_100", str(write_ghosts(model, folder / "ghosts.onnx")), "--downloads", "glsl"]
-    assert main(["view", *words, "-o", str(folder / "view.html"), "--json"]) == 0
-    return folder / "view.html", model
-
-
 @pytest.mark.parametrize("gpu", GPUS)
-def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(
-    browser: Any, flare: tuple[Path, GhostModel], gpu: str
-) -> None:
-    file, model = flare
-    opened = Opened(browser, file, gpu)
+def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: Any, tmp_path: Path, gpu: str) -> None:
+    lens = set_lens(read_lens(ROOT / "lenses" / "brendel_tessar_100.toml"), focus_m=np.inf)
+    tracer = GhostTracer(lens)
+    words = ["brendel_tessar_100", "--ghosts", "--downloads", "glsl"]
+    assert main(["view", *words, "-o", str(tmp_path / "view.html"), "--json"]) == 0
+    opened = Opened(browser, tmp_path / "view.html", gpu)
     opened.set(view="one", tool="lamp", width=WIDE, wavelength=NM, focus=np.inf, most=1)
     box = opened.page.locator("#picture").bounding_box()
     assert box is not None
@@ -288,7 +277,7 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(
     opened.page.mouse.down()
     opened.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
     opened.page.mouse.up()
-    drawn = f"neurolens.ghosts.shown === {len(model.pairs)} ? done() : setTimeout(look, 20)"
+    drawn = f"neurolens.ghosts.shown === {len(tracer.pairs)} ? done() : setTimeout(look, 20)"
     opened.page.evaluate(f"new Promise((done) => {{ const look = () => {drawn}; look(); }})")
     assert opened.number("neurolens.set.lamp") == pytest.approx([0.7, 0.7], abs=0.01)
     found = opened.number("(async () => [...await neurolens.engine.gpu.read(neurolens.ghosts.film)])()")
@@ -297,7 +286,7 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(
     rgb = (opened.number("neurolens.set.irradiance"),) * 3
     light = Light(np.degrees(np.arctan2(x, -z)), np.degrees(np.arcsin(y)), rgb)
     raster = Raster(tuple(opened.number("neurolens.engine.sides.a.values.film_mm")), WIDE, HIGH)
-    wanted = ghost_picture(model, [light], raster, wavelength_nm=(NM - 1, NM + 1), wavelengths=1, cell_px=4)[0, ..., 1]
+    wanted = ghost_picture(tracer, [light], raster, wavelength_nm=(NM - 1, NM + 1), wavelengths=1, cell_px=4)[0, ..., 1]
     assert picture.sum() == pytest.approx(wanted.sum(), rel=0.02)
     coarse = [p.reshape(27, 5, 48, 5).mean((1, 3)) for p in (picture, wanted)]
     assert np.abs(coarse[0] - coarse[1]).sum() < 0.1 * coarse[1].sum()

@@ -9,7 +9,6 @@ import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.base.html import text_of
-from neurolens.cli import main, view_run
+from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.osl import urgent
@@ -269,17 +268,6 @@ def test_bad_input_is_one_line_and_no_page(
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert said in error
     assert not list(tmp_path.glob("*.html"))
-
-
-def test_two_files_of_ghosts_of_one_lens_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(view_run, "_ghosts", lambda _: SimpleNamespace(lens=SimpleNamespace(lens_id=LENS)))
-    files = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
-    for file in files:
-        file.touch()
-    assert main(["view", LENS, *map(str, files), "-o", str(tmp_path / "view.html")]) == 2
-    assert f"ghosts of {LENS}: got '{files[1]}', expected one file a lens" in capsys.readouterr().err
 
 
 def test_a_paraboloid_has_a_path() -> None:

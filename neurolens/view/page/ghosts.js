@@ -1,4 +1,4 @@
-// Ghosts of one lamp far away: each fitted ghost's function on a grid of the front, its cells drawn as areas that add up.
+// Ghosts of one lamp far away: each ghost's function on a grid of the front, its cells drawn as areas that add up.
 const GHOST_CELLS = 28, GHOST_NM = 3; // cells a side (within 1% of 64), and wavelengths, of each ghost
 
 class GhostView {

@@ -164,7 +164,7 @@ function paint() {
   if (!engine.sides.a?.film) return;
   engine.paint(set.view, set.wipe, set.scene === "night" ? 1.8 : 1, ghosts.shown ? ghosts.film : null, ghosts.dimmed);
   const { samples } = engine.sides.a, { lens } = set;
-  const flared = !set.lamp ? "" : ghosts.all ? `; ${ghosts.shown} of ${ghosts.all} ghosts, which have ${(100 * lens.ghosts.light).toFixed(1)} % of all ghosts' light, at the focus of their fit` : "; no ghosts are fitted for a lamp so far from the axis";
+  const flared = !set.lamp ? "" : ghosts.all ? `; ${ghosts.shown} of ${ghosts.all} ghosts, which have ${(100 * lens.ghosts.light).toFixed(1)} % of all ghosts' light, at infinite focus` : "; ghosts are drawn for lamps up to 35 degrees from the axis";
   $("said").textContent = `${samples} of ${set.most} samples a pixel${flared}`;
 }
 

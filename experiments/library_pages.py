@@ -1,7 +1,13 @@
-"""`neurolens library`: a page for each lens of a folder, and an index that searches and sorts."""
+"""Pages of lenses, one for each, and an index that searches and sorts.
+
+A page has the section, spots, MTF, distortion, vignetting, colour, breathing and bokeh at three points of the field,
+the models with error and cost, the source and what is doubtful about it; the index has search, sorted by year, focal
+length, speed, error and character. A lens whose page is there, from the same file by the same version, is kept.
+"""
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,17 +34,9 @@ _COLOURS = 96  # in the palette of a picture
 
 @dataclass(frozen=True, kw_only=True)
 class Library(Reporting):
-    """Write a folder of pages: of each lens its section, spots, MTF, distortion, vignetting, colour, breathing and
-    bokeh at three points of the field, its models with error and cost, its source and what is doubtful about it; and an
-    index with search, sorted by year, focal length, speed, error and character. A lens whose page is there, from the
-    same file by the same version, is kept. Needs the extra "train" (torch)."""
+    """The lenses whose pages are written, and the folder."""
 
-    about: ClassVar[str] = "pages of lenses: pictures, figures, models"
-    epilog: ClassVar[str] = """\
-examples:
-  neurolens library -o pages
-  neurolens library -o pages laikin_double_gauss_50 my_lens.toml"""
-    kept: ClassVar[str] = "finished pages are kept; the same command goes on"
+    called: ClassVar[str] = "experiments library"
 
     lenses: tuple[Path, ...] = lens((), " (default: all of lenses/)", positional=True, nargs="*")
     out: Path = output_path("FOLDER", "for the pages")
@@ -63,6 +61,14 @@ examples:
         lines = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
         data = {"folder": str(folder), "bytes": size, "lenses": records}
         return self.answer(data, lambda: "\n".join(lines), 1 if failed else 0)
+
+
+OPTIONS = [Library.add_options]
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the pages; 1 where a lens could not be shown."""
+    return Library.of(args).run()
 
 
 def _page_names(files: Sequence[Path]) -> list[str]:
