@@ -127,7 +127,9 @@ def _planes(file: Path) -> dict[str, Any]:
     """The channels of all parts of an EXR, by name."""
     import OpenImageIO  # of Blender
 
-    picture, planes, part = OpenImageIO.ImageInput.open(str(file)), {}, 0
+    picture: Any = OpenImageIO.ImageInput.open(str(file))
+    planes: dict[str, Any] = {}
+    part = 0
     while picture.seek_subimage(part, 0):
         names = picture.spec().channelnames
         planes |= zip(names, picture.read_image(part, 0, 0, len(names), "float").transpose(2, 0, 1), strict=True)

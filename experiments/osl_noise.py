@@ -12,6 +12,8 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
+from operator import itemgetter
 from typing import Any
 
 from experiments import lab, osl_speed
@@ -93,12 +95,12 @@ def _page(data: Mapping[str, Any]) -> str:
     ]
     columns.append(lab.Column("camera", "camera"))
     for n in SAMPLES:
-        columns.append(lab.Column(f"{n} samples, %", lambda r, n=n: f"{100 * noise(r, n):.2f}"))
+        columns.append(lab.Column(f"{n} samples, %", partial(noise, samples=n), ".2f", 100))
     columns.append(lab.Column("worst channel at 16, %", lambda r: f"{100 * max(r['noise']['16']):.2f}"))
     columns.append(lab.Column("median pixel at 16, %", lambda r: f"{100 * r['median']['16']:.2f}"))
     for t in thresholds:
-        columns.append(lab.Column(f"adaptive samples at {t:g}", lambda r, t=t: f"{r[_taken(t)]:.0f}"))
-        columns.append(lab.Column("noise then, %", lambda r, t=t: f"{100 * r[f'noise {t:.3g}']:.2f}"))
+        columns.append(lab.Column(f"adaptive samples at {t:g}", itemgetter(_taken(t)), ".0f"))
+        columns.append(lab.Column("noise then, %", itemgetter(f"noise {t:.3g}"), ".2f", 100))
     (width, height), seeds = plan["size"], len(plan["seeds"])
     told = f"{width} x {height} pixels without an edge of {_EDGE}, {seeds} seeds, box filter; reference of "
     told += f"{plan['reference']} samples, at most {plan['most']} for adaptive sampling; Blender {data['blender']}; "
