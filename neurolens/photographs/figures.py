@@ -202,10 +202,12 @@ def _rising(height_mm: Array) -> int:
 
 
 def between(height_mm: Array, known_mm: Array, values: Array) -> Array:
-    """Values at heights between known ones; NaN beyond, and where too few are known."""
-    if len(known_mm) < _FEWEST:
+    """Values at heights between known ones, as far as these rise; NaN beyond, and where too few are known."""
+    count = _rising(known_mm) if len(known_mm) else 0
+    if count < _FEWEST:
         return np.full_like(height_mm, math.nan)
-    return np.asarray(CubicSpline(known_mm, values)(np.where(height_mm <= known_mm[-1], height_mm, math.nan)))
+    known = np.where(height_mm <= known_mm[count - 1], height_mm, math.nan)
+    return np.asarray(CubicSpline(known_mm[:count], values[:count])(known))
 
 
 def shapes(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> tuple[Array, Array, float]:

@@ -14,6 +14,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.compare import compare, open_light
+from neurolens.photographs.figures import between
 from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial, profile_named
 from neurolens.photographs.verify import names_of, verify
 from neurolens.readers.lensfile import read_lens
@@ -175,3 +176,11 @@ def test_a_fisheye_whose_profile_does_not_state_its_projection() -> None:
     assert canon.projection == "fisheye"
     (plain,) = profile_named("Canon EF 50mm f/1.4 USM")[:1]
     assert plain.projection == "rectilinear"
+
+
+def test_heights_that_fall_near_the_edge_end_a_curve() -> None:
+    """As chief rays of a wide zoom do, whose light of one colour turns back before that of another."""
+    known = np.array([*np.arange(1.0, 11.0), 9.5])
+    found = between(np.array([2.5, 9.8, 10.5]), known, known**2)
+    assert found[:2] == pytest.approx([6.25, 96.04]) and math.isnan(found[2])
+    assert np.isnan(between(np.ones(3), known[::-1], known)).all()
