@@ -117,18 +117,6 @@ def test_errors_of_zooms_and_of_inverse_maps() -> None:
     assert cells("scene point to film")[0].endswith(f"; {len(lenses)} lenses")
 
 
-def test_speed_of_ghosts() -> None:
-    found = results("ghosts")
-    rows = {(r["way"], r["cell_px"], r["wavelengths"]): r for r in found["rows"]}
-    exact, fitted = rows["exact, compiled", 40.0, 15], rows["polynomials", 40.0, 15]
-    ray, picture = found["ray_ns"], [r["cpu_ms"][0] for r in (exact, fitted)]
-    _, first, second, times, error = cells("ghosts of a double Gauss")
-    assert_printed(first, [ray[0], picture[0]])
-    assert_printed(second, [ray[1], picture[1]])
-    assert_printed(times, [ray[0] / ray[1], picture[0] / picture[1]])
-    assert_printed(error, [fitted["rms_um"], 100 * abs(fitted["energy"])])
-
-
 def test_errors_of_the_networks_that_ship() -> None:
     rows = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))["models"]
     kinds = errors_by_kind(rows, "mlp-16x2")
