@@ -398,6 +398,14 @@ def test_it_says_what_is_missing(browser: Any, page_file: Path) -> None:
         page.close()
 
 
+def test_a_page_that_loses_webgpu_goes_on_with_webgl2(browser: Any, page_file: Path) -> None:
+    opened = Opened(browser, page_file, "webgpu")
+    with opened.page.expect_navigation():
+        opened.page.evaluate("void neurolens.engine.gpu.device.destroy()")
+    opened.page.evaluate("neurolens.ready")
+    assert opened.number("neurolens.engine.gpu.name") == "WebGL2" and opened.said == []
+
+
 def test_a_phone_shows_everything_in_its_width(browser: Any, page_file: Path) -> None:
     opened = Opened(browser, page_file, viewport={"width": 360, "height": 740}, has_touch=True)
     assert opened.number("document.documentElement.scrollWidth") <= 360

@@ -12,7 +12,7 @@ class WebGpu {
     Object.assign(this, { canvas, context, device, blends, name: "WebGPU", format: navigator.gpu.getPreferredCanvasFormat() });
     context.configure({ device, format: this.format, alphaMode: "opaque" });
     device.addEventListener("uncapturederror", ({ error }) => fail(error));
-    device.lost.then(({ message }) => fail(Error(`The GPU stopped: ${message} With ?gpu=webgl2 after its address the page uses WebGL2.`)));
+    device.lost.then(() => (location.search = "?gpu=webgl2")); // drivers too new or too old for WebGPU run WebGL2
     this.blank = this.target(1, 1);
   }
 
