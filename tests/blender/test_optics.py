@@ -103,8 +103,8 @@ class Studio:
         assert found.shape[:2] == shape
         return found
 
-    def measured(self, shot: dict[str, Any]) -> dict[str, Any]:
-        return measures(self.picture(shot), shot["crop"][:2])
+    def measured(self, shot: dict[str, Any], samples: int | None = None) -> dict[str, Any]:
+        return measures(self.picture(shot, samples), shot["crop"][:2])
 
 
 @pytest.fixture(scope="module")
@@ -213,9 +213,10 @@ def test_a_scene_in_centimetres_is_the_scene_in_metres(studio: Studio) -> None:
         for unit_m in (1.0, 0.01):
             data.dof.focus_distance, data.clip_end = 3.0 / unit_m, 100.0 / unit_m
             scaled = shot | {"point_m": [v / unit_m for v in shot["point_m"]], "radius_m": shot["radius_m"] / unit_m}
-            found.append(studio.measured(scaled | {"custom": custom | {"unit_m": unit_m}}))
+            found.append(studio.measured(scaled | {"custom": custom | {"unit_m": unit_m}}, samples=434))
     finally:
         data.cycles_custom["unit_m"], data.clip_end = 1.0, 100.0
+    assert found[1]["centroid_px"][0] == pytest.approx(found[0]["centroid_px"][0], abs=0.02)
     for seen in found:
         assert seen["centroid_px"][0] == pytest.approx(shot["found"]["centroid_px"][0], abs=0.3)
         assert seen["area_px"] == pytest.approx(shot["found"]["area_px"], rel=0.02)
