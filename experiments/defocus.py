@@ -1,9 +1,9 @@
 """`neurolens defocus` beside path-traced pictures of the same lens, and beside a thin lens.
 
-Six scenes through a 50 mm f/1.4, wide open: a sharp plate (pinhole, 128 samples a pixel), the lens and the thin lens
-framed as it, path-traced (256 samples). FLIP (0 is equal) of the blurred plate against the path-traced lens, with
+Six scenes through a 50 mm f/1.4, wide open: a sharp plate (pinhole, 512 samples a pixel), the lens (1,024) and
+the thin lens framed as it (256), path-traced. FLIP (0 is equal) of the blurred plate against the path-traced lens, with
 highlights as discs and without, and of the path-traced thin lens against it. Rendered pictures stay in the folder
-`--pictures` and are taken from there by the next run; all take an hour of one slow core. The noise of both pictures
+`--pictures` and are taken from there by the next run; all take half an hour of one core. The noise of both pictures
 is part of FLIP: that of two path-traced pictures of other seeds is its floor, measured on the scene with the largest
 FLIP. Also a 4K plate, made of the first scene's by repeating pixels, for its time. Writes defocus.md and defocus.json.
 """
@@ -39,7 +39,7 @@ from neurolens.study.image import flip, rel_mse
 
 LENS = "leica_summilux_m_50mm_f1_4"
 SCENES = ("room", "garden", "lights", "chess", "studio", "lamps")
-F_NUMBER, WIDTH, SAMPLES = 1.4, 480, {"pinhole": 128, "fused": 256, "thin": 256}
+F_NUMBER, WIDTH, SAMPLES = 1.4, 480, {"pinhole": 512, "fused": 1024, "thin": 256}
 _LARGE = 3840, 2160
 _FLOOR_SEED = 1000
 # A render of a point of light has this film, pixels per mm, focus and radius of the ball in pixels; its kernel has so
@@ -240,8 +240,8 @@ _COLUMNS = lab.columns(
     ("from beyond the plate", "beyond", ".2%"),
 )
 _NOTES = """\
-{lens} at f/{f_number:g}, {width} pixels wide; FLIP against the same lens path-traced with {samples} samples a pixel
-(goal 0.06). Two path-traced pictures of {worst} with other seeds differ by FLIP {floor:.3f}; from the
+{lens} at f/{f_number:g}, {width} pixels wide; FLIP of plates of {plate} samples a pixel, blurred, against the same lens
+path-traced with {samples} (goal 0.06). Two path-traced pictures of {worst} with other seeds differ by FLIP {floor:.3f}; from the
 mean of both the blurred plate differs by {better:.3f}. A plate of {first} at
 {wide} x {high} takes {large:.0f} s of one core (goal 60), {count} highlights among them."""
 _POINTS, _PLATES = ((0.0, 0.8), (12.0, 0.8), (12.0, 10.0)), (16, 64)
@@ -317,6 +317,7 @@ def run(args: argparse.Namespace) -> None:
         "f_number": F_NUMBER,
         "width": WIDTH,
         "samples": SAMPLES["fused"],
+        "plate": SAMPLES["pinhole"],
         "first": first,
         "worst": worst,
         "better": better,
