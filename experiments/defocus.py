@@ -241,8 +241,8 @@ _COLUMNS = lab.columns(
 )
 _NOTES = """\
 {lens} at f/{f_number:g}, {width} pixels wide; FLIP of plates of {plate} samples a pixel, blurred, against the same lens
-path-traced with {samples} (goal 0.06). Two path-traced pictures of {worst} with other seeds differ by FLIP {floor:.3f}; from the
-mean of both the blurred plate differs by {better:.3f}. A plate of {first} at
+path-traced with {samples} (goal 0.06). Two path-traced pictures of {worst} with other seeds differ by FLIP
+{floor:.3f}; from the mean of both the blurred plate differs by {better:.3f}. A plate of {first} at
 {wide} x {high} takes {large:.0f} s of one core (goal 60), {count} highlights among them."""
 _POINTS, _PLATES = ((0.0, 0.8), (12.0, 0.8), (12.0, 10.0)), (16, 64)
 _POINT_COLUMNS = lab.columns(
