@@ -102,8 +102,8 @@ def _page(data: Mapping[str, Any]) -> str:
         columns.append(lab.Column(f"adaptive samples at {t:g}", itemgetter(_taken(t)), ".0f"))
         columns.append(lab.Column("noise then, %", itemgetter(f"noise {t:.3g}"), ".2f", 100))
     (width, height), seeds = plan["size"], len(plan["seeds"])
-    told = f"{width} x {height} pixels without an edge of {_EDGE}, {seeds} seeds, box filter; reference of "
-    told += f"{plan['reference']} samples, at most {plan['most']} for adaptive sampling; Blender {data['blender']}; "
-    head = told + lab.machine_line()
+    about = f"{width} x {height} pixels without an edge of {_EDGE}, {seeds} seeds, box filter; reference of "
+    about += f"{plan['reference']} samples, at most {plan['most']} for adaptive sampling; Blender {data['blender']}; "
+    head = about + lab.machine_line()
     return lab.page("# Noise in Cycles", __doc__ or "", head, lab.table(columns, data["rows"]),
                     lab.goal_table("Goal", data["goals"]))  # fmt: skip

@@ -26,8 +26,11 @@ _DEGREE = 13  # of the numbers of a surface by the wavelength
 
 @dataclass(frozen=True, eq=False)
 class Entrance:
-    """A ghost and where its light enters: at the points (mm) chief_mm p + scale_mm u of the plane z = 0 with |u| < 1,
-    where p are the x and y of the light's direction over the largest that they reach; `light` is that on the film."""
+    """A ghost, and the disc through which its light enters the lens.
+
+    The disc has the points chief_mm p + scale_mm u of the plane z = 0 (mm), with |u| < 1, where p is the light's direction
+    (x, y) over the sine of the widest angle. `light` is the ghost's light on the film.
+    """
 
     pair: Pair
     light: float
@@ -38,7 +41,7 @@ class Entrance:
 def entrances(
     tracer: GhostTracer, sine: float, film_radius_mm: float, wavelength_nm: float, seed: int = 0
 ) -> list[Entrance]:
-    """Where the ghosts enter whose light reaches the film, brightest first.
+    """Find the discs through which the ghosts enter whose light reaches the film, brightest first.
 
     Args:
         tracer: of a lens whose film is placed. sine: of the largest angle between the axis and the light.

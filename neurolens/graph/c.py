@@ -317,7 +317,7 @@ _IN_DOUBLE = {
 
 
 def write_double(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
-    """The text of `write_c` in double precision; hyperbolic tangents, of absorption, keep the error of single."""
+    """Write what `write_c` writes, in double precision; absorption stays as exact as in single."""
     token = _DOUBLE.set(True)
     try:
         text = write_c(program, name, comment, extras)
@@ -327,7 +327,7 @@ def write_double(program: Program, name: str, comment: Sequence[str], extras: Ex
 
 
 def in_double(text: str) -> str:
-    """C text with double in place of float."""
+    """Replace float by double in C text."""
     for pattern, new in _IN_DOUBLE.items():
         text = re.sub(pattern, new, text)
     return text

@@ -328,7 +328,7 @@ class CompiledSource:
     """A program as a shared library in its own temporary folder.
 
     Args:
-        double: for double precision, which programs with lookups do not have.
+        double: whether it computes in double precision, which is not for programs with lookups.
 
     Raises:
         Unavailable: there is no compiler, or it fails; the message says how.

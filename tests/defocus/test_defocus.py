@@ -241,7 +241,7 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
 
 
 def test_the_middle_of_a_disc_on_the_axis_is_smooth() -> None:
-    """By the parabola through its surroundings; one pixel beside the axis as much as on it."""
+    """The light in the middle five pixels continues the parabola about them, on the axis and one pixel beside it."""
     size = (3840, 2560)
     camera = make_camera("fused:leica_summilux_m_35mm_f1_4_asph_v1", Shot((36.0, 24.0), focus_m=0.7, f_number=1.4))
     for off in (0.0, 1.0):

@@ -179,7 +179,7 @@ def test_a_fisheye_whose_profile_does_not_state_its_projection() -> None:
 
 
 def test_heights_that_fall_near_the_edge_end_a_curve() -> None:
-    """As chief rays of a wide zoom do, whose light of one colour turns back before that of another."""
+    """Chief rays of one colour may turn back before those of another, as in a wide zoom; values end where they do."""
     known = np.array([*np.arange(1.0, 11.0), 9.5])
     found = between(np.array([2.5, 9.8, 10.5]), known, known**2)
     assert found[:2] == pytest.approx([6.25, 96.04]) and math.isnan(found[2])

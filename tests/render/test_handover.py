@@ -213,8 +213,8 @@ def test_terms_of_a_wide_lens_s_distortion_do_not_cancel(monkeypatch: pytest.Mon
     r, found = np.linspace(0, 20.6, 100, dtype=np.float32), json.loads(text)["lens"]["distortion"]
     shown = field.directions(r.astype(complex))
     goal = pinhole.focal_mm * shown[0] / shown[2]
-    for told, (start, end) in zip(found, ((r, goal), (goal.astype(np.float32), r)), strict=True):
-        k = np.array(told["radial"], np.float32)
+    for term, (start, end) in zip(found, ((r, goal), (goal.astype(np.float32), r)), strict=True):
+        k = np.array(term["radial"], np.float32)
         above, below = (1 + sum(k[n + 2 * i] * start ** (2 * i + 2) for i in range(3)) for n in (0, 1))
         assert k[1] != 0 and min(above.min(), below.min()) > 0.3
         assert np.abs(start * above / below - end).max() / plates.pixel_mm[0] < left_px + 0.01 < 0.11

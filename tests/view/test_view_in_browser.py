@@ -208,7 +208,7 @@ def others(browser: Any, others_file: Path) -> Iterator[Opened]:
 def test_webgpu_draws_what_webgl2_draws(
     browser: Any, file: str, forms: list[tuple[str, str]], request: pytest.FixtureRequest
 ) -> None:
-    """Of the same shaders, which GPUs round alike or nearly so: where a ray meets an edge, a pixel may differ."""
+    """Both run the same shaders and may round differently: a pixel may differ where a ray meets an edge."""
     pages = {}
     for gpu in ("WebGL2", "WebGPU"):
         pages[gpu] = Opened(browser, request.getfixturevalue(file), gpu.lower())
