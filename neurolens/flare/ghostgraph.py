@@ -28,8 +28,8 @@ _DEGREE = 13  # of the numbers of a surface by the wavelength
 class Entrance:
     """A ghost, and the disc through which its light enters the lens.
 
-    The disc has the points chief_mm p + scale_mm u of the plane z = 0 (mm), with |u| < 1, where p is the light's direction
-    (x, y) over the sine of the widest angle. `light` is the ghost's light on the film.
+    The disc has the points chief_mm p + scale_mm u of the plane z = 0 (mm), with |u| < 1, where p is the light's
+    direction (x, y) over the sine of the widest angle. `light` is the ghost's light on the film.
     """
 
     pair: Pair

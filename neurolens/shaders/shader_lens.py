@@ -147,7 +147,7 @@ def _sampled(
 
 
 def light(range_nm: tuple[float, float], numbers: Value, in_colour: Value) -> tuple[Value, Value, Value]:
-    """Choose a ray's wavelength and colour weights [3], red to blue; its random numbers [2] leave two for its pupil [2].
+    """Choose a ray's wavelength and colour weights [3], red to blue; its two random numbers leave two for its pupil.
 
     Cycles's numbers are the second and third dimension of Sobol's sequence, most even in their high bits. Four bits
     choose one of sixteen parts of the spectrum: the first of either number, whether the second ones differ, and the
