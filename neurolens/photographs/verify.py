@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,9 +82,11 @@ def _median(values: Iterable[float]) -> float:
 
 
 def names_of(lens: Lens) -> list[str]:
-    """The names under which a lens is looked for: what it is believed to be, its own, and that of its file."""
+    """The names under which a lens is looked for: what it is believed to be, its own, that of its file, and what stands
+    in brackets in its own, as "US 8,169,718 Example 4 (Nikon ...)" has it."""
     stem = Path(lens.path).stem.replace("_", " ")
-    return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}".strip(), stem) if name]
+    names = lens.believed_to_be, f"{lens.designer} {lens.name}".strip(), stem, *re.findall(r"\(([^()]+)\)", lens.name)
+    return [name for name in names if name]
 
 
 def found_for(

@@ -151,6 +151,7 @@ def test_light_alone_and_another_film(monkeypatch: pytest.MonkeyPatch) -> None:
         and c.distortion_percent.height_mm.max() <= (lens.image_radius_mm or math.inf) * 1.02
     )
     assert names_of(lens)[0] == "Some 50mm f/1.8"
+    assert names_of(replace(lens, name="US 1,234,567 Example 1 (Some 50mm f/1.8)"))[-1] == "Some 50mm f/1.8"
 
 
 def test_the_profile_of_the_film_that_a_lens_lights_and_one_that_another_contradicts(
