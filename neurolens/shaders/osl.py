@@ -34,9 +34,9 @@ from neurolens.cameras.pupil_search import PupilTable
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import low_orders, with_film_derivatives
-from neurolens.graph.osl import Parameter, write_osl
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import Parameter, write_osl
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.prescription import VISIBLE_NM
 from neurolens.shaders.lowtests import low_tests

@@ -24,7 +24,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html, text_of
 from neurolens.graph.c import Signature
-from neurolens.graph.osl import TEMPORARY, urgent
+from neurolens.graph.shading import TEMPORARY, urgent
 from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
 SCRIPTS = ("packed.js", "gl.js", "wgsl.js", "webgpu.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")

@@ -17,8 +17,8 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, pruned
-from neurolens.graph.osl import write_osl
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import write_osl
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.shot import Shot
