@@ -40,7 +40,7 @@ from neurolens.graph.shading import Parameter, write_osl
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.prescription import VISIBLE_NM
 from neurolens.shaders.lowtests import low_tests
-from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles, PupilDisc
+from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
 from neurolens.shaders.source import FOCUS, SMALLEST, Focusing, film_function, followed_rows, model_focusing
@@ -90,7 +90,7 @@ class OslCamera:
 
     lens: ShaderLens
     graph: Graph
-    pupil: PupilCircles | PupilDisc
+    pupil: PupilCircles
     film: Array
     nearest_m: tuple[float, float]
     limit_m: float
@@ -133,10 +133,9 @@ class OslLens:
         """Radius of the picture that all states fill."""
         return min(c.pupil.film_radius_mm for c in self.nodes)
 
-    def states(self) -> list[tuple[ShaderLens, PupilCircles | PupilDisc]]:
+    def states(self) -> list[tuple[ShaderLens, PupilCircles]]:
         """The lens and its pupil at each node, and in states between them."""
-        pupils: list[Any] = [c.pupil for c in self.nodes]  # all are of one kind
-        first, *others = pupils
+        first, *others = (c.pupil for c in self.nodes)
         nodes = zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True)
         return [(lens, first.mixed(others, weights)) for weights, lens in [*nodes, *self.between]]
 
@@ -303,7 +302,7 @@ def _film_position(camera: OslCamera) -> tuple[float, float]:
     return (low + high) / 2, max((high - low) / 2, 1e-6)
 
 
-def _samples(lens: ShaderLens, pupil: PupilCircles | PupilDisc, count: int = 32768) -> dict[str, NDArray[np.float32]]:
+def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[str, NDArray[np.float32]]:
     """Rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of samples."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * pupil.film_radius_mm * np.sqrt(rng.random(count))
@@ -424,7 +423,7 @@ def osl_lens(
     Raises:
         InputError: no ray passes.
     """
-    pupils: list[PupilCircles | PupilDisc] = [*fit_pupil(nodes, report, between)]
+    pupils = fit_pupil(nodes, report, between)
     samples = [_samples(*pair) for pair in zip(nodes, pupils, strict=True)]
     graphs = [lens.graph for lens in nodes]
     graphs = (tested := low_tests(graphs, samples)) or graphs
@@ -441,10 +440,8 @@ def osl_lens(
     return OslLens(cameras, axes, between)
 
 
-def _blade_margin(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
+def _blade_margin(lens: ShaderLens, pupil: PupilCircles) -> float:
     """The margin, in stop radii, by which the sampler widens blades: a fit may put a passing ray beyond one."""
-    if isinstance(pupil, PupilDisc):
-        return 0.0
     inputs = _samples(lens, pupil)
     ray = evaluate(lens.graph, inputs)
     passed = np.broadcast_to(ray["status"][0] == st.PASSED, inputs["at_stop"].shape[1:])

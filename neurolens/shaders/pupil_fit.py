@@ -19,8 +19,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Exponents, Graph
-from neurolens.shaders.pupil import PupilCircles, PupilDisc
+from neurolens.graph.ir import Exponents
+from neurolens.shaders.pupil import PupilCircles
 from neurolens.shaders.shader_lens import ShaderLens, passing_share
 from neurolens.shaders.stop_image import StopImage, draw_rays, fit_stop_images
 
@@ -46,10 +46,7 @@ _CALM = 1e-3  # rays, by whose force numbers stay at those that all states share
 _ALLOWED = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
 LOST = 1e-3  # of a zone's rays are lost in all
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
-# Discs: film radii and stops at which extents are measured, with so many rays; highest powers of film radius and stop.
-_DISC_RADII, _DISC_STOPS, _DISC_RAYS, _DISC_POWERS = 17, (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 1.0), 20_000, (6, 3)
-_RCOND = 1e-4  # of least squares: numbers stay small enough for float32
-_DISC_CHECKED, _DISC_LOST, _DISC_STEP = 400_000, 8e-4, 1.02  # rays that check; what may be lost; widening
+_DRAWN, _DISC_LOST = 24, 6e-4  # draws of rays that tell how wide a disc has to be; what may be lost
 _INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
 
 
@@ -71,7 +68,7 @@ class _Rays:
 
 def fit_pupil(
     lenses: Sequence[ShaderLens], report: Report, between: Sequence[tuple[Array, ShaderLens]] = ()
-) -> Sequence[PupilCircles] | Sequence[PupilDisc]:
+) -> list[PupilCircles]:
     """The pupil of a lens in each of its states. All but 1 in 1000 of the rays that pass, in any zone, lie inside.
 
     Args:
@@ -88,7 +85,7 @@ def fit_pupil(
         pupils, lost = _fit_circles(lenses, images, report, between)
         if lost <= LOST:
             return pupils
-    return fit_discs(lenses, report, between)
+    return _wide_discs(lenses, between)
 
 
 def _fit_circles(
@@ -97,7 +94,7 @@ def _fit_circles(
 ) -> tuple[list[PupilCircles], float]:  # fmt: skip
     """Circles, and the share of the rays of the worst zone that they lose."""
     exponents, pairs = _exponents(lenses[0].anamorphic), list(zip(lenses, images, strict=True))
-    pupils = [PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0), exponents[:0, :3], np.zeros((0, 3, 0)))
+    pupils = [PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0, 0.0), exponents[:0, :3], np.zeros((0, 3, 0)))
               for lens, image in pairs]  # fmt: skip
     rays = [_drawn(lens, pupil, 0) for lens, pupil in zip(lenses, pupils, strict=True)]
     rims = _rims(lenses[0], rays)
@@ -234,14 +231,14 @@ def _drawn(lens: ShaderLens, pupil: PupilCircles, seed: int) -> _Rays:
     return _Rays(inputs, codes, np.ravel_multi_index(zones, _ZONES))
 
 
-def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float]:
+def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float, float]:
     """`PupilCircles.wide`: images err most where the film ends."""
     size = rays.inputs["stop_radius_mm"][0] / pupil.image.stop_mm
     beyond = np.hypot(*rays.inputs["point_mm"]) / pupil.image.stop_mm / size - 1
     growth = (np.square(rays.inputs["film_mm"]).sum(0) / pupil.image.film_mm**2 * size) ** 2
     needs = [(float(growth[zone].mean()), need) for zone, need in _needs(rays, -beyond, _ALLOWED[0] / (rims + 1))]
     inner = max(0.0, *(need for at, need in needs if at < _INNER))
-    return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER))
+    return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER)), 0.0
 
 
 def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[NDArray[np.intp], float]]:
@@ -333,10 +330,10 @@ def _missed(rays: _Rays, within: Array) -> Array:
     return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
 
 
-def light_lost(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
+def light_lost(lens: ShaderLens, pupil: PupilCircles) -> float:
     """The share of the rays that pass which no sample is, in the worst zone of film and stop, by new random rays."""
-    if isinstance(pupil, PupilDisc):
-        return disc_lost(pupil, lens)
+    if pupil.wide[2]:
+        return max(float(np.mean(rows > pupil.wide[2])) for rows in _beyond_discs(lens, pupil, 100))
     counts = np.zeros((2, _ALL))
     for seed in range(4):
         rays = _drawn(lens, pupil, 100 + seed)
@@ -355,74 +352,35 @@ def _beside(lens: ShaderLens, image: StopImage) -> float:
     return float((np.bincount(part, away) / np.maximum(np.bincount(part), _FEW)).max())
 
 
-def fit_discs(
-    lenses: Sequence[ShaderLens], report: Report, between: Sequence[tuple[Array, ShaderLens]] = ()
-) -> list[PupilDisc]:
-    """The disc of a lens in each of its states; arguments of `fit_pupil`."""
-    exponents = np.array([(i, j) for i in range(_DISC_POWERS[0] + 1) for j in range(_DISC_POWERS[1] + 1)])
-    unit, stop = max(x.film_radius_mm for x in lenses), max(x.stop_radius_mm for x in lenses)
-    discs = []
-    for lens in lenses:
-        disc = PupilDisc(lens.end_of_light_mm(), unit, stop, exponents, np.zeros((3, len(exponents))))
-        discs.append(replace(disc, numbers=_fitted_disc(lens, disc)))
-        report(len(discs) / (len(lenses) + 1))
-    states = [*zip(np.eye(len(discs)), lenses, strict=True), *between]
-    while max(disc_lost(discs[0].mixed(discs[1:], weights), lens) for weights, lens in states) > _DISC_LOST:
-        discs = [replace(d, numbers=d.numbers * [[1.0], [_DISC_STEP], [_DISC_STEP]]) for d in discs]
-    return discs
+def _wide_discs(lenses: Sequence[ShaderLens], between: Sequence[tuple[Array, ShaderLens]] = ()) -> list[PupilCircles]:
+    """One wide disc for each state; arguments of `fit_pupil`."""
+    images = fit_stop_images(lenses, folded=True)
+    assert images is not None  # a finer image had enough rays
+    nothing = np.zeros((0, 3), np.int64), np.zeros((0, 3, 0))
+    pupils = [
+        PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0, 1.0), *nothing)
+        for lens, image in zip(lenses, images, strict=True)
+    ]
+    states = [*zip(np.eye(len(pupils)), lenses, strict=True), *between]
+    rows = [r for weights, lens in states for r in _beyond_discs(lens, pupils[0].mixed(pupils[1:], weights), 6)]
+    more = max(float(np.quantile(r, 1 - _DISC_LOST)) for r in rows)
+    return [replace(p, wide=(1.0, 0.0, more)) for p in pupils]
 
 
-def _fitted_disc(lens: ShaderLens, disc: PupilDisc) -> Array:
-    """Numbers [3, M] by asymmetric least squares on the extents of what passes: those too small weigh more."""
-    rng, extents, at = np.random.default_rng(6), [], []
-    for radius in np.linspace(0, 0.9999 * disc.film_radius_mm, _DISC_RADII):
-        for share in _DISC_STOPS:
-            size = share * lens.stop_radius_mm
-            pupil, passed = _drawn_in_boxes(lens, np.full(_DISC_RAYS, radius), np.full(_DISC_RAYS, size), rng)
-            if passed.any():
-                (x, y), scaled = pupil[:, passed], (radius / disc.unit_mm, size / disc.stop_mm)
-                centre, wide, tall = (x.max() + x.min()) / 2, (x.max() - x.min()) / 2, np.abs(y).max()
-                corners = np.hypot((x - centre) / max(wide, 1e-9), y / max(tall, 1e-9)).max()
-                extents.append((centre, wide * corners, tall * corners))
-                at.append(np.prod(np.array(scaled) ** disc.exponents, axis=1))
-    rows, wanted = np.array(at), np.array(extents).T
-    numbers = list[Array]()
-    for k, values in enumerate(wanted):
-        # A centre may lie on either side: half widths are measured about the fitted one.
-        if k == 1:
-            values = values + np.abs(wanted[0] - rows @ numbers[0])
-        weight = np.ones(len(values))
-        for _ in range(20):
-            fit = np.linalg.lstsq(rows * weight[:, None], values * weight, rcond=_RCOND)[0]
-            weight = np.where((rows @ fit < values) & (k > 0), 10.0, 1.0)
-        numbers.append(fit)
-    return np.stack(numbers)
-
-
-def _drawn_in_boxes(
-    lens: ShaderLens, radius: Array, stop: Array, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Random pupil points [2, N] in the boxes of film points, in their frames, and whether rays pass there."""
-    count, pupil = radius.size, lens.drawn_in_boxes(radius, rng)
-    angle = 2 * np.pi * rng.random(count) * lens.anamorphic
-    turn = np.exp(1j * angle)
-    film, turned = radius * turn, (pupil[0] + 1j * pupil[1]) * turn
-    z, nm = (rng.uniform(*span, count) for span in (lens.film_z_mm, lens.wavelength_nm))
-    film_mm, pupil_mm = (np.stack([v.real, v.imag]) for v in (film, turned))
-    return pupil, np.asarray(lens.status(film_mm, pupil_mm, nm, z, stop) == st.PASSED)
-
-
-def disc_lost(disc: PupilDisc, lens: ShaderLens) -> float:
-    """The share of random rays that pass beyond the disc, in the worst zone of film and stop."""
-    rng = np.random.default_rng(7)
-    area, share = rng.random(_DISC_CHECKED), rng.choice(_DISC_STOPS, _DISC_CHECKED)
-    radius, stop = disc.film_radius_mm * np.sqrt(area), share * lens.stop_radius_mm
-    pupil, passed = _drawn_in_boxes(lens, radius, stop, rng)
-    g = Graph()
-    g.outputs["rows"] = g.concat(*disc._rows(g.input("radius"), g.input("stop")))
-    inputs = {"radius": radius[None] / disc.unit_mm, "stop": stop[None] / disc.stop_mm}
-    centre, wide, tall = evaluate(g, inputs)["rows"]
-    out = passed & (np.hypot((pupil[0] - centre) / wide, pupil[1] / tall) > 1)
-    zone = (8 * area).astype(np.intp) * 3 + np.digitize(share, (0.3, 0.6))
-    counts, missed = (np.bincount(zone[rows], minlength=24) for rows in (passed, out))
-    return float((missed / np.maximum(counts, _FEW)).max())
+def _beyond_discs(lens: ShaderLens, pupil: PupilCircles, seed: int) -> list[Array]:
+    """How far random rays that pass lie beyond the image of the smallest stop that they pass, in units of
+    `StopImage.stop_mm`; for each zone of the film and that stop with enough rays."""
+    beyond, zones = [], []
+    for k in range(_DRAWN):
+        rays = draw_rays(lens, None, seed + k)
+        inputs = {"film_mm": rays.film_mm, "point_mm": 0 * rays.point_mm}
+        inputs |= {"film_z_mm": rays.film_z_mm[None], "wavelength_nm": rays.wavelength_nm[None]}
+        middle, by_x, by_y = evaluate(pupil.image.graph, inputs).values()
+        way, area = rays.pupil_mm - middle, by_x[0] * by_y[1] - by_x[1] * by_y[0]
+        x, y = (way[0] * by_y[1] - way[1] * by_y[0]) / area, (by_x[0] * way[1] - by_x[1] * way[0]) / area
+        size = np.hypot(*rays.point_mm)
+        beyond.append((np.hypot(x, y) - size) / pupil.image.stop_mm)
+        part = np.square(rays.film_mm).sum(0) / lens.film_radius_mm**2 * 8
+        zones.append(part.astype(np.intp) * 3 + np.digitize(size / lens.stop_radius_mm, (0.3, 0.6)))
+    lacks, zone = np.concatenate(beyond), np.concatenate(zones)
+    return [lacks[zone == z] for z in np.flatnonzero(np.bincount(zone) >= _FEW)]

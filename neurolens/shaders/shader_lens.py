@@ -19,7 +19,7 @@ from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.shaders.source import Focusing
 
 if TYPE_CHECKING:
-    from neurolens.shaders.pupil import PupilCircles, PupilDisc
+    from neurolens.shaders.pupil import PupilCircles
 
 Array = NDArray[np.float64]
 _PART = 1 << 15  # rays that are evaluated together
@@ -111,7 +111,7 @@ _SAMPLES, _TRIES = 20_000, 64  # film points; samples that decide whether one ha
 
 
 def passing_share(
-    lens: ShaderLens, pupil: PupilCircles | PupilDisc, stops: Sequence[float] = (1.0, 0.5, 0.25)
+    lens: ShaderLens, pupil: PupilCircles, stops: Sequence[float] = (1.0, 0.5, 0.25)
 ) -> dict[float, float]:
     """The share of samples that pass, all over the film, by shares of the widest stop.
 
@@ -136,7 +136,7 @@ def passing_share(
 
 
 def _sampled(
-    lens: ShaderLens, pupil: PupilCircles | PupilDisc, square: Array, film: Array, call: Array, share: float
+    lens: ShaderLens, pupil: PupilCircles, square: Array, film: Array, call: Array, share: float
 ) -> NDArray[np.bool_]:
     """Test whether rays [N] of points of the unit square pass, at film positions and wavelengths `call` [2, N]."""
     (film_z, nanometres), stop = call, np.array([[share * lens.stop_radius_mm]])

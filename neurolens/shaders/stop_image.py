@@ -139,12 +139,17 @@ class StopRays(NamedTuple):
     point_mm: Array
 
 
-def fit_stop_images(lenses: Sequence[ShaderLens]) -> list[StopImage] | None:
-    """The image of the stop in every state of a lens, with the same terms; None where too few rays pass."""
+def fit_stop_images(lenses: Sequence[ShaderLens], folded: bool = False) -> list[StopImage] | None:
+    """The image of the stop in every state of a lens, with the same terms; None where too few rays pass.
+
+    Where it is `folded`, the best that but moves and scales the stop.
+    """
     candidates = _candidates(lenses[0].anamorphic)
+    if folded:
+        candidates = candidates[candidates[:, 3:5].sum(1) <= lenses[0].anamorphic]
     images: list[StopImage] | None = None
     for seed, most in enumerate(_TERMS[lenses[0].anamorphic]):
-        previous: Sequence[StopImage | None] = images or [None] * len(lenses)
+        previous: Sequence[StopImage | None] = [None] * len(lenses) if folded or images is None else images
         rays = [draw_rays(lens, image, seed) for lens, image in zip(lenses, previous, strict=True)]
         if min(r.film_z_mm.size for r in rays) < _FEWEST:
             return None
