@@ -146,7 +146,6 @@ def zoom(name: str, axis: Axis) -> tuple[list[ShaderLens], list[tuple[np.ndarray
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quick fit of the pupil, where it is not the pupil that is tested."""
     monkeypatch.setattr(pupil_fit, "_RAYS", 3000)
-    monkeypatch.setattr(pupil_fit, "_FIRST", 15_000)
     monkeypatch.setattr(stop_image, "_RAYS", 4000)
 
 
