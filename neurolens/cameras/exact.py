@@ -23,8 +23,15 @@ from neurolens.cameras.cameragraph import D_FILM, METRES, LensGraph
 from neurolens.cameras.companions import lanes_graph, shifted
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import GraphRun, Kind, LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
-from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
-from neurolens.cameras.pupil_search import COARSE, FINE, Detail, PupilTable, outline_of
+from neurolens.cameras.pupil_outline import (
+    COARSE,
+    FINE,
+    Detail,
+    PupilOutline,
+    PupilTable,
+    outline_of,
+    wavelength_between,
+)
 from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph

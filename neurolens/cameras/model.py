@@ -17,8 +17,7 @@ from neurolens.cameras.cameragraph import LensGraph, status_graph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
 from neurolens.cameras.onnxlens import InverseRays, LensRays, OnnxInverse, OnnxLens, load_inverse, load_model
-from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE, PupilTable, outline_of
+from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
 from neurolens.cameras.sampling import (
     beyond_circle,
     common_light,

@@ -14,7 +14,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.onnxlens import OnnxLens, load_model
-from neurolens.cameras.pupil_search import PupilTable
+from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.graph.ir import Graph
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import Lens

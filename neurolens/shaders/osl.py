@@ -30,7 +30,7 @@ from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.lenscamera import squeeze_of, stratified
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
-from neurolens.cameras.pupil_search import PupilTable
+from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import low_orders, with_film_derivatives

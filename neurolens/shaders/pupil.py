@@ -2,7 +2,7 @@
 
 The rays that pass a lens cross its stop within the opening, and within what the rims before and behind the stop leave
 of it. Seen in points of the stop, rims are circles whose centres and radii are short polynomials of the film point.
-Samples fill what the circles have in common, and `stop_image` maps them to the pupil.
+Samples fill what the circles have in common, and `shader_lens.StopImage` maps them to the pupil.
 
 Nothing here is a table: in a renderer's shader a table costs more than all of this. `pupil_outline` fits the pupil more
 closely, at one stop and focus.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.cameragraph import unit_disc
 from neurolens.graph.ir import Exponents, Graph, Value
-from neurolens.shaders.stop_image import HAIR, StopImage, frame_of_film_point, moving_polynomial
+from neurolens.shaders.shader_lens import HAIR, StopImage, frame_of_film_point, moving_polynomial
 
 MAX_BLADES = 16
 _CLOSEST = 0.05  # of the stop's radius: the middle of a pupil to an edge; nearer, or beyond it, points stay apart

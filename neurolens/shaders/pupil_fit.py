@@ -21,8 +21,7 @@ from neurolens.base.progress import Report
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents
 from neurolens.shaders.pupil import PupilCircles
-from neurolens.shaders.shader_lens import ShaderLens, passing_share
-from neurolens.shaders.stop_image import StopImage, draw_rays, fit_stop_images
+from neurolens.shaders.shader_lens import ShaderLens, StopImage, draw_rays, fit_stop_images, passing_share
 
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -97,7 +96,7 @@ def _fit_circles(
     counts = np.max([np.bincount(e.codes, minlength=_CODES) for e in edges], axis=0)
     counts[: st.NO_SOLUTION + 1] = counts[st.blocked(lenses[0].stop_surface, st.RIM)] = 0
     rims = np.flatnonzero(counts > _RARE)
-    fits = [_fit_rims(edges, pupils, exponents, code) for code in rims]
+    fits = [_fit_rims(edges, pupils, exponents, int(code)) for code in rims]
     for k, (pupil, drawn) in enumerate(zip(pupils, rays, strict=True)):
         numbers = np.array([fit[k] for fit in fits]).reshape(len(rims), -1)
         pupils[k] = _with_circles(replace(pupil, wide=_disc(pupil, drawn, len(rims))), exponents, numbers)

@@ -26,7 +26,7 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders import blender_shader as shaders
-from neurolens.shaders import lowtests, osl, pupil_fit, stop_image
+from neurolens.shaders import lowtests, osl, pupil_fit, shader_lens
 from neurolens.shaders.blender_shader import _smallest, exact_lens
 from neurolens.shaders.pupil import Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
@@ -146,7 +146,7 @@ def zoom(name: str, axis: Axis) -> tuple[list[ShaderLens], list[tuple[np.ndarray
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quick fit of the pupil, where it is not the pupil that is tested."""
     monkeypatch.setattr(pupil_fit, "_RAYS", 3000)
-    monkeypatch.setattr(stop_image, "_RAYS", 4000)
+    monkeypatch.setattr(shader_lens, "_RAYS", 4000)
 
 
 @pytest.mark.slow

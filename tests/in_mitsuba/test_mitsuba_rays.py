@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import NeurolensError, NeurolensWarning
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.mitsuba import library, load_scene
 from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples
 from neurolens.render.colour import SpectralRange
