@@ -33,13 +33,12 @@ from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
-from neurolens.graph.loworder import low_orders, with_film_derivatives
+from neurolens.graph.loworder import low_orders, low_tests, with_film_derivatives
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import Parameter, write_osl
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.prescription import VISIBLE_NM
-from neurolens.shaders.lowtests import low_tests
 from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
@@ -369,14 +368,10 @@ def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, f
     return np.stack([_powers(at, z, powers) for z in positions]), (nearest, ahead)
 
 
-def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: bool = False) -> OslLens:
-    """An exported model.
-
-    Args:
-        graph: of a model of one state; None takes its own. fixed: in its state alone.
-    """
+def model_lens(model: OnnxLens, report: Report, *, fixed: bool = False) -> OslLens:
+    """An exported model; `fixed`: in its state alone."""
     if not model.axes or fixed:
-        return osl_lens([shader_lens(model, graph)], report)
+        return osl_lens([shader_lens(model)], report)
     axes = model.axes
     between = [(weights(axes, state), shader_lens(model.at(*state))) for state in states_between(axes)]
     return osl_lens([shader_lens(model.at(*state)) for state in product(axes)], report, axes, between)
@@ -388,20 +383,18 @@ def states_between(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
     return list(itertools.product(*middles))
 
 
-def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
-    """A model in its state; its graph, where that is not the one in its file."""
+def shader_lens(model: OnnxLens) -> ShaderLens:
+    """A model in its state."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
     all_nm = short, long = tuple(map(float, d["wavelength_nm"]))
     visible = max(short, VISIBLE_NM[0]), min(long, VISIBLE_NM[1])
     short, long = visible if visible[0] < visible[1] else all_nm
     stop = float(d["stop_radius_mm"])
-    if graph is None:
-        graph = model.graph()
     height = _BESIDE * float(d["film_radius_mm"])
     squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
     return ShaderLens(
-        graph=graph,
+        graph=model.graph(),
         table=PupilTable.of(d["bounds"]),
         film_z_mm=(float(low), float(high)),
         wavelength_nm=(short, long),

@@ -17,6 +17,7 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, pruned
+from neurolens.graph.loworder import low_tests
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_osl
 from neurolens.lens.apertures import Aperture
@@ -26,8 +27,8 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders import blender_shader as shaders
-from neurolens.shaders import lowtests, osl, pupil_fit, shader_lens
-from neurolens.shaders.blender_shader import _smallest, exact_lens
+from neurolens.shaders import osl, pupil_fit, shader_lens
+from neurolens.shaders.blender_shader import exact_lens
 from neurolens.shaders.pupil import Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
@@ -41,7 +42,7 @@ FAR = 1e9
 
 @cache
 def lens() -> osl.OslLens:
-    return osl.model_lens(load_model(MODEL), _smallest(load_model(MODEL)), lambda share: None)
+    return osl.model_lens(load_model(MODEL), lambda share: None)
 
 
 def written() -> osl.OslCamera:
@@ -132,7 +133,7 @@ def test_fewer_terms_tell_which_rays_pass_and_move_none() -> None:
 def test_an_exact_lens_keeps_its_tests() -> None:
     lens = read_lens(GAUSS)
     traced = exact_graph(lens, pupil_plane_z_mm(lens), (400.0, 700.0))
-    assert lowtests.low_tests([traced], [osl._samples(written().lens, written().pupil)]) is None
+    assert low_tests([traced], [osl._samples(written().lens, written().pupil)]) is None
 
 
 def zoom(name: str, axis: Axis) -> tuple[list[ShaderLens], list[tuple[np.ndarray, ShaderLens]]]:
@@ -217,7 +218,7 @@ def fitted(name: str) -> tuple[ShaderLens, PupilCircles]:
     if name == MODEL.stem:
         return written().lens, written().pupil
     model = load_model(ROOT / "models" / f"{name}.onnx")
-    shown = osl.shader_lens(model, _smallest(model))
+    shown = osl.shader_lens(model)
     return shown, fit_pupil([shown], lambda share: None)[0]
 
 
@@ -331,7 +332,7 @@ def beyond_circles(circles: PupilCircles, rays: dict[str, np.ndarray]) -> np.nda
 @pytest.mark.usefixtures("few_rays")
 def test_light_is_that_of_the_camera_where_rims_leave_half_a_pupil() -> None:
     file = ROOT / "models" / "ogawa_zoom_70_200-135mm.ols-60.onnx"
-    made = osl.model_lens(load_model(file), None, lambda share: None)
+    made = osl.model_lens(load_model(file), lambda share: None)
     assert min(made.passing().values()) > 0.97
     again, rng = osl.osl_graph(made.nodes[0]), np.random.default_rng(11)
     camera = OnnxCamera(load_model(file), Shot(FILM, math.inf))
