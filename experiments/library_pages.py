@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
 from neurolens.base.lensname import lens_id_of
-from neurolens.cli.arguments import Reporting, check_run_folder, lens, output_path
-from neurolens.cli.lens_list import CHARACTER
+from neurolens.cli.arguments import Reporting, lens, output_path
+from neurolens.cli.lens import CHARACTER
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
@@ -46,7 +46,6 @@ class Library(Reporting):
         from neurolens.readers.any_format import lens_files
 
         folder = self.out
-        check_run_folder(folder, self.called, "--output")
         files = self.lenses or lens_files(library() / "lenses")
         names = _page_names(files)
         folder.mkdir(parents=True, exist_ok=True)

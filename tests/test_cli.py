@@ -325,7 +325,7 @@ def test_an_interrupt_says_what_is_kept(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("neurolens.frames.frame.render", interrupted)
+    monkeypatch.setattr("neurolens.frames.render", interrupted)
     assert main(["render", str(scene), "--camera", "thin", "-o", str(tmp_path / "a.exr"), "--quiet"]) == 130
     assert "no picture was written" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.exr"))

@@ -24,7 +24,7 @@ from neurolens.base.errors import NeurolensError
 from neurolens.base.files import noted_files
 from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
-from neurolens.frames.frame import Frame, Prepared, flare_choice, prepare, render_frame
+from neurolens.frames import Frame, Prepared, flare_choice, prepare, render_frame
 from neurolens.render.film import digest
 from neurolens.render.tiles import read_tile, tile_path, write_picture
 

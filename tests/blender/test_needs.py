@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from neurolens.blender import pack
+from neurolens import blender as pack
 
 
 def _extension() -> tuple[ModuleType, ModuleType]:
@@ -77,7 +77,7 @@ def test_what_keeps_no_tolerance_names_the_best() -> None:
 def test_field_is_that_of_the_lens_and_goes_through_the_zip(tmp_path: Path) -> None:
     """A stopped and scaled form of the same lens has the field scaled; the facts are read as they were written."""
     pytest.importorskip("torch")
-    from neurolens.cli.blender_lenses import field_table
+    from neurolens.cli.blender import field_table
     from neurolens.readers.lensfile import read_lens
     from neurolens.setting.states import set_lens
 

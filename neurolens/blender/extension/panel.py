@@ -11,8 +11,19 @@ import bpy.utils.previews
 
 from . import camera as on_camera
 from . import library as facts
-from .library import KINDS, LensError, LensFacts, error_px, notes, outside, read_library, refusals, refused, too_large
-from .needs import needs
+from .library import (
+    KINDS,
+    LensError,
+    LensFacts,
+    error_px,
+    needs,
+    notes,
+    outside,
+    read_library,
+    refusals,
+    refused,
+    too_large,
+)
 
 _FIRST = ("f_number", "focus_m", "zoom_mm")  # of the settings, before the others
 _LABELS = {  # where Blender would show the name alone
