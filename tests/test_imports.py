@@ -186,7 +186,7 @@ def test_cameras_renderer_and_command_line_load_without_the_training_packages() 
 
 
 def test_help_of_the_command_line_loads_not_even_numpy() -> None:
-    code = "import sys; sys.modules['numpy'] = None; from neurolens.cli import build_parser; build_parser('').format_help()"
+    code = "import sys; sys.modules['numpy'] = None; from neurolens.cli import build_parser as b; b('').format_help()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
 

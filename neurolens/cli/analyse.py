@@ -56,11 +56,9 @@ class Analyse(cli.Reporting):
       seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
       psf         point spread, geometric and by diffraction
 
-    Without WHAT all are shown. Rays fill the real stop, not a paraxial pupil; fields are angles
-    from the axis in degrees, of the chief ray in the scene. The edge is that of the film, or the
-    text says which; one that no chief ray reaches is a warning. Pupils are sampled finer and finer
-    until two samplings agree to the digits that are printed; what does not settle has fewer.
-    Needs the extra "train" (torch)."""
+    Without WHAT all are shown. Rays fill the real stop; fields are angles of the chief ray in the scene, to the edge of
+    the film, or the text says which. Figures that do not settle as the pupil is sampled finer have fewer digits. Needs
+    the extra "train" (torch)."""
 
     epilog = """\
 examples:

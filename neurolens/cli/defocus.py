@@ -33,17 +33,11 @@ class Defocus(cli.Reporting):
     vignetting.
 
     PLATE.exr is a pinhole's picture: R, G, B and a channel Z with the distance along the axis in metres (0, 1e9
-    and more, inf: sky), sharp, without motion blur; depth without antialiasing is best. Its pinhole stands where
-    `neurolens stmap` says: focal length and place are printed there. Pictures of `neurolens render --camera
-    pinhole:LENS` need nothing else. A data window larger than the display window is overscan, which a lens with
-    barrel distortion needs.
-
-    What a lens sees behind the edges of things is not in one picture. Layers with a depth of their own (behind.R,
-    behind.G, behind.B, behind.Z in the file, or the files of --behind) and deep files have it; else what is beside
-    an edge is put there, and the share of that light is said.
-
-    Pixels far brighter than their surroundings are spread as clean discs, without noise. A sensor counts the
-    finished picture, as in `neurolens render`."""
+    and more, inf: sky), without motion blur; depth without antialiasing is best. Its pinhole stands where
+    `neurolens stmap` says; pictures of `neurolens render --camera pinhole:LENS` need nothing else. A data window
+    larger than the display window is overscan, which a lens with barrel distortion needs. What a lens sees behind the
+    edges of things comes of layers with a depth of their own (behind.R, behind.G, behind.B, behind.Z in the file, or
+    --behind) or deep files; else what is beside an edge is put there, and the share of that light is said."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 
@@ -128,9 +122,8 @@ class Bokeh(PictureCommand):
       OUT.0.8m.png     the same, each kernel as bright as the others, to be looked at
 
     Every kernel has its field's cat's eye, coma and colour fringes, in pixels of the picture, and a sum of 1 in each
-    channel. All cells have the same odd width, and the centroid of green is in the middle one of its pixels. How much
-    light each field gets relative to the axis, and how far its blur reaches, is in the metadata and with --json.
-    For a program that takes one kernel, --grid 1x1 gives the one of the axis."""
+    channel; all cells have the same odd width, the centroid of green in the middle. The light of each field relative to
+    the axis is in the metadata and with --json. For a program that takes one kernel, --grid 1x1 gives the axis's."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 

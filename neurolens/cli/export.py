@@ -37,19 +37,15 @@ _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 
 @dataclass(frozen=True, kw_only=True)
 class Export(cli.Reporting):
-    """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
-    arrays that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an
-    ONNX file. Domain guard, stop, rims,
-    transmittance and status codes are those of the model; the card is a comment at the top. c-double is C in double
-    precision, with which a lens file's rays are those of the tracer within 1e-12 mm. Constants
-    (planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
-    (or of internal focus) the state is an argument. A lens file gives the exact lens.
-    OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
-    zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
-    With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
-    ray out, its pupil's outline as a table in the file (of shading languages but CUDA, data beside it).
-    Needs the extra "train" (torch); without it source code is written from the graph in the file,
-    whole and with nothing fixed."""
+    """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for arrays
+    that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an ONNX file.
+    Domain guard, stop, rims, transmittance and status codes are those of the model; the card is a comment at the top,
+    and constants and the film's position for a focus stand beside it. Of a model of a zoom's whole range (or of
+    internal focus) the state is an argument. A lens file gives the exact lens, with c-double within 1e-12 mm of the
+    tracer. OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades, zoom and more are its inputs.
+    With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted ray
+    out, its pupil's outline as a table in the file (of shading languages but CUDA, data beside it).
+    Needs the extra "train" (torch); without it source code is written from the model's file, whole, nothing fixed."""
 
     epilog = """\
 values fixed by a scene are folded into fewer operations (--fix, repeatable):

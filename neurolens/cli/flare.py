@@ -66,29 +66,18 @@ def _gain(text: str) -> tuple[str, list[float]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Flare(cli.Reporting):
-    """Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the film, with
-    the reflectance of Fresnel's equations or of the coatings, all rims, the shape of the stop, and the
-    spectrum. The command prints the brightest ghosts with their energy, position and size. Positions are
-    on the film itself, which pictures show turned by 180 degrees: a light to the right is imaged at x < 0.
+    """Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the film, with the
+    reflectance of Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. The
+    brightest are printed with energy, position and size, on the film itself, which pictures show turned by 180 degrees.
 
-    With -o the ghosts are written as an OpenEXR picture that can be added to a render of the same lens,
-    film and focus: R, G and B are the sum of the layers (ghosts.R, .G, .B, and so on). The --layers ghosts
-    with the greatest values on the film become layers of their own (g07-03 is reflected at surface 7, then
-    at surface 3, counted from 0 at the front), and the layer "rest" has the others. A PNG preview beside
-    the EXR shows the flare, brighter by --exposure. Values are those of `neurolens render`: a white card of
-    radiance 1 is 1 on the axis.
+    With -o they are an OpenEXR picture that can be added to a render of the same lens, film and focus: R, G and B are
+    the sum of the layers (ghosts.R, .G, .B, and so on); the --layers ghosts with the greatest values on the film have
+    layers of their own. A white card of radiance 1 is 1 on the axis, as in `neurolens render`.
 
-    Each surface divides light by the mean of both polarisations. If polarisation were followed from surface
-    to surface, the light of all ghosts would change by -2 to +12% in three lenses tried, and that of single
-    bright ghosts by -22 to +48%, most in coated lenses. Edges of ghosts are as rays draw them, without the
-    rings of diffraction, which no option adds.
-
-    With --photons light goes on by chance instead, with any number of reflections, smoothed by a kernel.
-    With --glare, or if anything scatters, photons of the same kind make the layer "glare": light that is
-    reflected more than twice or scatters, so that ghosts and glare together are all the light. With
-    --starburst the layer "starburst" has the light that diffraction sends aside, by the shape of the
-    opening as each light sees it: the streaks of blades. It is 0 at the image of the light itself, which a
-    render has. Needs the extra "train" (torch) and a C compiler."""
+    With --photons light goes on by chance instead, with any number of reflections. With --glare, or if anything
+    scatters, photons make the layer "glare": light that is reflected more than twice or scatters. The layer "starburst"
+    has the light that diffraction sends aside, but not the image of the light itself. Each surface divides light by the
+    mean of both polarisations. Needs the extra "train" (torch) and a C compiler."""
 
     epilog = """\
 examples:

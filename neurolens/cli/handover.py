@@ -33,16 +33,14 @@ class Handover(StMap):
 
       shot.undistort.exr, shot.redistort.exr, shot.illumination.exr   ST maps, see neurolens stmap
       shot.nk, shot.blender.py     the maps as node groups of Nuke and Blender, with the pinhole to render CG with
-      shot.usda                    that pinhole in USD, and the lens by NVIDIA's lookup pictures, shot.enter.exr and
-                                   shot.exit.exr
+      shot.usda                    that pinhole in USD, with NVIDIA's lookup pictures, shot.enter.exr and shot.exit.exr
       shot.opentrackio.json        a sample of OpenTrackIO 1.0.1
       shot.lensfun.xml             a profile of lensfun: distortion, lateral colour, light by aperture
       shot.opencv.yaml, .json ...  projections of OpenCV, nerfstudio and NVIDIA, see neurolens projection
       README.md                    how to start, what each file leaves in pixels, what its standard cannot say
 
-    With --frames there is one of each map, sample and projection a frame; cameras are animated. An interrupted run
-    goes on: maps that are whole stay. What a standard has no place for is not written, and said. Needs the extra
-    "train" (scipy)."""
+    With --frames there is one of each map, sample and projection a frame; cameras are animated. What a standard has no
+    place for is not written, and said. Needs the extra "train" (scipy)."""
 
     kept = "files that were written are whole; the same command goes on"
     epilog = f"""{cli.CAMERAS_HELP}

@@ -43,7 +43,6 @@ examples:
   neurolens lens lenses/brendel_tessar_100.toml --focal-length 50 --focus 1.5 --layout tessar.png
   neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
   neurolens lens downloads/ --json
-  neurolens lens list --layouts lenses.png
   neurolens lens list --sort swirl
   neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
     kept = "only a finished --layout picture is written"
@@ -58,7 +57,6 @@ examples:
         "draw the lens with rays from three field points: axis, 70% and edge of the film"
     )
     breathing: Path | None = cli.plot_path("draw field of view, focal length, magnification against the focus distance")
-    layouts: Path | None = cli.plot_path("of several files: draw all lenses in section on one sheet")
     sort: _Sort | None = setting(
         None, "of several files: the order; the last five are figures of bokeh and flare, the strongest first, which "
         "take seconds a lens that is not of lenses/",
@@ -88,16 +86,16 @@ examples:
 
     def _check_mode(self, several: bool) -> None:
         """Refuse the options of other modes."""
-        sheet, rims = {"--layouts", "--sort"}, {"--derive-rims", "--edge-pupil", "--half-field", "--output"}
+        rims = {"--derive-rims", "--edge-pupil", "--half-field", "--output"}
         if several:
-            modes, allowed = "with one lens file", sheet
+            modes, allowed = "with one lens file", {"--sort"}
         elif self.derive_rims:
             modes, allowed = "with one lens file alone", rims
         else:
             modes, allowed = "with --derive-rims", {*changed(self.state), "--layout", "--breathing"}
         for option in changed(self):
             if option not in allowed | {"--glass", "--json", "--quiet"}:
-                where = 'with "list", a folder or several files' if option in sheet else modes
+                where = 'with "list", a folder or several files' if option == "--sort" else modes
                 self.refuse(option, "(given)", f"this option only {where}")
 
     def _describe(self, file: Path) -> int:
@@ -142,19 +140,12 @@ examples:
         return self.answer(data, lambda: _lens_text(data))
 
     def _list(self, paths: tuple[Path, ...], checked: bool) -> int:
-        """Print a table of lenses, and draw their sections."""
+        """Print a table of lenses."""
         from neurolens.readers.any_format import lens_files
 
         files = [file for path in paths for file in (lens_files(path) if path.is_dir() else [_file(path)])]
         rows = self._rows(files, checked)
-        if self.layouts is not None:
-            from neurolens.analysis.layout import sheet
-            from neurolens.study.describe import section
-
-            sheet([section(Path(r["file"])) for r in rows if "name" in r], self.layouts)
-        note = "" if self.layouts is None else f"\n\nSections drawn in {self.layouts}"
-        data = {"lenses": rows, "layouts": self.layouts and str(self.layouts)}
-        return self.answer(data, lambda: _list_text(rows, self.sort) + note)
+        return self.answer({"lenses": rows}, lambda: _list_text(rows, self.sort))
 
     def _rows(self, files: list[Path], checked: bool) -> list[dict[str, Any]]:
         """`study.describe.library_row` of each lens, in the order of --sort; the library's index has some of them."""

@@ -177,23 +177,15 @@ def _remarks(model: dict[str, Any]) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(cli.Reporting):
-    """Measure an exported model on fresh rays of its card's domain, traced through the exact lens in
-    float64 and through the ONNX model in onnxruntime. Prints each figure beside the card's promise and
-    exits with code 1 if one does not hold. Needs the extra "train" (torch).
+    """Measure an exported model on fresh rays of its card's domain, traced through the exact lens in float64 and
+    through the ONNX model in onnxruntime. Prints each figure beside the card's promise, of the whole film, stopped down
+    ("2_stops.false_pass") and of its thirds by radius ("full.edge.rms_um"); exits with code 1 if one does not hold.
+    Needs the extra "train" (torch).
 
-    Micrometres are film-equivalent: the distance between the exact and the predicted ray on the plane in
-    focus, taken back to the film, for rays within 60 degrees of the axis (rms_infinity_um: on the plane at
-    infinity). False passes and blocks are shares of all rays that the model, or the lens, passes.
-
-    Promises are over the whole film, stopped down with the same fit ("2_stops.false_pass") and of the
-    film's centre, mid and edge, its thirds by radius ("full.edge.rms_um").
-
-    A model of many states (zoom, internal focus) is measured at six random states; its figures are the
-    worst of them, and hold while they are at most 25% above the promise.
-
-    As the rays differ from the card's, an error holds while it is above the promise by at most 4 standard
-    deviations of its estimate from so many rays, at least 10% and at most 50%; a share by at most 4
-    standard deviations of the root of its count. A largest error is only shown."""
+    Micrometres are film-equivalent: the distance between the exact and the predicted ray on the plane in focus, taken
+    back to the film. An error holds while it is above the promise by at most 4 standard deviations of its estimate from
+    so many rays, at least 10% and at most 50%; a share by at most 4 of the root of its count; the figures of a model of
+    many states, the worst of six random ones, by at most 25%. A largest error is only shown."""
 
     epilog = """\
 examples:

@@ -40,14 +40,11 @@ class Plan(cli.Reporting):
     afterwards, a thin or thick lens, a model that ships, a polynomial fitted for this shot alone, or the
     exact lens. Needs the extra "train" (torch).
 
-    Errors are distances between footprints, the picture of a point by a camera and by the exact lens: the
-    least RMS way on which light moves to turn one into the other, in pixels of the scene's picture (place,
-    size and shape of the blur, each wavelength by itself), and the relative error of light, of which 1% is
-    allowed. Both are those that 95% of the picture keep. The cost of a path, times the noise of its picture,
-    is proportional to the time to equal error: measured here, on one thread; of Cycles counted and turned
-    into its nanoseconds, measured once; of GLSL in operations. For our renderer the whole picture counts,
-    and the noise that dispersion adds. Cameras that take up to 1.2 times the least are alike, and the exact
-    lens is chosen where it is one of them."""
+    Errors are distances between the pictures of a point by a camera and by the exact lens, the least RMS way on which
+    light moves, and the relative error of light, of which 1% is allowed; 95% of the picture keep both. The cost of a
+    path, measured here on one thread, times the noise of its picture is proportional to the time to equal error; for
+    our renderer the whole picture counts. Cameras that take up to 1.2 times the least are alike, and the exact lens is
+    chosen where it is one of them."""
 
     epilog = """\
 examples:
@@ -57,15 +54,8 @@ examples:
 
 -o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
 models/ with what was fitted, and plan.toml: 'render' and 'export' take it for the camera, and 'train' fits a
-model of the shot from it, from scratch.
-
---trade draws what the scene's error costs, marks the cameras that no other betters and the choice for the budget,
-and says what half of its time would buy. Seconds are of one thread and of the whole picture at the scene's own size,
-to the noise that the exact lens has with the scene's samples; the camera's share stands beside them. Strips of the
-picture in our renderer measure what a path takes, and its noise. Of other targets the camera alone counts, in Cycles
-under a white sky; of GLSL its operations. -o (default: runs/trade-SCENE-LENS) leaves
-trade.html (one page that needs no other file: small pictures side by side, their difference from the exact lens's,
-the table), trade.png, trade.json and models/ with what was fitted."""
+model of the shot from it, from scratch. --trade leaves trade.html (a page with small pictures side by side),
+trade.png and trade.json (default: runs/trade-SCENE-LENS)."""
     kept = "models fitted so far are kept, the plan is not written"
 
     scene: Path = setting(..., "scene file (.toml)", positional=True, metavar="SCENE")

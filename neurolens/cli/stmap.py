@@ -121,20 +121,14 @@ class StMap(PictureCommand):
       SHOT.redistort.exr     makes the picture of the lens from an undistorted one, as CG is rendered
       SHOT.illumination.exr  relative illumination of the plate, channel Y, 1 on the axis
 
-    R is s, G is t, B is 1 inside the picture that is read and 0 outside it. s and t are 0 at the left and
-    bottom edge of that picture, 1 at its right and top edge; the centre of pixel x, y from its lower left
-    corner is (x + 0.5) / width, (y + 0.5) / height: as Nuke's STMap and Blender's Map UV read them (which
-    takes B for alpha). Load the maps as raw data. A map has the size of the picture it makes.
+    R is s, G is t, from 0 at the left and bottom edge of the picture that is read to 1, as Nuke's STMap and Blender's
+    Map UV read them; B is 1 inside that picture. Load the maps as raw data. A map has the size of the picture it makes.
 
-    The undistorted picture has the plate's pixels and centre, and is larger by the overscan, which is printed:
-    it holds every pixel of the plate. Render CG of that size with a pinhole camera of the focal length and place
-    that are printed: the lens's paraxial size in the plane in focus, seen from its entrance pupil. Things at other
-    distances are off by what is printed as parallax, for a lens's pupil moves with the field: --distance makes maps
-    for another plane. Maps that an earlier run of the same settings left stay.
-
-    The place of a thing in the picture is the centroid of its light at this stop, over pupil and wavelengths as the
-    eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length and its own
-    entrance pupil. All maps have the pixel aspect ratio, which is printed, in the attribute pixelAspectRatio."""
+    The undistorted picture has the plate's pixels and centre, and is larger by the overscan: it holds every pixel of
+    the plate. Render CG of that size with a pinhole camera of the focal length and place that are printed: the lens's
+    paraxial size in the plane in focus, seen from its entrance pupil. Things at other distances are off by what is
+    printed as parallax; --distance makes maps for another plane. The place of a thing is the centroid of its light at
+    this stop, as the eye weighs wavelengths. Maps that an earlier run of the same settings left stay."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 

@@ -24,16 +24,13 @@ from neurolens.study.advice import advice, ns_text
 
 @dataclass(frozen=True, kw_only=True)
 class Train(cli.Reporting):
-    """Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
-    measure errors and speed against the exact tracer, render the scenes, and write one report.
-    Needs the extra "train" (torch).
+    """Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX, measure errors and
+    speed against the exact tracer, render the scenes, and write one report. Needs the extra "train" (torch).
 
-    Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
-    full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
-    for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
-    lens is too long for that). It takes a minute; --within asks for an error instead. A file of another
-    program (Zemax, CODE V, ...) is read as "neurolens convert" reads it; where that lacks something, convert
-    first, with its options.
+    Without an experiment file, --lens fits a polynomial and a network to that lens in its default state: full aperture,
+    its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated for less; one where no
+    dispersion is known), focus from infinity to 14 focal lengths (further where the lens is too long for that). It
+    takes a minute; --within asks for an error instead.
 
     An interrupted run resumes where it stopped: existing models of the same settings are kept."""
 

@@ -74,29 +74,6 @@ _COMMENT = re.compile(r"/\*.*?\*/\s*", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class GhostFunction:
-    """The function of a ghost, whose rays cross the plane z = 0 at (x, y) = chief_mm p + scale_mm u."""
-
-    name: str
-    text: str
-    call: str
-    chief_mm: Sequence[float]
-    scale_mm: Sequence[float]
-
-
-@dataclass(frozen=True)
-class Ghosts:
-    """Ghosts, brightest first, for p = direction / sine and stops up to `stop_radius_mm`; `light` is their share of the
-    light of all."""
-
-    functions: Sequence[GhostFunction]
-    sine: float
-    wavelength_nm: tuple[float, float]
-    stop_radius_mm: float
-    light: float
-
-
-@dataclass(frozen=True)
 class Form:
     """A lens as one of its models, or traced.
 
@@ -130,7 +107,7 @@ class ViewLens:
 
     Attributes:
         squeeze: of an anamorphic picture across. f_numbers: (focal length in mm, f-number of the widest stop) by zoom.
-        nearest_m: the nearest focus. section: from `section_svg`. path: from `shaders.path_glsl`. ghosts: of a lamp.
+        nearest_m: the nearest focus. section, path, ghosts (of a lamp): from `section_svg`, `path_glsl`, `ghosts_glsl`.
     """
 
     key: str
@@ -144,7 +121,7 @@ class ViewLens:
     section: Mapping[str, Any]
     path: tuple[str, Sequence[str]] | None
     forms: Sequence[Form]
-    ghosts: Ghosts | None = None
+    ghosts: tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]] | None = None
 
 
 def write_page(
@@ -215,8 +192,7 @@ def _facts(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
     for f in lens.forms:
         files = [kind for kind in kinds if kind == "glsl" or kind in f.files]
         forms.append({"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": files})
-    ghosts = None if lens.ghosts is None else asdict(replace(lens.ghosts, functions=()))
-    return found | {"forms": forms, "paths": lens.path is not None, "ghosts": ghosts}
+    return found | {"forms": forms, "paths": lens.path is not None, "ghosts": lens.ghosts and lens.ghosts[0]}
 
 
 def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
@@ -230,7 +206,7 @@ def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[s
             yield f"{lens.key}/{form.kind}/glsl", form.glsl
         yield f"{lens.key}/path", text
         if lens.ghosts is not None:
-            yield f"{lens.key}/ghosts", json.dumps([asdict(ghost) for ghost in lens.ghosts.functions]).encode()
+            yield f"{lens.key}/ghosts", json.dumps(lens.ghosts[1]).encode()
     for kind, lens in product(kinds, lenses):
         for form in lens.forms:
             if kind in form.files:
@@ -382,22 +358,27 @@ def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> t
     return _text(program, "lens_path"), list(Signature.of(program, "lens_path").outputs)
 
 
-def ghosts_glsl(lens: Lens, film_radius_mm: float, most: int) -> Ghosts:
+def ghosts_glsl(lens: Lens, film_radius_mm: float, most: int) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The brightest ghosts on the film of a lens, which must be placed; at most so many.
+
+    Returns the facts of all, for p = direction / sine and stops up to `stop_radius_mm`, where `light` is their share of
+    the light of all ghosts; and of each, brightest first, its function, whose rays cross the plane z = 0 at
+    (x, y) = chief_mm p + scale_mm u.
 
     Raises:
         InputError: as `GhostTracer` and `ghost_graphs`.
     """
     every = entrances(GhostTracer(lens), _SINE, film_radius_mm, 0.5 * sum(VISIBLE_NM))
-    found = []
-    for ghost, graph in zip(every[:most], ghost_graphs(lens, [g.pair for g in every[:most]], VISIBLE_NM), strict=True):
+    some, functions = every[:most], []
+    for ghost, graph in zip(some, ghost_graphs(lens, [g.pair for g in some], VISIBLE_NM), strict=True):
         name, program = f"ghost_{ghost.pair.name.replace('-', '_')}", lower(graph)
         given = [_ENTERING[i] for i in Signature.of(program, name).inputs]
         call = f"{name}({', '.join([*given, *_ARRIVING])})"
-        places = ghost.chief_mm.tolist(), ghost.scale_mm.tolist()
-        found.append(GhostFunction(ghost.pair.name, _text(program, name), call, *places))
-    light = sum(g.light for g in every[:most]) / max(sum(g.light for g in every), 1e-300)
-    return Ghosts(found, _SINE, VISIBLE_NM, float(lens.stop_radius_mm), light)
+        places = {"chief_mm": ghost.chief_mm.tolist(), "scale_mm": ghost.scale_mm.tolist()}
+        functions.append({"name": ghost.pair.name, "text": _text(program, name), "call": call, **places})
+    light = sum(g.light for g in some) / max(sum(g.light for g in every), 1e-300)
+    facts = {"sine": _SINE, "wavelength_nm": VISIBLE_NM, "stop_radius_mm": float(lens.stop_radius_mm), "light": light}
+    return facts, functions
 
 
 def _text(program: Program, name: str) -> str:
