@@ -17,7 +17,7 @@ from importlib import import_module
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable, reason
 from neurolens.base.signals import handled
 from neurolens.cli.arguments import Help, Parser, more_glasses
 
@@ -145,9 +145,7 @@ def _failed(error: Exception) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     if isinstance(error, OSError):
-        # The error of a full disk names no file.
-        place = "" if error.filename is None else f"{error.filename}: "
-        return _fail(f"{place}{error.strerror or error}")
+        return _fail(reason(error))
     return _fault(error)
 
 

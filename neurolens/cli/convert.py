@@ -118,25 +118,22 @@ def _summary(lens: Lens, notes: list[str]) -> dict[str, Any]:
 
 
 def _text(data: dict[str, Any]) -> str:
-    efl, efl_x, back, film, f_number, stated = (
-        cli.number(data[key], digits)
-        for key, digits in (
-            *(("efl_mm", 6), ("efl_x_mm", 6), ("back_focus_mm", 6), ("film_gap_mm", 6)),
-            *(("f_number", 4), ("stated_f_number", 4)),
-        )
-    )
+    def mm(key: str) -> str:
+        return f"{cli.number(data[key], 6)} mm"
+
+    across = "" if data["efl_x_mm"] is None else f" (in y; {mm('efl_x_mm')} in x)"
     lines = [
         data["name"],
         data["source"],
         f"surfaces      {data['surfaces']}, stop on {data['stop_surface']}; rims: {data['rims']}",
-        f"focal length  {efl} mm" + ("" if data["efl_x_mm"] is None else f" (in y; {efl_x} mm in x)"),
-        f"back focus    {back} mm; film tabled at {film} mm",
-        f"f-number      f/{f_number}, stated f/{stated}",
+        f"focal length  {mm('efl_mm')}{across}",
+        f"back focus    {mm('back_focus_mm')}; film tabled at {mm('film_gap_mm')}",
+        f"f-number      f/{cli.number(data['f_number'])}, stated f/{cli.number(data['stated_f_number'])}",
+        *([f"states        {', '.join(data['configurations'])}"] if data["configurations"] else ()),
+        *(f"warning: {text}" for text in data["warnings"]),
+        f"written to {data['output']}",
     ]
-    if data["configurations"]:
-        lines.append(f"states        {', '.join(data['configurations'])}")
-    lines += [f"warning: {text}" for text in data["warnings"]]
-    return "\n".join([*lines, f"written to {data['output']}"])
+    return "\n".join(lines)
 
 
 _CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")
@@ -169,54 +166,34 @@ examples:
         glasses: list[catalogue.Glass] = []
         for name in self.name:
             if _CODE.fullmatch(name):
-                glasses += _near(name)
+                digits = re.sub("[./]", "", name)
+                n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
+                first, *others = catalogue.by_code(name, 6)
+                found = [g for g in (first, *others) if abs(g.n_d - n_d) <= _NEAR_N_D and abs(g.V_d - V_d) <= _NEAR_V_D]
+                if not found:
+                    near = f"the nearest is {first} (n_d {first.n_d:.4f}, V_d {first.V_d:.1f})"
+                    expected = f"a code within {_NEAR_N_D:g} in n_d and {_NEAR_V_D:g} in V_d of a glass; {near}"
+                    raise InputError("argument", "NAME", name, expected)
+                glasses += found
             else:
                 catalogue.find(name, "argument", "NAME")
                 glasses += catalogue.same_name(name)
         rows = [_record(glass) for glass in dict.fromkeys(glasses)]
-        return self.answer({"glasses": rows}, lambda: _glass_text(rows))
-
-
-def _glass_text(rows: list[dict[str, Any]]) -> str:
-    header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
-    lines = [
-        [
-            *(row["glass"], f"{row['n_d']:.6f}", f"{row['V_d']:.2f}", *(cli.number(v) for v in row["range_nm"])),
-            *(cli.number(row["internal_transmittance_10mm"].get(f"{nm:.0f}")) for nm in _TRANSMITTED_NM),
+        header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
+        cells = [
+            [r["glass"], f"{r['n_d']:.6f}", f"{r['V_d']:.2f}"]
+            + [cli.number(v) for v in (*r["range_nm"], *r["internal_transmittance_10mm"].values())]
+            for r in rows
         ]
-        for row in rows
-    ]
-    return cli.table(header, lines)
-
-
-def _near(code: str) -> list[Any]:
-    """The glasses nearest to a code, those alone that are near it.
-
-    Raises:
-        InputError: none is.
-    """
-    from neurolens.lens import catalogue
-
-    digits = re.sub("[./]", "", code)
-    n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
-    nearest = catalogue.by_code(code, 6)
-    found = [g for g in nearest if abs(g.n_d - n_d) <= _NEAR_N_D and abs(g.V_d - V_d) <= _NEAR_V_D]
-    if not found:
-        near = f"{nearest[0]} (n_d {nearest[0].n_d:.4f}, V_d {nearest[0].V_d:.1f})"
-        expected = f"a code within {_NEAR_N_D:g} in n_d and {_NEAR_V_D:g} in V_d of a glass; the nearest is {near}"
-        raise InputError("argument", "NAME", code, expected)
-    return found
+        return self.answer({"glasses": rows}, lambda: cli.table(header, cells))
 
 
 def _record(glass: Any) -> dict[str, Any]:
-    """Figures of one glass; internal transmittance by wavelength in nm, empty where the source has none."""
-    absorption = {nm: glass.absorption_per_mm(nm) for nm in _TRANSMITTED_NM if glass.absorption}
-    return {
-        "glass": str(glass),
-        "n_d": glass.n_d,
-        "V_d": glass.V_d,
-        "range_nm": [1000 * v for v in glass.range_um],
-        "form": glass.form,
-        "coefficients": glass.coefficients,
-        "internal_transmittance_10mm": {f"{nm:.0f}": math.exp(-_PLATE_MM * a) for nm, a in absorption.items()},
+    """Figures of one glass; internal transmittance by wavelength in nm, None where the source has none."""
+    figures = {name: getattr(glass, name) for name in ("n_d", "V_d", "form", "coefficients")}
+    through = {
+        f"{nm:.0f}": math.exp(-_PLATE_MM * glass.absorption_per_mm(nm)) if glass.absorption else None
+        for nm in _TRANSMITTED_NM
     }
+    range_nm = [1000 * v for v in glass.range_um]
+    return {"glass": str(glass), **figures, "range_nm": range_nm, "internal_transmittance_10mm": through}

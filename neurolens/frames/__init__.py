@@ -13,13 +13,13 @@ A `Frame` holds everything that decides one picture; `render_frame` renders it a
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from neurolens import __version__
-from neurolens.base.errors import InputError, NeurolensError, warn
+from neurolens.base.errors import InputError, NeurolensError, reason, warn
 from neurolens.base.files import check_writable
 from neurolens.base.lensname import Named, resolve
 from neurolens.base.progress import Progress
@@ -28,6 +28,7 @@ from neurolens.base.settings import setting, whole
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.shot import Dispersion, FocusMode, Shot, Vignetting, film_size
+from neurolens.readers.glasses import more_glasses
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, check_name, conversion, converted
 from neurolens.render.film import PixelGrid
 from neurolens.render.job import MEANING
@@ -126,14 +127,6 @@ class Frame(Picture):
         """A frame of a scene file through a camera, both by name, as in `neurolens render SCENE --camera CAMERA`."""
         return cls(scene=Path(scene), camera=resolve(camera), **settings)
 
-    def glasses(self) -> AbstractContextManager[None]:
-        """A block in which the glasses of `glass_files` are known."""
-        if not self.glass_files:
-            return nullcontext()
-        from neurolens.readers.glasses import more_glasses
-
-        return more_glasses(self.glass_files)
-
     def shot(self, settings: CameraSettings, aperture: Aperture | None) -> Shot:
         """The scene's settings of the camera, and its stop's shape, with the changes of the frame."""
         # A scene's f-number is clamped to the lens; one of the frame must be possible.
@@ -227,15 +220,11 @@ class Prepared:
             watch=watch,
         )  # fmt: skip
 
-    def metadata(self) -> dict[str, Any]:
-        """The metadata of the EXR about scene and camera."""
-        return {"version": __version__, "scene": str(self.frame.scene), "camera": plain(self.camera.settings)}
-
 
 def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepared:
     """Read and check everything that a frame needs, before it is rendered to `out` (of a tile: beside it).
 
-    The glasses of `frame.glass_files` must be known already, see `Frame.glasses`.
+    The glasses of `frame.glass_files` must be known already, see `readers.glasses.more_glasses`.
 
     Warns:
         NeurolensWarning: what the camera's settings note, as a film larger than the image circle.
@@ -255,16 +244,12 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
     PixelGrid(width, height, shot.film_mm)  # checked before the slow make_camera
     rows = None if frame.tile is None else rows_of(height, frame.tile)
     camera = make_camera(str(frame.camera), shot, progress)
-    for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
+    for note in camera.settings.get("notes", ()):
         warn(note)
-    return Prepared(frame, files, scene, film, sensor, camera, (width, height), rows)
-
-
-def _pixel_notes(camera: Camera, width: int) -> list[str]:
-    """A warning where the error of a model is larger than the pixels of a picture of some width."""
     error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
-    pixel = 1e3 * camera.film_mm[0] / width
-    return [f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um"] if error > pixel else []
+    if error > (pixel := 1e3 * camera.film_mm[0] / width):
+        warn(f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um")
+    return Prepared(frame, files, scene, film, sensor, camera, (width, height), rows)
 
 
 def render_frame(
@@ -290,7 +275,7 @@ def render_frame(
         InputError, OSError: as `prepare`. NeurolensError: a worker failed, or the files cannot be written.
     """
     progress = progress or Progress(quiet=True)
-    with frame.glasses():
+    with more_glasses(frame.glass_files):
         prepared = prepare(frame, out, progress)
         flare = flare_of(prepared, choice, threads, progress)
         with progress.stage(f"render {prepared.name}") as report:
@@ -329,23 +314,21 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
         return None
     from neurolens.flare.layers import scene_choice
 
-    some = frames[:: -(-len(frames) // _CHOICE_FRAMES)]
+    scene = prepared.scene
+    lenses: dict[tuple[Any, ...], Lens] = {_state(prepared.frame): prepared.camera.lens}  # type: ignore[attr-defined]
+    scenes = []
+    for frame in frames[:: -(-len(frames) // _CHOICE_FRAMES)]:
+        if _state(frame) not in lenses:
+            shot = frame.shot(scene.settings.camera, scene.aperture)
+            lenses[_state(frame)] = make_camera(str(frame.camera), shot).lens  # type: ignore[attr-defined]
+        scenes.append((seen_from(scene, frame.scene, frame.position_m, frame.look_at_m), lenses[_state(frame)]))
     with _errors_of_table(prepared.frame.scene):
-        return scene_choice(list(_scenes(some, prepared)), _raster(prepared), threads)
+        return scene_choice(scenes, _raster(prepared), threads)
 
 
-def _scenes(frames: Sequence[Frame], prepared: Prepared) -> Iterator[tuple[Scene, Lens]]:
-    """The scene and the lens in each of the frames."""
-
-    def state(frame: Frame) -> tuple[Any, ...]:
-        return frame.focus_m, frame.f_number, frame.zoom
-
-    lenses: dict[tuple[Any, ...], Lens] = {state(prepared.frame): prepared.camera.lens}  # type: ignore[attr-defined]
-    for frame in frames:
-        if state(frame) not in lenses:
-            shot = frame.shot(prepared.scene.settings.camera, prepared.scene.aperture)
-            lenses[state(frame)] = make_camera(str(frame.camera), shot).lens  # type: ignore[attr-defined]
-        yield seen_from(prepared.scene, frame.scene, frame.position_m, frame.look_at_m), lenses[state(frame)]
+def _state(frame: Frame) -> tuple[Any, ...]:
+    """What frames with the same lens share."""
+    return frame.focus_m, frame.f_number, frame.zoom
 
 
 def _raster(prepared: Prepared) -> Raster:
@@ -377,8 +360,9 @@ def write_pictures(
     from neurolens.render.pictures import write_exr, write_png
 
     frame, files, (width, height) = prepared.frame, prepared.files, prepared.size
-    space, settings = COLOUR_SPACES[prepared.film.colour_space], prepared.metadata()
-    metadata = settings | {"render": plain(result.stats), "colour": space.stated}
+    space, camera = COLOUR_SPACES[prepared.film.colour_space], plain(prepared.camera.settings)
+    metadata: dict[str, Any] = {"version": __version__, "scene": str(frame.scene), "camera": camera}
+    metadata |= {"render": plain(result.stats), "colour": space.stated}
     layers: Layers = {}
     if frame.channels == "all" or not result.stats["complete"]:
         layers, metadata["layers"] = asdict(result.layers), MEANING
@@ -388,7 +372,7 @@ def write_pictures(
         layers |= expose(sum(added, start=result.rgb), sensor, frame.seed, rows[0])
         metadata["sensor"] = about(sensor, frame.seed)
     layers |= flare_channels({name: picture[slice(*rows)] for name, picture in flare.items()}, space)
-    attributes = standard_attributes(settings["camera"], width, height, frame.number)
+    attributes = standard_attributes(camera, width, height, frame.number)
     if frame.tile is not None:
         number, count = frame.tile
         metadata["tile"] = {"number": number, "of": count, "frame": frame.number, "half": frame.half}
@@ -401,7 +385,7 @@ def write_pictures(
         if preview:
             write_png(files.preview, result.rgb, frame.exposure)
     except (OSError, NeurolensError) as error:
-        raise NeurolensError(f"{_text(error)}; {_rescued(files, result)}") from None
+        raise NeurolensError(f"{reason(error)}; {_rescued(files, result)}") from None
 
 
 def flare_channels(flare: Mapping[str, FloatArray], space: ColourSpace) -> Layers:
@@ -425,13 +409,6 @@ def _rescued(files: Files, result: RenderResult) -> str:
         result.save()
     except (OSError, NeurolensError, MemoryError) as error:
         if files.checkpoint.exists():
-            return f"only a part of the render is kept ({_text(error)}): {files.kept()}"
-        return f"the render is lost, for the checkpoint cannot be written either ({_text(error)})"
+            return f"only a part of the render is kept ({reason(error)}): {files.kept()}"
+        return f"the render is lost, for the checkpoint cannot be written either ({reason(error)})"
     return f"the render is kept: {files.kept()}"
-
-
-def _text(error: BaseException) -> str:
-    if not isinstance(error, OSError):
-        return str(error) or type(error).__name__
-    file = "" if error.filename is None else f"{error.filename}: "
-    return f"{file}{error.strerror or error}"

@@ -25,6 +25,7 @@ from neurolens.base.files import noted_files
 from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
 from neurolens.frames import Frame, Prepared, flare_choice, prepare, render_frame
+from neurolens.readers.glasses import more_glasses
 from neurolens.render.film import digest
 from neurolens.render.tiles import read_tile, tile_path, write_picture
 
@@ -92,7 +93,7 @@ def render_frames(
     out, frame = next(iter(frames.items()))
     progress = progress or Progress(quiet=True)
     folder = folder or out.with_name(f"{out.name}.tiles")
-    with noted_files() as files, frame.glasses():
+    with noted_files() as files, more_glasses(frame.glass_files):
         prepared = prepare(frame, out, progress)
         choice = flare_choice(shown or list(frames.values()), prepared)
     common = packed(files | {path for path in (frame.scene, frame.camera.file, *frame.glass_files) if path is not None})
