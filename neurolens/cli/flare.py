@@ -25,7 +25,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import placed_settings
 from neurolens.cameras.field import Field, field_of
 from neurolens.cli import arguments as cli
-from neurolens.cli.keys import Frames, frames_group, frames_of
+from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
 from neurolens.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
@@ -186,7 +186,6 @@ examples:
 
     def _check(self) -> None:
         """Refuse options that exclude each other and files that cannot be written; raises InputError."""
-        self.frames.check(_COMMAND)
         if self.frames.frames is not None and self.out is None:
             self.refuse("--frames", f"({len(self.frames.frames)})", "-o beside it")
         reflections = self.settings.most_reflections
@@ -231,15 +230,11 @@ examples:
 
     def _states(self) -> Iterator[Flare]:
         """The command with the settings of each frame."""
-        state = replace(self.state, focus_m=self.focus_m)
-        if self.frames.frames is None:
-            yield replace(self, state=state)
-            return
-        for frame, digits, values in frames_of(self.frames.frames, self.frames.key, vars(self.state), _COMMAND):
-            of_lens = {name: value for name, value in values.items() if name in vars(state)}
+        for frame, digits, values in self.frames.states(vars(self.state), self.called):
+            of_lens = {"focus_m": self.focus_m} | {k: v for k, v in values.items() if k in vars(self.state)}
             place = {name: value for name, value in values.items() if name not in of_lens}
-            out = self.picture.with_name(f"{self.picture.stem}.{digits}{self.picture.suffix}")
-            yield replace(self, state=replace(state, **of_lens), frame=frame, out=out, **place)
+            out = self.out and numbered(self.out, digits)
+            yield replace(self, state=replace(self.state, **of_lens), frame=frame, out=out, **place)
 
     def _write_all(self, states: list[Flare], shots: Shots, progress: Progress) -> dict[str, Any]:
         """Write the picture, or those of the frames that are missing.

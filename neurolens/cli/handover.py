@@ -57,7 +57,6 @@ examples:
 
     def run(self) -> int:
         """Trace the fields of all frames, write the maps, then what is fitted to them."""
-        self.frames.check(self.called)
         from neurolens.handover import Handed, Pinhole  # fails here where scipy is missing, before the work
 
         progress = self.progress()

@@ -24,7 +24,7 @@ from neurolens.base.settings import changed, group, positive, setting, setting_o
 from neurolens.base.signals import Stopping, Unfinished
 from neurolens.cameras.contract import FloatArray
 from neurolens.cli import arguments as cli
-from neurolens.cli.keys import Frames, frames_group, frames_of
+from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
 from neurolens.frames.farm import how_to_resume, render_frames
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
@@ -126,9 +126,11 @@ examples:
             raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
 
     def _run(self) -> int:
-        self.frames.check(self.called)
         frame = self.frame()
-        frames = {self.out: frame} if self.frames.frames is None else self._by_file(frame)
+        frames = {
+            numbered(self.out, digits): replace(frame, **values, number=number, seed=frame.seed + (number or 0))
+            for number, digits, values in self.frames.states(vars(frame), self.called)
+        }
         missing = frames if self.frames.frames is None else self._missing(frames)
         if self.dask is not None:
             return self._run_on_dask(self.dask, frames, missing)
@@ -150,15 +152,6 @@ examples:
             self.scene[0], self.camera, **self.state.settings(), **vars(self.picture), glass_files=self.glass,
             **{name: getattr(self, name) for name in same},
         )  # fmt: skip
-
-    def _by_file(self, frame: Frame) -> dict[Path, Frame]:
-        """The frames of --frames by the files of their pictures; `frame` has the settings that no key sets."""
-        assert self.frames.frames is not None
-        frames = {}
-        for number, digits, values in frames_of(self.frames.frames, self.frames.key, vars(frame), self.called):
-            out = self.out.with_name(f"{self.out.stem}.{digits}{self.out.suffix}")
-            frames[out] = replace(frame, **values, number=number, seed=frame.seed + number)
-        return frames
 
     def _missing(self, frames: Mapping[Path, Frame]) -> dict[Path, Frame]:
         """The frames that are to be rendered: without --restart those that do not exist, or that have a checkpoint.

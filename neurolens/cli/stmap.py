@@ -21,7 +21,7 @@ from neurolens.base.settings import positive, setting
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Field, field_of, frame_of, spectrum_of
 from neurolens.cli import arguments as cli
-from neurolens.cli.keys import LENS_KEYS, Frames, frames_group, frames_of
+from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
 from neurolens.lens.shot import Shot
 from neurolens.render.film import PixelGrid
 from neurolens.render.pictures import read_metadata, standard_attributes, write_channels
@@ -160,7 +160,6 @@ examples:
 
     def run(self) -> int:
         """Trace the fields of all frames, then write their maps, of one size."""
-        self.frames.check(self.called)
         progress = self.progress()
         frames, plates = self.traced(progress)
         files = self.maps(frames, plates, progress, self.out)
@@ -169,9 +168,7 @@ examples:
 
     def states(self) -> list[tuple[str, cli.LensState]]:
         """The numbers of frames as file names have them, and the state of the lens there."""
-        if self.frames.frames is None:
-            return [("", self.state)]
-        keyed = frames_of(self.frames.frames, self.frames.key, vars(self.state), self.called, LENS_KEYS)
+        keyed = self.frames.states(vars(self.state), self.called, LENS_KEYS)
         return [(digits, replace(self.state, **values)) for _, digits, values in keyed]
 
     def traced(self, progress: Progress) -> tuple[list[TracedFrame], Plates]:

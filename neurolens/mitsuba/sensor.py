@@ -292,20 +292,15 @@ def _camera_of(props: Any, shape: float) -> Camera:
     name = props.get("camera", None)
     if not isinstance(name, str):
         raise InputError(PLUGIN, "camera", "(missing)", "a model (.onnx), a lens file (.toml), thin or pinhole")
-    names = ("blades", "blade_rotation_deg", "blade_curvature", "aperture_mask")
-    blades, rotation, curvature, mask = (props.get(k, None) for k in names)
+    mask = props.get("aperture_mask", None)
     mask = Path(_found(mask)) if isinstance(mask, str) else mask
-    aperture = make_aperture(StopShape(blades, rotation, curvature, mask))
+    blades = (props.get(k, None) for k in ("blades", "blade_rotation_deg", "blade_curvature"))
+    size = props.get("focal_length_mm", props.get("efl_mm", None))
+    more = {k: props.get(k) for k in ("f_number", "zoom", "dispersion") if props.get(k, None) is not None}
     shot = Shot(
-        film_mm=(width_mm, height_mm),
-        focus_m=_number_of(props, "focus_m", math.inf),
-        f_number=props.get("f_number", None),
-        focal_length_mm=props.get("focal_length_mm", props.get("efl_mm", None)),
-        zoom=props.get("zoom", None),
-        aperture=aperture,
-        wavelength_nm=LIGHT_NM,
-        dispersion=props.get("dispersion", "full"),
-    )
+        (width_mm, height_mm), _number_of(props, "focus_m", math.inf), focal_length_mm=size,
+        aperture=make_aperture(StopShape(*blades, mask)), wavelength_nm=LIGHT_NM, **more,
+    )  # fmt: skip
     return make_camera(_found(name), shot)
 
 
