@@ -152,10 +152,7 @@ GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 # 7100, and its time grows faster than their number.
 MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
-_EDGE_RAYS, _BEYOND = (
-    2**15,
-    1.01,
-)  # rays that look for the edge of the light on the front, and how far it may lie beyond
+_EDGE_RAYS = 2**16  # rays that look for where light crosses the front surface
 
 
 class LensCamera:
