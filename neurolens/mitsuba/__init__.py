@@ -28,8 +28,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.shot import Dispersion, Shot
-from neurolens.mitsuba.library import matrix, require_mitsuba
-from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, register
+from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, matrix, register, require_mitsuba
 
 __all__ = ["camera", "load_scene", "register", "render", "require_mitsuba"]
 PASS_RAYS = 1 << 20  # of one wavefront: numpy holds some 200 bytes per ray
