@@ -379,7 +379,7 @@ class LensCamera:
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
     def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
-        """Inputs of the lens's graph for rays all over film, pupil and wavelengths, and their margins as in `lanes_graph`."""
+        """Inputs of the lens's graph for rays all over film, pupil and light, and their margins as in `lanes_graph`."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))
