@@ -283,7 +283,6 @@ class Demo(cli.Command):
         """Render and write the page."""
         from neurolens.study.pages import figures_of
 
-        cli.check_run_folder(self.out, self.called, "--output")
         self.out.mkdir(parents=True, exist_ok=True)
         parser = cli.Parser()
         Render.fill(parser)
