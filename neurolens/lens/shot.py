@@ -40,8 +40,8 @@ class Shot:
         cover_glass_mm: thickness of a plate of N-BK7 that is put before the film of a lens file, which is focused anew.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error for a model, and
             opens the stop of a lens file as far as the rims let light through.
-        vignetting: the part that is kept; see `neurolens.cameras.vignetting`.
-        dispersion: the part that is kept; see `neurolens.cameras.dispersion`.
+        vignetting: the part that is kept; see `neurolens.cameras.reduced`.
+        dispersion: the part that is kept; see `neurolens.cameras.reduced`.
 
     Raises:
         InputError: a film, focus, f-number, focus mode, vignetting or dispersion that no camera has.

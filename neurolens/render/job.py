@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
-from neurolens.cameras.dispersion import film_shift
+from neurolens.cameras.reduced import film_shift
 from neurolens.graph.compiler import c_source, has_compiler, load_compiled
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant

@@ -33,10 +33,9 @@ from neurolens.flare.ghostgraph import entrances, ghost_graphs
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.graph.c import Signature
 from neurolens.graph.ir import Graph
-from neurolens.graph.osl import TEMPORARY, urgent
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
-from neurolens.graph.shading import write_glsl
+from neurolens.graph.shading import TEMPORARY, urgent, write_glsl
 from neurolens.lens.prescription import VISIBLE_NM, Lens
 from neurolens.shaders.pupil import Blades
 from neurolens.trace.tracegraph import exact_graph

@@ -13,7 +13,7 @@ from shipped import whole
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.lens.shot import Shot
 from neurolens.render.colour import SpectralRange, table
 from neurolens.render.film import PixelGrid

@@ -21,7 +21,7 @@ from neurolens.base.html import text_of
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.graph.osl import urgent
+from neurolens.graph.shading import urgent
 from neurolens.lens.prescription import VISIBLE_NM, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
