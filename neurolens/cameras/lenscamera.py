@@ -278,15 +278,16 @@ class LensCamera:
         hero = self._run("hero", lanes - 1)(given)
         rays = camera_rays(hero)
         light, places = hero["light"], hero["places"].reshape(lanes, 2, -1)
-        edge = np.flatnonzero((hero["margin"][0] < self._edge_mm) & (rays.weight > 0))
+        doubt = np.flatnonzero((hero["sure"] < self._sure) & (light > 0))  # of all companions, one after the other
+        ray = doubt % film.shape[1]
         same = {"film_mm": film, "pupil_mm": hero["pupil_mm"], "wavelength_nm": nm[:1]}
-        near = {name: np.tile(values.take(edge, axis=1), lanes - 1) for name, values in same.items()}
-        near["companion_nm"] = nm[1:].take(edge, axis=1).reshape(1, -1)
-        passes = (self._run("companion")(near)["status"] == st.PASSED).reshape(lanes - 1, -1)
-        light[:, edge] *= passes
-        places[1:, :, edge] = np.where(passes[:, None], places[1:, :, edge], film[:, edge])
+        near = {name: values.take(ray, axis=1) for name, values in same.items()}
+        near["companion_nm"] = nm[1:].reshape(1, -1).take(doubt, axis=1)
+        lost = self._run("companion")(near)["status"][0] != st.PASSED
+        light.reshape(-1)[doubt[lost]] = 0
+        places[1 + doubt[lost] // film.shape[1], :, ray[lost]] = film[:, ray[lost]].T
         weight = np.concatenate([rays.weight[None], light])
-        weight /= np.maximum(np.count_nonzero(weight, axis=0), 1).astype(np.float32)
+        weight /= np.maximum((weight > 0).sum(axis=0, dtype=np.uint8), 1).astype(np.float32)
         return SpectralRays(rays, weight, places)
 
     @property
@@ -343,9 +344,9 @@ class LensCamera:
         return fit_shift(self.lens_graph().graph, samples, margin, companions, self.film_mm)
 
     @cached_property
-    def _edge_mm(self) -> float:
-        """`Shift.edge_mm`; all of the pupil where a shape in the stop has other edges."""
-        return self._shift.edge_mm if self._shift and self.lens_graph().aperture is None else math.inf
+    def _sure(self) -> float:
+        """The `sure` of `lanes_graph` from which companions need no ray; none where a shape in the stop has edges."""
+        return 0.0 if self.lens_graph().aperture is None else math.inf
 
     def _of_the_lens(self) -> dict[str, float]:
         """The inputs of the lens's graph for a whole call."""
@@ -381,7 +382,7 @@ class LensCamera:
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
     def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
-        """Inputs of the lens's graph for rays all over film, pupil and wavelengths, and their `lanes_graph` margins."""
+        """Inputs of the lens's graph for rays all over film, pupil and wavelengths, and their margins as in `lanes_graph`."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))

@@ -218,7 +218,7 @@ class ChannelWavelengths:
     def draw(self, sample: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Wavelengths [N] in nm and weights [3, N] for uniform samples [N] in [0, 1)."""
         weights = self._weights.take(self._range.bin_of(sample), axis=1)
-        return self._range.wavelengths_nm(sample), weights
+        return self._range.wavelengths_nm(sample)[0], weights
 
 
 def wavelength_samples(position: FloatArray, aperture: FloatArray) -> FloatArray:
