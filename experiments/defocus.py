@@ -25,12 +25,10 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.cli import main
-from neurolens.defocus.atlas import pinhole_of
 from neurolens.defocus.gather import Gathered
-from neurolens.defocus.kernels import kernel_at
+from neurolens.defocus.kernels import kernel_at, pinhole_of
 from neurolens.defocus.picture import defocus
-from neurolens.defocus.plate import Layer, PlatePinhole
-from neurolens.defocus.read import DepthSettings, Plate, read_plate
+from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_exr, write_png
 from neurolens.render.renderer import render

@@ -14,7 +14,7 @@ from neurolens.cli.output import number
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
 
 if TYPE_CHECKING:
-    from neurolens.defocus.atlas import Cell
+    from neurolens.defocus.kernels import Cell
 
 _MOST = 64  # fields along a side
 
@@ -67,9 +67,8 @@ examples:
         check_folder(self.out, "--output")
         if not self.out.name:
             self.refuse("--output", str(self.out), "the start of the files' names")
-        from neurolens.defocus.atlas import as_picture, as_preview, kernels_over
+        from neurolens.defocus.kernels import Grooves, as_picture, as_preview, aspheres, kernels_over
         from neurolens.defocus.picture import check_field
-        from neurolens.defocus.rings import Grooves, aspheres
         from neurolens.render.pictures import write_channels, write_png
 
         progress = self.progress()

@@ -89,7 +89,7 @@ examples:
         from neurolens.cameras.build import make_camera
         from neurolens.cameras.field import frame_of
         from neurolens.defocus.picture import check_field, defocus
-        from neurolens.defocus.read import DepthSettings, read_plate
+        from neurolens.defocus.plate import DepthSettings, read_plate
         from neurolens.render.pictures import standard_attributes, write_exr, write_png
         from neurolens.render.sensor import about, expose
 

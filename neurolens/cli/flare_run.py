@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,9 +27,10 @@ from neurolens.cli.keys import frames_of
 from neurolens.cli.output import number, table
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
-from neurolens.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
+from neurolens.flare.layers import brightest, flare_layers, kept_beside, sum_of, with_coating
 from neurolens.flare.lights import SUN, Light, read_lights, with_disc
-from neurolens.flare.sources import KeptLights, SceneLights, chosen, highlights, keep_named
+from neurolens.flare.picture import FlareJob
+from neurolens.flare.sources import KeptLights, SceneLights, highlights, keep
 from neurolens.frames.frame import Files, flare_channels
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 _COMMAND = "neurolens flare"
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table; tables; ghosts of a light in metadata
 _FEWEST = 256  # rays behind a table
-_GHOST_FRAMES, _LIGHT_FRAMES = 16, 64  # at most; they decide which ghosts are the brightest, and which lights are kept
+_GHOST_FRAMES = 16  # at most, which decide which ghosts are the brightest
 _QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile of the lit pixels to this value
 
 
@@ -81,7 +82,7 @@ def run_flare(args: Flare) -> int:
         settings = args.settings
         progress.note(f"quick: {args.width} pixels wide, {settings.bins} wavelengths, cells of {settings.cell_px:g}")
     states = list(_states(args))
-    shots = Shots(args, states, read_any(args.file), progress)
+    shots = Shots(args, read_any(args.file), progress)
     first = shots.at(states[0])
     results = {"lens": first.job.lens.name, "pairs": len(ghost_pairs(first.job.lens)), **first.metadata()}
     if args.path is not None:
@@ -118,7 +119,7 @@ def _states(flare: Flare) -> Iterator[Flare]:
 class Shots:
     """The flare of each frame. Files are read once, and frames with the same focus, stop and zoom share the lens."""
 
-    def __init__(self, args: Flare, states: Sequence[Flare], tabled: Lens, progress: Progress) -> None:
+    def __init__(self, args: Flare, tabled: Lens, progress: Progress) -> None:
         if not (args.light or args.lights or args.image):
             raise InputError(_COMMAND, "--light", "(missing)", "--light, --lights or --image")
         self._tabled, self._progress = tabled, progress
@@ -126,8 +127,6 @@ class Shots:
         self._tracks = [t for path in args.lights if path.suffix.lower() != ".toml" for t in read_lights(path)]
         scenes = [(path, load_scene(path)) for path in args.lights if path.suffix.lower() == ".toml"]
         self._scenes: list[tuple[Path, Scene, SceneLights]] = [(p, scene, SceneLights(scene)) for p, scene in scenes]
-        self._states = states[:: -(-len(states) // _LIGHT_FRAMES)] if args.frames.frames is not None else ()
-        self._chosen: dict[Path, frozenset[int]] = {}
         self._fields: dict[tuple[Any, ...], Field] = {}
         self._lenses: dict[tuple[Any, ...], Lens] = {}
         self._last: tuple[Flare, Shot] | None = None
@@ -172,17 +171,9 @@ class Shots:
         if behind := of_lists.count(None):
             warn(f"{behind} lights of lists stand behind the lens{at}")
         for path, scene, sources in self._scenes:
-
-            def visible(
-                state: Flare, path: Path = path, scene: Scene = scene, sources: SceneLights = sources
-            ) -> Mapping[int, Light]:
-                camera = seen_from(scene, path, state.position_m, state.look_at_m)
-                return sources.named(camera, lens.film_z_mm or 0.0)
-
-            here = visible(args)
-            if path not in self._chosen:
-                self._chosen[path] = chosen([visible(state) for state in self._states] or [here], args.settings.most)
-            lights += _with_warning(keep_named(here, self._chosen[path]), path)
+            camera = seen_from(scene, path, args.position_m, args.look_at_m)
+            found = sources.seen(camera, lens.film_z_mm or 0.0)
+            lights += _with_warning(keep(found, args.settings.most, fade=args.frame is not None), path)
         if (plate := _plate(args)) is not None:
             lights += self._of_picture(args, plate, lens)
         if not lights:

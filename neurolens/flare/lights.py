@@ -14,15 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.flare.steps import Floats
 from neurolens.lens.prescription import Lens
 from neurolens.trace.shapes import sag_mm
 
+Floats = NDArray[np.float32]
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
 
 SUN = math.pi  # irradiance by which the sun lights a white card across its way to radiance 1
@@ -154,7 +153,9 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
     counts = [min(math.ceil(math.degrees(side) / most_deg + 1e-9), most) for side in _lengths(corners)]
     if 1 < max(counts) and most != CELLS:
         weights = weights.repeat(FADE, 0).repeat(FADE, 1)
-        corners = ndimage.zoom(corners, [(len(weights) + 1) / len(corners)] * 2 + [1], order=1)
+        at, nodes = np.linspace(0, CELLS, len(weights) + 1), np.arange(CELLS + 1)
+        for axis in (0, 1):
+            corners = np.apply_along_axis(lambda v: np.interp(at, nodes, v), axis, corners)
     middles = 0.25 * (corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1])
     parts = []
     for along in _shares(counts[0], len(weights)):

@@ -7,30 +7,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.base.kept import Kept
-from neurolens.flare.areas import Doubles, Floats, draw_edges, edges_of
-from neurolens.flare.canvas import Raster, Smear, axis_irradiance, enlarged, smear_of, smeared, spread
+from neurolens.base.progress import Report
+from neurolens.base.tasks import in_order
+from neurolens.flare.canvas import Doubles, Raster, Smear, draw_edges, edges_of, enlarged, smear_of, smeared, spread
 from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
-from neurolens.flare.lights import Light, Patch, light_rays, patches, rays_across
+from neurolens.flare.lights import Floats, Light, Patch, disc, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
+from neurolens.flare.steps import entering
 from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.render.colour import SRGB, SpectralRange, in_gamut
 from neurolens.render.film import digest
+from neurolens.render.settings import FlareSettings
+from neurolens.trace.rays import Rays, trace
 
+_AXIS = 1 << 15  # rays of the exposure
 _AT_ONCE = 1 << 16  # photons of a call
 _ENOUGH = 200  # photons of a kernel: a noise of 8%
 _COLOURED = 3200  # photons of a kernel of colour: eyes see its noise in wider areas
-_WAIT_S = 0.5  # between two reports
 _KEEP_S = 30.0  # between two states of long work
 _GOLDEN = 0.6180339887498949
 _STRIP = 1 << 22  # bytes of a strip of the canvas, which one thread draws
@@ -41,8 +48,68 @@ _PATCH_DEG = 2.0  # of an extended light: see `patches`
 _PATCHES, _CELLS = (4, 6, 9), 48  # along a side, at most; cells of a ghost along a side, which many patches keep
 _UNEVEN, _FAINT = 0.6, 5e-4  # share of its light that may come or go over a patch; share of all light, of a faint ghost
 
-_T = TypeVar("_T")
-_R = TypeVar("_R")
+
+@dataclass(frozen=True)
+class FlareJob:
+    """Everything that decides the flare of one picture.
+
+    Attributes:
+        lens: its film must be placed (`set_lens`), and it must have the coating of the settings (`with_coating`).
+        wavelength_nm: range of light. threads: of the work.
+        ghosts: traces the ghosts of the same lens and stop; left out, all of two reflections.
+        single: names of the ghosts that become layers; the others are the layer "rest".
+        keep: picture beside which the photons of long work are kept until they are whole.
+        finer: wavelengths of a ghost at most, for one of a star or of photons.
+    """
+
+    lens: Lens
+    lights: Sequence[Light]
+    raster: Raster
+    settings: FlareSettings = FlareSettings()
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    threads: int = 2
+    ghosts: GhostTracer | None = None
+    single: tuple[str, ...] = ()
+    keep: Path | None = None
+    finer: int = 4
+
+    def spectral(self, finer: int = 1) -> SpectralRange:
+        """The range of light in its wavelengths, or in so many times as many."""
+        return SpectralRange(*self.wavelength_nm, bins=finer * self.settings.bins)
+
+    @property
+    def exposure(self) -> float:
+        """See `axis_irradiance`."""
+        return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm))
+
+    @cached_property
+    def tracer(self) -> GhostTracer:
+        """The tracer of its ghosts."""
+        return self.ghosts or GhostTracer(self.lens)
+
+
+@lru_cache(maxsize=32)
+def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
+    """Irradiance at the film's centre from uniform surroundings of radiance 1, in sr: the integral of T cos."""
+    film_z = lens.film_z_mm
+    assert film_z is not None  # of a tracer's lens
+
+    def share(sines: Doubles) -> Doubles:
+        d = torch.from_numpy(np.stack([*sines, -np.sqrt(1 - (sines**2).sum(0))]))
+        zero = torch.zeros_like(d[0])
+        traced = trace(lens, Rays(zero, zero, zero + film_z, *d), wavelength_nm, transmittance=True)
+        assert traced.transmittance is not None
+        return torch.where(traced.status == 0, traced.transmittance, 0.0).numpy()
+
+    coarse = disc(0, _AXIS)
+    widest = 1.0
+    for _ in range(3):  # narrows to the cone that passes, and a little more
+        lit = share(widest * coarse) > 0
+        widest *= 1.02 * float(np.hypot(*coarse)[lit].max(initial=0.0)) if lit.any() else 0.3
+    light = math.pi * widest**2 * float(share(min(widest, 1.0) * coarse).mean())
+    if not light > 0:
+        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
+    return light
 
 
 class _Task(NamedTuple):
@@ -55,76 +122,66 @@ class _Task(NamedTuple):
     colours: Doubles
 
 
-def ghost_picture(
-    tracer: GhostTracer, lights: Sequence[Light], raster: Raster, *, layers: Sequence[int] | None = None, **options: Any
-) -> Floats:
-    """The ghosts of lights, [layers, H, W, 3] linear sRGB, with the options of `ghost_layers`.
+def ghost_picture(job: FlareJob, layers: Sequence[int] | None = None, done: Report = lambda share: None) -> Floats:
+    """The ghosts of lights, [layers, H, W, 3] linear sRGB.
 
     Args:
-        layers: for each pair, the layer that takes it; None puts all into one.
+        layers: for each pair of the tracer, the layer that takes it; None puts all into one.
     """
-    layers = [0] * len(tracer.pairs) if layers is None else layers
-    picture = np.zeros((1 + max(layers, default=0), raster.height, raster.width, 3), np.float32)
-    for number, drawn in ghost_layers(tracer, lights, raster, layers, **options):
+    layers = [0] * len(job.tracer.pairs) if layers is None else layers
+    picture = np.zeros((1 + max(layers, default=0), job.raster.height, job.raster.width, 3), np.float32)
+    for number, drawn in ghost_layers(job, layers, done):
         picture[number] = drawn
     return picture
 
 
 def ghost_layers(
-    tracer: GhostTracer,
-    lights: Sequence[Light],
-    raster: Raster,
-    layers: Sequence[int],
-    *,
-    wavelength_nm: tuple[float, float] = (400.0, 700.0),
-    wavelengths: int = 60,
-    cell_px: float = 8.0,
-    threads: int = 2,
-    done: Callable[[float], None] = lambda share: None,
+    job: FlareJob, layers: Sequence[int], done: Report = lambda share: None
 ) -> Iterator[tuple[int, Floats]]:
     """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
 
-    Each ghost is drawn as the areas of a grid of rays (`flare.canvas`).
+    Each ghost is drawn as the areas of a grid of rays (`flare.canvas`). Of the wavelengths, fewer stand for all where a
+    ghost's colours part little.
 
     Args:
-        layers: for each pair, the layer that takes it.
-        wavelengths: of equal shares of the range, which fewer stand for where a ghost's colours part little.
-        cell_px: about the size of a grid's cells on the film: see `grids_of`.
-        done: is called with the share of the work that is done.
+        layers: for each pair of the tracer, the layer that takes it. done: is called with the share of the work.
     """
-    lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
+    tracer, raster, spectral = job.tracer, job.raster, job.spectral(job.finer)
     layer = dict(zip(tracer.pairs, layers, strict=True))
-    middle = 0.5 * sum(wavelength_nm)
-    unit = raster.per_mm**2 / axis_irradiance(lens, middle) / wavelengths
-    half, nm = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), spectral.centres_nm
+    unit, nm = raster.per_mm**2 / job.exposure / spectral.bins, spectral.centres_nm
     groups: dict[tuple[int, Smear | None], list[_Task]] = {}
-    for light in lights:
-        for patch, pair, grid, moves in _parts(tracer, light, nm.tolist(), middle, half, cell_px / raster.per_mm):
+    for light in job.lights:
+        for patch, pair, grid, moves in _parts(job, tracer, light, nm.tolist()):
             response = np.asarray(unit * spectral.response * spectral.spectrum(patch.light.rgb), np.float64).T
             task = _Task(patch.light, pair, grid, *_bands(nm, response, grid))
             groups.setdefault((layer[pair], smear_of(patch, raster.per_mm * moves * (-1, 1))), []).append(task)
-    work = _Work(sum(map(len, groups.values())), done, threads)
+    count, whole = 0, max(sum(map(len, groups.values())), 1)
     for number in sorted({number for number, _ in groups}):
         picture = np.zeros((raster.height, raster.width, 3), np.float32)
-        for (_, smear), tasks in ((key, tasks) for key, tasks in groups.items() if key[0] == number):
-            if smear is None:
-                _draw(tracer, tasks, picture, raster.per_mm, work)
-                continue
-            coarse = smear.coarse
-            kernel = smear.kernel(max(raster.width, raster.height) // 2, coarse)
-            more = 3 * (coarse > 1) - 1
-            room = [n // coarse + k + more for n, k in zip(picture.shape[:2], kernel.shape, strict=True)]
-            canvas = np.zeros((*room, 3), np.float32)
-            _draw(tracer, tasks, canvas, raster.per_mm / coarse, work)
-            picture += enlarged(smeared(canvas, kernel) / np.float32(coarse**2), coarse, raster.height, raster.width)
+        for smear, tasks in ((smear, tasks) for (of, smear), tasks in groups.items() if of == number):
+            coarse, canvas, kernel = 1, picture, None
+            if smear is not None:
+                coarse = smear.coarse
+                kernel = smear.kernel(max(raster.width, raster.height) // 2, coarse)
+                more = 3 * (coarse > 1) - 1
+                room = [n // coarse + k + more for n, k in zip(picture.shape[:2], kernel.shape, strict=True)]
+                canvas = np.zeros((*room, 3), np.float32)
+            for drawn in _draw(tracer, tasks, canvas, raster.per_mm / coarse, job.threads):
+                count += drawn
+                done(count / whole)
+            if kernel is not None:
+                light_of = smeared(canvas, kernel) / np.float32(coarse**2)
+                picture += enlarged(light_of, coarse, raster.height, raster.width)
         yield number, picture
 
 
 def _parts(
-    tracer: GhostTracer, light: Light, nm: Sequence[float], middle_nm: float, half_mm: tuple[float, float], cell: float
+    job: FlareJob, tracer: GhostTracer, light: Light, nm: Sequence[float]
 ) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
     """The patches of a light, and the ghosts of each with their grids and moves. Patches are finer for a ghost much of
     whose light comes or goes over a patch, because rims cut it differently there."""
+    raster, middle_nm = job.raster, 0.5 * sum(job.wavelength_nm)
+    half_mm, cell = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), job.settings.cell_px / raster.per_mm
     efl, needs = abs(float(first_order(tracer.lens).efl_mm)), dict.fromkeys(tracer.pairs, _PATCHES[0])
     for most in _PATCHES:
         pairs = [pair for pair in tracer.pairs if needs[pair] == most]
@@ -145,31 +202,26 @@ def _parts(
         yield from (part for part in found if needs[part[1]] == most)
 
 
-def _draw(tracer: GhostTracer, tasks: Sequence[_Task], canvas: Floats, per_mm: float, work: _Work) -> None:
-    """Add ghosts to a picture of so many pixels per mm."""
+def _draw(tracer: GhostTracer, tasks: Sequence[_Task], canvas: Floats, per_mm: float, threads: int) -> Iterator[int]:
+    """Add ghosts to a picture of so many pixels per mm, and yield how many were added each time."""
     height, width, _ = canvas.shape
     high = max(1, _STRIP // (32 * width))
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
     def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
         """The edges of each wavelength's cells, and the light of the cells."""
-        if not work.step():
-            return [], task.colours[:0]
         rays, area = rays_across(tracer.lens, task.light, task.grid.places)
-        rows = tracer.follow_each(tracer.start(rays), task.wavelengths_nm, task.pair, REACH)
+        rows = tracer.follow_each(entering(rays), task.wavelengths_nm, task.pair, REACH)
         each = [edges_of(of_one, task.grid.columns, (width, height), per_mm) for of_one in rows]
         return each, area * task.grid.cell * task.colours
 
     for batch in _batches(tasks):
-        ghosts = [ghost for _, ghost in work.results(edges, batch)]
-        each = [edges for of_ghost, _ in ghosts for edges in of_ghost]
-        drawn = np.concatenate(each), np.array(list(map(len, each))), np.concatenate([light for _, light in ghosts])
-
-        def strip(rows: range, drawn: tuple[Any, ...] = drawn) -> None:
-            draw_edges(canvas, rows, *drawn)
-
-        for _ in work.results(strip, strips):
+        found, colours = zip(*in_order(threads, edges, batch), strict=True)
+        each = [edges for of_ghost in found for edges in of_ghost]
+        drawn = np.concatenate(each), np.array(list(map(len, each))), np.concatenate(colours)
+        for _ in in_order(threads, lambda rows, drawn=drawn: draw_edges(canvas, rows, *drawn), strips):
             pass
+        yield len(batch)
 
 
 def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
@@ -219,66 +271,65 @@ PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
 
 
 def photon_picture(
-    tracer: PhotonTracer,
-    lights: Sequence[Light],
-    raster: Raster,
-    *,
-    part: str = "flare",
-    wavelength_nm: tuple[float, float] = (400.0, 700.0),
-    wavelengths: int = 15,
-    photons: int = 1 << 20,
-    most_reflections: int = 10,
-    kernel_px: float = 3.0,
-    seed: int = 0,
-    threads: int = 2,
-    keep: Path | None = None,
-    done: Callable[[float], None] = lambda share: None,
+    job: FlareJob, part: str = "flare", photons: int = 1 << 20, done: Report = lambda share: None
 ) -> Floats:
     """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
 
     Args:
         part: one of `PARTS`: photons that were reflected or scattered ("flare"), reflected twice at most ("ghosts"),
             reflected more often or scattered ("glare"), or neither ("image").
-        photons: of each light and wavelength. kernel_px: radius of the narrowest kernel: see `_smoothed`.
-        keep: file that holds the state of long work until the work is whole; the same call goes on from it.
+        photons: of each light and wavelength. done: is called with the share of the work.
     """
-    lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
-    exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm))
+    settings, raster, spectral = job.settings, job.raster, job.spectral()
+    lens, tracer, count = job.lens, PhotonTracer(job.lens, settings.scatter), spectral.bins
     edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
     firsts = range(0, photons, _AT_ONCE)
-    tasks = [(number, light, k) for number, light in enumerate(lights) for k in range(wavelengths)]
+    whole = [(number, light, k) for number, light in enumerate(job.lights) for k in range(count)]
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
     sums = np.zeros((2, raster.height, raster.width), np.float32)
-    same = lens, tracer.scatter, list(lights), raster, part, spectral.centres_nm, photons, most_reflections, seed
-    kept, first_task = Kept(keep, digest(same), _KEEP_S), 0
+    same = lens, tracer.scatter, list(job.lights), raster, part, spectral.centres_nm, photons
+    kept, begun = (
+        Kept(
+            job.keep and kept_file(job.keep, part), digest((*same, settings.most_reflections, settings.seed)), _KEEP_S
+        ),
+        0,
+    )
     if (state := kept.load()) is not None:
-        first_task, (picture, sums) = state[0]["done"], state[1]
-    work = _Work((len(tasks) - first_task) * len(firsts), done, threads)
+        begun, (picture, sums) = state[0]["done"], state[1]
 
-    def one(task: tuple[int, Light, int]) -> tuple[Floats, Doubles]:
-        """Sums of weights and of their squares, [2, H, W], and the colour [3] of a weight of 1."""
-        number, light, k = task
-        film, area = np.zeros((2, raster.height, raster.width), np.float32), 0.0
-        shift = (k / wavelengths + seed * _GOLDEN % 1) % 1
-        for first in firsts:
-            if not work.step():
-                break
-            rays, area = light_rays(lens, light, first, min(_AT_ONCE, photons - first), shift, photons**-0.5)
-            # A seed of its own, the same for any number of threads.
-            chances = ((seed << 44) + (number * wavelengths + k) * photons + first) % (1 << 64)
-            for xy, weight in _arrivals(tracer, part, rays, float(spectral.centres_nm[k]), most_reflections, chances):
-                x, y = xy * raster.per_mm
-                for power in (1, 2):
-                    film[power - 1] += np.histogram2d(y, -x, bins=edges, weights=weight**power)[0]
-        colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
-        return film, colour * (area * raster.per_mm**2 / photons / exposure)
+    def one(task: tuple[int, Light, int, int]) -> tuple[Floats, float]:
+        """Sums of weights and of their squares, [2, H, W], and the area of the light."""
+        number, light, k, first = task
+        shift = (k / count + settings.seed * _GOLDEN % 1) % 1
+        rays, area = light_rays(lens, light, first, min(_AT_ONCE, photons - first), shift, photons**-0.5)
+        # A seed of its own, the same for any number of threads.
+        chances = ((settings.seed << 44) + (number * count + k) * photons + first) % (1 << 64)
+        film = np.zeros((2, raster.height, raster.width), np.float32)
+        nm = float(spectral.centres_nm[k])
+        for xy, weight in _arrivals(tracer, part, rays, nm, settings.most_reflections, chances):
+            x, y = xy * raster.per_mm
+            for power in (1, 2):
+                film[power - 1] += np.histogram2d(y, -x, bins=edges, weights=weight**power)[0]
+        return film, area
 
-    for _, (film, colour) in work.results(one, tasks[first_task:]):
+    tasks = ((*of_light, first) for of_light in whole[begun:] for first in firsts)
+    answers, steps, ready = in_order(job.threads, one, tasks), max(len(firsts) * (len(whole) - begun), 1), 0
+    for number, (_, light, k) in enumerate(whole[begun:], begun + 1):
+        film, area = np.zeros_like(sums), 0.0
+        for _, (some, of_light) in zip(firsts, answers, strict=False):
+            film, area, ready = film + some, of_light, ready + 1
+            done(ready / steps)
+        colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / count
+        colour = colour * (area * raster.per_mm**2 / photons / job.exposure)
         picture += film[0, ..., None] * colour.astype(np.float32)
         sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
-        first_task += 1
-        kept.save({"done": first_task}, (picture, sums))
-    return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
+        kept.save({"done": number}, (picture, sums))
+    return _smoothed(picture, sums, settings.kernel_px) if settings.kernel_px > 0 else picture
+
+
+def kept_file(picture: Path, part: str) -> Path:
+    """The file of photons that interrupted work leaves beside a picture."""
+    return picture.with_name(f"{picture.name}.{part}.part")
 
 
 def _arrivals(
@@ -294,37 +345,6 @@ def _arrivals(
             which &= (photons.scattered > 0) == scatters
         # A film that sends light back is exposed by what it keeps.
         yield photons.film_xy_mm[:, which], photons.weight[which] / (1 - tracer.scatter.sensor)
-
-
-class _Work:
-    """Steps of work in threads. While they go on, `done` is called with their share; where it raises, they end soon."""
-
-    def __init__(self, steps: int, done: Callable[[float], None], threads: int) -> None:
-        self._steps, self._done, self._threads = max(steps, 1), done, threads
-        self._count, self._stopping = 0, False
-
-    def step(self) -> bool:
-        """Count a step; return whether to go on."""
-        self._count += 1
-        return not self._stopping
-
-    def results(self, one: Callable[[_T], _R], tasks: Sequence[_T]) -> Iterator[tuple[_T, _R]]:
-        """Yield each task with its result, in order; no more than one task a thread is under way."""
-        with ThreadPoolExecutor(self._threads) as pool:
-            try:
-                for begin in range(0, len(tasks), self._threads):
-                    batch = tasks[begin : begin + self._threads]
-                    for task, future in zip(batch, [pool.submit(one, task) for task in batch], strict=True):
-                        while not wait([future], _WAIT_S).done:
-                            self._report()
-                        yield task, future.result()
-                    self._report()
-            except BaseException:
-                self._stopping = True
-                raise
-
-    def _report(self) -> None:
-        self._done(min(self._count / self._steps, 1.0))
 
 
 def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:

@@ -7,7 +7,7 @@ them; a picture's are regions brighter than a threshold. The sky and other surro
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -29,8 +29,6 @@ _FADES = 1.25  # lights fade from so many times the energy of the brightest ligh
 _MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # above the threshold; at a time, each of some 500 bytes
 _DIMMEST = 0.02  # relative illumination below which a highlight's radiance is not known
 
-Name = int  # the number of a light in its scene
-
 
 class SceneLights:
     """The lights of a scene, as any camera in it sees them."""
@@ -50,10 +48,6 @@ class SceneLights:
         return balance(self._spectral.film_rgb(self._world.palette.illuminant(illuminant)))
 
     def seen(self, scene: Scene, film_z_mm: float, most: int | None = None) -> list[Light]:
-        """The lights of `named`."""
-        return list(self.named(scene, film_z_mm, most).values())
-
-    def named(self, scene: Scene, film_z_mm: float, most: int | None = None) -> dict[Name, Light]:
         """The lights before the lens of the camera of `scene`, which may stand anywhere in this scene.
 
         Args:
@@ -66,7 +60,7 @@ class SceneLights:
         middle, corner = ((2 * np.arange(CELLS + k) + 1 - k) / CELLS - 1 for k in (0, 1))
         place = np.concatenate([np.stack(np.meshgrid(a, a, indexing="ij")).reshape(2, -1) for a in (middle, corner)], 1)
         point = np.repeat(front[:, None], place.shape[1], 1).astype(np.float32)
-        lights, own, visible = self._world.lights, CELLS * CELLS, dict[Name, Light]()
+        lights, own, found = self._world.lights, CELLS * CELLS, list[Light]()
         numbers = range(lights.count) if most is None else lights.strongest(tuple(front.tolist()), most)
         for number, (is_round, aimed) in zip(numbers, lights.each(numbers, point, place), strict=True):
             direction, distance, scale = (a[..., :own] for a in aimed)
@@ -78,8 +72,8 @@ class SceneLights:
             )  # fmt: skip
             rgb = self._rgb[self._colour[number]] * (seen.sum() / inside.sum())
             if rgb.any() and (light := _light(axes.T @ (direction @ seen), rgb, distance, shape)):
-                visible[number] = light
-        return visible
+                found.append(light)
+        return found
 
 
 def _light(towards: Array, rgb: Array, distance: FloatArray, shape: Shape) -> Light | None:
@@ -111,31 +105,9 @@ def keep(lights: Sequence[Light], most: int, fade: bool = False) -> KeptLights:
         shares = [min((_energy(k) / cut - 1) / (_FADES - 1), 1.0) for k in kept]
         faded = ((k, s, *k.rgb) for k, s in zip(kept, shares, strict=True) if s > 0)
         kept = [replace(k, rgb=(s * r, s * g, s * b)) for k, s, r, g, b in faded]
-    return _kept(kept, ordered)
-
-
-def keep_named(lights: Mapping[Name, Light], names: frozenset[Name]) -> KeptLights:
-    """The lights of these names; see `chosen`."""
-    kept = sorted((light for name, light in lights.items() if name in names), key=_energy, reverse=True)
-    return _kept(kept, lights.values())
-
-
-def _kept(kept: list[Light], lights: Collection[Light]) -> KeptLights:
-    whole = sum(map(_energy, lights))
-    left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(kept) < len(lights) else 0.0
-    return KeptLights(kept, len(lights), left)
-
-
-def chosen(frames: Sequence[Mapping[Name, Light]], most: int) -> frozenset[Name]:
-    """The names of the lights that are kept in all frames: at most so many, of the most energy in all frames together.
-
-    So no light comes or goes because others do.
-    """
-    energy: dict[Name, float] = {}
-    for frame in frames:
-        for number, light in frame.items():
-            energy[number] = energy.get(number, 0.0) + _energy(light)
-    return frozenset(sorted(energy, key=lambda number: -energy[number])[:most])
+    whole = sum(map(_energy, ordered))
+    left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(kept) < len(ordered) else 0.0
+    return KeptLights(kept, len(ordered), left)
 
 
 def _energy(light: Light) -> float:

@@ -79,7 +79,7 @@ def render_frames(
     Args:
         frames: of one scene and one camera, by the files of their pictures (.exr); without tiles of their own.
         folder: where tiles are kept (default: OUT.exr.tiles for the first picture OUT.exr).
-        shown: the frames that decide which lights and ghosts the flare has, see `flare_choice`; None: these frames.
+        shown: the frames that decide which ghosts the flare has as layers, see `flare_choice`; None: these frames.
         restart: render tiles that are there again.
 
     Returns:
@@ -96,7 +96,7 @@ def render_frames(
         prepared = prepare(frame, out, progress)
         choice = flare_choice(shown or list(frames.values()), prepared)
     common = packed(files | {path for path in (frame.scene, frame.camera.file, *frame.glass_files) if path is not None})
-    shared = sha256(common).hexdigest(), None if choice is None else (sorted(map(repr, choice.lights)), choice.single)
+    shared = sha256(common).hexdigest(), choice
     todo = [_picture(each, out, folder, shared, prepared, restart) for out, each in frames.items()]
     folder.mkdir(exist_ok=True)
     pictures, done, count = dict[Path, dict[str, Any]](), 0, sum(len(picture.tiles) for picture in todo)

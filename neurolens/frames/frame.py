@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 Layers = dict[str, FloatArray]
-_CHOICE_FRAMES = 16  # of an animation, which decide the brightest lights and ghosts
+_CHOICE_FRAMES = 16  # of an animation, which decide the brightest ghosts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +278,7 @@ def render_frame(
 
     Args:
         out: the picture; of a tile the name of the whole picture, see `render.tiles.tile_path`.
-        choice: the lights and ghosts of `flare_choice`, which all frames of an animation share; None: of this frame.
+        choice: see `flare_choice`, which all frames of an animation share; None: of this frame.
         watch: previews, checkpoints and an early end. preview: whether OUT.png is written.
 
     Raises:
@@ -315,7 +315,7 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
 
 
 def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) -> Choice | None:
-    """Choose the lights and ghosts that the layers of flare show in all frames of an animation.
+    """Choose the ghosts that are layers of the flare in all frames of an animation.
 
     At most 16 of the frames, evenly spread, decide which are brightest. `prepared` is one of the frames, or of the same
     camera and scene. The choice is None where there is no flare.

@@ -145,10 +145,10 @@ class Job:
         size = {"width": self.grid.width, "height": self.grid.height}
         return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
-    def render_tile(self, tile: int, part: int) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
+    def render_tile(self, which: tuple[int, int]) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
         """Sums [pixels, columns] of one pass of one tile, what belongs to other pixels, and the seconds [2] spent in
         the camera, and in all."""
-        began = time.perf_counter()
+        began, (tile, part) = time.perf_counter(), which
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
         pixels = np.arange(within.start, within.stop) + self.tiling.start

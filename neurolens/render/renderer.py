@@ -1,37 +1,26 @@
-"""The render of a scene through a camera, with workers, progress, previews, checkpoints and an early end.
-
-Workers are forked processes: numpy's short operations leave no time for threads to share the interpreter (two threads
-were slower than one at 8k-element batches, two processes twice as fast). Where the system does not fork, threads do the
-work.
-"""
+"""The render of a scene through a camera, with workers, progress, previews, checkpoints and an early end."""
 
 from __future__ import annotations
 
 import math
 import multiprocessing
-import os
-import signal
 import sys
-import threading
 import time
-import traceback
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neurolens.base.errors import InputError, NeurolensError, one_line
-from neurolens.base.signals import held
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.tasks import Failed, Forked, Here, run_each
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.render.colour import check_name
 from neurolens.render.film import (
     DROPPED,
     PASSED,
-    Film,
     PixelGrid,
     check_memory,
     identity,
@@ -43,13 +32,10 @@ from neurolens.render.scene import Scene
 from neurolens.render.settings import FilmSettings
 
 Progress = Callable[[float, float], None]
-RenderTile = Callable[[int, int], tuple[Any, ...]]  # tile and pass to what `Job.render_tile` returns
 _FORKS = sys.platform.startswith("linux")
-_POLL_S, _POLL_PARENT_S, _PATIENCE_S = 0.05, 0.5, 5.0
 # Previews and checkpoints wait so many times as long as the last one took: they cost a twentieth of one core at most.
 _REST = 20.0
 _MOST_SAMPLES = 1 << 20
-_LONGEST = 600  # characters of an error
 
 
 @dataclass(frozen=True)
@@ -280,121 +266,17 @@ def _count(field: str, value: int, most: float = math.inf) -> int:
 def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None:
     """Render what the job's film lacks; `watch` is polled, and True ends the work early, between tiles.
 
-    Without `watch` a single worker is this process itself.
+    Workers are forked processes: numpy's short operations leave no time for threads to share the interpreter (two
+    threads were slower than one at 8k-element batches, two processes twice as fast). Where the system does not fork,
+    threads do the work; without `watch` a single worker is this process itself.
 
     Raises:
         NeurolensError: a worker failed or was killed; whole tiles are on the film.
     """
-    if workers == 1 and watch is None:
-        _drive(job.film, _renderer(job))
-        return
     forks = _FORKS and not multiprocessing.current_process().daemon  # such as a worker of Dask: it may have no children
-    with held():  # inherited by forked workers: only this process handles Ctrl-C
-        forked = [_Forked(job, k, workers) for k in range(workers)] if forks else []
-    renderers: list[RenderTile] = [worker.render for worker in forked]
-    renderers = renderers or [_renderer(job) for _ in range(workers)]
-    with ThreadPoolExecutor(workers) as threads:
-        running = {threads.submit(_drive, job.film, render) for render in renderers}
-        try:
-            while running and not (watch is not None and watch()):
-                ended, running = wait(running, _POLL_S, FIRST_COMPLETED)
-                for thread in ended:
-                    thread.result()
-        finally:
-            job.film.stop()
-            wait(running, _PATIENCE_S)
-            for worker in forked:
-                worker.end()
-
-
-def _drive(film: Film, render: RenderTile) -> None:
-    """Have tiles rendered until none is left; of several workers each has a thread here."""
-    while (task := film.take()) is not None:
-        film.add(*task, *render(*task))
-
-
-def _renderer(job: Job) -> RenderTile:
-    """Renders tiles where it is called; raises NeurolensError with one line."""
-
-    def render(tile: int, part: int) -> tuple[Any, ...]:
-        try:
-            return job.render_tile(tile, part)
-        except Exception as error:
-            raise NeurolensError(_reason(error)) from error
-
-    return render
-
-
-class _Forked:
-    """A forked worker, which renders the tiles that it is asked for one after another."""
-
-    def __init__(self, job: Job, number: int, workers: int) -> None:
-        context: Any = multiprocessing.get_context("fork")
-        self._pipe, there = context.Pipe()
-        self._process = context.Process(target=_serve, args=(job, there, number, workers, os.getpid()), daemon=True)
-        self._process.start()
-        there.close()
-
-    def render(self, tile: int, part: int) -> tuple[Any, ...]:
-        """Have a tile rendered.
-
-        Raises:
-            NeurolensError: the worker failed, or was killed.
-        """
-        try:
-            self._pipe.send((tile, part))
-            answer = self._pipe.recv()
-        except (EOFError, OSError):
-            self._process.join()
-            code = self._process.exitcode or 0
-            guess = ": did the memory run out?" if code == -signal.SIGKILL else ""
-            why = f" (signal {-code}{guess})" if code < 0 else ""
-            raise NeurolensError(f"a render worker was killed{why} before it had finished") from None
-        if isinstance(answer, str):
-            raise NeurolensError(answer)
-        return answer
-
-    def end(self) -> None:
-        """Kill it: what it may still render is of no use."""
-        self._process.kill()
-        self._process.join()
-
-
-def _serve(job: Job, pipe: Any, number: int, workers: int, parent: int) -> None:
-    """The main function of a forked worker."""
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    _pin(number, workers)
-    if (torch := sys.modules.get("torch")) is not None:
-        torch.set_num_threads(1)  # a forked process must not enter torch's thread pool: it never returns
-    try:
-        render = _renderer(job)
-        while True:
-            pipe.send(render(*pipe.recv()))
-    except Exception as error:
-        pipe.send(_reason(error))
-
-
-def _end_with(parent: int) -> None:
-    """End this worker once its parent is gone, whatever it does: a killed parent can ask nobody to stop."""
-    while os.getppid() == parent:
-        time.sleep(_POLL_PARENT_S)
-    os._exit(1)
-
-
-def _reason(error: BaseException) -> str:
-    """One line for an expected error; for any other with its place in the code."""
-    if isinstance(error, NeurolensError):
-        return str(error)
-    if isinstance(error, MemoryError):
-        return f"a render worker ran out of memory ({error or 'no more said'})"
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    place = f"{os.path.basename(frame.filename)}:{frame.lineno}"
-    return one_line(f"a render worker failed: {type(error).__name__}: {error}", _LONGEST) + f" ({place})"
-
-
-def _pin(number: int, workers: int) -> None:
-    """Pin a worker to one core if there is a worker for each core; fewer are left to the scheduler."""
-    with suppress(AttributeError, OSError):
-        cores = sorted(os.sched_getaffinity(0))
-        if workers >= len(cores):
-            os.sched_setaffinity(0, {cores[number % len(cores)]})
+    alone = workers == 1 and watch is None
+    with Here() if alone else Forked(job.render_tile, workers) if forks else ThreadPoolExecutor(workers) as executor:
+        for tile, answer in run_each(executor, job.render_tile, iter(job.film.take, None), stop=watch):
+            if isinstance(answer, Failed):
+                raise NeurolensError(answer.reason)
+            job.film.add(*tile, *answer)

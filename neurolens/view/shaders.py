@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from neurolens.cameras.cameragraph import weight_graph
-from neurolens.flare.ghostgraph import entrances, ghost_graphs
-from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.ghosts import GhostTracer, entrances, ghost_graphs
 from neurolens.graph.c import Signature
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program

@@ -18,10 +18,9 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.defocus.gather import gather, spread_over
-from neurolens.defocus.highlights import spread_highlights, take_highlights
 from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.plate import Layer, PlatePinhole
-from neurolens.defocus.read import DepthSettings, read_plate
+from neurolens.defocus.picture import spread_highlights, take_highlights
+from neurolens.defocus.plate import DepthSettings, Layer, PlatePinhole, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_channels, read_exr, write_channels

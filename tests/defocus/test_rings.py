@@ -13,9 +13,7 @@ import torch
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.defocus.atlas import pinhole_of
-from neurolens.defocus.kernels import Kernel, kernel_at
-from neurolens.defocus.rings import Grooves, aspheres, moves, responses
+from neurolens.defocus.kernels import Grooves, Kernel, aspheres, kernel_at, moves, pinhole_of, responses
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot

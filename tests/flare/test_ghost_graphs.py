@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.flare.ghostgraph import entrances, ghost_graphs
-from neurolens.flare.ghosts import GhostTracer, coated
+from neurolens.flare.ghosts import GhostTracer, coated, entrances, ghost_graphs
 from neurolens.flare.lights import Light, light_rays
 from neurolens.graph.interpret import evaluate
 from neurolens.lens.apertures import Aperture
