@@ -35,7 +35,7 @@ from neurolens.frames.frame import Files, flare_channels
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
-from neurolens.render.environment import SUN_RADIUS_RAD
+from neurolens.render.lights import SUN_RADIUS_RAD
 from neurolens.render.pictures import (
     read_colour_space,
     read_exr,

@@ -216,7 +216,7 @@ examples:
             NeurolensWarning: frames that exist are kept, whatever keys they were rendered by.
         """
         from neurolens.frames.frame import Files
-        from neurolens.render.tiles import tile_path
+        from neurolens.render.renderer import tile_path
 
         missing = {}
         for out, frame in frames.items():
@@ -291,7 +291,7 @@ examples:
         if not self.scene:
             self.refuse("--merge", "(no tiles)", "the tiles of a render")
         check_suffix(self.out, "--output", (".exr",))
-        from neurolens.render.tiles import merge_tiles
+        from neurolens.render.renderer import merge_tiles
 
         return self._say_pictures(merge_tiles(list(self.scene), self.out, self.picture.exposure))
 

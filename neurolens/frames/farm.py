@@ -26,7 +26,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
 from neurolens.frames.frame import Frame, Prepared, flare_choice, prepare, render_frame
 from neurolens.render.film import digest
-from neurolens.render.tiles import read_tile, tile_path, write_picture
+from neurolens.render.renderer import read_tile, tile_path, write_picture
 
 if TYPE_CHECKING:
     from neurolens.flare.layers import Choice

@@ -29,7 +29,7 @@ from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, check_name
 from neurolens.render.film import PixelGrid
 from neurolens.render.job import MEANING
 from neurolens.render.pictures import standard_attributes
-from neurolens.render.renderer import RenderResult, Watch, render
+from neurolens.render.renderer import RenderResult, Watch, render, rows_of, tile_path, windows
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
 from neurolens.render.sensor import about, expose
 from neurolens.render.settings import (
@@ -41,7 +41,6 @@ from neurolens.render.settings import (
     WavelengthSampling,
     size_by_shape,
 )
-from neurolens.render.tiles import rows_of, tile_path, windows
 
 if TYPE_CHECKING:
     from neurolens.flare.canvas import Raster

@@ -19,9 +19,9 @@ from neurolens.cameras.dispersion import film_shift
 from neurolens.graph.compiler import c_source, has_compiler, load_compiled
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
-from neurolens.render.environment import sun_spectrum, total_spectrum
 from neurolens.render.film import Film, PixelGrid, Spill, Tiling
 from neurolens.render.integrator import trace
+from neurolens.render.lights import sun_spectrum, total_spectrum
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
 from neurolens.render.scene import CameraSettings, Scene
 from neurolens.render.scenetables import Vector

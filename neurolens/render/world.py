@@ -17,8 +17,15 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.colour import Index, Palette, SpectralRange
-from neurolens.render.environment import SunLight, make_surroundings
-from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
+from neurolens.render.lights import (
+    FlatLights,
+    Lights,
+    LightSamples,
+    PointLights,
+    SphereLights,
+    SunLight,
+    Surroundings,
+)
 from neurolens.render.materials import CoatTable
 from neurolens.render.mesh import Mesh, has_embree, triangle_planes
 from neurolens.render.primitives import (
@@ -361,7 +368,7 @@ class World:
         discs = [disc for disc in settings.discs if any(disc.emission)]
         spheres = [sphere for sphere in settings.spheres if any(sphere.emission)]
         points = [*settings.points, *settings.spots]
-        self._sky = make_surroundings(settings.environment, settings.sky, self.scene.environment, self.palette)
+        self._sky = Surroundings(settings, self.scene.environment, self.palette)
         self._sun = SunLight(settings.sky)
         sizeless = PointLights(settings.points, settings.spots)
         groups = (FlatLights(quads, discs), SphereLights(spheres), sizeless, self._sun, self._sky)
