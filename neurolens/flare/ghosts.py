@@ -158,11 +158,7 @@ class GhostTracer:
         Args:
             direct: whether the light that forms the image comes last, as if it were one more ghost.
         """
-        return self.follow(self.start(rays), wavelength_nm, direct=direct)
-
-    def start(self, rays: Floats) -> Floats:
-        """The form in which `follow` takes rays [6, N], at any wavelength."""
-        return entering(rays)
+        return self.follow(entering(rays), wavelength_nm, direct=direct)
 
     def follow(
         self,
@@ -173,7 +169,7 @@ class GhostTracer:
         direct: bool = False,
         reach: float = 1.0,
     ) -> GhostRays:
-        """Follow rays in the form of `start`.
+        """Follow rays as `entering` gives them.
 
         Args:
             only: some of the tracer's ghosts; None follows all. direct: see `trace`.
@@ -193,12 +189,12 @@ class GhostTracer:
         return GhostRays(out)
 
     def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
-        """Rays in the form of `start` along one ghost at several wavelengths, [W, 4, N]: rows of `GhostRays`."""
+        """Rays as `entering` gives them along one ghost at several wavelengths, [W, 4, N]: rows of `GhostRays`."""
         return np.concatenate([self.follow(start, nm, only=[pair], reach=reach).rows for nm in wavelengths_nm])
 
     def sums(self, rays: Floats, wavelength_nm: float) -> NDArray[np.float64]:
         """`GhostRays.sums` of rays [6, N] for every ghost, then for the image, [P + 1, 5], by blocks of rays."""
-        start = self.start(rays)
+        start = entering(rays)
         blocks = (np.ascontiguousarray(start[:, k : k + _BLOCK]) for k in range(0, start.shape[1], _BLOCK))
         zero = np.zeros((len(self.pairs) + 1, 5))
         return sum((self.follow(block, wavelength_nm, direct=True).sums for block in blocks), zero)

@@ -4,9 +4,8 @@ Their sizes are checked before they are decoded. Radiance (.hdr) has three manti
 text header, an empty line, a line with the size, then rows of pixels, each row in one of two forms (Greg Ward, "Real
 Pixels", Graphics Gems II, 1991; the Radiance reference manual, "Picture file format"):
 
-old     4 bytes a pixel; a pixel 1, 1, 1, n repeats the one before it n times, or n * 256^k times where k such pixels
-        stand before it
-new     2, 2, width in two bytes, then the row of each of the four bytes by itself, as runs: n > 128 repeats the next
+plain   4 bytes a pixel (runs of whole pixels, which programs wrote before 1991, are refused)
+runs    2, 2, width in two bytes, then the row of each of the four bytes by itself, as runs: n > 128 repeats the next
         byte n - 128 times, any other n is followed by n bytes
 
 A mantissa m with the exponent e is m * 2^(e - 136), as Blender, OpenImageIO and OpenCV read it; e = 0 is black.
@@ -43,8 +42,7 @@ _MAGIC = (b"#?RADIANCE", b"#?RGBE")
 _RGBE = "32-bit_rle_rgbe"
 _SIZE = re.compile(rb"([-+])Y (\d{1,9}) ([-+])X (\d{1,9})")
 _LONGEST_LINE, _MOST_LINES = 4096, 1000  # of the header
-_NEW = range(8, 1 << 15)  # widths of rows in the new form
-_REPEAT = b"\1\1\1"
+_NEW = range(8, 1 << 15)  # widths of rows with runs
 Bytes = NDArray[np.uint8]
 
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # Pillow logs what our errors say of damaged files
@@ -246,10 +244,13 @@ def _row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
         if int.from_bytes(start[2:], "big") != width:
             raise ValueError("one of its rows has another width")
         return _new_row(data, place + 4, width)
-    whole = np.frombuffer(data[place : place + 4 * width], np.uint8)
-    if whole.size == 4 * width and not (whole.reshape(width, 4)[:, :3] == 1).all(axis=1).any():
-        return whole.reshape(width, 4), place + 4 * width
-    return _old_row(data, place, width)
+    row = np.frombuffer(data[place : place + 4 * width], np.uint8)
+    if row.size < 4 * width:
+        raise ValueError("it is cut short")
+    row = row.reshape(width, 4)
+    if (row[:, :3] == 1).all(axis=1).any():
+        raise ValueError("it has runs of whole pixels, which programs wrote before 1991: write it again")
+    return row, place + 4 * width
 
 
 def _new_row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
@@ -269,22 +270,3 @@ def _new_row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
         if len(planes) > end:
             raise ValueError("one of its runs is longer than its row")
     return np.frombuffer(planes, np.uint8).reshape(4, width).T, place
-
-
-def _old_row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
-    pixels, shift = bytearray(), 0
-    while len(pixels) < 4 * width:
-        pixel = data[place : place + 4]
-        if len(pixel) < 4:
-            raise ValueError("it is cut short")
-        place += 4
-        if pixel[:3] != _REPEAT:
-            pixels += pixel
-            shift = 0
-            continue
-        count = pixel[3] << shift
-        if not pixels or shift > 24 or 4 * count > 4 * width - len(pixels):
-            raise ValueError("one of its runs is longer than its row, or repeats nothing")
-        pixels += pixels[-4:] * count
-        shift += 8
-    return np.frombuffer(pixels, np.uint8).reshape(width, 4), place

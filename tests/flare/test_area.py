@@ -12,7 +12,7 @@ from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
 from neurolens.flare.grids import REACH, grids_of
 from neurolens.flare.lights import Light, light_rays, rays_across
 from neurolens.flare.picture import FlareJob, ghost_picture
-from neurolens.flare.steps import LOST
+from neurolens.flare.steps import LOST, entering
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.lens.apertures import Aperture
@@ -157,7 +157,7 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
             continue
         grid = grids[pair]
         rows, area = rays_across(lens, light, grid.places)
-        found = tracer.follow(tracer.start(rows), 550.0, only=[pair], reach=REACH)
+        found = tracer.follow(entering(rows), 550.0, only=[pair], reach=REACH)
         edges = edges_of(found.rows[0], grid.columns, (96, 64), 96 / size)
         picture = np.zeros((64, 96, 3), np.float32)
         draw_edges(picture, range(64), edges, np.array([len(edges)]), np.full((1, 3), area * grid.cell))

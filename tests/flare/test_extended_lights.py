@@ -16,6 +16,7 @@ from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs, ghost_table
 from neurolens.flare.lights import CELLS, Light, light_towards, sides_across, with_disc
 from neurolens.flare.picture import FlareJob, ghost_picture, photon_picture
 from neurolens.flare.sources import SceneLights
+from neurolens.flare.steps import entering
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
@@ -109,7 +110,7 @@ def ghost_by_chance(lens: Lens, light: Light, pair: Pair, raster: Raster, count:
         far = np.linalg.norm(way, axis=0)
         rays = np.concatenate([place, 0 * place[:1], way / far])
         rays[:3] -= 60 * rays[3:]
-        x, y, power, worst = tracer.follow_each(tracer.start(rays), [550.0], pair)[0].astype(np.float64)
+        x, y, power, worst = tracer.follow_each(entering(rays), [550.0], pair)[0].astype(np.float64)
         lit = worst <= 1
         if part < 0:
             low, high = place[:, lit].min(1) - 0.2, place[:, lit].max(1) + 0.2
