@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.meshfile import TriangleSet, read_file, read_library, read_triangles, whole_values
+from neurolens.render.meshfile import TriangleSet, read_file, read_library, whole_values
 from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Rays, slabs
 from neurolens.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshSettings, Texture, Vector
 
@@ -223,16 +223,16 @@ class Parts:
         if mesh.file is None or mesh.file.suffix.lower() != ".obj":
             expected = "the name of a material; only an OBJ file with usemtl brings its own"
             raise InputError(scene, f"{place}.material", "(missing)", expected)
-        whole, used = read_triangles(scene, f"{place}.file", scene.parent / mesh.file)
-        libraries = list(dict.fromkeys(used.libraries))
+        whole = read_file(scene, f"{place}.file", scene.parent / mesh.file, whole=False)
+        libraries = list(dict.fromkeys(whole.libraries))
         found = read_library(scene, mesh.file, libraries)
         # Faces of a material that have texture coordinates or normals are apart from those that have none.
         has_uv, has_normals = (
             np.zeros(len(whole.faces), np.bool_) if v is None else np.isfinite(v[whole.faces[:, 0]]).all(1)
             for v in (whole.uv, whole.normals)
         )
-        numbers = {name: k for k, name in enumerate(dict.fromkeys(used.names))}
-        number = np.array([4 * numbers[name] for name in used.names], np.int64) + 2 * ~has_uv + ~has_normals
+        numbers = {name: k for k, name in enumerate(dict.fromkeys(whole.materials))}
+        number = np.array([4 * numbers[name] for name in whole.materials], np.int64) + 2 * ~has_uv + ~has_normals
         names = list(numbers)
         for form in np.unique(number):
             name, chosen = names[form // 4], number == form
@@ -241,7 +241,7 @@ class Parts:
                 if name not in found:
                     expected = f"a material of the scene or of {', '.join(libraries) or 'an MTL file'}"
                     raise InputError(scene, f"{place}.file, usemtl", name or "(none before a face)", expected)
-                objects = dict.fromkeys(used.objects[k] for k in np.flatnonzero(chosen))
+                objects = dict.fromkeys(whole.objects[k] for k in np.flatnonzero(chosen))
                 which = f"{scene.parent / mesh.file}, {', '.join(filter(None, objects)) or name}"
                 material = self._defined(f"{mesh.file.stem}:{name}", found[name], not form & 2, which)
             part = replace(mesh, material=material)
