@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.tasks import in_order
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.defocus.plate import FINEST, FloatArray, Layer, PlatePinhole, as_structs
 from neurolens.graph.compiler import c_source, load_compiled
@@ -253,7 +253,15 @@ def gather(
     lost = np.zeros(3)
     edges = [round(j * height / down) for j in range(down + 1)]
 
-    def band(j: int, rays: FloatArray) -> NDArray[np.float64]:
+    def tasks() -> Iterator[tuple[int, FloatArray]]:
+        before = table.row(0)
+        for j in range(down):
+            after = table.row(j + 1)
+            yield j, np.stack([before, after])
+            before = after
+
+    def band(task: tuple[int, FloatArray]) -> NDArray[np.float64]:
+        j, rays = task
         first, stop = edges[j], edges[j + 1]
         sums = np.empty((stop - first, width, 8), np.float32)
         struct = _Table(
@@ -271,16 +279,9 @@ def gather(
         rgb[first:stop] = light * np.divide(sums[..., :3], weight, out=np.zeros_like(weight), where=weight > 0)
         return sums[..., [4, 6, 7]].sum(axis=(0, 1), dtype=np.float64)
 
-    with ThreadPoolExecutor(threads) as pool:
-        before, running = table.row(0), []
-        for j in range(down):
-            after = table.row(j + 1)
-            running.append(pool.submit(band, j, np.stack([before, after])))
-            before = after
-            if len(running) > 2 * threads:
-                lost += running.pop(0).result()
-            report((j + 1 - len(running)) / down)
-        lost += sum(f.result() for f in running)
+    for j, part in enumerate(in_order(threads, band, tasks()), 1):
+        lost += part
+        report(j / down)
     del kept
     filled, beyond = lost[1:] / max(lost[0], 1e-30)
     return Gathered(rgb, float(filled), float(beyond))

@@ -189,9 +189,9 @@ def test_lights_of_frames_neither_come_nor_go() -> None:
     last, cast, steps = np.zeros(13), set[tuple[int, ...]](), 0.0
     for x in np.linspace(-3.0, 3.0, 601):
         every = lights.seen(seen_from(made, "scene", (x, 2.0, 3.0), (x, 2.0, -3.0)), 100.0)
-        kept = {light.azimuth_deg: sum(light.rgb) for light in keep(every, 5, fade=True).lights}
+        kept = {(k.azimuth_deg, k.distance_m): sum(k.rgb) for k in keep(every, 5, fade=True).lights}
         assert len(every) == 13 and len(kept) <= 5
-        now = np.array([kept.get(light.azimuth_deg, 0.0) for light in every])
+        now = np.array([kept.get((k.azimuth_deg, k.distance_m), 0.0) for k in every])
         steps, last = max(steps, float(np.abs(now - last).max()) if last.any() else 0.0), now
         cast.add(tuple(np.flatnonzero(now)))
     assert len(cast) > 3 and steps < 0.1 * last.max()
