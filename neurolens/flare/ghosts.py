@@ -115,14 +115,6 @@ class GhostRays(NamedTuple):
         """The largest r^2 / R^2 at any rim on the way, [P, N]: at most 1 where the ray arrives."""
         return self.rows[:, 3]
 
-    @property
-    def sums(self) -> NDArray[np.float64]:
-        """Light on the film's plane summed over rays, [P, 5]: power, power x, power y, power r^2 (mm, lens frame), and
-        the number of rays that arrive."""
-        x, y, power = np.moveaxis(self.rows[:, :3].astype(np.float64), 1, 0)
-        x, y = (np.where(power > 0, v, 0.0) for v in (x, y))  # lost rays are nowhere
-        return np.stack([power, power * x, power * y, power * (x * x + y * y), power > 0], 1).sum(2)
-
 
 class GhostTracer:
     """Traces ghosts of a set lens, and the direct light, as compiled code in float32.
@@ -192,13 +184,6 @@ class GhostTracer:
         """Rays as `entering` gives them along one ghost at several wavelengths, [W, 4, N]: rows of `GhostRays`."""
         return np.concatenate([self.follow(start, nm, only=[pair], reach=reach).rows for nm in wavelengths_nm])
 
-    def sums(self, rays: Floats, wavelength_nm: float) -> NDArray[np.float64]:
-        """`GhostRays.sums` of rays [6, N] for every ghost, then for the image, [P + 1, 5], by blocks of rays."""
-        start = entering(rays)
-        blocks = (np.ascontiguousarray(start[:, k : k + _BLOCK]) for k in range(0, start.shape[1], _BLOCK))
-        zero = np.zeros((len(self.pairs) + 1, 5))
-        return sum((self.follow(block, wavelength_nm, direct=True).sums for block in blocks), zero)
-
 
 @dataclass(frozen=True)
 class Ghost:
@@ -219,10 +204,16 @@ class Ghost:
 
 def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: int = RANKED) -> list[Ghost]:
     """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first, by `count` rays."""
-    rays, _ = light_rays(tracer.lens, light, 0, count)
-    *sums, (of_image, *_) = tracer.sums(rays, wavelength_nm).tolist()
+    start, sums = entering(light_rays(tracer.lens, light, 0, count)[0]), np.zeros((len(tracer.pairs) + 1, 5))
+    for k in range(0, count, _BLOCK):  # the rows of a block stay in the caches
+        block = np.ascontiguousarray(start[:, k : k + _BLOCK])
+        found = tracer.follow(block, wavelength_nm, direct=True).rows[:, :3].astype(np.float64)
+        x, y, power = np.moveaxis(found, 1, 0)
+        x, y = (np.where(power > 0, v, 0.0) for v in (x, y))  # lost rays are nowhere
+        sums += np.stack([power, power * x, power * y, power * (x * x + y * y), power > 0], 1).sum(2)
+    *of_ghosts, (of_image, *_) = sums.tolist()
     rows = []
-    for pair, (power, *moments, lit) in zip(tracer.pairs, sums, strict=True):
+    for pair, (power, *moments, lit) in zip(tracer.pairs, of_ghosts, strict=True):
         if power > 0:
             x, y, r2 = (moment / power for moment in moments)
             size = math.sqrt(max(r2 - x * x - y * y, 0.0))

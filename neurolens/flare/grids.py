@@ -96,11 +96,8 @@ def grids_of(
         some = pairs[k : k + _AT_ONCE]
         rows = tracer.follow(start, wavelength_nm, only=some, reach=REACH).rows
         each = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in nodes]
-        for pair, kept, of_one, *colours in zip(
-            some, _kept(rows, half_mm), rows, *_colours(each, half_mm), strict=True
-        ):
-            if kept.any():
-                ghosts.append((pair, kept, _look(kept, of_one, nodes, *colours, half_mm)))
+        seen = zip(some, _kept(rows, half_mm), rows, *_colours(each, half_mm), strict=True)
+        ghosts += [(pair, kept, _look(kept, *more, nodes, half_mm)) for pair, kept, *more in seen if kept.any()]
     work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in ghosts])
     most = min(_ERROR * cell_mm / half_mm[0], _WORST)
     error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
