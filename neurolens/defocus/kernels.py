@@ -27,7 +27,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.defocus.gather import LIGHT_NM, RayTable, channel_wavelengths, turned
-from neurolens.defocus.plate import FloatArray, PlatePinhole
+from neurolens.defocus.plate import FloatArray, Plate, PlatePinhole
 from neurolens.flare.canvas import LOST, draw_edges, edges_of
 
 Array = NDArray[np.float64]
@@ -139,11 +139,11 @@ class Kernel:
 
 
 def kernel_at(
-    camera: Camera, pinhole: PlatePinhole, size: tuple[int, int], place_px: tuple[float, float], inverse_depth: float,
-    guess_px: tuple[float, float], cells: int = GRID, colours: int = COLOURS,
-    wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
+    camera: Camera, plate: Plate, place_px: tuple[float, float], inverse_depth: float, guess_px: tuple[float, float],
+    cells: int = GRID, colours: int = COLOURS, wavelengths_nm: tuple[float, float, float] | None = None,
+    grooves: Grooves | None = None,
 ) -> Kernel | None:  # fmt: skip
-    """The kernel of a point at a place of the plate, in pixels of a film of `size`; None where no light arrives.
+    """The kernel of a point at a place of the plate, in pixels of the camera's picture; None where no light arrives.
 
     Args:
         guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths a channel.
@@ -154,7 +154,7 @@ def kernel_at(
         InputError: a kernel of over 2048 pixels a side; grooves on a lens without aspheres, or too many.
     """
     pupil = _square(_RIM * _disk(np.linspace(-1, 1, cells + 1)))
-    table = RayTable(camera, pinhole, size, pupil, np.zeros(pupil.shape[1], np.float32))
+    table = RayTable(camera, plate, pupil, np.zeros(pupil.shape[1], np.float32))
     if wavelengths_nm is not None:
         nm = np.array(wavelengths_nm, np.float32)[:, None]
     elif len(table.nm) > 1:
@@ -333,12 +333,12 @@ class Cell:
         return 2 * int(np.abs([first, first + self.kernel.light.shape[1::-1] - 1]).max()) + 1
 
 
-def pinhole_of(camera: Camera, size: tuple[int, int]) -> PlatePinhole:
-    """The camera's own pinhole, whose picture has `size` pixels on its film: that of `neurolens stmap`."""
+def own_plate(camera: Camera, size: tuple[int, int]) -> Plate:
+    """An empty plate of the camera's own pinhole, that of `neurolens stmap`, with `size` pixels on its film."""
     frame = frame_of(camera)
     per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
     reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
-    return PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1])
+    return Plate([], PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1]), size)
 
 
 def kernels_over(
@@ -356,20 +356,18 @@ def kernels_over(
     Raises:
         InputError: a distance within the lens; kernels too large for memory.
     """
-    pinhole, found = pinhole_of(camera, size), []
+    plate, found = own_plate(camera, size), []
     places = [
         ((i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1])
         for j, i in itertools.product(range(fields[1]), range(fields[0]))
     ]
     for number, distance in enumerate(distances_m):
-        ahead, cells = distance - pinhole.before_film_mm / 1000, list[Cell]()
+        ahead, cells = distance - plate.pinhole.before_film_mm / 1000, list[Cell]()
         if not ahead > 0:
-            expected = f"above {pinhole.before_film_mm / 1000:g}, the entrance pupil"
+            expected = f"above {plate.pinhole.before_film_mm / 1000:g}, the entrance pupil"
             raise InputError("kernels", "distance_m", distance, expected)
         for place in places:
-            kernel = kernel_at(
-                camera, pinhole, size, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves
-            )
+            kernel = kernel_at(camera, plate, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves)
             field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
             cells.append(Cell(field, distance, place if kernel is None else kernel.middle_px, kernel))
             if max(fields) * (side := cells[-1].width_px) > _LARGEST:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
 from neurolens.defocus.gather import Gathered, compiled, gather, radius_px, spread_over
 from neurolens.defocus.kernels import LARGEST, kernel_at
-from neurolens.defocus.plate import FloatArray, Layer, Plate, PlatePinhole, as_structs
+from neurolens.defocus.plate import FloatArray, Plate
 
 _SAID = 0.002  # share of the light that was made up, from which it is said
 _EDGE = 9  # points of each side of the film that are tried
@@ -54,16 +54,15 @@ def defocus(
     """
     progress = progress or Progress(quiet=True)
     check_field(camera)
-    layers, pinhole, size = plate.layers, plate.pinhole, plate.size
-    spread = spread_over(camera, pinhole, size)
-    taken = [take_highlights(v, pinhole, spread, size, layers[:k]) for k, v in enumerate(layers) if highlights]
+    spread = spread_over(camera, plate)
+    taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:
-        found = gather(layers, pinhole, camera, size, spread, 1 << (samples - 1).bit_length(), threads, report)
+        found = gather(plate, camera, spread, 1 << (samples - 1).bit_length(), threads, report)
     for some in taken:
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                spread_highlights(found.rgb, some, layers, pinhole, camera, report)
-    _say(found, len(layers))
+                spread_highlights(found.rgb, some, plate, camera, report)
+    _say(found, len(plate.layers))
     return replace(found, highlights=sum(len(some.radius_px) for some in taken))
 
 
@@ -106,14 +105,12 @@ class Highlights:
     light: FloatArray
 
 
-def take_highlights(
-    layer: Layer, pinhole: PlatePinhole, spread: NDArray[np.float64], size: tuple[int, int],
-    before: Sequence[Layer] = (),
-) -> Highlights:  # fmt: skip
-    """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes.
+def take_highlights(plate: Plate, number: int, spread: NDArray[np.float64]) -> Highlights:
+    """Take the highlights out of a layer of a plate, which is changed, for a camera of such a spread at its nodes.
 
-    What the layers `before` show, too, at the same place and depth, is taken out and left to them.
+    What the layers before it show, too, at the same place and depth, is taken out and left to them.
     """
+    layer, size = plate.layers[number], plate.size
     rgb, w = layer.texel[..., :3], layer.texel[..., 3]
     bright = rgb.max(axis=2)
     log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
@@ -123,9 +120,7 @@ def take_highlights(
     row, column = np.nonzero((bright > cap) & (w >= 0))
     nodes = [
         np.clip(((v + 0.5 - border) / n * (k - 1)).round().astype(int), 0, k - 1)
-        for v, border, n, k in zip(
-            (row, column), pinhole.border_px(size)[::-1], size[::-1], spread.shape[:2], strict=True
-        )
+        for v, border, n, k in zip((row, column), plate.border_px[::-1], size[::-1], spread.shape[:2], strict=True)
     ]
     radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
     _, ab, b = np.moveaxis(spread[nodes[0], nodes[1]], -1, 0)
@@ -137,7 +132,7 @@ def take_highlights(
     light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
     rgb[row, column] -= light
     own = np.ones(len(row), bool)
-    for other in before:
+    for other in plate.layers[:number]:
         own &= np.abs(other.texel[row, column, 3] - w[row, column]) > _SAME * w[row, column]
     row, column = row[own], column[own]
     place = np.stack([column, row], axis=1) + np.float64(0.5)
@@ -156,24 +151,24 @@ def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def spread_highlights(
-    picture: FloatArray, found: Highlights, layers: list[Layer], pinhole: PlatePinhole, camera: Camera,
+    picture: FloatArray,
+    found: Highlights,
+    plate: Plate,
+    camera: Camera,
     report: Callable[[float], None] = lambda _: None,
-) -> None:  # fmt: skip
+) -> None:
     """Add the light of highlights to a picture [H, W, 3]."""
-    height, width = picture.shape[:2]
-    border = np.array(pinhole.border_px((width, height)))
+    (width, height), border = plate.size, np.array(plate.border_px)
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
     radius, near = np.maximum(found.radius_px, 1e-3), 4.0 * _FINE_PX / _FINE
     step = np.where(radius < near / 4, radius / _FINE_PX, near + np.log(radius) / _FINE).round().astype(int)
     for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), found.side.tolist(), strict=True)):
         groups[key].append(k)
-    structs, kept = as_structs(layers)
+    structs = plate.structs()
     for number, rows in enumerate(groups.values()):
         place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
-        kernel = kernel_at(
-            camera, pinhole, (width, height), (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS
-        )
+        kernel = kernel_at(camera, plate, (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS)
         if kernel is not None:
             points = np.empty((len(rows), 8), np.float32)
             points[:, :2], points[:, 2] = found.place_px[rows], found.inverse_depth[rows]
@@ -181,8 +176,7 @@ def spread_highlights(
             points[:, 5:] = found.light[rows]
             sweep, light = np.ascontiguousarray(kernel.sweep, np.float32), np.ascontiguousarray(kernel.light)
             compiled().splat(
-                structs, len(layers), points.ctypes.data, len(rows), light.ctypes.data, *light.shape[1::-1],
+                structs, len(structs), points.ctypes.data, len(rows), light.ctypes.data, *light.shape[1::-1],
                 sweep.ctypes.data, width, height, picture.ctypes.data,
             )  # fmt: skip
         report((number + 1) / len(groups))
-    del kept

@@ -65,10 +65,6 @@ class PlatePinhole:
     centre_px: tuple[float, float]
     before_film_mm: float
 
-    def border_px(self, size: tuple[int, int]) -> tuple[float, float]:
-        """How far a plate's first pixel lies beyond that of a film of `size` whose pixels are as large: overscan."""
-        return self.centre_px[0] - size[0] / 2, self.centre_px[1] - size[1] / 2
-
     def lines(self, origin_m: FloatArray, direction: FloatArray) -> FloatArray:
         """Rays [3, N] in the camera frame as lines [4, N] in the plate: x = ax + bx w, y = ay + by w, w in 1/m."""
         slope = direction[:2] / -direction[2]
@@ -110,19 +106,33 @@ class _Struct(ctypes.Structure):
     ]
 
 
-def as_structs(layers: list[Layer]) -> tuple[Any, list[Any]]:
-    """The layers as an array of C's structures, and what must be kept while these are used."""
-    kept: list[Any] = []
-    structs = (_Struct * len(layers))()
-    for layer, struct in zip(layers, structs, strict=True):
-        flat = np.concatenate([level.reshape(-1, 2) for level in layer.bounds])
-        start = np.cumsum([0, *(level[..., 0].size for level in layer.bounds)])[:-1].astype(np.int64)
-        kept += [flat, start, layer]
-        struct.width, struct.height = layer.size
-        struct.levels, struct.nearest = len(layer.bounds), layer.nearest
-        for name, array in (("texel", layer.texel), ("jump", layer.jump), ("bounds", flat), ("start", start)):
-            setattr(struct, name, array.ctypes.data)
-    return structs, kept
+@dataclass(frozen=True)
+class Plate:
+    """A plate: its layers, the front first, its pinhole, and the size and colour space of a camera's picture of it."""
+
+    layers: list[Layer]
+    pinhole: PlatePinhole
+    size: tuple[int, int]
+    space: ColourSpace = SRGB
+
+    @property
+    def border_px(self) -> tuple[float, float]:
+        """How far the first pixel lies beyond that of the picture, whose pixels are as large: overscan."""
+        return self.pinhole.centre_px[0] - self.size[0] / 2, self.pinhole.centre_px[1] - self.size[1] / 2
+
+    def structs(self) -> Any:
+        """The layers as an array of C's structures, which keeps what these point at."""
+        structs = (_Struct * len(self.layers))()
+        structs.kept = []
+        for layer, struct in zip(self.layers, structs, strict=True):
+            flat = np.concatenate([level.reshape(-1, 2) for level in layer.bounds])
+            start = np.cumsum([0, *(level[..., 0].size for level in layer.bounds)])[:-1].astype(np.int64)
+            structs.kept += [flat, start, layer]
+            struct.width, struct.height = layer.size
+            struct.levels, struct.nearest = len(layer.bounds), layer.nearest
+            for name, array in (("texel", layer.texel), ("jump", layer.jump), ("bounds", flat), ("start", start)):
+                setattr(struct, name, array.ctypes.data)
+        return structs
 
 
 def _lesser(step: FloatArray, axis: int) -> FloatArray:
@@ -184,16 +194,6 @@ class DepthSettings:
     scale_m: float | None = None
     along: Along = "axis"
     from_film: bool | None = None
-
-
-@dataclass(frozen=True)
-class Plate:
-    """A plate: its layers, the front first, its pinhole, the size of the picture in pixels, and its colour space."""
-
-    layers: list[Layer]
-    pinhole: PlatePinhole
-    size: tuple[int, int]
-    space: ColourSpace
 
 
 def read_plate(
