@@ -188,10 +188,15 @@ def enlarged(picture: Floats, factor: int, height: int, width: int) -> Floats:
         return picture
     for axis, size in enumerate((height, width)):
         at = (np.arange(size) + 0.5 - size / 2) / factor + picture.shape[axis] / 2 - 0.5
-        first = np.floor(at).astype(int)
-        part = np.moveaxis((at - first).astype(np.float32)[:, None, None], 0, axis)
-        picture = picture.take(first, axis) * (1 - part) + picture.take(first + 1, axis) * part
+        picture = resampled(picture, axis, at)
     return picture
+
+
+def resampled(values: Floats, axis: int, at: Doubles) -> Floats:
+    """Values at places along an axis, linear between them."""
+    first = np.floor(at).astype(int)
+    part = np.moveaxis((at - first).astype(np.float32).reshape(-1, *[1] * (values.ndim - 1)), 0, axis)
+    return values.take(first, axis, mode="clip") * (1 - part) + values.take(first + 1, axis, mode="clip") * part
 
 
 def spread(picture: Floats, radius: float) -> Floats:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.base.tasks import in_order
-from neurolens.flare.canvas import Raster, smear_of, smeared
+from neurolens.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
 from neurolens.flare.lights import Floats, Light, patches
 from neurolens.flare.picture import FlareJob
@@ -106,12 +106,7 @@ class Spectrum:
         total = np.zeros((len(y_mm), len(x_mm)), np.float32)
         for found, edges in zip(self.values, self.edges, strict=True):
             for axis, place in ((0, y_mm), (1, x_mm)):
-                at = place * (1e6 / wavelength_nm / self.step) + found.shape[axis] // 2
-                first = np.floor(at).astype(int)
-                part = (at - first).astype(np.float32)
-                part = part[:, None] if axis == 0 else part
-                low, high = (found.take(first + k, axis, mode="clip") for k in (0, 1))
-                found = low * (1 - part) + high * part
+                found = resampled(found, axis, place * (1e6 / wavelength_nm / self.step) + found.shape[axis] // 2)
             total += found / np.maximum(4 * math.pi**2 * _squares(edges, x_mm, y_mm), 1e-30)
         return np.maximum(total, 0)
 

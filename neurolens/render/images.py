@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, warn
 from neurolens.base.files import read_bytes
 from neurolens.cameras.contract import FloatArray
 from neurolens.lens.apertures import MAX_MASK, THRESHOLD, Aperture
@@ -101,7 +101,8 @@ def read_picture(
                 data, lambda *size: check_size(scene, field, str(path), size, most, pixels)
             )
         if ignored:
-            _warn(scene, field, f"{path.name}: its pixels are taken as they are stored, without {', '.join(ignored)}")
+            unused = ", ".join(ignored)
+            warn(f"{scene}: {field}: {path.name}: its pixels are taken as they are stored, without {unused}")
         return radiance
     with _opened(scene, field, path, most, pixels) as picture:
         if picture.mode.startswith("I;16"):
@@ -124,18 +125,13 @@ def _clamped(scene: Path, field: str, path: Path, picture: FloatArray, most: flo
     bad = ~((picture >= 0) & (picture <= most)).all(axis=-1)  # so that NaN is bad
     if bad.any():
         row, column = divmod(int(bad.argmax()), bad.shape[1])
-        _warn(
-            scene, field,
-            f"{path.name}: {int(bad.sum())} of {bad.size} pixels have values that are negative, not a number or "
-            f"above {most:g}, the first in row {row + 1} from the top, column {column + 1}: they are clamped",
+        warn(
+            f"{scene}: {field}: {path.name}: {int(bad.sum())} of {bad.size} pixels have values that are negative, not a "
+            f"number or above {most:g}, the first in row {row + 1} from the top, column {column + 1}: they are clamped",
         )  # fmt: skip
         np.nan_to_num(picture, copy=False, nan=0.0, posinf=most, neginf=0.0)
         np.clip(picture, 0, most, out=picture)
     return picture
-
-
-def _warn(scene: Path, field: str, said: str) -> None:
-    warnings.warn(f"{scene}: {field}: {said}", NeurolensWarning, stacklevel=3)
 
 
 def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:

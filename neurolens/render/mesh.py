@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, warn
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.meshfile import TriangleSet, read_file, read_library, whole_values
 from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Rays, slabs
@@ -169,8 +168,7 @@ def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> T
         k = int(np.flatnonzero(flat)[0])
         expected = "a triangle with an area, not a degenerate one"
         raise InputError(scene, f"{field}.faces[{k}]", faces[k].tolist(), expected)
-    text = f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out"
-    warnings.warn(text, NeurolensWarning, stacklevel=2)
+    warn(f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out")
     return replace(mesh, faces=faces[~flat])
 
 
@@ -201,21 +199,22 @@ def _is_closed(corners: NDArray[np.float64]) -> bool:
     return forth[0].shape == back[0].shape and all(np.array_equal(x, y) for x, y in zip(forth, back, strict=True))
 
 
-@dataclass
 class Parts:
-    """Meshes of one material each, and the materials and textures that come with them."""
+    """The meshes of a scene in parts of one material each, and the materials and textures that come with them.
 
-    meshes: list[MeshSettings] = field(default_factory=list)
-    triangles: list[TriangleSet] = field(default_factory=list)
-    materials: dict[str, Material] = field(default_factory=dict)
-    textures: dict[str, Texture] = field(default_factory=dict)
+    A mesh that has a material is one part, another is cut by the materials of its file. `known`: those of the scene.
 
-    def add(self, scene: Path, place: str, mesh: MeshSettings, known: Mapping[str, Material]) -> None:
-        """Add a mesh: as it is where it has a material, else cut by the materials of its file.
+    Raises:
+        InputError: as of `read_mesh`; a file without materials, or with some that are defined nowhere.
+    """
 
-        Raises:
-            InputError: as of `read_mesh`; a file without materials, or with some that are defined nowhere.
-        """
+    def __init__(self, scene: Path, meshes: Sequence[MeshSettings], known: Mapping[str, Material]) -> None:
+        self.meshes, self.triangles = list[MeshSettings](), list[TriangleSet]()
+        self.materials, self.textures = dict[str, Material](), dict[str, Texture]()
+        for k, mesh in enumerate(meshes):
+            self._add(scene, f"meshes[{k}]", mesh, known)
+
+    def _add(self, scene: Path, place: str, mesh: MeshSettings, known: Mapping[str, Material]) -> None:
         if mesh.material is not None:
             self.meshes.append(mesh)
             self.triangles.append(read_mesh(scene, place, mesh))
@@ -256,8 +255,7 @@ class Parts:
             self.materials[name] = Material("diffuse", texture=name)
             return name
         if picture is not None:
-            text = f"{which[:300]}: no texture coordinates: {picture.name} is left out there"
-            warnings.warn(text, NeurolensWarning, stacklevel=2)
+            warn(f"{which[:300]}: no texture coordinates: {picture.name} is left out there")
             name += " without coordinates" if name in self.materials else ""
         self.materials[name] = Material("diffuse", reflectance=colour)
         return name
