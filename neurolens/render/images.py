@@ -126,8 +126,8 @@ def _clamped(scene: Path, field: str, path: Path, picture: FloatArray, most: flo
     if bad.any():
         row, column = divmod(int(bad.argmax()), bad.shape[1])
         warn(
-            f"{scene}: {field}: {path.name}: {int(bad.sum())} of {bad.size} pixels have values that are negative, not a "
-            f"number or above {most:g}, the first in row {row + 1} from the top, column {column + 1}: they are clamped",
+            f"{scene}: {field}: {path.name}: {int(bad.sum())} of {bad.size} pixels have values that are negative, not "
+            f"a number or above {most:g}, the first in row {row + 1} from the top, column {column + 1}: they are clamped",
         )  # fmt: skip
         np.nan_to_num(picture, copy=False, nan=0.0, posinf=most, neginf=0.0)
         np.clip(picture, 0, most, out=picture)

@@ -240,7 +240,7 @@ class Parts:
                 if name not in found:
                     expected = f"a material of the scene or of {', '.join(libraries) or 'an MTL file'}"
                     raise InputError(scene, f"{place}.file, usemtl", name or "(none before a face)", expected)
-                objects = dict.fromkeys(whole.objects[k] for k in np.flatnonzero(chosen))
+                objects = dict.fromkeys(whole.objects[k] for k in np.flatnonzero(chosen).tolist())
                 which = f"{scene.parent / mesh.file}, {', '.join(filter(None, objects)) or name}"
                 material = self._defined(f"{mesh.file.stem}:{name}", found[name], not form & 2, which)
             part = replace(mesh, material=material)

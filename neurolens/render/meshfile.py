@@ -214,7 +214,8 @@ class Property(NamedTuple):
     length: str = ""
 
 
-class Element(NamedTuple):
+@dataclass(frozen=True)
+class Element:
     """A kind of element in a PLY file, how many the header promises, and what each has."""
 
     name: str
