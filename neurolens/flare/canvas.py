@@ -19,15 +19,20 @@ import ctypes
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.flare.lights import CELLS, FADE, Floats, Patch
 from neurolens.graph.compiler import c_source, load_compiled
 
+if TYPE_CHECKING:
+    from neurolens.flare.lights import Patch
+
+Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+CELLS = 8  # along each side of an extended light
+FADE = 8  # parts of a cell's side where patches of a light fade into each other
 LOST = 1e30  # `worst` of a ray that meets no surface, or is totally reflected where it should go on
 _PER_CELL = 8  # edges of two triangles that rims cut, at most
 _LEAST = 0.5  # pixels that a picture moves, below which a light is a point

@@ -18,8 +18,8 @@ from neurolens.base.progress import Progress, Report
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import Pair, coated, ghost_pairs
+from neurolens.flare.lights import SceneLights, keep
 from neurolens.flare.picture import PARTS, FlareJob, ghost_layers, kept_file, photon_picture
-from neurolens.flare.sources import SceneLights, keep
 from neurolens.flare.steps import Floats
 from neurolens.lens.prescription import Lens
 from neurolens.render.film import check_memory

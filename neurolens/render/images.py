@@ -125,10 +125,9 @@ def _clamped(scene: Path, field: str, path: Path, picture: FloatArray, most: flo
     bad = ~((picture >= 0) & (picture <= most)).all(axis=-1)  # so that NaN is bad
     if bad.any():
         row, column = divmod(int(bad.argmax()), bad.shape[1])
-        warn(
-            f"{scene}: {field}: {path.name}: {int(bad.sum())} of {bad.size} pixels have values that are negative, not "
-            f"a number or above {most:g}, the first in row {row + 1} from the top, column {column + 1}: they are clamped",
-        )  # fmt: skip
+        count, place = f"{int(bad.sum())} of {bad.size} pixels", f"row {row + 1} from the top, column {column + 1}"
+        said = f"{count} have values that are negative, not a number or above {most:g}, the first in {place}"
+        warn(f"{scene}: {field}: {path.name}: {said}: they are clamped")
         np.nan_to_num(picture, copy=False, nan=0.0, posinf=most, neginf=0.0)
         np.clip(picture, 0, most, out=picture)
     return picture

@@ -13,9 +13,8 @@ from shipped import whole
 from neurolens.flare.canvas import Raster, Smear
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs, ghost_table
-from neurolens.flare.lights import CELLS, Light, light_towards, sides_across, with_disc
+from neurolens.flare.lights import CELLS, Light, SceneLights, light_towards, sides_across, with_disc
 from neurolens.flare.picture import FlareJob, ghost_picture, photon_picture
-from neurolens.flare.sources import SceneLights
 from neurolens.flare.steps import entering
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens

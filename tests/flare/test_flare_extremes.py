@@ -16,10 +16,9 @@ from neurolens.cli import main
 from neurolens.flare import picture, sources
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
-from neurolens.flare.lights import Light
+from neurolens.flare.lights import Light, highlights
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import FlareJob, photon_picture
-from neurolens.flare.sources import highlights
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens

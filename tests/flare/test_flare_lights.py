@@ -10,8 +10,17 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
-from neurolens.flare.lights import SUN, Light, light_rays, patches, read_lights, with_disc
-from neurolens.flare.sources import SceneLights, highlights, keep
+from neurolens.flare.lights import (
+    SUN,
+    Light,
+    SceneLights,
+    highlights,
+    keep,
+    light_rays,
+    patches,
+    read_lights,
+    with_disc,
+)
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables, seen_from
