@@ -19,8 +19,8 @@ from neurolens.base.progress import Progress
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import far_field, outline_spectrum, star, starburst_picture
 from neurolens.flare.exit_pupil import Array, ExitPupil, coverage, exit_pupil, outline
+from neurolens.flare.layers import FlareJob
 from neurolens.flare.lights import Light
-from neurolens.flare.picture import FlareJob
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens

@@ -28,9 +28,8 @@ from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
-from neurolens.flare.layers import brightest, flare_layers, kept_beside, sum_of, with_coating
+from neurolens.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
 from neurolens.flare.lights import SUN, KeptLights, Light, SceneLights, highlights, keep, read_lights, with_disc
-from neurolens.flare.picture import FlareJob
 from neurolens.frames import Files, flare_channels
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any

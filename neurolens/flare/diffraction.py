@@ -25,6 +25,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -36,10 +37,12 @@ from neurolens.base.tasks import in_order
 from neurolens.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
 from neurolens.flare.lights import Floats, Light, patches
-from neurolens.flare.picture import FlareJob
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.lens.prescription import Lens
 from neurolens.render.colour import in_gamut
+
+if TYPE_CHECKING:
+    from neurolens.flare.layers import FlareJob
 
 _PER_CYCLE = 2.5  # cells a cycle of the field
 _NEAR, _FAR = 2.0, 4.0  # pixels from the centre between which the sum over cells gives way to the outline

@@ -10,8 +10,8 @@ from shipped import whole
 from neurolens.flare.canvas import Raster, draw_edges, edges_of
 from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
 from neurolens.flare.grids import REACH, grids_of
+from neurolens.flare.layers import FlareJob
 from neurolens.flare.lights import Light, light_rays, rays_across
-from neurolens.flare.picture import FlareJob, ghost_picture
 from neurolens.flare.steps import LOST, entering
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -21,6 +21,7 @@ from neurolens.render.colour import SRGB
 from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
 from tests.flare.test_ghosts import lens_of
+from tests.ghost_pictures import ghost_picture
 
 
 def drawn(found: np.ndarray, columns: int, share: float, size: tuple[int, int] = (12, 10)) -> np.ndarray:
@@ -208,7 +209,7 @@ def test_a_ghost_that_a_rim_cuts_by_colour_has_no_bands() -> None:
     job = FlareJob(lens, [Light(13.7, 10.0)], Raster((36.0, 24.0), 180, 120), ghosts=tracer)
     picture = ghost_picture(job)[0]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neurolens.flare.picture.FEWEST", 60)
+        patch.setattr("neurolens.flare.layers.FEWEST", 60)
         fine = ghost_picture(job)[0]
     assert np.abs(picture - fine).max() < 0.05 * fine.max()
     assert np.abs(np.diff(picture[5], axis=0)).max() < 1.5 * np.abs(np.diff(fine[5], axis=0)).max()
@@ -229,7 +230,7 @@ def test_a_picture_of_all_ghosts_has_no_bands(name: str, coating: str) -> None:
     job = FlareJob(lens, [Light(13.7, 10.0)], Raster((36.0, 24.0), 180, 120), FlareSettings(bins=4))
     picture = ghost_picture(job)[0]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neurolens.flare.picture.FEWEST", 16)
+        patch.setattr("neurolens.flare.layers.FEWEST", 16)
         fine = ghost_picture(job)[0]
     assert np.quantile(np.abs(picture - fine).max(-1) / fine.max(-1).clip(1e-30), 0.95) < 0.1
     assert np.abs(picture.sum((0, 1)) / fine.sum((0, 1)) - 1).max() < 0.1  # each colour's light

@@ -19,8 +19,8 @@ from neurolens.base.errors import InputError
 from neurolens.flare import diffraction as d
 from neurolens.flare import exit_pupil as p
 from neurolens.flare.canvas import Raster
+from neurolens.flare.layers import FlareJob, axis_irradiance
 from neurolens.flare.lights import Light, light_rays
-from neurolens.flare.picture import FlareJob, axis_irradiance
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.render.settings import FlareSettings

@@ -13,8 +13,8 @@ from shipped import whole
 from neurolens.flare.canvas import Raster, Smear
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs, ghost_table
+from neurolens.flare.layers import FlareJob, photon_picture
 from neurolens.flare.lights import CELLS, Light, SceneLights, light_towards, sides_across, with_disc
-from neurolens.flare.picture import FlareJob, ghost_picture, photon_picture
 from neurolens.flare.steps import entering
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
@@ -23,6 +23,7 @@ from neurolens.render.scene import load_scene
 from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
 from tests.flare.test_ghosts import LENSES, lens_of
+from tests.ghost_pictures import ghost_picture
 
 CASE = Path(__file__).parents[3] / "shared/data/cases/render/area_light_flare.toml"
 

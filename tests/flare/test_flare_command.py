@@ -18,14 +18,15 @@ from neurolens.cli import main
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, coated
+from neurolens.flare.layers import FlareJob
 from neurolens.flare.lights import Light, light_rays, with_disc
-from neurolens.flare.picture import FlareJob, ghost_picture
 from neurolens.lens.apertures import Aperture
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import ACESCG, COLOUR_SPACES, SRGB, conversion
 from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_channels, write_exr
 from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
+from tests.ghost_pictures import ghost_picture
 
 COOKE = ["flare", "cooke_triplet_50", "--width", "36", "--bins", "2"]
 

@@ -13,12 +13,12 @@ import pytest
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
 from neurolens.cli import main
-from neurolens.flare import picture, sources
+from neurolens.flare import layers, lights
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.layers import FlareJob, photon_picture
 from neurolens.flare.lights import Light, highlights
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import FlareJob, photon_picture
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
@@ -65,7 +65,7 @@ def test_nested_rings_take_memory_and_time_by_their_pixels(monkeypatch: pytest.M
     y, x = np.mgrid[:n, :n]
     ring = np.minimum(np.minimum(x, y), n - 1 - np.maximum(x, y))
     picture = np.repeat((10.0 * (ring % 2 == 0)).astype(np.float32)[..., None], 3, 2)
-    monkeypatch.setattr(sources, "_AT_ONCE", 5000)
+    monkeypatch.setattr(lights, "_AT_ONCE", 5000)
     found = highlights(picture, field, film, 2.0, 10_000)
     # Of each ring: the cells of 8 pixels that it crosses, counted from its corner.
     cells = 0
@@ -111,7 +111,7 @@ def test_photons_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatch: 
     taken."""
     beside, keep, started = tmp_path / "a.exr", tmp_path / "a.exr.flare.part", list[float]()
     plain = FlareJob(cooke(), [Light(5.0, 3.0)], Raster((36.0, 24.0), 36, 24), threads=1)
-    monkeypatch.setattr(picture, "_KEEP_S", -1.0)
+    monkeypatch.setattr(layers, "_KEEP_S", -1.0)
     trace = PhotonTracer.trace
     monkeypatch.setattr(
         PhotonTracer, "trace", lambda self, r, nm, **k: (started.append(nm), trace(self, r, nm, **k))[1]

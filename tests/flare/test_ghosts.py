@@ -13,15 +13,16 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_layout, ghost_pairs
+from neurolens.flare.layers import FlareJob, axis_irradiance
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import FlareJob, axis_irradiance, ghost_picture
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import Rays, follow, trace, turning
+from tests.ghost_pictures import ghost_picture
 
 LENSES = Path(__file__).parents[2] / "lenses"
 

@@ -12,9 +12,8 @@ from command_line import failure, run_json
 from neurolens.blender import extension_library
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, ghost_table
-from neurolens.flare.layers import flare_layers
+from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.lights import Light, read_lights
-from neurolens.flare.picture import FlareJob
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_channels
 from neurolens.render.settings import FlareSettings

@@ -10,9 +10,9 @@ from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, ghost_pairs
+from neurolens.flare.layers import FlareJob, _smoothed, axis_irradiance, photon_picture
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
-from neurolens.flare.picture import FlareJob, _smoothed, axis_irradiance, photon_picture
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB

@@ -12,9 +12,8 @@ from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.flare.canvas import Raster
-from neurolens.flare.layers import flare_layers
+from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.lights import SceneLights
-from neurolens.flare.picture import FlareJob
 from neurolens.lens.shot import Shot
 from neurolens.plan.footprints import Footprints, blur_mm, distance_mm, left_to
 from neurolens.plan.light import overview, stray_light

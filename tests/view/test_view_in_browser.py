@@ -22,8 +22,8 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.layers import FlareJob
 from neurolens.flare.lights import Light
-from neurolens.flare.picture import FlareJob, ghost_picture
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
@@ -32,6 +32,7 @@ from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import model_extras
 from neurolens.surrogates.source import export_source
+from tests.ghost_pictures import ghost_picture
 
 ROOT = Path(__file__).parents[2]
 LENS = "petzval_portrait_100"
