@@ -262,9 +262,7 @@ PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
 }
 
 
-def photon_picture(
-    job: FlareJob, part: str = "flare", photons: int = 1 << 20, done: Report = lambda share: None
-) -> Floats:
+def photon_picture(job: FlareJob, part: str, photons: int, done: Report = lambda share: None) -> Floats:
     """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
 
     Args:
@@ -415,9 +413,8 @@ def _scene_job(sources: SceneLights, scene: Scene, lens: Lens, raster: Raster, t
     settings = scene.settings.flare
     assert settings is not None and lens.film_z_mm is not None
     lights = keep(sources.seen(scene, lens.film_z_mm), settings.most, fade).lights
-    return FlareJob(
-        with_coating(lens, settings), lights, raster, settings, scene.settings.camera.wavelength_nm, threads
-    )
+    light_nm = scene.settings.camera.wavelength_nm
+    return FlareJob(with_coating(lens, settings), lights, raster, settings, light_nm, threads)
 
 
 def scene_flare(
@@ -449,8 +446,7 @@ def brightest(frames: Sequence[FlareJob], done: Callable[[float], None] = lambda
 
     These are at most `settings.brightest` names, the brightest first. A ghost without light on the film is never one.
     """
-    peaks: dict[str, float] = {}
-    raster, count = frames[0].raster, frames[0].settings.brightest
+    raster, count, peaks = frames[0].raster, frames[0].settings.brightest, dict[str, float]()
     if not count:
         return ()
     every = [job.tracer.pairs for job in frames]

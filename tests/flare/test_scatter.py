@@ -189,7 +189,7 @@ def test_direct_highlights_have_the_light_that_passes() -> None:
     expected = area * direct / axis_irradiance(lens, 550.0)
     noise = 4 / math.sqrt(direct * (1 << 15))
     assert picture[..., 1].sum() == pytest.approx(expected, rel=noise)
-    flare = photon_picture(job, photons=1 << 15)
+    flare = photon_picture(job, "flare", 1 << 15)
     assert flare.max() < 0.1 * picture.max()
 
 
