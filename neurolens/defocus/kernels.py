@@ -32,7 +32,6 @@ from neurolens.flare.canvas import LOST, draw_edges, edges_of
 
 Array = NDArray[np.float64]
 _STEP_MM = 0.01  # on the pupil's plane, of differences
-Array = NDArray[np.float64]
 GRID = 48  # cells of the pupil along a side
 COLOURS = 5  # wavelengths of a channel
 _STEPS = 5  # of Newton's method

@@ -122,7 +122,7 @@ class Plate:
 
     def structs(self) -> Any:
         """The layers as an array of C's structures, which keeps what these point at."""
-        structs = (_Struct * len(self.layers))()
+        structs: Any = (_Struct * len(self.layers))()
         structs.kept = []
         for layer, struct in zip(self.layers, structs, strict=True):
             flat = np.concatenate([level.reshape(-1, 2) for level in layer.bounds])

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -32,7 +32,6 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.base.progress import Report
 from neurolens.base.tasks import in_order
 from neurolens.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
@@ -202,7 +201,7 @@ def _elements(pupil: ExitPupil, lines: Sequence[Array], spacing: float) -> tuple
     return np.concatenate(places, 1), np.concatenate(normals, 1)
 
 
-def starburst_picture(job: FlareJob, done: Report = lambda share: None) -> Floats:
+def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda share: None) -> Floats:
     """The stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
 
     For a point it is 0 where rays make the image itself, and at the pixels next to that: there a render has the light.

@@ -96,8 +96,11 @@ def grids_of(
         some = pairs[k : k + _AT_ONCE]
         rows = tracer.follow(start, wavelength_nm, only=some, reach=REACH).rows
         each = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in nodes]
-        seen = zip(some, _kept(rows, half_mm), rows, *_colours(each, half_mm), strict=True)
-        ghosts += [(pair, kept, _look(kept, *more, nodes, half_mm)) for pair, kept, *more in seen if kept.any()]
+        for pair, kept, of_one, *by_colour in zip(
+            some, _kept(rows, half_mm), rows, *_colours(each, half_mm), strict=True
+        ):  # fmt: skip
+            if kept.any():
+                ghosts.append((pair, kept, _look(kept, of_one, tuple(by_colour), nodes, half_mm)))
     work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in ghosts])
     most = min(_ERROR * cell_mm / half_mm[0], _WORST)
     error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
@@ -172,9 +175,8 @@ class _Look(NamedTuple):
 
 
 def _look(
-    kept: NDArray[np.bool_], rows: Floats, spread: float, swept: float, power_at: Array, nm: Sequence[float],
-    half_mm: tuple[float, float],
-) -> _Look:  # fmt: skip
+    kept: NDArray[np.bool_], rows: Floats, colours: tuple[Any, ...], nm: Sequence[float], half_mm: tuple[float, float]
+) -> _Look:
     """Measure a ghost by the cells that are kept, its scouts `rows` [4, N], and its `_colours` at wavelengths."""
     x, y, power, worst = rows.reshape(4, _SCOUTS + 1, _SCOUTS + 1).astype(np.float64)
     lit, half = worst <= 1, np.array(half_mm)[:, None]
@@ -196,9 +198,10 @@ def _look(
     share = (lit.sum() + 0.5) / ((box[0] + 1) * (box[1] + 1))
     size, whole_light = max(float(np.ptp(places, 1).max()), 1e-3 * half_mm[0]), float(light.sum())
     along_u, along_v = (max(v, _EVEN * whole_light) for v in off)
-    colours = whole_light * min(max(spread / size, _EVEN), 1.0)
+    moved, swept, power_at = colours
     spectrum = tuple(zip(nm, power_at.tolist(), strict=True))
-    return _Look(along_u, along_v, colours, size, share, whole_light, swept, spectrum)
+    of_colours = whole_light * min(max(moved / size, _EVEN), 1.0)
+    return _Look(along_u, along_v, of_colours, size, share, whole_light, swept, spectrum)
 
 
 def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray[Any]:
@@ -231,7 +234,7 @@ def _colours(each: Sequence[Floats], half_mm: tuple[float, float]) -> tuple[Arra
     for before, after in pairwise(rows[:, 2].astype(np.float64) for rows in each):
         sums = [np.where((before > 0) & (after > 0), power, 0).sum(1) for power in (before, after)]
         ratios.append(np.divide(sums[1], sums[0], out=np.ones_like(sums[0]), where=sums[0] > 0))
-    return moved, swept, np.cumprod(ratios, 0).T
+    return moved, np.asarray(swept), np.cumprod(ratios, 0).T.astype(np.float64)
 
 
 def _kept(rows: Floats, half_mm: tuple[float, float]) -> NDArray[np.bool_]:

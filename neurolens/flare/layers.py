@@ -52,6 +52,7 @@ _PATCH_DEG = 2.0  # of an extended light: see `patches`
 _PATCHES, _CELLS = (4, 6, 9), 48  # along a side, at most; cells of a ghost along a side, which many patches keep
 _UNEVEN, _FAINT = 0.6, 5e-4  # share of its light that may come or go over a patch; share of all light, of a faint ghost
 Layers = dict[str, Floats]
+Done = Callable[[float], None]  # is called with the share of the work that is done
 REST = "rest"
 
 
@@ -127,9 +128,7 @@ class _Task(NamedTuple):
     colours: Doubles
 
 
-def ghost_layers(
-    job: FlareJob, layers: Sequence[int], done: Report = lambda share: None
-) -> Iterator[tuple[int, Floats]]:
+def ghost_layers(job: FlareJob, layers: Sequence[int], done: Done = lambda share: None) -> Iterator[tuple[int, Floats]]:
     """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
 
     Each ghost is drawn as the areas of a grid of rays (`flare.canvas`). Of the wavelengths, fewer stand for all where a
@@ -210,8 +209,11 @@ def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: 
     for batch in _batches(tasks):
         found, colours = zip(*in_order(threads, edges, batch), strict=True)
         each = [edges for of_ghost in found for edges in of_ghost]
-        drawn = np.concatenate(each), np.array(list(map(len, each))), np.concatenate(colours)
-        for _ in in_order(threads, lambda rows, drawn=drawn: canvas.draw_edges(picture, rows, *drawn), strips):
+        strip = partial(
+            canvas.draw_edges, picture, edges=np.concatenate(each), counts=np.array(list(map(len, each))),
+            light=np.concatenate(colours),
+        )  # fmt: skip
+        for _ in in_order(threads, strip, strips):
             pass
         yield len(batch)
 
@@ -262,7 +264,7 @@ PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
 }
 
 
-def photon_picture(job: FlareJob, part: str, photons: int, done: Report = lambda share: None) -> Floats:
+def photon_picture(job: FlareJob, part: str, photons: int, done: Done = lambda share: None) -> Floats:
     """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
 
     Args:
@@ -441,7 +443,7 @@ def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
     return sum((layers[name] for name in MAKERS if name in layers), none)
 
 
-def brightest(frames: Sequence[FlareJob], done: Callable[[float], None] = lambda share: None) -> tuple[str, ...]:
+def brightest(frames: Sequence[FlareJob], done: Done = lambda share: None) -> tuple[str, ...]:
     """Names of the ghosts whose own pictures, with their gains, have the greatest values on the film in any frame.
 
     These are at most `settings.brightest` names, the brightest first. A ghost without light on the film is never one.

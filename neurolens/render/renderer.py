@@ -300,7 +300,8 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
         for tile, answer in run_each(executor, job.render_tile, iter(job.film.take, None), stop=watch):
             if isinstance(answer, Failed):
                 raise NeurolensError(answer.reason)
-            job.film.add(*tile, *answer)
+            sums, spill, seconds = answer
+            job.film.add(*tile, sums, spill, seconds)
 
 
 def rows_of(height: int, tile: tuple[int, int]) -> tuple[int, int]:
