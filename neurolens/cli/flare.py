@@ -84,7 +84,6 @@ examples:
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating quarter-wave --blades 6 --f-number 8 -o flare.exr
   neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,3/2.5/1.5 --layers 8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
-  neurolens flare laikin_double_gauss_50 --light 15,8 --blades 7 --f-number 11 --starburst -o flare.exr
   neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr"""
 
     file: Path = cli.lens(positional=True)

@@ -266,7 +266,7 @@ def render_frame(
     The bytes of the picture depend on the frame alone, not on the number of threads.
 
     Args:
-        out: the picture; of a tile the name of the whole picture, see `render.tiles.tile_path`.
+        out: the picture; of a tile the name of the whole picture, see `render.renderer.tile_path`.
         choice: see `flare_choice`, which all frames of an animation share; None: of this frame.
         watch: previews, checkpoints and an early end. preview: whether OUT.png is written.
 
