@@ -81,9 +81,13 @@ class Line:
             )
         return value
 
+    def first(self, keyword: str, words: Sequence[str]) -> float:
+        """Return the first word as a finite number."""
+        return self.numbers(keyword, words[:1])[0]
+
     def positive(self, keyword: str, words: Sequence[str]) -> float:
         """Return the first word as a number above 0."""
-        value = self.numbers(keyword, words[:1])[0]
+        value = self.first(keyword, words)
         if value <= 0:
             raise self.error(keyword, value, "a number above 0")
         return value
