@@ -191,8 +191,8 @@ class Table:
         return tables
 
     def text(self, key: str, *, required: bool = True) -> str:
-        """Return a text; an empty one where a text that is not required is absent."""
-        if key not in self.data and not required:
+        """Return a text; an empty one where a text that is not required is absent or null."""
+        if self.data.get(key) is None and not required:
             return ""
         value = self.data.get(key, "(missing)")
         if key not in self.data or not isinstance(value, str) or (required and not value.strip()):
