@@ -45,7 +45,7 @@ from neurolens.graph.loworder import with_film_derivatives, with_low_order_deriv
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
-from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import LINE_D_NM
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 
 _ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, not a cylinder

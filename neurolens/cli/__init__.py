@@ -17,7 +17,7 @@ from typing import Any
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable
-from neurolens.base.signals import handled
+from neurolens.base.tasks import handled
 from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
 # Packages of the extra that a base install lacks.

@@ -14,12 +14,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
-from neurolens.base.bounds import FILM_MM, WAVELENGTH_NM
 from neurolens.base.errors import InputError, one_line, printable
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import program
 from neurolens.base.settings import (
+    FILM_MM,
+    WAVELENGTH_NM,
     add_options,
     between,
     from_options,

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 import neurolens
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import fingerprint_of, kept_in_cache, safe_name, sha256_of
 from neurolens.base.lensname import is_model, lens_id_of, maker_of
+from neurolens.base.settings import RANGE
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
 from neurolens.cameras.build import ideal_as, make_camera

@@ -162,7 +162,7 @@ examples:
 
     def run(self) -> int:
         """Print the requested glasses."""
-        from neurolens.lens import catalogue
+        from neurolens.lens import glass as catalogue
 
         glasses: list[catalogue.Glass] = []
         for name in self.name:
@@ -193,7 +193,7 @@ def _near(code: str) -> list[Any]:
     Raises:
         InputError: none is.
     """
-    from neurolens.lens import catalogue
+    from neurolens.lens import glass as catalogue
 
     digits = re.sub("[./]", "", code)
     n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10

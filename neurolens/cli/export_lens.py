@@ -16,10 +16,10 @@ import numpy as np
 
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
+from neurolens.base.settings import RANGE
 from neurolens.cameras.model import load_model
 from neurolens.graph.c import Extras
 from neurolens.graph.program import Program

@@ -151,7 +151,7 @@ examples:
 
             lens_layout(layout_profile(lens, domain), self.layout)
         if self.breathing is not None:
-            from neurolens.analysis.breathing import draw_breathing
+            from neurolens.analysis.field_curves import draw_breathing
 
             figures = draw_breathing(lens, self.breathing)
             data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in figures.items()}
@@ -238,7 +238,7 @@ def _near(configuration: dict[str, Any]) -> bool:
 
 
 def _first_order(data: dict[str, Any]) -> str:
-    from neurolens.lens.film_plane import LINE_D_NM
+    from neurolens.lens.prescription import LINE_D_NM
 
     focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
     across = data["efl_x_mm"] is not None

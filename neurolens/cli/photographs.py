@@ -14,10 +14,9 @@ from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
-    from neurolens.photographs.compare import Comparison, Curve
     from neurolens.photographs.faults import Checked
     from neurolens.photographs.rims import FittedRims
-    from neurolens.photographs.verify import Verified
+    from neurolens.photographs.verify import Comparison, Curve, Verified
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +98,7 @@ def _text(found: Verified, name: str, last: list[str]) -> str:
 
 
 def _row(c: Comparison) -> list[str]:
-    from neurolens.photographs.compare import near_f8
+    from neurolens.photographs.rims import near_f8
 
     cells = [f"{c.focal_mm:g}", number(c.distortion_percent and c.distortion_percent.rms, 2)]
     eight, widest = (

@@ -20,7 +20,7 @@ from neurolens.base.files import atomic_write_text, library
 from neurolens.base.progress import Progress, duration
 from neurolens.base.records import plain, program
 from neurolens.base.settings import changed, group, positive, setting, setting_of, whole
-from neurolens.base.signals import Stopping, Unfinished
+from neurolens.base.tasks import Stopping, Unfinished
 from neurolens.cli.arguments import (
     CAMERAS_HELP,
     Command,

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
+from neurolens.base.settings import RANGE
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli.blender_lenses import forms_of, key_of, kind_of, library, squeeze_of
 from neurolens.cli.export_lens import write_lens

@@ -22,7 +22,7 @@ from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.lights import Light
 from neurolens.flare.sources import SceneLights, highlights, keep
 from neurolens.graph.compiler import has_compiler
-from neurolens.lens.film_plane import colours
+from neurolens.lens.paraxial import colours
 from neurolens.lens.prescription import Lens
 from neurolens.render.colour import SpectralRange
 from neurolens.render.job import expected_light

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
+from neurolens.base.settings import WAVELENGTH_NM, within
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import (
     UNKNOWN,

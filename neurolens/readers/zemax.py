@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.lens import catalogue
+from neurolens.lens import glass as catalogue
 from neurolens.lens.prescription import Lens
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, Draft, Positions, lens_of, primary_first

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import InputError, NeurolensError, one_line
-from neurolens.base.signals import held
+from neurolens.base.tasks import held
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.render.colour import check_name
 from neurolens.render.film import (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.lens import film_plane, paraxial
+from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
@@ -206,7 +206,7 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
     """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light,
     by default `Lens.light_nm`.
 
-    Rays of the colours of `film_plane.colours` are spread evenly over the entrance pupil, and those that stop and rims
+    Rays of the colours of `paraxial.colours` are spread evenly over the entrance pupil, and those that stop and rims
     let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
     closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
     thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
@@ -229,7 +229,7 @@ def _least_spot_mm(
     """Film planes of least spot for an axial point, behind the stop as it is or behind round ones of some radii."""
     # Without dispersion all light is of one colour.
     one = (lens.reference_nm, lens.reference_nm)
-    wavelengths, weights = film_plane.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
+    wavelengths, weights = paraxial.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
     along, across, at_stop = _moments(lens, object_z_mm, wavelengths)
     share = torch.from_numpy(weights)[:, None, None].expand_as(along)[None]
     if stops_mm is not None:  # rays at the edge count in part
@@ -315,7 +315,7 @@ def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]
     image = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return image, image
-    colours = np.linspace(*wavelength_nm, film_plane.COLOURS if lens.dispersive else 1)
+    colours = np.linspace(*wavelength_nm, paraxial.COLOURS if lens.dispersive else 1)
     low = high = image
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
         # The rays within each ring are those that a smaller stop lets through.

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.lens.film_plane import PupilBounds
-from neurolens.lens.paraxial import first_order
+from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.rims import end_mm
 from neurolens.trace.rays import passing, trace

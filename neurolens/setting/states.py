@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
+from neurolens.base.settings import F_NUMBER, FOCAL_MM, said, within
 from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.lens.shot import FocusMode, Shot

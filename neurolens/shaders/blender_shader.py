@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
+from neurolens.base.settings import RANGE
 from neurolens.cameras.onnxlens import OnnxLens, load_model
 from neurolens.cameras.pupil_search import PupilTable
 from neurolens.graph.ir import Graph

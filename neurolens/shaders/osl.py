@@ -37,8 +37,7 @@ from neurolens.graph.loworder import low_orders, with_film_derivatives
 from neurolens.graph.osl import Parameter, write_osl
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
-from neurolens.lens.film_plane import LINE_D_NM
-from neurolens.lens.prescription import VISIBLE_NM
+from neurolens.lens.prescription import LINE_D_NM, VISIBLE_NM
 from neurolens.shaders.lowtests import low_tests
 from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles, PupilDisc
 from neurolens.shaders.pupil_fit import fit_pupil

@@ -15,7 +15,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pupil_search import PupilTable, end_of_light, pass_test
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
-from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import LINE_D_NM
 from neurolens.shaders.source import Focusing
 
 if TYPE_CHECKING:
