@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.kept import Kept
+from neurolens.base.files import Kept
 from neurolens.flare.areas import Doubles, Floats, draw_edges, edges_of
 from neurolens.flare.canvas import Raster, Smear, axis_irradiance, enlarged, smear_of, smeared, spread
 from neurolens.flare.ghosts import GhostTracer, Pair

@@ -16,17 +16,19 @@ from neurolens.base.errors import InputError
 from neurolens.base.settings import WAVELENGTH_NM, within
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import (
+    MAX_TERMS,
     UNKNOWN,
     finish,
     first_order,
     narrowed,
+    qbfs_terms,
+    qcon_terms,
     smaller_stop,
     stop_aperture,
     with_likely_rims,
     with_rims,
     with_stop,
 )
-from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
 from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, ReadOptions, warn
 from neurolens.setting.rims import check_states
 

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import fingerprint_of
-from neurolens.base.kept import CHUNK_BYTES, read_arrays, write_arrays
+from neurolens.base.files import CHUNK_BYTES, fingerprint_of, read_arrays, write_arrays
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.render.settings import FilmSettings
 

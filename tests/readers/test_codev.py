@@ -13,8 +13,8 @@ from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.lens import glass as catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.readers.assemble import qbfs_terms, qcon_terms
 from neurolens.readers.codev import read_seq
-from neurolens.readers.forbes import qbfs_terms, qcon_terms
 from neurolens.readers.source import ReadOptions
 
 TEXT = """\

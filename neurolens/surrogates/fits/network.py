@@ -23,7 +23,7 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.kept import Kept, read_arrays
+from neurolens.base.files import Kept, read_arrays
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network, Residual
 from neurolens.surrogates.fits.boundaries import (
     MOST_NETWORK_TERMS,
