@@ -13,6 +13,7 @@ The workers of a render (`render.renderer`) are not tasks: they are forked, so t
 
 from __future__ import annotations
 
+import ctypes
 import math
 import multiprocessing
 import os
@@ -24,6 +25,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing.connection import wait
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -33,6 +35,7 @@ from neurolens.base.errors import NeurolensError, one_line
 T = TypeVar("T")
 R = TypeVar("R")
 _LONGEST = 600  # characters of a reason
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 # Another thread that starts a process asks all processes for their exit codes, which can be read only once.
 _STARTING = threading.Lock()
 # Signals that ask a command to end: Ctrl-C, SIGTERM, and SIGHUP, which a terminal sends when it closes.
@@ -192,6 +195,19 @@ def answer_of(outcome: Any) -> Any:
 def cores() -> int:
     """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def keep_memory() -> None:
+    """Let the C library (glibc) keep the memory of arrays, once a process, up to the sizes that it comes to by itself.
+
+    Else it gives that of every larger array back, and a trace spends half of its time on getting pages anew. Dask's
+    nannies ask for it (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth.
+    """
+    with suppress(AttributeError, OSError):  # another C library
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 32 << 20)
+        library.mallopt(_M_TRIM_THRESHOLD, 64 << 20)
 
 
 def _context(modules: list[str]) -> Any:

@@ -19,7 +19,7 @@ from neurolens.lens.paraxial import FirstOrder, first_order
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.setting.focusing import axial_rays, best_focus_z_mm
 from neurolens.setting.pupil_nodes import FilmLight
-from neurolens.setting.pupils import pupil_plane_z_mm
+from neurolens.setting.pupils import on_plane, pupil_plane_z_mm
 from neurolens.setting.rims import end_mm
 from neurolens.setting.states import in_state
 from neurolens.trace.aiming import aim_at_stop

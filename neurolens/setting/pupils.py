@@ -53,6 +53,12 @@ def camera_rays(
     return Rays(film_x, film_y, start_z, x * scale, y * scale, (z * scale).expand_as(film_x))
 
 
+def on_plane(rays: Rays, z_mm: float) -> Rays:
+    """Rays moved along themselves to the plane at z."""
+    t = (z_mm - rays.z) / rays.dz
+    return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=torch.full_like(rays.z, z_mm))
+
+
 def passes_at_any_azimuth(
     lens: Lens,
     film_radius: Tensor,
