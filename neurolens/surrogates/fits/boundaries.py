@@ -38,7 +38,7 @@ MOST_BOUNDARY_TERMS = 64
 # Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
 # those errors, or by hardly more than with all terms. At a quarter as many rays were clipped wrongly as with all;
 # networks clipped more, and keep all.
-NEEDED_SHARE, _NEARLY = 0.25, 1.1
+NEEDED_SHARE, _NEARLY = 0.25, 1.2
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
@@ -209,6 +209,13 @@ class _BoundaryFit:
 
     def scores(self) -> np.ndarray:
         return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
+
+
+def needed_for(sweep: Sweep, error: float) -> list[int]:
+    """The fewest columns of A and B of a vector with this squared residual, or with hardly more than all leave."""
+    sweep.restart([])
+    terms = sweep.count // 2
+    return _BoundaryFit(sweep, terms, NEEDED_SHARE**2 / max(error, 1e-300), terms).needed()
 
 
 def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: float = 0.0) -> list[int]:
