@@ -119,7 +119,7 @@ def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     least = 0.0
     for row, vector in enumerate((DIRECTION, POSITION)):
         mine = columns
-        if settings.method == "ols":
+        if settings.method == "ols" and len(columns) == settings.terms:
             sweep = _sweep(exponents, field, wanted[row : row + 1])
             sweep.restart(columns)
             error = max(sweep.residual, least)
