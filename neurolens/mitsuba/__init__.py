@@ -48,7 +48,7 @@ def camera(
     Args:
         film_mm: width and height; they have the shape of the scene's picture.
         focus_m: distance from the film to the object in focus.
-        f_number: None is the widest. dispersion: "off" has the least noise, see `neurolens.cameras.reduced`.
+        f_number: None is the widest. dispersion: "off" has the least noise, see `neurolens.cameras.dispersion`.
 
     Other settings: see `neurolens.cameras.build`.
 
