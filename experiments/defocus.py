@@ -25,9 +25,8 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.cli import main
-from neurolens.defocus.gather import Gathered
 from neurolens.defocus.kernels import kernel_at, own_plate
-from neurolens.defocus.picture import defocus
+from neurolens.defocus.picture import Gathered, defocus
 from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_exr, write_png
