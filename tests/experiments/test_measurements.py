@@ -1,6 +1,5 @@
 """Measurements: goals that cannot be missed unseen, kept rows, promises, pupils, benches on known times."""
 
-from itertools import pairwise
 from pathlib import Path
 
 import lens_models
@@ -12,7 +11,7 @@ from experiments import lab
 from experiments import pupils as passage
 from experiments.__main__ import main
 from experiments.promises import Outcome, read_index, report_outcome
-from experiments.pupils import CASES, TABLE_5_3
+from experiments.pupils import CASES
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.program import SCENE_RAY
@@ -87,15 +86,6 @@ def test_tessar_through_the_rear_rim_is_steinerts() -> None:
     row = measured("brendel_tessar_100", 4.0)
     for method in ("rear rim", "pixel disc"):
         assert 100 * row["rates"][method]["passed"] == pytest.approx(row["theirs_percent"][method], abs=3)
-
-
-def test_pixel_of_table_5_3() -> None:
-    rows = list(passage.pixel_rates(SAMPLES))
-    assert [n for n, _, _ in rows] == list(TABLE_5_3)
-    # Once vignetting is past, the rate goes with the area of the stop.
-    areas = [rate * n**2 for n, rate, _ in rows[1:6]]
-    for area, later in pairwise(areas):
-        assert later / area == pytest.approx(1, rel=0.1)
 
 
 def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:
