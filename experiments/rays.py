@@ -245,7 +245,7 @@ def measure(name: str, rounds: int, compiled: bool, report: lab.Report) -> list[
     task = task_of(name)
     exact, focal = reference(task), first_order(task.lens).efl_mm
     field = [*ours(name, task, compiled), *PEERS]
-    about = {"lens": name, "title": f"{task.lens.name}, {task.lens.refractions} refractions (`{name}`)"}
+    about: lab.Row = {"lens": name, "title": f"{task.lens.name}, {task.lens.refractions} refractions (`{name}`)"}
     about["rays"] = (
         f"Film disc {task.domain.film_radius_mm:.4g} mm at z = {task.film_z:.6f}, pupil disc "
         f"{task.domain.pupil_radius_mm:.6f} mm at z = {task.pupil_z:.6f} (front vertex at 0, mm); "
