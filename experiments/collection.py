@@ -252,8 +252,10 @@ def page(rows: list[Row]) -> str:
     refused = [(r, r["reason"]) for r in rows if r["verdict"] != "read"]
     shown = [[len(found), text, _why(text), "; ".join(map(stem, found))] for text, found in grouped(refused)]
     parts += ["## Refused", lab.table("files|reason|why it is right|which", shown)]
-    shown = [[len(some), text, stem(some[0])] for text, some in grouped((r, text) for r in read for text in r["notes"])]
-    parts += ["## Notes of the reader", lab.table("files|what|the first", shown)]
+    for title, key in (("Assumed", "assumed"), ("Told", "notes")):
+        pairs = [(r, text) for r in read for text in r[key] if key == "assumed" or text not in r["assumed"]]
+        shown = [[len(some), text, stem(some[0])] for text, some in grouped(pairs)]
+        parts += [f"## {title}", lab.table("files|what|the first", shown)]
     if any("cause" in r for r in read):
         parts += _agreement(read)
     return lab.page("# A public collection", "`python -m experiments collection`", *parts)

@@ -92,7 +92,7 @@ def _state(model: OnnxLens, rng: np.random.Generator) -> tuple[tuple[float, ...]
 
     Returns also whether the state is one of the model's; None so close to the ends that rounding decides.
     """
-    values, within = [], [True]
+    values, within = [], list[bool | None]([True])
     for low, high in (axis.limits for axis in model.axes):
         v = low + (high - low) * rng.uniform()
         if rng.uniform() < 1 / 7:

@@ -104,7 +104,8 @@ def make_subjects(quick: bool, report: Report) -> list[Subject]:
     for k, (subject, spec, efl) in enumerate(specs):
         film, f_number = (_FILM[0] * efl, _FILM[1] * efl), None if spec == "pinhole" else _F_NUMBER
         try:
-            subject.camera = camera = make_camera(spec, Shot(film, _FOCUS_M, f_number))
+            camera: Any = make_camera(spec, Shot(film, _FOCUS_M, f_number))
+            subject.camera = camera
             if subject.kind in (EXACT_C, *FUSED_MODELS):  # fits its differentials here, not in every render
                 camera.sample_differentials(*(np.full((n, 1), v, np.float32) for n, v in ((2, 0), (2, 0.5))), _GREEN)
         except InputError as error:
