@@ -23,13 +23,21 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.graph.newton import solve, with_jacobian
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
 from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_system, stop_system
+from neurolens.surrogates.inverse import (
+    STEPS,
+    TOLERANCE,
+    InverseModel,
+    front_index,
+    scene_system,
+    solve,
+    stop_system,
+    with_jacobian,
+)
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs

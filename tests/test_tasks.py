@@ -25,7 +25,7 @@ from neurolens.base.files import noted_files, read_bytes
 from neurolens.base.lensname import Named
 from neurolens.base.tasks import Failed, Here, Processes, Shared, run_each
 from neurolens.cli import main
-from neurolens.frames.frame import Frame
+from neurolens.frames import Frame
 from neurolens.render.pictures import read_channels
 
 Client = pytest.importorskip("distributed", reason="needs the extra dask").Client

@@ -34,6 +34,7 @@ _FEWEST = 500  # rays, to fit to
 _WORST_MM, _WORST = 5e-4, 0.05  # RMS error of the film point, alone and of the shifts, one of which must do
 _BEYOND = 1.5  # the farthest shift over that of the rays of the fit, and the edge of the pupil over where they are lost
 _SURELY = 0.02  # the share of the rays, next to the edge, that are traced in any case
+_ALIKE = 1e-6  # 1 / um^2: wavelengths closer than this are one
 
 
 class Shift(NamedTuple):
@@ -46,13 +47,14 @@ class Shift(NamedTuple):
             the points in mm of the same scene ray at the companion wavelength, `ratio` of its light to the hero's, and
             `known`, 0 beyond the film or the reach.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
-        edge_mm: a companion passes if the hero does, and the hero's `margin` of `lanes_graph` is larger than this.
+        edge: a companion passes if the hero does, and crosses the pupil farther inside than the first number (mm), and
+            than the second times the difference of 1 / wavelength^2 (um).
     """
 
     of_hero: Graph
     graph: Graph
     reach_mm: tuple[float, float]
-    edge_mm: float
+    edge: tuple[float, float]
 
 
 def fit_shift(
@@ -63,7 +65,7 @@ def fit_shift(
     Args:
         lens: the graph of the lens (`cameragraph.LensGraph`).
         samples: its inputs for rays that cover film, pupil and wavelengths; half of them measure the error.
-        margin: [N] of these rays, see `lanes_graph`.
+        margin: [N] how far inside the pupil these rays pass, as in `lanes_graph`.
         companion_nm: [N] wavelengths of the companions. film_mm: width and height of the film.
     """
     found = _solved(lens, samples, companion_nm)
@@ -79,8 +81,10 @@ def fit_shift(
     x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
     graphs = _shift_graphs(weights, tint, scale, (middle, spread), (x, y), film_mm)
     on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
-    lost = margin[found.kept][on_film & ~found.passed[found.kept]]
-    return Shift(*graphs, (x, y), max(_BEYOND * float(lost.max(initial=0)), float(np.quantile(margin, _SURELY))))
+    lost, surely = on_film & ~found.passed[found.kept], float(np.quantile(margin, _SURELY))
+    lost &= margin[found.kept] > surely
+    steepest = (margin[found.kept] / np.maximum(np.abs(waves[0] - waves[1]), _ALIKE))[lost].max(initial=0)
+    return Shift(*graphs, (x, y), (surely, _BEYOND * float(steepest)))
 
 
 def _terms(columns: Array, values: Array) -> tuple[Array, Array, float]:
@@ -141,8 +145,8 @@ def lanes_graph(shift: Shift, companions: int) -> Graph:
     Inputs: those of `Shift.of_hero`, `companion_nm` [companions], and of the hero's ray `square` [2], `area_mm2` and
     `weight`.
     Outputs: `light` [companions], the weights that they would have alone, 0 where they are not `known`; `places`, the
-    film points of all wavelengths, the hero's where there is no light; `margin`, how far inside the pupil the
-    ray passes, about in mm.
+    film points of all wavelengths, the hero's where there is no light; `sure` [companions], above 0 where a companion
+    passes if the hero does.
     """
     g = Graph()
     film, light, weight = g.input("film_mm", 2), g.input("companion_nm", companions), g.input("weight")
@@ -156,7 +160,11 @@ def lanes_graph(shift: Shift, companions: int) -> Graph:
     there = (g.select(lane <= 0.0, film, f["film_there"]) for lane, f in zip(lanes, found, strict=True))
     g.outputs |= {"light": g.concat(*lanes), "places": g.concat(film, *there)}
     inside = (g.input("square", 2) * 2.0 - 1.0).abs()
-    g.outputs["margin"] = (1.0 - inside[0].maximum(inside[1])) * g.input("area_mm2").maximum(0.0).sqrt()
+    margin = (1.0 - inside[0].maximum(inside[1])) * g.input("area_mm2").maximum(0.0).sqrt()  # about in mm
+    waves = [g.square(1000.0 / nm) for nm in (g.input("wavelength_nm"), *g.split(light, [1] * companions))]
+    least, slope = shift.edge
+    edges = [((wave - waves[0]).abs() * slope).maximum(least) for wave in waves[1:]]
+    g.outputs["sure"] = g.concat(*(margin - edge for edge in edges))
     return g
 
 

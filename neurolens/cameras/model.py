@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,14 +14,11 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.cameras.cameragraph import LensGraph, status_graph
-from neurolens.cameras.contract import FilmPoints, FloatArray
-from neurolens.cameras.front_aim import FrontAim, front_aim
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
 from neurolens.cameras.onnxlens import InverseRays, LensRays, OnnxInverse, OnnxLens, load_inverse, load_model
-from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE, PupilTable, outline_of
+from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
 from neurolens.cameras.sampling import (
-    arrived,
     beyond_circle,
     common_light,
     lens_state,
@@ -29,6 +27,7 @@ from neurolens.cameras.sampling import (
 from neurolens.graph.interpret import evaluate
 from neurolens.lens import film_plane
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Surface
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.card import DOMAIN_SLACK, state_for
@@ -73,7 +72,6 @@ class OnnxCamera(LensCamera):
         card = model.card
         lens, domain = card["lens"], card["domain"]
         self.model, self.path = model, model.path
-        self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = shot.film_mm
         low, high = (float(v) for v in domain["wavelength_nm"])
@@ -123,37 +121,33 @@ class OnnxCamera(LensCamera):
         unit = form is ONNX and self.model.fitted.direction == "angle"
         return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status, unit)
 
-    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m through points of the front surface chosen by `pupil`.
+    @property
+    def front(self) -> Surface | None:
+        """The front surface of the lens, as the inverse map has it."""
+        return self._inverse.front
 
-        By the inverse map of scene rays, NAME.scene.onnx beside the model; what it does not find is NO_SOLUTION.
+    def _traced_back(
+        self, position: NDArray[np.float64], direction: NDArray[np.float64], wavelength_nm: FloatArray
+    ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
+        """By the inverse map of scene rays, NAME.scene.onnx beside the model; what it does not find is NO_SOLUTION."""
+        scene = self.film.scene
+        assert isinstance(scene, ModelScene)
+        out = self._inverse.from_scene(position, direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
+        return out.rays[:2].astype(np.float64), np.maximum(out.transmittance, 0), scene.status_of(out)
+
+    @cached_property
+    def _inverse(self) -> OnnxInverse:
+        """The inverse map.
 
         Raises:
             InputError: no such file, or a model of many states, whose inverse is not exported.
         """
-        inverse, front = self._inverse_map()
-        scene = self.film.scene
-        assert isinstance(scene, ModelScene)
-        aim = front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [scene.film_z_mm]], pupil)
-        out = inverse.from_scene(aim.position, aim.direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
-        status = np.where(aim.status == st.PASSED, scene.status_of(out), aim.status)
-        origin = 1e-3 * (aim.position - [[0], [0], [scene.film_z_mm]])
-        squared = ((point_m - origin) ** 2).sum(0)
-        with np.errstate(all="ignore"):
-            weight = np.maximum(out.transmittance, 0) * aim.area / (self.film.exposure * squared)
-        return arrived(out.rays[:2].astype(np.float64), origin, point_m, weight, status, wavelength_nm)
-
-    def _inverse_map(self) -> tuple[OnnxInverse, FrontAim]:
-        """The inverse map and where to aim at, found once."""
-        if self._inverse is None:
-            if self.model.axes:
-                raise InputError(self.model.path, "inverse", "(a model of many states)", "a model of one state")
-            try:
-                inverse = load_inverse(self.model.path, self.model.card["lens"]["sha256"])
-            except ModelError as error:
-                raise InputError(self.model.path, "inverse", f"({error})", "a model exported with --inverse") from error
-            self._inverse = inverse, front_aim(self.film, self.film_mm, self._light_nm, inverse.front)
-        return self._inverse
+        if self.model.axes:
+            raise InputError(self.model.path, "inverse", "(a model of many states)", "a model of one state")
+        try:
+            return load_inverse(self.model.path, self.model.card["lens"]["sha256"])
+        except ModelError as error:
+            raise InputError(self.model.path, "inverse", f"({error})", "a model exported with --inverse") from error
 
 
 @dataclass(frozen=True)

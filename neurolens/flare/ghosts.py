@@ -29,8 +29,7 @@ from neurolens.flare.steps import LOST, STATE, Floats, Stack, entering, reflects
 from neurolens.graph.compiler import c_source
 from neurolens.lens.designs import design
 from neurolens.lens.prescription import Lens
-from neurolens.trace.rays import Rays
-from neurolens.trace.sequence import follow, turning
+from neurolens.trace.rays import Rays, follow, turning
 
 RANKED = 4096  # rays behind a ghost's energy in a table
 _BLOCK = 512  # rays whose states, 32 bytes each before every surface, fit the second cache

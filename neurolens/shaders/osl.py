@@ -30,17 +30,16 @@ from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.lenscamera import squeeze_of, stratified
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
-from neurolens.cameras.pupil_search import PupilTable
+from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
-from neurolens.graph.loworder import low_orders, with_film_derivatives
-from neurolens.graph.osl import Parameter, write_osl
+from neurolens.graph.loworder import low_orders, low_tests, with_film_derivatives
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import Parameter, write_osl
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.prescription import VISIBLE_NM
-from neurolens.shaders.lowtests import low_tests
-from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles, PupilDisc
+from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
 from neurolens.shaders.source import FOCUS, SMALLEST, Focusing, film_function, followed_rows, model_focusing
@@ -90,7 +89,7 @@ class OslCamera:
 
     lens: ShaderLens
     graph: Graph
-    pupil: PupilCircles | PupilDisc
+    pupil: PupilCircles
     film: Array
     nearest_m: tuple[float, float]
     limit_m: float
@@ -133,10 +132,9 @@ class OslLens:
         """Radius of the picture that all states fill."""
         return min(c.pupil.film_radius_mm for c in self.nodes)
 
-    def states(self) -> list[tuple[ShaderLens, PupilCircles | PupilDisc]]:
+    def states(self) -> list[tuple[ShaderLens, PupilCircles]]:
         """The lens and its pupil at each node, and in states between them."""
-        pupils: list[Any] = [c.pupil for c in self.nodes]  # all are of one kind
-        first, *others = pupils
+        first, *others = (c.pupil for c in self.nodes)
         nodes = zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True)
         return [(lens, first.mixed(others, weights)) for weights, lens in [*nodes, *self.between]]
 
@@ -303,7 +301,7 @@ def _film_position(camera: OslCamera) -> tuple[float, float]:
     return (low + high) / 2, max((high - low) / 2, 1e-6)
 
 
-def _samples(lens: ShaderLens, pupil: PupilCircles | PupilDisc, count: int = 32768) -> dict[str, NDArray[np.float32]]:
+def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[str, NDArray[np.float32]]:
     """Rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of samples."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * pupil.film_radius_mm * np.sqrt(rng.random(count))
@@ -370,14 +368,10 @@ def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, f
     return np.stack([_powers(at, z, powers) for z in positions]), (nearest, ahead)
 
 
-def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: bool = False) -> OslLens:
-    """An exported model.
-
-    Args:
-        graph: of a model of one state; None takes its own. fixed: in its state alone.
-    """
+def model_lens(model: OnnxLens, report: Report, *, fixed: bool = False) -> OslLens:
+    """An exported model; `fixed`: in its state alone."""
     if not model.axes or fixed:
-        return osl_lens([shader_lens(model, graph)], report)
+        return osl_lens([shader_lens(model)], report)
     axes = model.axes
     between = [(weights(axes, state), shader_lens(model.at(*state))) for state in states_between(axes)]
     return osl_lens([shader_lens(model.at(*state)) for state in product(axes)], report, axes, between)
@@ -389,20 +383,18 @@ def states_between(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
     return list(itertools.product(*middles))
 
 
-def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
-    """A model in its state; its graph, where that is not the one in its file."""
+def shader_lens(model: OnnxLens) -> ShaderLens:
+    """A model in its state."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
     all_nm = short, long = tuple(map(float, d["wavelength_nm"]))
     visible = max(short, VISIBLE_NM[0]), min(long, VISIBLE_NM[1])
     short, long = visible if visible[0] < visible[1] else all_nm
     stop = float(d["stop_radius_mm"])
-    if graph is None:
-        graph = model.graph()
     height = _BESIDE * float(d["film_radius_mm"])
     squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
     return ShaderLens(
-        graph=graph,
+        graph=model.graph(),
         table=PupilTable.of(d["bounds"]),
         film_z_mm=(float(low), float(high)),
         wavelength_nm=(short, long),
@@ -424,7 +416,7 @@ def osl_lens(
     Raises:
         InputError: no ray passes.
     """
-    pupils: list[PupilCircles | PupilDisc] = [*fit_pupil(nodes, report, between)]
+    pupils = fit_pupil(nodes, report, between)
     samples = [_samples(*pair) for pair in zip(nodes, pupils, strict=True)]
     graphs = [lens.graph for lens in nodes]
     graphs = (tested := low_tests(graphs, samples)) or graphs
@@ -441,10 +433,8 @@ def osl_lens(
     return OslLens(cameras, axes, between)
 
 
-def _blade_margin(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
+def _blade_margin(lens: ShaderLens, pupil: PupilCircles) -> float:
     """The margin, in stop radii, by which the sampler widens blades: a fit may put a passing ray beyond one."""
-    if isinstance(pupil, PupilDisc):
-        return 0.0
     inputs = _samples(lens, pupil)
     ray = evaluate(lens.graph, inputs)
     passed = np.broadcast_to(ray["status"][0] == st.PASSED, inputs["at_stop"].shape[1:])

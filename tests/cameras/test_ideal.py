@@ -15,8 +15,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras import build
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.ideal import ThickLens, ThinLens
-from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
+from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, ThinLens
 from neurolens.cameras.sampling import concentric_disk
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.apertures import Aperture

@@ -13,7 +13,8 @@ from PIL import Image
 
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
-from neurolens.cli import flare_run, main
+from neurolens.cli import flare as command
+from neurolens.cli import main
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, coated
@@ -66,8 +67,8 @@ def seen_once() -> Iterator[None]:
     """The directions that a plate's film sees are sought once for a lens and its state: they take a second."""
     camera = cache(make_camera)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flare_run, "make_camera", lambda file, shot, _: camera(file, shot))
-        patch.setattr(flare_run, "field_of", cache(field_of))
+        patch.setattr(command, "make_camera", lambda file, shot, _: camera(file, shot))
+        patch.setattr(command, "field_of", cache(field_of))
         yield
 
 

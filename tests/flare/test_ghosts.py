@@ -20,8 +20,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.trace.rays import Rays, trace
-from neurolens.trace.sequence import follow, turning
+from neurolens.trace.rays import Rays, follow, trace, turning
 
 LENSES = Path(__file__).parents[2] / "lenses"
 

@@ -18,8 +18,7 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB
 from neurolens.render.settings import Scatter
 from neurolens.setting.states import set_lens
-from neurolens.trace.rays import Rays
-from neurolens.trace.sequence import follow, turning
+from neurolens.trace.rays import Rays, follow, turning
 from tests.flare.test_ghosts import LENSES, lens_of
 
 COUNT = 1 << 17

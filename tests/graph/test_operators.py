@@ -17,11 +17,11 @@ from neurolens.graph.compiler import compile_c
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
-from neurolens.graph.newton import determinant, limited_newton, solve
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_glsl
+from neurolens.surrogates.inverse import determinant, limited_newton, solve
 
 Array = np.ndarray
 RNG = np.random.default_rng(0)

@@ -13,8 +13,7 @@ from shipped import whole
 
 from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.render.renderer import Watch, render
 
 LETTER_F = ["#####", "#....", "####.", "#....", "#....", "#...."]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from render_helpers import FLOOR, MATERIALS, assert_aimed, radiance, scene, world
 
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.render.colour import SRGB, SpectralRange, table
 from neurolens.render.environment import (
     SunLight,

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.speed import Race, camera_candidate, exact_candidates, race
