@@ -45,6 +45,7 @@ from experiments.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Peer, Pre
 from experiments.tracer_race import has_avx512
 from neurolens.analysis.plots import drawing, plain_log_ticks
 from neurolens.cameras.model import load_model
+from neurolens.cameras.onnxlens import BATCH
 from neurolens.graph.compiler import FLAGS, find_compiler, has_compiler
 from neurolens.graph.ir import pruned
 from neurolens.graph.program import SCENE_RAY
@@ -66,7 +67,7 @@ CASES = {  # lens: its models
     "canon_aspheric_50": ("ols-64", "mlp-16x2"),
     "thorlabs_lb1471_biconvex_50": ("ols-64", "mlp-16x2"),
 }
-C_BATCHES, TORCH_BATCHES = (2000, 4000, 10000, 20000), (10000, 20000, 50000)
+C_BATCHES, ONNX_BATCHES, TORCH_BATCHES = (2000, 4000, 10000, 20000), (8192, BATCH), (10000, 20000, 50000)
 TITLE, COMMAND = "# An open benchmark of lens rays", "`python -m experiments rays`"
 FAMILIES = {"exact, ours": "tab:blue", "model, ours": "tab:green", "others": "tab:red"}
 PACKAGES = ("optiland", "rayoptics", "deeplens-core")
@@ -177,8 +178,11 @@ def ours(name: str, task: Task, compiled: bool) -> list[Peer]:
     for kind in CASES[name]:
         file = lab.MODELS / f"{name}.{kind}.onnx"
         source = cache(lambda file=file: CompiledSource(fused_program([read_model(file).at()])))
-        for how, adapter in (("C", as_c(source)), ("onnxruntime", in_onnxruntime(file))):
-            rows.append(Peer(f"{kind}, {how}", "float32", adapter, C_BATCHES, COUNT, "model, ours"))
+        for how, adapter, sizes in (
+            ("C", as_c(source), C_BATCHES),
+            ("onnxruntime", in_onnxruntime(file), ONNX_BATCHES),
+        ):
+            rows.append(Peer(f"{kind}, {how}", "float32", adapter, sizes, COUNT, "model, ours"))
     return rows
 
 
