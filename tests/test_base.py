@@ -274,22 +274,6 @@ def test_the_resolved_settings_read_back_bit_for_bit(settings: Experiment) -> No
     assert from_dict(Experiment, to_dict(settings), "memory") == settings
 
 
-class Clock:
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> None:
-    clock, stream = Clock(), io.StringIO()
-    progress = Progress({"trace": 10, "fit": 60}, stream=stream, interval_s=5, clock=clock)
-    with progress.stage("trace") as report:
-        clock.now += 6
-        report(0.25)
-    assert stream.getvalue().splitlines()[0] == "trace:  25%, 6.0 s, 18 s left (in all 1 min 18 s left)"
-
-
 @pytest.mark.parametrize("fraction", [-1.0, 0.0, 1.0, 7.0])
 def test_any_fraction_is_taken_and_quiet_prints_nothing(fraction: float) -> None:
     for quiet in (False, True):
