@@ -27,8 +27,10 @@ from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.ideal import Pinhole
+from neurolens.lens.shot import Shot
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.sensor import libraries
 from neurolens.render.renderer import render
@@ -118,7 +120,7 @@ def rows(model: Path, settings: Settings) -> list[Row]:
     libraries()[1].set_thread_count(settings.threads)
     box = cornell_box(settings)
     pinhole = Pinhole(FOCAL_MM, film_mm(box))
-    lens = mitsuba.camera(model, film_mm=(28.0, 28.0), focus_m=FOCUS_M, f_number=F_NUMBER)
+    lens = make_camera(model, Shot((28.0, 28.0), FOCUS_M, F_NUMBER))
     behind, meshes = (
         our_scene(box, pinhole.film_mm, back_m=1e-3 * FOCAL_MM, triangles=triangles) for triangles in (False, True)
     )

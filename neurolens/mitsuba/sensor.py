@@ -299,7 +299,7 @@ def _camera_of(props: Any, shape: float) -> Camera:
     more = {k: props.get(k) for k in ("f_number", "zoom", "dispersion") if props.get(k, None) is not None}
     shot = Shot(
         (width_mm, height_mm), _number_of(props, "focus_m", math.inf), focal_length_mm=size,
-        aperture=make_aperture(StopShape(*blades, mask)), wavelength_nm=LIGHT_NM, **more,
+        aperture=make_aperture(StopShape(*blades, mask)), **more,
     )  # fmt: skip
     return make_camera(_found(name), shot)
 
