@@ -21,7 +21,7 @@ from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
 from neurolens.base.records import plain, program
 from neurolens.base.settings import changed, group, positive, setting, setting_of
-from neurolens.base.signals import Stopping, Unfinished
+from neurolens.base.tasks import Stopping, Unfinished
 from neurolens.cameras.contract import FloatArray
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
@@ -29,9 +29,8 @@ from neurolens.frames import Files, Frame, Picture, Prepared, flare_choice, flar
 from neurolens.frames.farm import how_to_resume, render_frames
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
 from neurolens.render.pictures import write_png
-from neurolens.render.renderer import RenderResult, Watch
+from neurolens.render.renderer import RenderResult, Watch, merge_tiles, tile_path
 from neurolens.render.settings import FilmSettings, SensorSettings
-from neurolens.render.tiles import merge_tiles, tile_path
 
 _FARMS, _LONG = "farms", "long renders"  # titles in the help
 
