@@ -25,8 +25,10 @@ from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.ideal import Pinhole
+from neurolens.lens.shot import Shot
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.sensor import libraries
 from neurolens.render.renderer import render
@@ -104,7 +106,7 @@ def renderers(args: argparse.Namespace) -> list[Renderer]:
     box = cornell_box(args.size, args.samples)
     side = 2 * FOCAL_MM * math.tan(math.radians(box["sensor"]["fov"] / 2))  # a 50 mm pinhole sees what theirs sees
     pinhole = Pinhole(FOCAL_MM, (side, side))
-    lens = mitsuba.camera(lab.MODELS / MODEL, film_mm=(28.0, 28.0), focus_m=FOCUS_M, f_number=F_NUMBER)
+    lens = make_camera(lab.MODELS / MODEL, Shot((28.0, 28.0), FOCUS_M, F_NUMBER))
     behind, meshes = (
         our_scene(box, pinhole.film_mm, back_m=1e-3 * FOCAL_MM, triangles=triangles) for triangles in (False, True)
     )
