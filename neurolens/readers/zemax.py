@@ -114,11 +114,6 @@ def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
     return lens_of(file, options)
 
 
-def looks_like_zmx(head: str) -> bool:
-    """Test whether the beginning of a text is that of a Zemax file."""
-    return any(line.split()[:1] in (["SURF"], ["MODE"]) for line in head.splitlines())
-
-
 def _read(file: File, line: Line) -> None:
     word, rest = line.words[0].upper(), line.words[1:]
     if word.startswith("!"):
@@ -331,12 +326,7 @@ def _add_ends(file: File) -> None:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces.
-
-    Raises:
-        InputError: a file that was cut off, a shape that the lens model cannot hold, the working f-number of a near
-            object.
-    """
+    """Set what follows from all surfaces."""
     file.skipped["lines of the merit function"] += file.behind.total()
     first, *middle, image = file.blocks
     for before, block in zip(file.blocks, file.blocks[1:], strict=False):
