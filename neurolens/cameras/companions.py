@@ -34,7 +34,6 @@ _FEWEST = 500  # rays, to fit to
 _WORST_MM, _WORST = 5e-4, 0.05  # RMS error of the film point, alone and of the shifts, one of which must do
 _BEYOND = 1.5  # the farthest shift over that of the rays of the fit, and the edge of the pupil over where they are lost
 _SURELY = 0.02  # the share of the rays, next to the edge, that are traced in any case
-_ALIKE = 1e-6  # 1 / um^2: wavelengths closer than this are one
 
 
 class Shift(NamedTuple):
@@ -47,14 +46,15 @@ class Shift(NamedTuple):
             the points in mm of the same scene ray at the companion wavelength, `ratio` of its light to the hero's, and
             `known`, 0 beyond the film or the reach.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
-        edge: a companion passes if the hero does, and crosses the pupil farther inside than the first number (mm), and
-            than the second times the difference of 1 / wavelength^2 (um).
+        edge: a companion passes if the hero does, and crosses the pupil farther inside than the first number (mm), than
+            the second times d and than the third times -d. d is the difference of 1 / wavelength^2 (um) to the hero's,
+            negative on the far side of the pupil's middle: dispersion moves rays to one side.
     """
 
     of_hero: Graph
     graph: Graph
     reach_mm: tuple[float, float]
-    edge: tuple[float, float]
+    edge: tuple[float, float, float]
 
 
 def fit_shift(
@@ -81,10 +81,11 @@ def fit_shift(
     x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
     graphs = _shift_graphs(weights, tint, scale, (middle, spread), (x, y), film_mm)
     on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
-    lost, surely = on_film & ~found.passed[found.kept], float(np.quantile(margin, _SURELY))
-    lost &= margin[found.kept] > surely
-    steepest = (margin[found.kept] / np.maximum(np.abs(waves[0] - waves[1]), _ALIKE))[lost].max(initial=0)
-    return Shift(*graphs, (x, y), (surely, _BEYOND * float(steepest)))
+    surely, inside = float(np.quantile(margin, _SURELY)), margin[found.kept]
+    lost = on_film & ~found.passed[found.kept] & (inside > surely)
+    away = ((waves[1] - waves[0]) * np.where((rays[:2] * rays[2:4]).sum(axis=0) <= 0, -1, 1))[lost]
+    slopes = (_BEYOND * float(np.max(inside[lost] / way, initial=0, where=way > 0)) for way in (away, -away))
+    return Shift(*graphs, (x, y), (surely, *slopes))
 
 
 def _terms(columns: Array, values: Array) -> tuple[Array, Array, float]:
@@ -161,9 +162,11 @@ def lanes_graph(shift: Shift, companions: int) -> Graph:
     g.outputs |= {"light": g.concat(*lanes), "places": g.concat(film, *there)}
     inside = (g.input("square", 2) * 2.0 - 1.0).abs()
     margin = (1.0 - inside[0].maximum(inside[1])) * g.input("area_mm2").maximum(0.0).sqrt()  # about in mm
-    waves = [g.square(1000.0 / nm) for nm in (g.input("wavelength_nm"), *g.split(light, [1] * companions))]
-    least, slope = shift.edge
-    edges = [((wave - waves[0]).abs() * slope).maximum(least) for wave in waves[1:]]
+    surely, *slopes = shift.edge
+    hero, *others = (g.square(1000.0 / nm) for nm in (g.input("wavelength_nm"), *g.split(light, [1] * companions)))
+    side = g.select(g.dot(film, g.input("pupil_mm", 2)) <= 0.0, -1.0, 1.0)
+    aways = [(other - hero) * side for other in others]
+    edges = [(away * slopes[0]).maximum(away * -slopes[1]).maximum(surely) for away in aways]
     g.outputs["sure"] = g.concat(*(margin - edge for edge in edges))
     return g
 

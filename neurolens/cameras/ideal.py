@@ -35,13 +35,12 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import camera_rays, unit_disc
+from neurolens.cameras.cameragraph import camera_rays, concentric_disk, unit_disc
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
 from neurolens.cameras.sampling import (
     LEAST_COS2,
     ahead,
     arrived,
-    concentric_disk,
     ideal_state,
     positive,
     sound,

@@ -1,4 +1,4 @@
-"""Helpers of all cameras: the map from the unit square to a disk, finite rays, checks, and the lens data of headers."""
+"""Helpers of all cameras: finite rays, where light from the scene is aimed, checks, and the lens data of headers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.cameras.cameragraph import concentric_disk
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.lens.prescription import Surface
 from neurolens.trace.shapes import sag_mm
@@ -23,25 +24,6 @@ _ANGLES, _ROOM = (
 )  # intervals of angles of light at a lens's front; how far it may lie beyond the rays that tell
 LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
-
-
-def concentric_disk(square: FloatArray) -> FloatArray:
-    """Map points [2, N] of the unit square to the unit disk [2, N], keeping areas and neighbours.
-
-    The ideal cameras use it for their pupil; lenses and their models map the square to the outline of what passes
-    (`pupil_outline`). Source: Shirley and Chiu 1997, "A low distortion map between disk and square".
-    """
-    a = square[0] * np.float32(2) - np.float32(1)
-    b = square[1] * np.float32(2) - np.float32(1)
-    swap = np.abs(b) > np.abs(a)
-    radius = np.where(swap, b, a)
-    other = np.where(swap, a, b)
-    angle = other * np.float32(math.pi / 4)
-    # The centre, radius 0, has no direction: dividing by 1 there leaves the angle 0 and the point at the origin.
-    with np.errstate(over="ignore", invalid="ignore"):  # of points outside the square
-        angle /= np.where(radius == 0, np.float32(1), radius)
-        cos, sin = np.cos(angle), np.sin(angle)
-        return np.stack([radius * np.where(swap, sin, cos), radius * np.where(swap, cos, sin)])
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ class Command:
     """A command: its fields are arguments and options (`base.settings`), its docstring is the text of its help.
 
     Paths to write are checked before it runs, by the placeholder of their option: OUT.exr is a file of this kind in a
-    folder that exists, FOLDER and DIR are folders, other words the start of a file's name.
+    folder that exists, FOLDER and DIR are folders, which are made, other words the start of a file's name.
 
     Attributes:
         called: the command as errors name it. epilog: the end of the help.

@@ -1,6 +1,6 @@
 """The film: the film points of pixels, the sums of every pixel, which grow by tiles and passes, and its checkpoint.
 
-A checkpoint (see `base.kept`) holds the sums and the identity of the render: everything that the picture depends on, as
+A checkpoint (see `base.files`) holds the sums and the identity of the render: everything that the picture depends on, as
 JSON that two renders can compare.
 """
 
@@ -198,11 +198,6 @@ class Film:
         """The next tile and pass to render, all tiles of one pass before the next pass; None: there is no more."""
         with self._lock:
             return next(self._missing, None)
-
-    def stop(self) -> None:
-        """Give out no more tiles."""
-        with self._lock:
-            self._missing = iter(())
 
     def add(
         self, tile: int, part: int, sums: NDArray[np.float64], spill: Spill | None, seconds: NDArray[np.float64]
