@@ -40,6 +40,14 @@ class Result:
         return found
 
 
+@dataclass(frozen=True)
+class OverField(Result):
+    """Base of results over F fields, `field_deg` [F], whose chief rays meet the film at `height_mm` [F]."""
+
+    field_deg: Array
+    height_mm: Array
+
+
 DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
 
 # Half field from which a lens counts as a wide one: near objects then lie on a sphere, not on a plane.

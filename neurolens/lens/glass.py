@@ -211,13 +211,9 @@ def by_code(code: str, count: int = 3) -> list[Glass]:
 
     def rank(g: Glass) -> float:
         # Rounded as codes are, so that all glasses of one code are equally near.
-        return round(_distance(round(g.n_d, 3) - n_d, round(g.V_d, 1) - V_d), 6)
+        return round(math.hypot((round(g.n_d, 3) - n_d) / 0.001, (round(g.V_d, 1) - V_d) / 0.5), 6)
 
     return sorted(all_glasses(), key=rank)[:count]
-
-
-def _distance(n_d: float, V_d: float) -> float:
-    return math.hypot(n_d / 0.001, V_d / 0.5)
 
 
 def _key(name: str) -> str:

@@ -188,7 +188,10 @@ def _entries(lines: Sequence[Line]) -> list[_Entry]:
     for line in lines:
         word, rest = line.words[0].upper(), line.words[1:]
         if word == "NM":
-            entries.append(_entry(line, rest))
+            formula, _, n_d = line.numbers("NM", [rest[1], "0", *rest[3:4]] if len(rest) > 3 else [], 3)
+            if len(rest[0]) > MAX_NAME:
+                raise line.error("NM", f"(a name of {len(rest[0])} characters)", f"at most {MAX_NAME}")
+            entries.append(_Entry(line, rest[0], int(formula), n_d))
             if len(entries) > MAX_GLASSES:
                 raise line.error("NM", f"({len(entries)} glasses)", f"at most {MAX_GLASSES}")
         elif not entries:
@@ -204,13 +207,6 @@ def _entries(lines: Sequence[Line]) -> list[_Entry]:
             if um > 0 and thickness > 0:
                 entries[-1].samples[1000 * um] = -math.log(min(max(share, _DARKEST), 1.0)) / thickness
     return entries
-
-
-def _entry(line: Line, rest: list[str]) -> _Entry:
-    formula, _, n_d = line.numbers("NM", [rest[1], "0", *rest[3:4]] if len(rest) > 3 else [], 3)
-    if len(rest[0]) > MAX_NAME:
-        raise line.error("NM", f"(a name of {len(rest[0])} characters)", f"at most {MAX_NAME}")
-    return _Entry(line, rest[0], int(formula), n_d)
 
 
 def _glass(entry: _Entry, maker: str) -> Glass:

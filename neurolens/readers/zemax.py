@@ -427,7 +427,10 @@ def shape_of(block: Block) -> dict[str, Any]:
         case kind if kind.startswith(Q_TYPE):
             shape = _q_type(block)
         case "TOROIDAL" | "BICONICX":
-            shape = _crossed(block)
+            biconic, radius_x = block.kind == "BICONICX", block.parameter(1)
+            conic_x = block.parameter(2) if biconic else None
+            curve = block.rotational(() if biconic else [(2 * i - 2, block.parameter(i)) for i in range(2, 9)])
+            shape = block.crossed(curve, radius_x or math.inf, conic_x)
         case "PARAXIAL":
             shape = {"radius_mm": math.inf, "focal_mm": block.parameter(1)}
             block.parameters.pop(2, None)
@@ -453,11 +456,3 @@ def _q_type(block: Block) -> dict[str, Any]:
     if form == 1:
         assume(block.start.file, f"line {block.start.number}: {block.kind}: 1 in XDAT 1 is taken to mean Qcon")
     return block.q_type(block.kind, form == 1, values, radius)
-
-
-def _crossed(block: Block) -> dict[str, Any]:
-    """Return a toroidal or biconic surface."""
-    biconic, radius_x = block.kind == "BICONICX", block.parameter(1)
-    conic_x = block.parameter(2) if biconic else None
-    curve = block.rotational(() if biconic else [(2 * i - 2, block.parameter(i)) for i in range(2, 9)])
-    return block.crossed(curve, radius_x or math.inf, conic_x)
