@@ -162,10 +162,11 @@ def added(glasses: Iterable[Glass], refused: Mapping[str, str]) -> Iterator[None
     try:
         yield
     finally:
-        for table, old in zip((_ADDED, _REFUSED), before, strict=True):
-            table.clear()
-            table.update(old)  # type: ignore[arg-type]
+        _ADDED.clear()
+        _REFUSED.clear()
         _FOUND.clear()
+        _ADDED.update(before[0])
+        _REFUSED.update(before[1])
 
 
 def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") -> Glass:

@@ -312,8 +312,8 @@ def _zoom(file: File, command: Command) -> None:
     surface, values, last = -1, words[1:], len(file.blocks) - 1
     if name in ("THI", "CIR"):
         match = re.fullmatch(r"S([0-9]{1,4}|O)", values[0].upper()) if values else None
-        surface = int(match[1].replace("O", "0")) if match else math.inf
-        if match is None or surface > last:
+        surface = int(match[1].replace("O", "0")) if match else last + 1
+        if surface > last:
             raise line.error(f"ZOO {name}", " ".join(values[:1]), f"a surface from S0 to S{last}")
         values = values[1:]
         if name == "THI" and not values:

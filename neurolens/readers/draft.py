@@ -86,7 +86,11 @@ class Block:
 
     def row(self, shape: dict[str, Any]) -> Row:
         """The row of a surface whose fields of shape are given."""
-        figures = {"thickness_mm": self.thickness, "diameter_mm": 2 * self.semi_diameter, "stop": self.stop}
+        figures: dict[str, Any] = {
+            "thickness_mm": self.thickness,
+            "diameter_mm": 2 * self.semi_diameter,
+            "stop": self.stop,
+        }
         return Row(Surface(**figures, **shape, **self.medium), self.aperture, self.name)
 
 
