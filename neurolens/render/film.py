@@ -1,7 +1,7 @@
 """The film: the film points of pixels, the sums of every pixel, which grow by tiles and passes, and its checkpoint.
 
-A checkpoint (see `base.files`) holds the sums and the identity of the render: everything that the picture depends on, as
-JSON that two renders can compare.
+A checkpoint (see `base.files`) holds the sums and the identity of the render: everything that the picture depends on,
+as JSON that two renders can compare.
 """
 
 from __future__ import annotations
