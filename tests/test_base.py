@@ -100,7 +100,7 @@ def test_what_killed_runs_left_is_removed_after_a_day(tmp_path: Path, monkeypatc
     os.utime(fresh, (time.time() - 2 * 86400,) * 2)
     atomic_write_text(tmp_path / "a.txt", "a")
     assert fresh.exists()  # looked for once an hour: thousands of files in a folder cost each as much as one
-    monkeypatch.setattr("neurolens.base.files._CLEANED_S", 0.0)
+    monkeypatch.setattr("neurolens.base.files._cleaned", set())
     atomic_write_text(tmp_path / "a.txt", "a")
     assert not fresh.exists()
 
