@@ -257,9 +257,9 @@ class Job:
             parts.append(LensRays(origin, self._axes @ rays.direction, weight, places))
         if len(parts) == 1:
             return parts[0]
-        origin, direction, weight = (np.concatenate([part[k] for part in parts], axis=-1) for k in range(3))
-        moved = [part.places for part in parts if part.places is not None]
-        return LensRays(origin, direction, weight, np.concatenate(moved, axis=-1) if moved else None)
+        each = zip(*parts, strict=True)
+        joined: list[Any] = [None if some[0] is None else np.concatenate(some, axis=-1) for some in each]
+        return LensRays(*joined)
 
     def _camera_wavelengths(self, hue: FloatArray, lanes: int) -> FloatArray:
         """Wavelengths [lanes, N] for the camera, clipped to its range if it does not disperse."""
