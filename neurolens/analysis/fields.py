@@ -22,7 +22,7 @@ from neurolens.base.records import plain
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
 from neurolens.lens.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.pupils import image_radius_mm, on_plane
 from neurolens.trace.aiming import Axis, aim_at_stop, between, bracket, without_rims
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
@@ -38,6 +38,14 @@ class Result:
         """Plain lists, numbers and strings by field name; NaN and infinities stay floats."""
         found: dict[str, Any] = plain(asdict(self), strict=False)
         return found
+
+
+@dataclass(frozen=True)
+class OverField(Result):
+    """Base of results over F fields, `field_deg` [F], whose chief rays meet the film at `height_mm` [F]."""
+
+    field_deg: Array
+    height_mm: Array
 
 
 DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
@@ -129,7 +137,7 @@ class Scene:
     @property
     def image_radius_mm(self) -> float:
         """Radius of the lit film."""
-        return _image_radius_mm(self.lens)
+        return image_radius_mm(self.lens)[0]
 
     def image_axes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Tangential component, positive towards the image, and sagittal component of x and y on the film."""
@@ -239,17 +247,6 @@ class Scene:
         """Raise InputError for a pinhole, which has no focus."""
         if is_pinhole(self.lens):
             raise InputError(self.lens.path, "surfaces", "(a pinhole)", "a lens with power")
-
-
-def on_plane(rays: Rays, z_mm: float) -> Rays:
-    """Rays moved along themselves to the plane at z."""
-    t = (z_mm - rays.z) / rays.dz
-    return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=torch.full_like(rays.z, z_mm))
-
-
-@lru_cache(maxsize=16)
-def _image_radius_mm(lens: Lens) -> float:
-    return image_radius_mm(lens)[0]
 
 
 @lru_cache(maxsize=16)

@@ -35,11 +35,16 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from neurolens.base.bounds import within
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
 
 T = TypeVar("T")
+# Bounds that every input keeps: beyond them searches take minutes or find no light.
+F_NUMBER = 0.1, 10_000.0
+FOCAL_MM = 1e-3, 1e6
+FILM_MM = 1e-3, 1e4  # a side
+WAVELENGTH_NM = 100.0, 20_000.0  # from lithography to thermal cameras
+RANGE = "range"  # a zoom position that stands for all of them
 _UNIT = re.compile(r"(.+?)_(per_mm|px|mm|um|nm|m|deg|s)")
 _PLACEHOLDERS = {int: "N", float: "X", str: "NAME", Path: "FILE"}
 _NAMES = {
@@ -50,6 +55,16 @@ _NAMES = {
     Path: "a path",
     NoneType: '"none"',
 }
+
+
+def within(bounds: tuple[float, float], value: float) -> bool:
+    """True for a value between two bounds, False for NaN."""
+    return bounds[0] <= value <= bounds[1]
+
+
+def said(bounds: tuple[float, float]) -> str:
+    """The bounds in words: "from 0.1 to 10000"."""
+    return f"from {bounds[0]:g} to {bounds[1]:g}"
 
 
 @dataclass(frozen=True)
@@ -130,9 +145,9 @@ def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -
     return convert
 
 
-def between(low: float, high: float, unit: str) -> Callable[[str], float]:
+def between(low: float, high: float, unit: str, kind: Callable[[str], Any] = float) -> Callable[[str], Any]:
     """Type of an argument that is a number from `low` to `high`."""
-    return _within(float, (low, high), unit)
+    return number(kind, lambda value: low <= value <= high, _expected(kind, (low, high), unit))
 
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
@@ -146,10 +161,6 @@ def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
     """Type of an argument that is a number above 0; "inf" only if `infinite`."""
     expected = f"{unit} above 0{', or inf' if infinite else ''}"
     return number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
-
-
-def _within(kind: Any, bounds: tuple[float, float], unit: str) -> Callable[[str], Any]:
-    return number(kind, lambda value: bounds[0] <= value <= bounds[1], _expected(kind, bounds, unit))
 
 
 def _expected(kind: Any, bounds: tuple[float, float], unit: str) -> str:
@@ -220,7 +231,7 @@ def _details(
         unit = _UNIT.fullmatch(f.name)
         details["metavar"] = option.metavar or (unit[2].upper() if unit else _PLACEHOLDERS[kind])
         bounds = None if option.kind else option.within
-        details["type"] = _within(kind, bounds, option.unit) if bounds else option.kind or kind
+        details["type"] = between(*bounds, option.unit, kind) if bounds else option.kind or kind
     if option.nargs is not None:
         details["nargs"] = option.nargs
     elif many:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.cameras.contract import CameraRays, RayDifferentials
 from neurolens.graph.derive import derivative
+from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import FILM_X_Y
 from neurolens.lens.apertures import Aperture
@@ -154,6 +155,14 @@ def unit_disc(square: Value) -> Value:
     cos = size * g.series(squared, _COS)
     sin = size * angle * g.series(squared, _SIN)
     return g.concat(g.select(flat, cos, sin), g.select(flat, sin, cos))
+
+
+def concentric_disk(square: NDArray[Any]) -> NDArray[Any]:
+    """`unit_disc` of points [2, N], which keeps areas and neighbours."""
+    g = Graph()
+    g.outputs["disc"] = unit_disc(g.input("square", 2))
+    found: NDArray[Any] = evaluate(g, {"square": square})["disc"]
+    return found
 
 
 def _series(function: Callable[[Array], Array]) -> Array:

@@ -46,8 +46,7 @@ from neurolens.graph.loworder import with_film_derivatives, with_low_order_deriv
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
-from neurolens.lens.film_plane import LINE_D_NM
-from neurolens.lens.prescription import Surface
+from neurolens.lens.prescription import LINE_D_NM, Surface
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.trace.shapes import sag_and_derivatives
 
@@ -152,10 +151,7 @@ GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 # 7100, and its time grows faster than their number.
 MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
-_EDGE_RAYS, _BEYOND = (
-    2**15,
-    1.01,
-)  # rays that look for the edge of the light on the front, and how far it may lie beyond
+_EDGE_RAYS = 2**16  # rays that look for where light crosses the front surface
 
 
 class LensCamera:
@@ -382,7 +378,7 @@ class LensCamera:
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
     def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
-        """Inputs of the lens's graph for rays all over film, pupil and wavelengths, and their margins as in `lanes_graph`."""
+        """Inputs of the lens's graph for rays all over film, pupil and light, and their margins as in `lanes_graph`."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))

@@ -25,7 +25,7 @@ from neurolens.cameras.sampling import (
     refuse,
 )
 from neurolens.graph.interpret import evaluate
-from neurolens.lens import film_plane
+from neurolens.lens import paraxial
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Surface
 from neurolens.lens.shot import Shot
@@ -251,7 +251,7 @@ class _Spot(NamedTuple):
 
 def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> _Spot:
     domain = scene.model.card["domain"]
-    colours, weights = film_plane.colours(wavelength_nm)
+    colours, weights = paraxial.colours(wavelength_nm)
     reach = float(domain["film_radius_mm"])
     round_ = scene.aperture is None and squeeze_of(scene, _SQUEEZED * reach, wavelength_nm) == 1.0
     spokes = 1 if round_ else _SPOKES  # of a round lens one stands for all
@@ -308,15 +308,15 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
     """The table `lens_state` of the settings, by the first-order data of the card."""
     model, film_z = scene.model, scene.film_z_mm
     lens, radius = model.card["lens"], model.card["domain"]["film_radius_mm"]
-    efl, front_efl = lens["efl_mm"], lens["efl_mm"] * film_plane.index_ratio(lens)
+    efl, front_efl = lens["efl_mm"], lens["efl_mm"] * paraxial.index_ratio(lens)
     focal_points = lens["front_principal_z_mm"] - front_efl, lens["rear_principal_z_mm"] + efl
     exit_z = float(lens.get("exit_pupil_z_mm", math.nan))
-    entrance = film_plane.entrance_pupil_z_mm(efl, front_efl, focal_points, exit_z)
+    entrance = paraxial.entrance_pupil_z_mm(efl, front_efl, focal_points, exit_z)
     breathes = any(a.name == "focus" for a in model.axes)
     return lens_state(
         nominal_mm=None if breathes else efl,
         efl_mm=efl,
-        pinhole_mm=film_plane.reach_mm(efl, front_efl, focal_points, entrance, film_z),
+        pinhole_mm=paraxial.reach_mm(efl, front_efl, focal_points, entrance, film_z),
         entrance_pupil_mm=film_z - entrance,
         f_number=f_number,
         transmittance=axial_transmittance(scene, wavelength_nm),
@@ -337,7 +337,7 @@ def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
         return float(lens["film_z_mm"])  # its groups have moved
-    z = film_plane.film_z_of_card_mm(lens, focus_m)
+    z = paraxial.film_z_of_card_mm(lens, focus_m)
     # A domain may hold the film of best focus alone: a millimetre from the paraxial one, of a singlet.
     least, most = sorted(float(v) for v in model.card["domain"]["focus_m"])
     if not (near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK or least <= focus_m <= most):

@@ -15,12 +15,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
-from neurolens.base.bounds import WAVELENGTH_NM
 from neurolens.base.errors import InputError, one_line, printable, warn
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, program
-from neurolens.base.settings import add_options, between, from_options, group, setting, setting_of, spelling
+from neurolens.base.settings import (
+    WAVELENGTH_NM,
+    add_options,
+    between,
+    from_options,
+    group,
+    setting,
+    setting_of,
+    spelling,
+)
 from neurolens.lens.shot import FocusMode, Shot, StopShape, film_size
 
 if TYPE_CHECKING:
@@ -91,7 +99,7 @@ class Command:
     """A command: its fields are arguments and options (`base.settings`), its docstring is the text of its help.
 
     Paths to write are checked before it runs, by the placeholder of their option: OUT.exr is a file of this kind in a
-    folder that exists, FOLDER and DIR are folders, other words the start of a file's name.
+    folder that exists, FOLDER and DIR are folders, which are made, other words the start of a file's name.
 
     Attributes:
         called: the command as errors name it. epilog: the end of the help.

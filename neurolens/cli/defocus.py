@@ -14,10 +14,9 @@ from neurolens.base.settings import group, positive, setting, setting_of, whole
 from neurolens.cameras.field import frame_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
-from neurolens.defocus.atlas import Cell, as_picture, as_preview, kernels_over
+from neurolens.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
 from neurolens.defocus.picture import check_field, defocus
-from neurolens.defocus.read import DepthSettings, read_plate
-from neurolens.defocus.rings import Grooves, aspheres
+from neurolens.defocus.plate import DepthSettings, read_plate
 from neurolens.frames import Files
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
 from neurolens.render.pictures import standard_attributes, write_channels, write_exr, write_png

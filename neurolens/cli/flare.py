@@ -6,7 +6,7 @@ import argparse
 import math
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -29,13 +29,12 @@ from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
 from neurolens.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
-from neurolens.flare.lights import SUN, Light, read_lights, with_disc
-from neurolens.flare.sources import KeptLights, SceneLights, chosen, highlights, keep_named
+from neurolens.flare.lights import SUN, KeptLights, Light, SceneLights, highlights, keep, read_lights, with_disc
 from neurolens.frames import Files, flare_channels
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
-from neurolens.render.environment import SUN_RADIUS_RAD
+from neurolens.render.lights import SUN_RADIUS_RAD
 from neurolens.render.pictures import (
     read_colour_space,
     read_exr,
@@ -51,7 +50,7 @@ _COMMAND = "neurolens flare"
 _QUICK_WIDTH = 480  # pixels at most
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table; tables; ghosts of a light in metadata
 _FEWEST = 256  # rays behind a table
-_GHOST_FRAMES, _LIGHT_FRAMES = 16, 64  # at most; they decide which ghosts are the brightest, and which lights are kept
+_GHOST_FRAMES = 16  # at most, which decide which ghosts are the brightest
 _QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile of the lit pixels to this value
 
 
@@ -85,7 +84,6 @@ examples:
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating quarter-wave --blades 6 --f-number 8 -o flare.exr
   neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,3/2.5/1.5 --layers 8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
-  neurolens flare laikin_double_gauss_50 --light 15,8 --blades 7 --f-number 11 --starburst -o flare.exr
   neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr"""
 
     file: Path = cli.lens(positional=True)
@@ -188,11 +186,8 @@ examples:
         """Refuse options that exclude each other and files that cannot be written; raises InputError."""
         if self.frames.frames is not None and self.out is None:
             self.refuse("--frames", f"({len(self.frames.frames)})", "-o beside it")
-        reflections = self.settings.most_reflections
-        if not (self.settings.photons or self.settings.glare) and reflections not in (
-            FlareSettings.most_reflections,
-            2,
-        ):
+        by_chance, reflections = self.settings.photons or self.settings.glare, self.settings.most_reflections
+        if not by_chance and reflections not in (FlareSettings.most_reflections, 2):
             self.refuse("--reflections", reflections, "2, or --photons or --glare beside it, which take more")
         if self.out is not None:
             Files.of(self.out)
@@ -208,7 +203,7 @@ examples:
             cells = f"{self.settings.bins} wavelengths, cells of {self.settings.cell_px:g}"
             progress.note(f"quick: {self.width} pixels wide, {cells}")
         states = list(self._states())
-        shots = Shots(self, states, read_any(self.file), progress)
+        shots = Shots(self, read_any(self.file), progress)
         first = shots.at(states[0])
         results = {"lens": first.job.lens.name, "pairs": len(ghost_pairs(first.job.lens)), **first.metadata()}
         if self.path is not None:
@@ -283,13 +278,11 @@ class Shot(NamedTuple):
 class Shots:
     """The flare of each frame. Files are read once, and frames with the same focus, stop and zoom share the lens."""
 
-    def __init__(self, command: Flare, states: Sequence[Flare], tabled: Lens, progress: Progress) -> None:
+    def __init__(self, command: Flare, tabled: Lens, progress: Progress) -> None:
         self._fixed = [_light(text) for text in command.light]
         self._tracks = [t for path in command.lights if path.suffix.lower() != ".toml" for t in read_lights(path)]
         scenes = [(path, load_scene(path)) for path in command.lights if path.suffix.lower() == ".toml"]
         self._scenes = [(path, scene, SceneLights(scene)) for path, scene in scenes]
-        self._states = states[:: -(-len(states) // _LIGHT_FRAMES)] if command.frames.frames is not None else ()
-        self._chosen: dict[Path, frozenset[int]] = {}
         self._lens = cache(lambda state: with_coating(state.set_lens(tabled), command.settings))
         self._progress, self._fields = progress, dict[cli.LensState, Field]()
         self._last: tuple[Flare, Shot] | None = None
@@ -327,13 +320,8 @@ class Shots:
         if behind := of_lists.count(None):
             warn(f"{behind} lights of lists stand behind the lens{at}")
         for path, scene, sources in self._scenes:
-            here, *others = (
-                sources.named(seen_from(scene, path, state.position_m, state.look_at_m), lens.film_z_mm or 0.0)
-                for state in (args, *(() if path in self._chosen else self._states))
-            )
-            if path not in self._chosen:
-                self._chosen[path] = chosen(others or [here], args.settings.most)
-            lights += _with_warning(keep_named(here, self._chosen[path]), path)
+            found = sources.seen(seen_from(scene, path, args.position_m, args.look_at_m), lens.film_z_mm or 0.0)
+            lights += _with_warning(keep(found, args.settings.most, fade=args.frame is not None), path)
         if args.plate is not None:
             lights += self._of_picture(args, args.plate)
         if not lights:

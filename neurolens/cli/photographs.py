@@ -5,18 +5,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
-    from neurolens.photographs.compare import Comparison, Curve
-    from neurolens.photographs.faults import Checked
     from neurolens.photographs.rims import FittedRims
-    from neurolens.photographs.verify import Verified
+    from neurolens.photographs.verify import Comparison, Verified
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +45,14 @@ examples:
 
     def run(self) -> int:
         """Compare, draw, write."""
-        from neurolens.photographs.verify import FREE, plot_verified, verify
+        from neurolens.photographs.faults import check
+        from neurolens.photographs.verify import FREE, found_for, plot_verified, verify
         from neurolens.readers.any_format import read_any
 
         tabled = read_any(self.file)
-        checked = _checked(tabled, self.profile) if self.check and not tabled.anamorphic else None
+        checked = None
+        if self.check and not tabled.anamorphic:
+            checked = check(tabled, found_for(tabled, self.profile, any_focal=True)[1][0])
         try:
             found = verify(tabled, self.profile)
         except InputError as error:
@@ -75,13 +75,6 @@ examples:
         return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, last))
 
 
-def _checked(tabled: Lens, profile: str | None) -> Checked:
-    from neurolens.photographs.faults import check
-    from neurolens.photographs.verify import found_for
-
-    return check(tabled, found_for(tabled, profile, any_focal=True)[1][0])
-
-
 def _text(found: Verified, name: str, last: list[str]) -> str:
     other = f"; also possible: {', '.join(found.also)}" if found.also else ""
     head = f"against lensfun's {found.profile}, crop {found.crop:g} (match of names: {found.certainty}{other})"
@@ -93,20 +86,16 @@ def _text(found: Verified, name: str, last: list[str]) -> str:
 
 
 def _row(c: Comparison) -> list[str]:
-    from neurolens.photographs.compare import near_f8
+    from neurolens.photographs.rims import near_f8
 
     cells = [f"{c.focal_mm:g}", cli.number(c.distortion_percent and c.distortion_percent.rms, 2)]
-    eight, widest = (
-        (c.light_stops[near_f8(c.light_stops)], c.light_stops[min(c.light_stops)]) if c.light_stops else (None, None)
-    )
+    light = c.light_stops
+    eight, widest = (light[near_f8(light)], light[min(light)]) if light else (None, None)
     for curve, digits in ((c.red_um, 2), (c.blue_um, 2), (eight, 3), (widest, 3)):
-        cells += [cli.number(v, digits) for v in _last(curve)]
+        # At the largest height.
+        last = (None, None) if curve is None else (float(curve.computed[-1]), float(curve.measured[-1]))
+        cells += [cli.number(v, digits) for v in last]
     return cells
-
-
-def _last(curve: Curve | None) -> tuple[Any, Any]:
-    """The computed and the measured figure at the largest height."""
-    return (None, None) if curve is None else (float(curve.computed[-1]), float(curve.measured[-1]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
 from neurolens.base.records import plain, program
 from neurolens.base.settings import changed, group, positive, setting, setting_of
-from neurolens.base.signals import Stopping, Unfinished
+from neurolens.base.tasks import Stopping, Unfinished
 from neurolens.cameras.contract import FloatArray
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
@@ -29,9 +29,8 @@ from neurolens.frames import Files, Frame, Picture, Prepared, flare_choice, flar
 from neurolens.frames.farm import how_to_resume, render_frames
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
 from neurolens.render.pictures import write_png
-from neurolens.render.renderer import RenderResult, Watch
+from neurolens.render.renderer import RenderResult, Watch, merge_tiles, tile_path
 from neurolens.render.settings import FilmSettings, SensorSettings
-from neurolens.render.tiles import merge_tiles, tile_path
 
 _FARMS, _LONG = "farms", "long renders"  # titles in the help
 
@@ -62,10 +61,7 @@ class Render(cli.Reporting):
     epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
-  neurolens render experiments/scenes/room.toml --camera pinhole --samples 4 -o quick.exr
   neurolens render experiments/scenes/room.toml --camera lenses/laikin_double_gauss_50.toml -o exact.exr
-  neurolens render experiments/scenes/lights.toml --camera models/NAME.onnx --f-number 2.8 \\
-      --half -o lights.exr
   neurolens render experiments/scenes/grid.toml --camera lenses/ogawa_zoom_70_200.toml \\
       --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
   neurolens render experiments/scenes/room.toml --camera thin --samples 64 --keep-checkpoint -o room.exr
@@ -283,7 +279,6 @@ class Demo(cli.Command):
         """Render and write the page."""
         from neurolens.study.pages import figures_of
 
-        cli.check_run_folder(self.out, self.called, "--output")
         self.out.mkdir(parents=True, exist_ok=True)
         parser = cli.Parser()
         Render.fill(parser)

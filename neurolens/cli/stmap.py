@@ -205,7 +205,11 @@ examples:
                 path = start.with_name(".".join(filter(None, (start.name, kind, name, frame.number, "exr"))))
                 field, facts = frame.fields[name], self._facts(frame, plates, kind, name)
                 if not _is_of(path, facts):
-                    planes = make(field, plates, lambda share, k=k: report((k + share / 2) / len(todo)))
+
+                    def part(share: float, done: int = k) -> None:
+                        report((done + share / 2) / len(todo))
+
+                    planes = make(field, plates, part)
                     header = standard_attributes(frame.camera.settings, frame=frame.index)
                     header["pixelAspectRatio"] = facts["pixel_aspect"]
                     write_channels(path, planes, None, facts, header)

@@ -38,12 +38,9 @@ class Train(cli.Reporting):
 examples:
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
-  neurolens train --lens lenses/cooke_triplet_50.toml
   neurolens train --lens lenses/cooke_triplet_50.toml --within 0.1px --rounds 0
   neurolens train --lens lenses/*_50.toml -o runs/fifties
   neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range -o runs/zoom
-  neurolens train --lens lenses/brendel_tessar_100.toml -o runs/tessar \\
-      --set lens.focal_length_mm=50
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
 lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""

@@ -11,13 +11,12 @@ from typing import Any
 
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.base.settings import setting, setting_of
+from neurolens.base.settings import RANGE, setting, setting_of
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import arguments as cli
 from neurolens.cli.blender import Build, forms_of, key_of, kind_of, library, squeeze_of
@@ -141,10 +140,7 @@ def _library() -> Iterator[_Entry]:
 
 def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
     """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
-    root = shipped()
-    lenses: dict[str, Lens | None] = {}
-    models: dict[str, list[Path]] = {}
-    from_library: dict[str, list[Path]] = {}
+    lenses, models = dict[str, Lens | None](), dict[str, list[Path]]()
     for path in paths:
         if is_model(path):
             lens_id = str(read_card(path)["lens"]["id"])
@@ -153,13 +149,14 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
         else:
             lens = read_any(path)
             lenses[lens.lens_id] = lens
-            ours = path.resolve().parent == (root / "lenses").resolve()  # a lens of the library brings its models
-            if ours and any((root / "models").glob(f"{path.stem}.*.onnx")):
-                ((from_library[lens.lens_id], _),) = library(root / "models", root / "lenses", [path.stem])
-    for lens_id, lens_or_none in lenses.items():
-        own = models.get(lens_id) or from_library.get(lens_id, [])
-        zoom = RANGE if any(read_card(m).get("states") for m in own) else None
-        yield _Entry(lens_id, own, lens_or_none, zoom)
+    folder, ships = shipped() / "lenses", shipped() / "models"
+    for lens_id, one in lenses.items():
+        own = models.get(lens_id, [])
+        # A lens of the library brings its models.
+        ours = one is not None and Path(one.path).resolve().parent == folder.resolve()
+        if ours and not own and any(ships.glob(f"{lens_id}.*.onnx")):
+            ((own, _),) = library(ships, folder, [lens_id])
+        yield _Entry(lens_id, own, one, RANGE if any(read_card(m).get("states") for m in own) else None)
 
 
 def _view_lens(

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.areas import LOST, Floats
+from neurolens.flare.canvas import LOST, Floats
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.ir import Graph, Value

@@ -33,11 +33,10 @@ from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, check_name
 from neurolens.render.film import PixelGrid
 from neurolens.render.job import MEANING
 from neurolens.render.pictures import standard_attributes
-from neurolens.render.renderer import RenderResult, Watch, render
+from neurolens.render.renderer import RenderResult, Watch, render, rows_of, tile_path, windows
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
 from neurolens.render.sensor import about, expose
 from neurolens.render.settings import LAYERS, FilmSettings, SensorSettings, size_by_shape
-from neurolens.render.tiles import rows_of, tile_path, windows
 
 if TYPE_CHECKING:
     from neurolens.flare.canvas import Raster
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Vector = tuple[float, float, float]
 Layers = dict[str, FloatArray]
-_CHOICE_FRAMES = 16  # of an animation, which decide the brightest lights and ghosts
+_CHOICE_FRAMES = 16  # of an animation, which decide the brightest ghosts
 
 
 def with_changes(settings: T, changes: object) -> T:
@@ -267,8 +266,8 @@ def render_frame(
     The bytes of the picture depend on the frame alone, not on the number of threads.
 
     Args:
-        out: the picture; of a tile the name of the whole picture, see `render.tiles.tile_path`.
-        choice: the lights and ghosts of `flare_choice`, which all frames of an animation share; None: of this frame.
+        out: the picture; of a tile the name of the whole picture, see `render.renderer.tile_path`.
+        choice: see `flare_choice`, which all frames of an animation share; None: of this frame.
         watch: previews, checkpoints and an early end. preview: whether OUT.png is written.
 
     Raises:
@@ -305,7 +304,7 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
 
 
 def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) -> Choice | None:
-    """Choose the lights and ghosts that the layers of flare show in all frames of an animation.
+    """Choose the ghosts that are layers of the flare in all frames of an animation.
 
     At most 16 of the frames, evenly spread, decide which are brightest. `prepared` is one of the frames, or of the same
     camera and scene. The choice is None where there is no flare.

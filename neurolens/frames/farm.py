@@ -28,7 +28,7 @@ from neurolens.base.tasks import Failed, Shared, run_each
 from neurolens.frames import Frame, Prepared, flare_choice, prepare, render_frame
 from neurolens.readers.glasses import more_glasses
 from neurolens.render.film import digest
-from neurolens.render.tiles import read_tile, tile_path, write_picture
+from neurolens.render.renderer import read_tile, tile_path, write_picture
 
 if TYPE_CHECKING:
     from neurolens.flare.layers import Choice
@@ -76,7 +76,7 @@ def render_frames(
     Args:
         frames: of one scene and one camera, by the files of their pictures (.exr); without tiles of their own.
         folder: where tiles are kept (default: OUT.exr.tiles for the first picture OUT.exr).
-        shown: the frames that decide which lights and ghosts the flare has, see `flare_choice`; None: these frames.
+        shown: the frames that decide which ghosts the flare has as layers, see `flare_choice`; None: these frames.
         restart: render tiles that are there again.
 
     Returns:
@@ -93,7 +93,7 @@ def render_frames(
         prepared = prepare(frame, out, progress)
         choice = flare_choice(shown or list(frames.values()), prepared)
     common = packed(files | {path for path in (frame.scene, frame.camera.file, *frame.glass_files) if path is not None})
-    shared = sha256(common).hexdigest(), None if choice is None else (sorted(map(repr, choice.lights)), choice.single)
+    shared = sha256(common).hexdigest(), choice
     todo = dict(_picture(each, out, folder, shared, prepared, restart) for out, each in frames.items())
     folder.mkdir(exist_ok=True)
     pictures, done, count = dict[Path, dict[str, Any]](), 0, sum(len(picture.tiles) for picture in todo.values())

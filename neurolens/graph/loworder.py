@@ -270,24 +270,25 @@ def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np
     idle = _idle(known, gates)
     told = live_rows(graphs[0], {"status": graphs[0].outputs["status"]})[number]
     fitted = dict[int, list[Array]]()
-    for row in (r for r in range(graphs[0].nodes[number].rows) if r not in kept):
-        own, enough = _low_row(known, row, 0 if row in idle else _TEST_TERMS, _GATE if row in gates else _SMOOTH)
+    for row in (r for r in range(graphs[0].nodes[number].rows) if r not in kept and r not in idle):
+        own, enough = _low_row(known, row, _GATE if row in gates else _SMOOTH)
         if enough or row in told:  # rays that pass are counted below; transmittance is not
             fitted[row] = own
-    rows, weights = list(fitted), np.array(list(fitted.values())).swapaxes(0, 1)
-    used = weights.any((0, 1))
-    made = []
-    for state, w, given in zip(known, weights, samples, strict=True):
-        made.append(_written(state.graph, number, variables, rows, idle, (exponents[used], w[:, used])))
-        if not _same(_passed(made[-1], given), state.passed, given):
-            return None
-    return made
+    for weights in (
+        fitted,
+        dict[int, list[Array]](),
+    ):  # where few terms do not do, idle tests are left out all the same
+        made = [_written(s, number, variables, exponents, idle, {r: w[k] for r, w in weights.items()})
+                for k, s in enumerate(known)]  # fmt: skip
+        if all(_same(_passed(g, given), s.passed, given) for g, s, given in zip(made, known, samples, strict=True)):
+            return made
+    return None
 
 
-def _low_row(seen: Sequence[_GateSamples], row: int, most: int, good: float) -> tuple[list[Array], bool]:
-    """Weights [M] of at most so many monomials in each state, and whether they come as near as `good`."""
+def _low_row(seen: Sequence[_GateSamples], row: int, good: float) -> tuple[list[Array], bool]:
+    """Weights [M] of few monomials in each state, and whether they come as near as `good`."""
     columns, wanted = [s.products * s.weights[row] for s in seen], [s.values[row] * s.weights[row] for s in seen]
-    chosen, own = pursue(columns, wanted, [good] * len(seen), most)
+    chosen, own = pursue(columns, wanted, [good] * len(seen), _TEST_TERMS)
     weights = [np.zeros(len(c)) for c in columns]
     for w, values in zip(weights, own, strict=True):
         w[chosen] = values
@@ -379,15 +380,15 @@ def _passed(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> Truths:
 
 
 def _written(
-    graph: Graph, number: int, variables: int, rows: Sequence[int], idle: Collection[int],
-    polynomial: tuple[NDArray[np.int64], Array],
+    state: _GateSamples, number: int, variables: int, exponents: NDArray[np.int64], idle: Collection[int],
+    weights: Mapping[int, Array],
 ) -> Graph:  # fmt: skip
-    """The graph with these rows of a node as polynomials, and without idle tests."""
-    g, place = Graph(), list[Value]()
+    """The graph with rows of a node as polynomials with these weights [M], by row, and without idle tests."""
+    graph, g, place, rows = state.graph, Graph(), list[Value](), list(weights)
     for k, node in enumerate(graph.nodes):
         value = g.like(node, [place[i] for i in node.inputs])
-        if k == number:
-            own = g.polynomial(*polynomial, place[variables])
+        if k == number and rows:
+            own = g.polynomial(exponents, np.stack([*weights.values()]), place[variables])
             value = g.concat(*(own[rows.index(r)] if r in rows else value[r] for r in range(node.rows)))
         place.append(value)
     tests, gates = _tests(graph), _gates(graph, number)

@@ -19,10 +19,9 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import field_of
 from neurolens.flare.canvas import Raster
 from neurolens.flare.layers import FlareJob, flare_layers
-from neurolens.flare.lights import Light
-from neurolens.flare.sources import SceneLights, highlights, keep
+from neurolens.flare.lights import Light, SceneLights, highlights, keep
 from neurolens.graph.compiler import has_compiler
-from neurolens.lens.film_plane import colours
+from neurolens.lens.paraxial import colours
 from neurolens.lens.prescription import Lens
 from neurolens.render.colour import SpectralRange
 from neurolens.render.job import expected_light

@@ -24,8 +24,7 @@ from neurolens.cameras.build import ideal_as
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import Field, field_of
 from neurolens.graph.compiler import has_compiler
-from neurolens.lens.film_plane import PupilBounds
-from neurolens.lens.paraxial import first_order
+from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Dispersion, Shot
 from neurolens.plan import footprints as prints

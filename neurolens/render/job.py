@@ -19,9 +19,9 @@ from neurolens.cameras.reduced import film_shift
 from neurolens.graph.compiler import c_source, has_compiler, load_compiled
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
-from neurolens.render.environment import sun_spectrum, total_spectrum
 from neurolens.render.film import Film, PixelGrid, Spill, Tiling
 from neurolens.render.integrator import trace
+from neurolens.render.lights import sun_spectrum, total_spectrum
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
 from neurolens.render.scene import CameraSettings, Scene
 from neurolens.render.scenetables import Vector
@@ -145,10 +145,10 @@ class Job:
         size = {"width": self.grid.width, "height": self.grid.height}
         return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
-    def render_tile(self, tile: int, part: int) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
+    def render_tile(self, which: tuple[int, int]) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
         """Sums [pixels, columns] of one pass of one tile, what belongs to other pixels, and the seconds [2] spent in
         the camera, and in all."""
-        began = time.perf_counter()
+        began, (tile, part) = time.perf_counter(), which
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
         pixels = np.arange(within.start, within.stop) + self.tiling.start
@@ -256,7 +256,9 @@ class Job:
             parts.append(LensRays(origin, self._axes @ rays.direction, weight, places))
         if len(parts) == 1:
             return parts[0]
-        return LensRays(*(None if some[0] is None else np.concatenate(some, axis=-1) for some in zip(*parts)))
+        each = zip(*parts, strict=True)
+        joined: list[Any] = [None if some[0] is None else np.concatenate(some, axis=-1) for some in each]
+        return LensRays(*joined)
 
     def _camera_wavelengths(self, hue: FloatArray, lanes: int) -> FloatArray:
         """Wavelengths [lanes, N] for the camera, clipped to its range if it does not disperse."""

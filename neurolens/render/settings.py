@@ -176,8 +176,8 @@ class FlareSettings:
     )  # fmt: skip
     most: int = setting(
         32,
-        "of --image and of a scene: the lights of the most energy; what is left out is said. With --frames a scene has "
-        "the same ones in all frames, and those of pictures fade before they are left out",
+        "of --image and of a scene: the lights of the most energy; what is left out is said. With --frames they fade "
+        "before they are left out",
         within=(1, 10_000), title=OF_LIGHTS,
     )  # fmt: skip
     without: tuple[str, ...] = setting(

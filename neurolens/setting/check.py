@@ -19,7 +19,7 @@ from neurolens.lens.paraxial import FirstOrder, first_order
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.setting.focusing import axial_rays, best_focus_z_mm
 from neurolens.setting.pupil_nodes import FilmLight
-from neurolens.setting.pupils import pupil_plane_z_mm
+from neurolens.setting.pupils import on_plane, pupil_plane_z_mm
 from neurolens.setting.rims import end_mm
 from neurolens.setting.states import in_state
 from neurolens.trace.aiming import aim_at_stop
@@ -116,11 +116,9 @@ def _focal_length(lens: Lens, efl: float, stated: float | None, plane: str = "")
 
 def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
     tabled, last = float(lens.surfaces[-1].thickness_mm), float(lens.vertices_mm[-2])
-    doubt = ""
-    if efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl:
-        film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
-        doubt = f"{film}, its focus is at {last + computed:.2f} mm"
-    return Check("back focus, mm", computed, tabled, doubt)
+    film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
+    wrong = efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl
+    return Check("back focus, mm", computed, tabled, f"{film}, its focus is at {last + computed:.2f} mm" * wrong)
 
 
 def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:
@@ -135,11 +133,9 @@ def _beam(lens: Lens, data: FirstOrder) -> Check:
     """Whether the rims let the axial beam of the stop through: its f-number against that of the widest real beam."""
     height, blocker = axial_beam(lens)
     n = abs(data.efl_mm) / (2 * height) if height > 0 else math.inf
-    doubt = ""
-    wanted = max(data.f_number, lens.f_number)
-    if n > (1 + BEAM_TOLERANCE) * wanted and blocker is not None and blocker != lens.stop_index:
-        doubt = f"the rim of surface {blocker} limits the axial beam to f/{n:.3g}, the stop to f/{data.f_number:.3g}"
-    return Check("f-number of the axial beam", n, None, doubt)
+    wrong = n > (1 + BEAM_TOLERANCE) * max(data.f_number, lens.f_number) and blocker not in (None, lens.stop_index)
+    doubt = f"the rim of surface {blocker} limits the axial beam to f/{n:.3g}, the stop to f/{data.f_number:.3g}"
+    return Check("f-number of the axial beam", n, None, doubt * wrong)
 
 
 def _edges(lens: Lens) -> Check:
@@ -243,8 +239,8 @@ def axial_blur_mm(lens: Lens) -> float:
     if not len(r.x):
         return math.inf
     z = best_focus_z_mm(lens, math.inf, (lens.reference_nm, lens.reference_nm))
-    x, y = (c + (z - r.z) * d / r.dz for c, d in ((r.x, r.dx), (r.y, r.dy)))
-    return math.sqrt(float((x * x + y * y).mean()))
+    spot = on_plane(r, z)
+    return math.sqrt(float((spot.x**2 + spot.y**2).mean()))
 
 
 def film_edge_mm(lens: Lens) -> float | None:
@@ -258,11 +254,9 @@ def film_edge_mm(lens: Lens) -> float | None:
     with torch.no_grad():
         out = trace(lens, bundle.rays, towards="film")
     if int(out.status[0]) == st.PASSED and bool(bundle.reached[0, 0]):
-        r = out.rays
-        return abs(float(r.x + (first_order(lens).rear_focal_z_mm - r.z) * r.dx / r.dz))
-    if lens.half_field_deg < 60:
-        return abs(first_order(lens).front_efl_mm) * math.tan(math.radians(lens.half_field_deg))
-    return None
+        return abs(float(on_plane(out.rays, first_order(lens).rear_focal_z_mm).x))
+    wide = lens.half_field_deg >= 60
+    return None if wide else abs(first_order(lens).front_efl_mm) * math.tan(math.radians(lens.half_field_deg))
 
 
 def corner_illumination(lens: Lens, radius_mm: float) -> float:

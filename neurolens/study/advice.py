@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neurolens.base.bounds import RANGE
 from neurolens.base.files import library
 from neurolens.base.records import error_of, noisy, program, reaches, time_of
+from neurolens.base.settings import RANGE
 
 C = TypeVar("C")
 R = TypeVar("R", bound=Mapping[str, Any])

@@ -20,7 +20,7 @@ from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY, WAVELENGTH
-from neurolens.lens.film_plane import PupilBounds
+from neurolens.lens.paraxial import PupilBounds
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
 from neurolens.surrogates.card import DOMAIN_SLACK, mix_domain

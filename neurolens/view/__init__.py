@@ -29,8 +29,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html, text_of
 from neurolens.cameras.cameragraph import weight_graph
-from neurolens.flare.ghostgraph import entrances, ghost_graphs
-from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.ghosts import GhostTracer, entrances, ghost_graphs
 from neurolens.graph.c import Signature
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
