@@ -26,7 +26,7 @@ from neurolens.graph.ir import Graph
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
+from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.inverse import (
     STEPS,
@@ -47,15 +47,13 @@ from neurolens.trace.surfaces import front_rays
 PUBLISHED_STEPS = (3, 5, 10, 20)
 # A residual beyond this (in stop radii; of the front's radius, in radians) counts as diverged, not just missed.
 AWAY = 1.0
-# Points per side of the grid of starts in the search for rays that an inverse map did not find.
-_STARTS = 7
 
 
-def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) -> Row:
+def measure_lens(file: Path, rays: int, terms: int = 64) -> Row:
     """One record: lens, focus_m, and the shares of rays that each iteration finds.
 
     Args:
-        rays: that pass the lens (a tenth otherwise than by three steps). uniform: stop points.
+        rays: that pass the lens (a tenth otherwise than by three steps).
 
     Raises:
         InputError: a lens that cannot be fitted.
@@ -79,7 +77,6 @@ def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) 
             },
             "two_steps": convergence(inverse, few, steps=2),
             "published": _published(inverse, few),
-            "uniform": _uniform(inverse, uniform),
             "rays": rays,
         }
 
@@ -139,49 +136,6 @@ def _plain(system: Graph, given: dict[str, Tensor]) -> dict[str, Any]:
     return found
 
 
-def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
-    """Outcome for stop points uniform over the stop and film points uniform over the film.
-
-    Returns shares: passed, blocked, outside (the ray leaves the domain), unsolved; `missed`: unsolved although a ray
-    that passes is found from one of a grid of starts; and of the solved ones what the published iteration misses, by
-    number of steps.
-    """
-    domain = inverse.model.domain
-    rays = sample_domain(domain, count, seed=31)
-    scale = 0.9999 * domain.stop_radius_mm / domain.pupil_radius_mm
-    x, y = rays.pupil_x * scale, rays.pupil_y * scale
-    out = inverse.through_stop(rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
-    status = out.prediction.status
-    unsolved = status == st.NO_SOLUTION
-    part = rays.select(~unsolved)
-    there = x[~unsolved], y[~unsolved]
-    plain = _plain(stop_system(inverse.model), _stop_inputs(inverse.model, part, *there))
-    some = unsolved.nonzero()[:500, 0]
-    lost = _reachable(inverse, rays.select(some), x[some], y[some])
-    share = float(lost.double().mean()) * float(unsolved.double().mean()) if len(some) else 0.0
-    return {
-        "passed": float((status == st.PASSED).double().mean()),
-        "blocked": float((status >= 4).double().mean()),
-        "outside": float((status == st.OUTSIDE_DOMAIN).double().mean()),
-        "unsolved": float(unsolved.double().mean()),
-        "missed": share,
-        "published_missed": plain["missed"],
-        "published_away": plain["away"],
-    }
-
-
-def _reachable(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor) -> Tensor:
-    """[N] bool: whether a passing ray goes from each film point through each stop point, from many starts."""
-    asked = (rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
-    side = torch.linspace(-0.9, 0.9, _STARTS, dtype=torch.float64)
-    found = torch.zeros(len(rays), dtype=torch.bool)
-    for a in side:
-        for b in side:
-            start = torch.stack([a.expand(len(rays)), b.expand(len(rays))])
-            found |= inverse.through_stop(*asked, steps=15, start=start).prediction.status == st.PASSED
-    return found
-
-
 _INTRODUCTION = """\
 # Inverse maps
 
@@ -192,10 +146,6 @@ share of them, in percent, that an iteration does not find ({tolerance:g} of the
 and in radians). Published: Newton from the first-order map, undamped, 3 / 5 / 10 / 20 steps; "away": residual above 1
 after 20. Ours: direct fit, then {steps} limited steps (two for comparison). "other": another ray through the same point
 (the map is folded in the lens itself, and one ray of two is found). Both on the same model (64 coefficients)."""
-_UNIFORM = """\
-Shares in percent for film points uniform over the film. "no ray": no ray of the model's domain goes through the point,
-or none was found; "missed": of those, where one of 49 other starts leads to a ray that passes. Published: of the points
-that have a ray, those that it does not find."""
 
 
 def _share(title: str, path: str, rest: bool = False) -> lab.Column:
@@ -208,20 +158,14 @@ def _share(title: str, path: str, rest: bool = False) -> lab.Column:
     return lab.Column(title, cell)
 
 
-def _published_columns(missed: str, away: str) -> list[lab.Column]:
-    """The shares that the published iteration misses, by steps, and that ran away after the most."""
-    first, *more = PUBLISHED_STEPS
-    heads = {first: f"published: {first}"} | {n: str(n) for n in more}
-    return [*(_share(head, f"{missed}.{n}") for n, head in heads.items()), _share("away", f"{away}.{more[-1]}")]
-
-
 _MAPS = {"stop": "Film point and stop point to ray", "scene": "Scene ray to film"}
 
 
 def _map_columns(which: str) -> list[lab.Column]:
     return [
         *lab.columns(("lens", "lens"), ("rays", "rays")),
-        *_published_columns(f"published.{which}.missed", f"published.{which}.away"),
+        *(_share(f"published: {n}", f"published.{which}.missed.{n}") for n in PUBLISHED_STEPS),
+        _share("away", f"published.{which}.away.{PUBLISHED_STEPS[-1]}"),
         _share("ours: 2", f"two_steps.{which}.converged", rest=True),
         _share("3", f"ours.float64.{which}.converged", rest=True),
         _share("3, float32", f"ours.float32.{which}.converged", rest=True),
@@ -230,21 +174,12 @@ def _map_columns(which: str) -> list[lab.Column]:
     ]
 
 
-_OUTCOMES = ("passed", "blocked", "outside", "unsolved", "missed")
-_UNIFORM_COLUMNS = [
-    lab.Column("lens", "lens"),
-    *(_share("no ray" if k == "unsolved" else k, f"uniform.{k}") for k in _OUTCOMES),
-    *_published_columns("uniform.published_missed", "uniform.published_away"),
-]
-
-
 def page(records: Sequence[Row]) -> str:
     """The tables in Markdown."""
     done = [r for r in records if "ours" in r]
     parts = [_INTRODUCTION.format(steps=STEPS, tolerance=TOLERANCE)]
     for which, title in _MAPS.items():
         parts += [f"## {title}", lab.table(_map_columns(which), done)]
-    parts += ["## Stop points uniform over the stop", _UNIFORM, lab.table(_UNIFORM_COLUMNS, done)]
     refused = [f"- {r['lens']}: {r['refused']}" for r in records if "refused" in r]
     return lab.page(*parts, *(["Not measured:", "\n".join(refused)] if refused else []))
 

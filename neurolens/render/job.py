@@ -256,9 +256,9 @@ class Job:
             parts.append(LensRays(origin, self._axes @ rays.direction, weight, places))
         if len(parts) == 1:
             return parts[0]
-        return LensRays(
-            *(None if some[0] is None else np.concatenate(some, axis=-1) for some in zip(*parts, strict=True))
-        )
+        each = zip(*parts, strict=True)
+        joined: list[Any] = [None if some[0] is None else np.concatenate(some, axis=-1) for some in each]
+        return LensRays(*joined)
 
     def _camera_wavelengths(self, hue: FloatArray, lanes: int) -> FloatArray:
         """Wavelengths [lanes, N] for the camera, clipped to its range if it does not disperse."""

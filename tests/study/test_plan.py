@@ -248,7 +248,6 @@ def fitted_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Probe, "maps", property(lambda probed: probed.camera_maps))
         patch.setattr(pupil_fit, "_RAYS", 3000)
-        patch.setattr(pupil_fit, "_FIRST", 15_000)
         patch.setattr(focusing, "_RINGS", 96)
         patch.setattr(tried, "lens_of", lambda file, zoom, report: shader_of(file.name, zoom))
         yield
