@@ -18,7 +18,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.ideal import Pinhole
-from neurolens.cameras.warped import Warped
+from neurolens.cameras.reduced import Warped
 from neurolens.cli import main
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
