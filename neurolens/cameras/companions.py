@@ -24,6 +24,8 @@ from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import RAY
 
 Array = NDArray[np.float64]
+Degrees = tuple[int, int, int]
+Pair = tuple[float, float]
 
 # Degrees in film and pupil point of the terms without a wavelength, linear in the wavelengths, and quadratic; the
 # higher ones serve where the lower do not keep film points within `_WORST_MM`.
@@ -89,11 +91,11 @@ def fit_shift(
     surely, inside = float(np.quantile(margin, _SURELY)), margin[found.kept]
     lost = on_film & ~found.passed[found.kept] & (inside > surely)
     away = ((waves[1] - waves[0]) * np.where((rays[:2] * rays[2:4]).sum(axis=0) <= 0, -1, 1))[lost]
-    slopes = (_BEYOND * float(np.max(inside[lost] / way, initial=0, where=way > 0)) for way in (away, -away))
-    return Shift(*graphs, (x, y), (surely, *slopes))
+    near, far = (_BEYOND * float(np.max(inside[lost] / way, initial=0, where=way > 0)) for way in (away, -away))
+    return Shift(*graphs, (x, y), (surely, near, far))
 
 
-def _terms(columns: Array, values: Array, degrees: tuple[int, ...]) -> tuple[Array, Array, float]:
+def _terms(columns: Array, values: Array, degrees: Degrees) -> tuple[Array, Array, float]:
     """Fit the values [5, N] of `_Solved` by variables [6, N]: weights [5, M] of the monomials, coefficients of the
     light by wavelength, and the RMS error of the film point on the half of the rays that were not fitted."""
     exponents, parity = _monomials(degrees)
@@ -114,12 +116,7 @@ def _terms(columns: Array, values: Array, degrees: tuple[int, ...]) -> tuple[Arr
 
 
 def _shift_graphs(
-    degrees: tuple[int, ...],
-    weights: Array,
-    tint: Array,
-    scale: Array,
-    waves: tuple[float, float],
-    *limits_mm: tuple[float, float],
+    degrees: Degrees, weights: Array, tint: Array, scale: Array, waves: Pair, *limits_mm: Pair
 ) -> tuple[Graph, Graph]:
     """The graphs of `Shift`, for what `_terms` finds in variables so scaled, the reach and the film."""
     exponents, of_hero, g = _monomials(degrees)[0], Graph(), Graph()
@@ -205,7 +202,7 @@ def shifted(g: Graph, shift: Shift) -> Value:
 
 
 @cache
-def _monomials(degrees: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _monomials(degrees: Degrees) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Exponents [M, 6] of film x, y, pupil x, y, hero and companion; and [M] 0 where odd in x alone, 1 where odd in y
     alone, as shifts are, 2 where odd in neither, as light is.
 
