@@ -1,6 +1,4 @@
-"""A lens in one state as a shader uses it, over ranges of film position, wavelength and stop; the image of its stop.
-
-The image of a lens's stop in its exit pupil: pupil points as sparse polynomials of film point and stop point.
+"""A lens in one state as a shader uses it, and the image of its stop: pupil points by film point and stop point.
 
 Seen from a film point, a pupil may have many shapes. In coordinates of the stop it is nearly a disc, which the rims cut
 by other discs. Discs are easy to sample, and this map takes the samples to the pupil.
