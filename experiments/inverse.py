@@ -1,4 +1,4 @@
-"""Fit a model and its inverse maps to every lens file, and count the rays that three Newton steps do not find.
+"""Fit a model to every lens file, and count the rays that three Newton steps do not find.
 
 Beside it Newton's method as published (Hanika and Dachsbacher 2014; Schrade et al. 2016): from the first-order map,
 undamped, a fixed number of steps, with the Jacobian of the polynomial. Both work on the same model, so that only the
@@ -9,28 +9,40 @@ from __future__ import annotations
 
 import argparse
 import math
+import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 from experiments import lab
 from experiments.lab import Report, Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, Value
 from neurolens.graph.newton import solve, with_jacobian
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
+from neurolens.surrogates.cores import Array, Field
+from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_system, stop_system
-from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+from neurolens.surrogates.inverse import (
+    STEPS,
+    TOLERANCE,
+    InverseModel,
+    convergence,
+    front_index,
+    inverse_of,
+    scene_system,
+    stop_system,
+)
 from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.terms import pinned_threads
@@ -43,6 +55,9 @@ AWAY = 1.0
 _STARTS = 7
 
 
+Given = dict[str, NDArray[np.float64]]
+
+
 def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) -> Row:
     """One record: lens, focus_m, and the shares of rays that each iteration finds.
 
@@ -52,25 +67,25 @@ def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) 
     Raises:
         InputError: a lens that cannot be fitted.
     """
-    with pinned_threads(), warnings.catch_warnings(), torch.no_grad():
+    with pinned_threads(), warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)
         lens = LensChoice(file).read()
         domain = _domain(lens)
         known = prepare(make_pairs(lens, domain, PairSettings(train=15000, held_out=rays, rim=15000)))
         model = fit_model(known, ModelSettings("ols", terms=terms))
-        inverse = fit_inverse(model, known.pairs)
+        start = time.perf_counter()
+        inverse = inverse_of(model)
+        seconds = time.perf_counter() - start
         held_out = known.pairs.held_out.inputs
-        few = held_out.select(slice(0, rays // 10))
+        every = held_out.rows.numpy(), held_out.film_z.numpy()
+        few = every[0][:, : rays // 10], every[1][: rays // 10]
         return {
             "lens": file.stem,
             "focus_m": ["inf" if math.isinf(f) else f for f in domain.focus_m],
-            "fit": inverse.report,
-            "ours": {
-                dtype: convergence(inverse, FilmRays(*(c.to(getattr(torch, dtype)) for c in held_out.columns())))
-                for dtype in ("float64", "float32")
-            },
-            "two_steps": convergence(inverse, few, steps=2),
-            "published": _published(inverse, few),
+            "fit": {"seconds": seconds},
+            "ours": {t: convergence(inverse, *(c.astype(t) for c in every)) for t in ("float64", "float32")},
+            "two_steps": convergence(inverse, *few, steps=2),
+            "published": _published(inverse, *few),
             "uniform": _uniform(inverse, uniform),
             "rays": rays,
         }
@@ -84,50 +99,44 @@ def _domain(lens: Lens) -> Domain:
         return domain_of(lens)
 
 
-def _published(inverse: InverseModel, rays: FilmRays) -> dict[str, Any]:
+def _published(inverse: InverseModel, rays: Array, film_z: Array) -> dict[str, Any]:
     """For both maps: shares of the model's passing rays not found after each count of steps, and run away."""
     model = inverse.model
-    forward = model.predict(rays)
-    passed = forward.status == st.PASSED
-    rays = rays.select(passed)
-    x, y = forward.stop_x[passed], forward.stop_y[passed]
-    scene_rays = (c[passed].numpy() for c in forward.rays)
-    wavelength = rays.wavelength_nm.numpy()
-    known, _ = front_rays(model.front, *scene_rays, index=front_index(model), wavelength_nm=wavelength)
-    position, v = torch.from_numpy(known).split(2)
-    wanted = torch.cat([position / model.scales.position_mm, v])
-    scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays.wavelength_nm[None]})
-    return {"stop": _plain(stop_system(model), _stop_inputs(model, rays, x, y)), "scene": scene}
+    radius = np.full((1, 1), model.domain.stop_radius_mm)
+    forward = evaluate(model.graph, {"rays": rays, "film_z_mm": film_z[None], "stop_radius_mm": radius})
+    passed = forward["status"][0] == st.PASSED
+    rays, film_z, scene_ray = rays[:, passed], film_z[passed], forward["scene_ray"][:, passed]
+    known, _ = front_rays(model.front, *scene_ray, index=front_index(model), wavelength_nm=rays[4])
+    wanted = np.concatenate([known[:2] / model.scales.position_mm, known[2:]])
+    scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays[4:]})
+    stop = _stop_inputs(model, rays, film_z, forward["stop_xy_mm"][:, passed])
+    return {"stop": _plain(stop_system(model), stop), "scene": scene}
 
 
-def _stop_inputs(model: LensModel, rays: FilmRays, x: Tensor, y: Tensor) -> dict[str, Tensor]:
-    return {
-        "film": torch.stack([rays.film_x, rays.film_y]),
-        "wanted": torch.stack([x, y]) / model.scales.stop_mm,
-        "wavelength_nm": rays.wavelength_nm[None],
-        "film_z_mm": rays.film_z[None],
-    }
+def _stop_inputs(model: LensModel, rays: Array, film_z: Array, stop: Array) -> Given:
+    wanted = stop / model.scales.stop_mm
+    return {"film": rays[:2], "wanted": wanted, "wavelength_nm": rays[4:], "film_z_mm": film_z[None]}
 
 
-def _plain(system: Graph, given: dict[str, Tensor]) -> dict[str, Any]:
+def _plain(system: Graph, given: Given) -> dict[str, Any]:
     """Newton's method without limits; the system's inputs but the unknowns are given."""
     both, step = with_jacobian(system), Graph()
     unknowns = both.outputs["residual"].rows
     residual, *columns = (step.input(name, value.rows) for name, value in both.outputs.items())
     step.outputs["step"] = solve(columns, residual)
-    x = torch.zeros((unknowns, given["wavelength_nm"].shape[1]), dtype=torch.float64)
     # The first-order map's own solution is the start: linear, it takes one step from the axis.
     axis = {name: 0 * value if name in ("film", "wanted") else value for name, value in given.items()}
+    x = np.zeros((unknowns, given["wavelength_nm"].shape[1]))
     jacobian = evaluate(both, {"unknown": x, **axis})
-    residual_there = evaluate(system, {"unknown": x, **given})
-    x = x - evaluate(step, jacobian | residual_there)["step"]
+    x = x - evaluate(step, jacobian | evaluate(system, {"unknown": x, **given}))["step"]
     found: dict[str, Any] = {"missed": {}, "away": {}}
-    for count in range(1, max(PUBLISHED_STEPS) + 1):
-        x = x - evaluate(step, evaluate(both, {"unknown": x, **given}))["step"]
-        if count in PUBLISHED_STEPS:
-            size = evaluate(system, {"unknown": x, **given})["residual"].norm(dim=0)
-            found["missed"][str(count)] = float((~(size < TOLERANCE)).double().mean())  # NaN is missed
-            found["away"][str(count)] = float((~(size < AWAY)).double().mean())
+    with np.errstate(all="ignore"):
+        for count in range(1, max(PUBLISHED_STEPS) + 1):
+            x = x - evaluate(step, evaluate(both, {"unknown": x, **given}))["step"]
+            if count in PUBLISHED_STEPS:
+                size = np.linalg.norm(evaluate(system, {"unknown": x, **given})["residual"], axis=0)
+                found["missed"][str(count)] = float((~(size < TOLERANCE)).mean())  # NaN is missed
+                found["away"][str(count)] = float((~(size < AWAY)).mean())
     return found
 
 
@@ -139,38 +148,42 @@ def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
     number of steps.
     """
     domain = inverse.model.domain
-    rays = sample_domain(domain, count, seed=31)
-    scale = 0.9999 * domain.stop_radius_mm / domain.pupil_radius_mm
-    x, y = rays.pupil_x * scale, rays.pupil_y * scale
-    out = inverse.through_stop(rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
-    status = out.prediction.status
+    sample = sample_domain(domain, count, seed=31)
+    rays, film_z = sample.rows.numpy(), sample.film_z.numpy()
+    stop = rays[2:4] * 0.9999 * domain.stop_radius_mm / domain.pupil_radius_mm
+    status = inverse.through_stop(rays[:2], stop, rays[4], film_z).status
     unsolved = status == st.NO_SOLUTION
-    part = rays.select(~unsolved)
-    there = x[~unsolved], y[~unsolved]
-    plain = _plain(stop_system(inverse.model), _stop_inputs(inverse.model, part, *there))
-    some = unsolved.nonzero()[:500, 0]
-    lost = _reachable(inverse, rays.select(some), x[some], y[some])
-    share = float(lost.double().mean()) * float(unsolved.double().mean()) if len(some) else 0.0
+    part = rays[:, ~unsolved], film_z[~unsolved], stop[:, ~unsolved]
+    plain = _plain(stop_system(inverse.model), _stop_inputs(inverse.model, *part))
+    some = np.flatnonzero(unsolved)[:500]
+    lost = _reachable(inverse, rays[:, some], film_z[some], stop[:, some])
     return {
-        "passed": float((status == st.PASSED).double().mean()),
-        "blocked": float((status >= 4).double().mean()),
-        "outside": float((status == st.OUTSIDE_DOMAIN).double().mean()),
-        "unsolved": float(unsolved.double().mean()),
-        "missed": share,
+        "passed": float((status == st.PASSED).mean()),
+        "blocked": float((status >= 4).mean()),
+        "outside": float((status == st.OUTSIDE_DOMAIN).mean()),
+        "unsolved": float(unsolved.mean()),
+        "missed": float(lost.mean() * unsolved.mean()) if len(some) else 0.0,
         "published_missed": plain["missed"],
         "published_away": plain["away"],
     }
 
 
-def _reachable(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor) -> Tensor:
-    """[N] bool: whether a passing ray goes from each film point through each stop point, from many starts."""
-    asked = (rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
-    side = torch.linspace(-0.9, 0.9, _STARTS, dtype=torch.float64)
-    found = torch.zeros(len(rays), dtype=torch.bool)
-    for a in side:
-        for b in side:
-            start = torch.stack([a.expand(len(rays)), b.expand(len(rays))])
-            found |= inverse.through_stop(*asked, steps=15, start=start).prediction.status == st.PASSED
+@dataclass(frozen=True)
+class _OnePoint:
+    """A start that is the same pupil point for all rays."""
+
+    u: tuple[float, float]
+
+    def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
+        return [light.u * 0.0 + g.constant(np.array(self.u))]
+
+
+def _reachable(inverse: InverseModel, rays: Array, film_z: Array, stop: Array) -> NDArray[np.bool_]:
+    """[N] whether a passing ray goes from each film point through each stop point, from many starts."""
+    side, found = np.linspace(-0.9, 0.9, _STARTS), np.zeros(len(film_z), bool)
+    for a, b in product(side, side) if len(film_z) else ():
+        one = replace(inverse, stop=_OnePoint((float(a), float(b))))
+        found |= one.through_stop(rays[:2], stop, rays[4], film_z, steps=15).status == st.PASSED
     return found
 
 

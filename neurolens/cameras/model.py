@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.cameragraph import LensGraph, status_graph
 from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
-from neurolens.cameras.onnxlens import InverseRays, LensRays, OnnxInverse, OnnxLens, load_inverse, load_model
+from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, PupilTable, outline_of
 from neurolens.cameras.sampling import (
@@ -32,6 +33,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.card import DOMAIN_SLACK, state_for
+from neurolens.surrogates.inverse import InverseModel, InverseRays, inverse_of
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
@@ -73,7 +75,6 @@ class OnnxCamera(LensCamera):
         card = model.card
         lens, domain = card["lens"], card["domain"]
         self.model, self.path = model, model.path
-        self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = shot.film_mm
         low, high = (float(v) for v in domain["wavelength_nm"])
@@ -126,12 +127,12 @@ class OnnxCamera(LensCamera):
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m through points of the front surface chosen by `pupil`.
 
-        By the inverse map of scene rays, NAME.scene.onnx beside the model; what it does not find is NO_SOLUTION.
+        By the model's inverse map of scene rays; what it does not find is NO_SOLUTION.
 
         Raises:
-            InputError: no such file, or a model of many states, whose inverse is not exported.
+            InputError: as `inverse_of`.
         """
-        inverse, front = self._inverse_map()
+        inverse, front = self._inverse
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
         aim = front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [scene.film_z_mm]], pupil)
@@ -143,17 +144,11 @@ class OnnxCamera(LensCamera):
             weight = np.maximum(out.transmittance, 0) * aim.area / (self.film.exposure * squared)
         return arrived(out.rays[:2].astype(np.float64), origin, point_m, weight, status, wavelength_nm)
 
-    def _inverse_map(self) -> tuple[OnnxInverse, FrontAim]:
-        """The inverse map and where to aim at, found once."""
-        if self._inverse is None:
-            if self.model.axes:
-                raise InputError(self.model.path, "inverse", "(a model of many states)", "a model of one state")
-            try:
-                inverse = load_inverse(self.model.path, self.model.card["lens"]["sha256"])
-            except ModelError as error:
-                raise InputError(self.model.path, "inverse", f"({error})", "a model exported with --inverse") from error
-            self._inverse = inverse, front_aim(self.film, self.film_mm, self._light_nm, inverse.front)
-        return self._inverse
+    @cached_property
+    def _inverse(self) -> tuple[InverseModel, FrontAim]:
+        """The inverse maps, and where on the front surface to aim."""
+        model = self.model.fitted
+        return inverse_of(model), front_aim(self.film, self.film_mm, self._light_nm, model.front)
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,9 @@ from neurolens.shaders.source import Array, Focusing, film_extras, followed, sta
 from neurolens.study.measure import FRESH, fresh_rays, measure_on
 from neurolens.surrogates.axes import Axis, mixture_of, weights
 from neurolens.surrogates.export import export_inverse, export_onnx
-from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+from neurolens.surrogates.inverse import inverse_of
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
+from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.source import DOUBLE, Fix, Written, checked_name, fixed_models, lines_of, write_program
 from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
@@ -44,8 +44,8 @@ from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths
 _DISTANCES = 12  # about as many are placed for each lens
 _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
-# Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
-_HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
+# Rays for the errors of an ONNX file with fixed inputs.
+_HELD_OUT, _VIGNETTING = 20_000, 100_000
 
 
 def write_lens(
@@ -192,7 +192,8 @@ def write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, A
     if card is not None:
         export_onnx(model, out, card["errors"], derivatives=derivatives)
         return
-    seed, held_out = _seed(model), _pairs(model, train=1).held_out
+    seed = int(model.settings.get("rays_seed") or 0) + FRESH
+    held_out = make_pairs(model.lens, model.domain, PairSettings(1, _HELD_OUT, 1, seed)).held_out
     with atomic_path(out) as measured:  # a file without its errors never has the final name
         export_onnx(model, measured, {})
         rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
@@ -201,19 +202,5 @@ def write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, A
 
 
 def write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
-    """Write both inverse maps beside the model's file; returns their files and the share of fresh rays that each
-    finds."""
-    pairs = _pairs(model, train=_TRAIN)
-    inverse = fit_inverse(model, pairs)
-    converged = convergence(inverse, pairs.held_out.inputs)
-    files = export_inverse(inverse, out, load_model(out).card["errors"])
-    return {"inverse": {n: {"file": str(f), **converged[n]} for n, f in zip(("stop", "scene"), files, strict=True)}}
-
-
-def _seed(model: LensModel) -> int:
-    return int(model.settings.get("rays_seed") or 0) + FRESH
-
-
-def _pairs(model: LensModel, train: int) -> RayPairs:
-    settings = PairSettings(train=train, held_out=_HELD_OUT, rim=train, seed=_seed(model))
-    return make_pairs(model.lens, model.domain, settings)
+    """Write both inverse maps beside the model's file; returns their files and the share of rays that each finds."""
+    return {"inverse": export_inverse(inverse_of(model), out, load_model(out).card["errors"])}
