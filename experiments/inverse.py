@@ -31,7 +31,6 @@ from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
 from neurolens.surrogates.cores import Array, Field
-from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.inverse import (
     STEPS,
@@ -44,7 +43,7 @@ from neurolens.surrogates.inverse import (
     stop_system,
 )
 from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs, sample_domain
 from neurolens.surrogates.terms import pinned_threads
 from neurolens.trace.surfaces import front_rays
 

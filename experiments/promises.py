@@ -34,10 +34,9 @@ from neurolens.study.speed import (
     program_candidate,
     race,
 )
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
 from neurolens.surrogates.source import fused_program
 
 COMPILED = "exact compiled"

@@ -70,10 +70,7 @@ SLOW |= {"neurolens.cli.export_lens", "neurolens.cli.flare_run", "neurolens.cli.
 LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "defocus", "cli")
 LEAN_MODULES = {
     *(f"neurolens.trace.{name}" for name in ("arithmetic", "shapes", "surfaces")),
-    *(
-        f"neurolens.surrogates.{name}"
-        for name in ("assemble", "axes", "card", "cores", "file", "inverse", "lightfield")
-    ),
+    *(f"neurolens.surrogates.{name}" for name in ("assemble", "axes", "card", "cores", "file", "inverse")),
     *(f"neurolens.surrogates.{name}" for name in ("model", "source")),
 }
 

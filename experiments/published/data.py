@@ -14,11 +14,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.surrogates.cores import DIRECTION, POSITION, Array, Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.gates import gate_reach
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Gate
+from neurolens.surrogates.model import Encoding, Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.targets import ModelSettings, Prepared, scales_of
+from neurolens.surrogates.targets import ModelSettings, Prepared, gate_reach, scales_of
 from neurolens.surrogates.terms import Exponents, monomials, raw_exponents, raw_variables, united
 
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.

@@ -121,7 +121,7 @@ examples:
                 check_suffix(path, option, _LAYOUT_SUFFIXES)
         from neurolens.readers.any_format import read_any
         from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
-        from neurolens.surrogates.domain import domain_of
+        from neurolens.surrogates.pairs import domain_of
 
         began = time.perf_counter()
         with warned(file) as notes:

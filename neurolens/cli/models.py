@@ -16,7 +16,7 @@ from neurolens.base.records import program, reaches, time_of
 from neurolens.base.settings import setting
 from neurolens.cli.arguments import Answering, within
 from neurolens.cli.output import number, table
-from neurolens.study.advice import CLOSE_UM, Advice, advice, expected_exact, to_use
+from neurolens.study.pages import CLOSE_UM, Advice, advice, expected_exact, to_use
 
 
 @dataclass(frozen=True, kw_only=True)

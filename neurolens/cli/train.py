@@ -29,7 +29,7 @@ from neurolens.cli.arguments import (
     within,
 )  # fmt: skip
 from neurolens.cli.output import number, table
-from neurolens.study.advice import advice, ns_text
+from neurolens.study.pages import advice, ns_text
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,8 +37,8 @@ from neurolens.shaders.blender_shader import IDLE, lens_of
 from neurolens.study.experiment import DomainChoice
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.fits.polynomial import fit_planes
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.polynomial import fit_planes
 from neurolens.surrogates.targets import ModelSettings, Prepared
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]

@@ -39,9 +39,9 @@ from neurolens.plan.costs import ALONE, UNIT, Work, noise, ns_a_ray, small, stri
 from neurolens.plan.probe import LIGHT, Effect, Probe, SceneNeeds, effects_of, probe
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
-from neurolens.study.advice import SAVING, recommended
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
-from neurolens.study.image import Image, flip_map
+from neurolens.study.pages import SAVING, recommended
+from neurolens.study.scenes import Image, flip_map
 
 _SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
 _ACROSS, _SAMPLES = 240, 16  # of pictures

@@ -116,7 +116,7 @@ def _smallest(model: OnnxLens) -> Graph | None:
     """The graph of a model without the rims that block next to nothing, which need torch to be known; None without."""
     if model.axes or find_spec("torch") is None:
         return None
-    from neurolens.surrogates.pairs import without_idle_gates
+    from neurolens.surrogates.targets import without_idle_gates
 
     (smallest,) = without_idle_gates((model.fitted,), IDLE)
     return model_graph(smallest, SCALARS)

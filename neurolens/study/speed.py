@@ -38,9 +38,9 @@ from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays
 from neurolens.study.rays import frame_width_mm
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import FilmRays, sample_domain
 from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.terms import pinned_threads
 from neurolens.trace.rays import Traced, compile_tracing, trace

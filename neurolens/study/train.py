@@ -20,11 +20,9 @@ from neurolens.base.records import Results, reaches, target_record, versions, wr
 from neurolens.cameras.model import load_model
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.study.advice import CLOSE_UM, exact_of, to_use
 from neurolens.study.check import card_errors, errors_at, random_states
 from neurolens.study.describe import layout_profile
 from neurolens.study.experiment import Experiment, keep_inputs
-from neurolens.study.image import SETTINGS
 from neurolens.study.measure import (
     FRESH,
     MORE,
@@ -36,10 +34,10 @@ from neurolens.study.measure import (
     shared_rays,
     what_is_poor,
 )
-from neurolens.study.pages import write_report
+from neurolens.study.pages import CLOSE_UM, exact_of, to_use, write_report
 from neurolens.study.plots import illumination_plot, states_plot, trade_plot
 from neurolens.study.rays import Illumination, pixel_um, relative_illumination
-from neurolens.study.scenes import Pictures, domain_facts, render_all
+from neurolens.study.scenes import SETTINGS, Pictures, domain_facts, render_all
 from neurolens.study.speed import (
     EXACT,
     Race,
@@ -53,7 +51,7 @@ from neurolens.study.speed import (
 )
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
-from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
+from neurolens.surrogates.pairs import RayPairs, make_pairs
 from neurolens.surrogates.states import StateSettings, StateSpace, fit_states
 from neurolens.surrogates.terms import pinned_threads
 
@@ -110,8 +108,6 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
     settings = keep_inputs(experiment, folder)
     with progress.stage("trace ray pairs") as report:
         pairs = make_pairs(lens, domain, experiment.pairs, report)
-        if experiment.save_pairs:
-            save_pairs(pairs, folder / "pairs.npz")
         prepared = prepare(pairs)
     count, target = experiment.evaluation.vignetting_rays, experiment.target
     within_um = target.within_um(domain.film_radius_mm) if target else None

@@ -27,7 +27,6 @@ from neurolens.setting.focusing import at_infinity
 from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.axes import STATE
 from neurolens.surrogates.card import CARD_KEY, CARD_KIND, CARD_SCHEMA, MODEL_KEY, POLARISED, card_to_json
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import as_stored, coefficients_text, onnx_of
 from neurolens.surrogates.inverse import (
     STEPS,
@@ -40,6 +39,7 @@ from neurolens.surrogates.inverse import (
     stop_graph,
 )  # fmt: skip
 from neurolens.surrogates.model import Domain, LensModel, Prediction
+from neurolens.surrogates.pairs import FilmRays, sample_domain
 
 if TYPE_CHECKING:
     from neurolens.surrogates.states import StateModel

@@ -40,8 +40,7 @@ from neurolens.surrogates.card import (
     read_metadata,
 )  # fmt: skip
 from neurolens.surrogates.cores import CORES, Core
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Domain, Gate, LensModel, Scales, mixed, with_one_angle
+from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 
 SCHEMA = 2
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB

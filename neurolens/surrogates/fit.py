@@ -11,23 +11,25 @@ from pathlib import Path
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.surrogates.cores import Core, Refracted, Residual
-from neurolens.surrogates.domain import FilmRays, draw_everywhere
-from neurolens.surrogates.fits.network import fit_network, training_s, with_boundary_terms
-from neurolens.surrogates.fits.polynomial import fit_mirror, fit_paraxial, fit_planes, fit_polynomial
-from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs, with_angle, without_idle_gates
+from neurolens.surrogates.network import fit_network, training_s, with_boundary_terms
+from neurolens.surrogates.pairs import FilmRays, RayPairs, draw_everywhere, join_pairs, trace_pairs
+from neurolens.surrogates.polynomial import fit_mirror, fit_paraxial, fit_planes, fit_polynomial
 from neurolens.surrogates.targets import (
     NETWORKS,
     PLANES_SEARCHED,
     POLYNOMIALS,
     ModelSettings,
     Prepared,
+    choose_gates,
+    explained,
     fit_encoding,
     grazes,
     index_series,
     inside_front,
     scales_of,
+    with_angle,
+    without_idle_gates,
 )  # fmt: skip
 from neurolens.surrogates.terms import pinned_threads
 from neurolens.trace.rays import CHUNK

@@ -38,9 +38,19 @@ from neurolens.surrogates.assemble import (
     wavelength_row,
     within_domain,
 )  # fmt: skip
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Array, CoreValues, Field, Refracted, Units
-from neurolens.surrogates.lightfield import MIRROR, ROUND, Encoding
-from neurolens.surrogates.model import Domain, LensModel
+from neurolens.surrogates.cores import (
+    DIRECTION,
+    MIRROR,
+    POSITION,
+    ROUND,
+    STOP,
+    Array,
+    CoreValues,
+    Field,
+    Refracted,
+    Units,
+)
+from neurolens.surrogates.model import Domain, Encoding, LensModel
 from neurolens.trace.surfaces import front_rays
 
 STEPS = 3

@@ -107,7 +107,7 @@ def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
     Raises:
         InputError: a wavelength, film position or stop outside the model's domain; too many wavelengths, or one twice.
     """
-    from neurolens.surrogates.pairs import with_angle, without_idle_gates  # rays are traced, which needs torch
+    from neurolens.surrogates.targets import with_angle, without_idle_gates  # rays are traced, which needs torch
 
     wanted = fix.wavelengths_nm
     if len(wanted) > _MOST_WAVELENGTHS or len(set(wanted)) < len(wanted):
@@ -132,7 +132,7 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
     Raises:
         InputError: a wavelength outside the model's domain, or a model without a wavelength input.
     """
-    from neurolens.surrogates.pairs import with_angle
+    from neurolens.surrogates.targets import with_angle
 
     low, high = model.domain.wavelength_nm
     if model.encoding.w_half == 0:

@@ -28,14 +28,12 @@ from neurolens.setting.focusing import film_range_mm, infinity_states, nearest_f
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.axes import Array, Axis, product, weights
+from neurolens.surrogates.boundaries import invariant_core
 from neurolens.surrogates.cores import STOP
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import prepare
-from neurolens.surrogates.fits.boundaries import invariant_core
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Domain, LensModel, Scales, mixed
-from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs, with_angle
-from neurolens.surrogates.targets import Prepared, film_equivalent, fit_encoding, scales_of
+from neurolens.surrogates.model import Domain, Encoding, LensModel, Scales, mixed
+from neurolens.surrogates.pairs import PairSettings, RayPairs, domain_of, make_pairs
+from neurolens.surrogates.targets import Prepared, film_equivalent, fit_encoding, scales_of, with_angle
 from neurolens.surrogates.terms import (
     Exponents,
     Sweep,

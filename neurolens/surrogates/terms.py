@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.graph.interpret import monomials as monomials
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.cores import LightField
 
 Exponents = NDArray[np.int64]
 Floats = NDArray[np.float64]

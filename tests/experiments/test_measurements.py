@@ -18,7 +18,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.pairs import sample_domain
 from neurolens.trace.tracegraph import exact_graph
 
 

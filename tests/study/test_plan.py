@@ -47,8 +47,8 @@ from neurolens.shaders import pupil_fit
 from neurolens.shaders.blender_shader import lens_of
 from neurolens.shaders.osl import OslLens, osl_program
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.file import read_model
+from neurolens.surrogates.pairs import domain_of
 
 LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
 GAUSS = "lenses/laikin_double_gauss_50.toml"

@@ -10,7 +10,7 @@ import pytest
 
 from neurolens.analysis.layout import Layout, Line, Section
 from neurolens.base.errors import InputError
-from neurolens.study import plots
+from neurolens.study import plots, scenes
 from neurolens.study.rays import Illumination
 
 
@@ -47,7 +47,7 @@ def test_bad_images_are_refused(tmp_path: Path) -> None:
         ("name of an image", {"a": picture}, {"b": np.ones((4, 6))}),
     ):
         with pytest.raises(InputError, match=words):
-            plots.side_by_side(images, maps, path)
+            scenes.side_by_side(images, maps, path)
     for bad in ({}, {"ols": Illumination([0.0, 10.0], [1.0, math.nan], [1.0, 0.8], 0.0)}):
         with pytest.raises(InputError, match="illumination"):
             plots.illumination_plot(bad, path)

@@ -13,8 +13,8 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.speed import Call, Candidate, Race, Unavailable, camera_candidate, exact_candidates, race
-from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import FilmRays, domain_of
 from neurolens.surrogates.terms import pinned_threads
 
 LENSES = Path(__file__).parents[2] / "lenses"

@@ -21,12 +21,11 @@ from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.model import load_model
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.loworder import with_film_derivatives
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.inverse import InverseModel, convergence, front_index, inverse_of, passing_rays
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSet, trace_pairs
+from neurolens.surrogates.pairs import FilmRays, PairSet, sample_domain, trace_pairs
 from neurolens.trace.shapes import sag_and_derivatives
 from neurolens.trace.surfaces import front_rays
 from neurolens.trace.tracegraph import exact_graph

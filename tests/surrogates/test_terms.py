@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sklearn import linear_model
 
 from neurolens.graph.interpret import monomials
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.cores import LightField
 from neurolens.surrogates.terms import (
     SPANNED,
     Sweep,
