@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
     from neurolens.plan import plan as plans
     from neurolens.plan.candidates import Choice
-    from neurolens.plan.plan import Offer, Trade
+    from neurolens.plan.plan import Trade
     from neurolens.render.scene import Scene
 
 
@@ -190,7 +190,6 @@ def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
 
 
 def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
-    from neurolens.plan.plan import offers
     from neurolens.plan.probe import STRAY
 
     request = result.asked
@@ -241,9 +240,10 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
         sentence = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, "
         sentence += f"{number(best.cost, 3)} {result.unit} a path times noise"
         if result.work.rest[best.disperses]:
-            (offer,) = offers(result.probed.scene, result.probed, [best], result.work)
-            sentence += f".\nThe picture takes {number(offer.seconds, 3)} s of one thread to the noise that the "
-            sentence += f"scene's samples have with the exact lens, the camera {number(offer.camera, 2)} s of that"
+            sentence += f".\nThe picture takes {number(best.seconds, 3)} s of one thread to the noise that the "
+            sentence += (
+                f"scene's samples have with the exact lens, the camera {number(best.camera_seconds, 2)} s of that"
+            )
         if len(result.alike) > 1:
             sentence += f".\nAny of these takes about as long: {', '.join(result.alike)}"
         if (times := result.work.noise[best.disperses]) > 1 and not request.denoised:
@@ -288,69 +288,65 @@ def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> 
 
 def answer_trade(command: Answering, result: Trade, folder: Path, title: str, names: Mapping[str, str]) -> int:
     """Draw, write, print; 1 where no camera keeps the budget."""
+    from neurolens.plan.plan import front
     from neurolens.plan.plots import plot_trade
     from neurolens.study.scenes import side_by_side
 
     folder.mkdir(parents=True, exist_ok=True)
-    plot_trade(result, folder / "trade.png", title)
-    chosen = result.chosen
-    pictures = {_marked(s.offer, chosen): s for s in result.shown if s.offer.choice.error_px > 0}
-    exact = "● exact" if chosen is not None and chosen.choice.error_px == 0 else "exact"
+    plot_trade(result.plan, folder / "trade.png", title)
+    chosen = result.plan.best
+    pictures = {_marked(s.choice, chosen): s for s in result.shown if s.choice.error_px > 0}
+    exact = "● exact" if chosen is not None and chosen.error_px == 0 else "exact"
     side_by_side(
         {exact: result.exact, **{k: s.rgb for k, s in pictures.items()}},
         {k: s.difference for k, s in pictures.items()}, folder / "pictures.png",
-        {k: f"{_time(result, s.offer)}, {number(s.offer.choice.error_px, 2)} px\nFLIP {number(s.flip, 2)}"
+        {k: f"{_time(result, s.choice)}, {number(s.choice.error_px, 2)} px\nFLIP {number(s.flip, 2)}"
          for k, s in pictures.items()},
     )  # fmt: skip
     atomic_write_text(folder / "trade.html", _page(result, folder, title))
-    flips = {s.offer.choice.name: s.flip for s in result.shown}
-    rows = [
-        {**asdict(o.choice), "seconds": o.seconds, "camera_seconds": o.camera, "flip": flips.get(o.choice.name)}
-        for o in result.offered
-    ]
-    data: dict[str, Any] = {**names, "unit": result.unit, "work": asdict(result.plan.work), "cameras": rows}
+    flips = {s.choice.name: s.flip for s in result.shown}
+    rows = [{**asdict(c), "flip": flips.get(c.name)} for c in result.plan.choices]
+    data: dict[str, Any] = {**names, "unit": result.plan.unit_s, "work": asdict(result.plan.work), "cameras": rows}
     data |= {"alike": result.plan.alike}
-    data |= {"front": [o.choice.name for o in result.front], "chosen": chosen and chosen.choice.name}
-    data |= {"half": result.half and result.half.choice.name}
+    data |= {"front": [c.name for c in front(result.plan.choices)], "chosen": chosen and chosen.name}
+    data |= {"half": result.half and result.half.name}
     write_json(folder / "trade.json", plain(data))
-    return command.answer(data, lambda: _text(result, folder), 0 if chosen else 1)
+    return command.answer(data, lambda: _trade_text(result, folder), 0 if chosen else 1)
 
 
-def _short(offer: Offer) -> str:
-    return offer.choice.name.rpartition(".")[2]
+def _short(choice: Choice) -> str:
+    return choice.name.rpartition(".")[2]
 
 
-def _marked(offer: Offer, chosen: Offer | None) -> str:
-    return "● " * (offer == chosen) + _short(offer)
+def _marked(choice: Choice, chosen: Choice | None) -> str:
+    return "● " * (choice == chosen) + _short(choice)
 
 
-def _seconds(offer: Offer) -> str:
-    return "~" * offer.choice.noisy + number(offer.seconds, 3)
-
-
-def _time(result: Trade, offer: Offer) -> str:
-    return f"{_seconds(offer)} {result.unit}"
+def _time(result: Trade, choice: Choice) -> str:
+    return f"{'~' * choice.noisy}{number(choice.seconds, 3)} {result.plan.unit_s}"
 
 
 def _sentences(result: Trade) -> list[str]:
     """The choice for the budget, and what half of its time buys."""
-    chosen, half = result.chosen, result.half
+    made, chosen, half = result.plan, result.plan.best, result.half
     if chosen is None:
-        return [f"No camera keeps {result.plan.budget_px:g} px."]
-    sentences = [f"For {result.plan.budget_px:g} px: {_short(chosen)}, with which the {result.what} takes "
-            f"{_time(result, chosen)}, {number(chosen.choice.error_px, 3)} px"]  # fmt: skip
-    if result.what != "camera":
-        sentences[0] += f"; the camera takes {number(chosen.camera, 2)} {result.unit} of that"
-    if len(result.plan.alike) > 1:
-        sentences.append(f"Any of these takes about as long: {', '.join(result.plan.alike)}")
+        return [f"No camera keeps {made.budget_px:g} px."]
+    sentences = [f"For {made.budget_px:g} px: {_short(chosen)}, with which the {made.what} takes "
+            f"{_time(result, chosen)}, {number(chosen.error_px, 3)} px"]  # fmt: skip
+    if made.what != "camera":
+        sentences[0] += f"; the camera takes {number(chosen.camera_seconds, 2)} {made.unit_s} of that"
+    if len(made.alike) > 1:
+        sentences.append(f"Any of these takes about as long: {', '.join(made.alike)}")
     if half is None:
-        least = result.front[0]
+        from neurolens.plan.plan import front
+
+        least = front(made.choices)[0]
         sentences.append(f"Half of that buys no camera: the least is {_time(result, least)}, {_short(least)}, "
-                    f"{number(least.choice.error_px, 3)} px")  # fmt: skip
+                    f"{number(least.error_px, 3)} px")  # fmt: skip
     else:
         sentences.append(f"Half of that buys {_short(half)}: {_time(result, half)}, "
-                    f"{number(half.choice.error_px, 3)} px")  # fmt: skip
-    if later := " and ".join(result.plan.asked.afterwards):
+                    f"{number(half.error_px, 3)} px")  # fmt: skip
+    if later := " and ".join(made.asked.afterwards):
         sentences.append(
             f"Pixels leave out {later}, which compositing adds; FLIP and the pictures, taken before it, do not"
         )
@@ -359,27 +355,29 @@ def _sentences(result: Trade) -> list[str]:
 
 def _cameras(result: Trade) -> pages.Table:
     """Every camera with its figures: a disc before the choice for the budget, a ring where no other betters it."""
-    flips = {s.offer.choice.name: s.flip for s in result.shown}
+    from neurolens.plan.plan import front
+
+    made, flips = result.plan, {s.choice.name: s.flip for s in result.shown}
     records = [
-        {**asdict(o.choice), "seconds": {"min": o.seconds, "median": o.seconds + o.more},
-         "camera": o.camera, "flip": flips.get(o.choice.name)} for o in result.offered
-    ]  # fmt: skip
-    of = f"of the {result.what}, one thread, to the exact lens's noise with the scene's samples; ~ noisy"
+        {**asdict(c), "seconds": {"min": c.seconds, "median": c.seconds + c.more}, "flip": flips.get(c.name)}
+        for c in made.choices
+    ]
+    of = f"of the {made.what}, one thread, to the exact lens's noise with the scene's samples; ~ noisy"
     columns = (
         pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
         pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
-        pages.Column(result.unit, "seconds.min", about=of),
-        pages.Column("in the camera", "camera", digits=2, about=f"{result.unit} of these"),
+        pages.Column(made.unit_s, "seconds.min", about=of),
+        pages.Column("in the camera", "camera_seconds", digits=2, about=f"{made.unit_s} of these"),
         pages.Column("noise", "noise", about="times the paths that equal error takes"),
         pages.Column("FLIP", "flip", digits=2, about="of the small pictures, from the exact lens's"),
     )
-    front = result.front
-    marks = ["● " if o == result.chosen else "○ " if o in front else "" for o in result.offered]
-    names = [f"{m}{_short(o)}" for m, o in zip(marks, result.offered, strict=True)]
+    best = front(made.choices)
+    marks = ["● " if c == made.best else "○ " if c in best else "" for c in made.choices]
+    names = [f"{m}{_short(c)}" for m, c in zip(marks, made.choices, strict=True)]
     return pages.table(names, records, columns)
 
 
-def _text(result: Trade, folder: Path) -> str:
+def _trade_text(result: Trade, folder: Path) -> str:
     names, records, columns = _cameras(result)
     rows = [(name, *(c.cell(r) for c in columns), r["how"]) for name, r in zip(names, records, strict=True)]
     shown = table(("camera", *(c.heading for c in columns), ""), rows)

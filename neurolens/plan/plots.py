@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neurolens.analysis.plots import INK, drawing, plain_log_ticks
-from neurolens.plan.candidates import Choice
-from neurolens.plan.plan import Plan, Trade
+from neurolens.plan.plan import Plan, front
 from neurolens.study.plots import CHOSEN, error_scale, family_colour, log_norm, noisy_lines, place_labels
 
 _COLUMNS = 4  # of maps
@@ -75,26 +74,25 @@ def _bars_and_trade(plan: Plan, figure: Any) -> None:
     bars.set_xscale("log")
     bars.set_xlim(left=least)
     bars.set_xlabel("worth (pixels), grey: left out")
-    timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
-    whole = [c.whole(plan.work, plan.asked.denoised) for c in timed]
-    _cameras(trade, plan, [(c, w, w + c.cost * (c.spread - 1)) for c, w in zip(timed, whole, strict=True)])
-    trade.set_xlabel(f"cost ({plan.unit} a path times noise), --for {plan.target}")
+    _cameras(trade, plan)
+    trade.set_xlabel(f"{plan.unit_s} of the {plan.what}, --for {plan.target}")
     if plan.budget_px > 0:
         bars.axvline(plan.budget_px, color=CHOSEN, lw=1.2)
     plain_log_ticks(bars.xaxis)
 
 
-def _cameras(axes: Any, plan: Plan, timed: Sequence[tuple[Choice, float, float]]) -> None:
+def _cameras(axes: Any, plan: Plan) -> None:
     """Errors of cameras over their least time, with their median: within the budget in colour, the chosen one with a
     ring. From a noisy time a line leads to the median of its repeats."""
-    points = [(x, max(c.error_px, 1e-4)) for c, x, _ in timed]
-    axes.scatter(*np.reshape(points, (-1, 2)).T, c=["#0072b2" if c.within else "#b8b8b8" for c, _, _ in timed], s=26)
+    timed = [c for c in plan.choices if 0 < c.seconds < float("inf") and c.error_px < float("inf")]
+    points = [(c.seconds, max(c.error_px, 1e-4)) for c in timed]
+    axes.scatter(*np.reshape(points, (-1, 2)).T, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
     ring = {"s": 150, "fc": "none", "ec": CHOSEN, "lw": 1.8}
-    for point in (p for p, (c, _, _) in zip(points, timed, strict=True) if c == plan.best):
+    for point in (p for p, c in zip(points, timed, strict=True) if c == plan.best):
         axes.scatter(*point, **ring)
-    noisy_lines(axes, [(y, x, m) for (x, y), (c, _, m) in zip(points, timed, strict=True) if c.noisy])
+    noisy_lines(axes, [(y, x, x + c.more) for (x, y), c in zip(points, timed, strict=True) if c.noisy])
     axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
-    place_labels(axes, points, [c.name.rpartition(".")[2] or c.name for c, _, _ in timed])  # a model without its lens
+    place_labels(axes, points, [c.name.rpartition(".")[2] or c.name for c in timed])  # a model without its lens
     if plan.budget_px > 0:
         axes.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
     if any(axes.get_legend_handles_labels()):
@@ -102,13 +100,13 @@ def _cameras(axes: Any, plan: Plan, timed: Sequence[tuple[Choice, float, float]]
     plain_log_ticks(axes.xaxis, axes.yaxis)
 
 
-def plot_trade(trade: Trade, path: Path, title: str) -> None:
+def plot_trade(plan: Plan, path: Path, title: str) -> None:
     """Error of every camera against its seconds, with the front of those that no other betters."""
-    plan, offered = trade.plan, [o for o in trade.offered if o.choice.error_px < float("inf")]
+    best = front(plan.choices)
     subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
     with drawing(path, 8.5, 5.0, title, subtitle) as figure:
         axes = figure.subplots()
-        at = [o.seconds for o in trade.front], [max(o.choice.error_px, 1e-4) for o in trade.front]
+        at = [c.seconds for c in best], [max(c.error_px, 1e-4) for c in best]
         axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
-        axes.set_xlabel(f"{trade.unit} of the {trade.what}, one thread, to equal noise")
-        _cameras(axes, plan, [(o.choice, o.seconds, o.seconds + o.more) for o in offered])
+        axes.set_xlabel(f"{plan.unit_s} of the {plan.what}, one thread, to equal noise")
+        _cameras(axes, plan)
