@@ -34,11 +34,11 @@ from neurolens.shaders.source import Array, Focusing, film_extras, followed, sta
 from neurolens.study.measure import FRESH, fresh_rays, measure_on
 from neurolens.surrogates.axes import Axis, mixture_of, weights
 from neurolens.surrogates.export import export_inverse, export_onnx
+from neurolens.surrogates.fit import gap_axis, zoom_axis
 from neurolens.surrogates.inverse import inverse_of
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.source import DOUBLE, Fix, Written, checked_name, fixed_models, lines_of, write_program
-from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths

@@ -159,8 +159,7 @@ the table), trade.png, trade.json and models/ with what was fitted."""
 
     def _plan(self, scene: Scene, lens: Lens, folder: Path, look: Mapping[str, Any]) -> int:
         """Plan, write and print."""
-        from neurolens.plan.plan import plan, plan_seen, plan_within
-        from neurolens.plan.plots import plot_effects
+        from neurolens.plan.plan import plan, plan_seen, plan_within, plot_effects
 
         with self.progress({"plan": 10}).stage("plan") as report:
             more = {**look, "zoom": self.zoom, "report": report}
@@ -288,8 +287,7 @@ def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> 
 
 def answer_trade(command: Answering, result: Trade, folder: Path, title: str, names: Mapping[str, str]) -> int:
     """Draw, write, print; 1 where no camera keeps the budget."""
-    from neurolens.plan.plan import front
-    from neurolens.plan.plots import plot_trade
+    from neurolens.plan.plan import front, plot_trade
     from neurolens.study.scenes import side_by_side
 
     folder.mkdir(parents=True, exist_ok=True)

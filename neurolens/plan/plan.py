@@ -9,7 +9,7 @@ alike, and the exact lens is taken where it is one of them.
 Seconds are of one thread and of the whole picture at the scene's own size, to the noise that the exact lens has with
 the scene's samples. What a path takes besides its camera, and how dispersion adds to noise, is measured by strips of
 the picture in our renderer; in other targets the camera alone counts, in Cycles under a white sky. There cameras count
-as alike up to `advice.SAVING`, for what else a path takes is not known.
+as alike up to `pages.SAVING`, for what else a path takes is not known.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 import bisect
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.analysis.plots import INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import split_kind
 from neurolens.base.progress import Report
@@ -41,6 +42,7 @@ from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
 from neurolens.study.pages import SAVING, recommended
+from neurolens.study.plots import CHOSEN, error_scale, family_colour, log_norm, noisy_lines, place_labels
 from neurolens.study.scenes import Image, flip_map
 
 _SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
@@ -365,3 +367,103 @@ def spread(choices: Sequence[Choice], chosen: Choice | None, most: int = _SHOWN)
     if at and not rows & set(at):
         rows = rows - {min(rows, key=lambda k: (abs(k - at[0]), k))} | set(at)
     return [choices[k] for k in sorted(rows)]
+
+
+_MAPS_A_ROW = 4
+# Light that an effect takes is dark, light that it adds is orange; none is white.
+_SIGNED = ("#10183a", "#4d6796", "#c9d1de", "#ffffff", "#f6cfae", "#e58a45", CHOSEN)
+_TITLES = {"px": "pixels (logarithmic)", "relative": "% of the light\n(dark: taken, orange: added)"}
+
+
+def plot_effects(plan: Plan, path: Path, title: str) -> None:
+    """Draw effects as bars with the budget, the error of every timed camera against its time, and maps of the effects
+    that a camera needs: those in pixels, then those of light, each with one scale."""
+    asked = plan.asked
+    shown = [e for e in plan.effects if e.needed and e.name in plan.probed.maps]
+    groups = {unit: [e.name for e in shown if e.unit == unit] for unit in _TITLES}
+    groups = {unit: names for unit, names in groups.items() if names}
+    heights = [4.2, *(1.6 * -(-len(names) // _MAPS_A_ROW) + 0.15 for names in groups.values())]
+    subtitle = f"f/{asked.f_number:.3g}, focus {asked.shot.focus_m:g} m; 95% of the picture keeps these figures"
+    with drawing(path, 9.5, sum(heights), title, subtitle) as figure:
+        if not groups:
+            _bars_and_trade(plan, figure)
+            return
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
+        _bars_and_trade(plan, above)
+        for part, (unit, names) in zip(below, groups.items(), strict=True):
+            _maps(part, {name: plan.probed.maps[name][1] for name in names}, unit, asked.shot.film_mm)
+
+
+def _maps(figure: Any, maps: Mapping[str, Any], unit: str, film_mm: tuple[float, float]) -> None:
+    """Maps of effects of one unit, upright, in one scale of colours with its bar."""
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    colours: Any = "magma"
+    if unit == "px":
+        low, high = error_scale(maps.values(), 98)
+        norm = log_norm(low, high)
+        maps = {name: np.maximum(value, low) for name, value in maps.items()}
+    else:
+        maps = {name: 100 * value for name, value in maps.items()}
+        high = error_scale([np.abs(value) for value in maps.values()], 98)[1]
+        norm, colours = Normalize(-high, high), LinearSegmentedColormap.from_list("signed", _SIGNED)
+    cells = figure.subplots(-(-len(maps) // _MAPS_A_ROW), _MAPS_A_ROW, squeeze=False)
+    for axes, (name, value) in zip(cells.ravel(), maps.items(), strict=False):
+        extent = (0, film_mm[0], 0, film_mm[1])
+        picture = axes.imshow(value, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+        axes.set_title(name, fontsize=8)
+        axes.set(xticks=[], yticks=[])
+    for axes in cells.ravel()[len(maps) :]:
+        axes.set_axis_off()
+    bar = figure.colorbar(picture, ax=cells, extend="both", aspect=12 * len(cells), pad=0.015)
+    bar.ax.tick_params(labelsize=6.5)
+    bar.set_label(_TITLES[unit], fontsize=7)
+    if unit == "px":
+        plain_log_ticks(bar.ax.yaxis)
+
+
+def _bars_and_trade(plan: Plan, figure: Any) -> None:
+    wide = [e for e in plan.effects if e.unit == "px"][::-1]
+    bars, trade = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
+    least = max(min((e.worth for e in wide if e.worth > 0), default=1e-3) / 3, 1e-4)
+    colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in wide]
+    bars.barh([e.name for e in wide], [max(e.worth, least) for e in wide], color=colours, left=0)
+    bars.set_xscale("log")
+    bars.set_xlim(left=least)
+    bars.set_xlabel("worth (pixels), grey: left out")
+    _cameras(trade, plan)
+    trade.set_xlabel(f"{plan.unit_s} of the {plan.what}, --for {plan.target}")
+    if plan.budget_px > 0:
+        bars.axvline(plan.budget_px, color=CHOSEN, lw=1.2)
+    plain_log_ticks(bars.xaxis)
+
+
+def _cameras(axes: Any, plan: Plan) -> None:
+    """Errors of cameras over their least time, with their median: within the budget in colour, the chosen one with a
+    ring. From a noisy time a line leads to the median of its repeats."""
+    timed = [c for c in plan.choices if 0 < c.seconds < float("inf") and c.error_px < float("inf")]
+    points = [(c.seconds, max(c.error_px, 1e-4)) for c in timed]
+    axes.scatter(*np.reshape(points, (-1, 2)).T, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
+    ring = {"s": 150, "fc": "none", "ec": CHOSEN, "lw": 1.8}
+    for point in (p for p, c in zip(points, timed, strict=True) if c == plan.best):
+        axes.scatter(*point, **ring)
+    noisy_lines(axes, [(y, x, x + c.more) for (x, y), c in zip(points, timed, strict=True) if c.noisy])
+    axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
+    place_labels(axes, points, [c.name.rpartition(".")[2] or c.name for c in timed])  # a model without its lens
+    if plan.budget_px > 0:
+        axes.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+    if any(axes.get_legend_handles_labels()):
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
+    plain_log_ticks(axes.xaxis, axes.yaxis)
+
+
+def plot_trade(plan: Plan, path: Path, title: str) -> None:
+    """Error of every camera against its seconds, with the front of those that no other betters."""
+    best = front(plan.choices)
+    subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
+    with drawing(path, 8.5, 5.0, title, subtitle) as figure:
+        axes = figure.subplots()
+        at = [c.seconds for c in best], [max(c.error_px, 1e-4) for c in best]
+        axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
+        axes.set_xlabel(f"{plan.unit_s} of the {plan.what}, one thread, to equal noise")
+        _cameras(axes, plan)

@@ -1,9 +1,12 @@
 """A scene as a lens sees it: the places in view, the lens's footprints there, and what each of its effects is worth.
 
 A probe sends the chief rays of a grid of film points into the scene: what they meet, and how far off, are the places at
-which cameras are held against the exact lens (`footprints`), in the scene's own light (`light`). An effect's worth is
-its part of the exact footprints in pixels, or the light that it adds or takes relative to the picture, where it is
-largest but for 5% of the picture.
+which cameras are held against the exact lens (`footprints`), in the scene's own light. An effect's worth is its part of
+the exact footprints in pixels, or the light that it adds or takes relative to the picture, where it is largest but for
+5% of the picture.
+
+A small picture with few samples shows where the scene is bright; two of other seeds, where it has contrast that is no
+noise. The lens's ghosts, glare and stars of the scene's own lights, drawn on as few pixels, are set against it.
 """
 
 from __future__ import annotations

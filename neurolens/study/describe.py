@@ -1,4 +1,9 @@
-"""A lens in figures, a folder of lenses as a table, and their sections, with units in the keys."""
+"""A lens in figures, a folder of lenses as a table, their sections, and the character of a lens in five numbers.
+
+Character is that of a lens wide open. Its discs are those of lights at infinity while the lens is focused at 30 focal
+lengths: on the axis, at 0.6 and at 0.95 of the field. Vignetting follows the rims: where the file's are derived or
+estimated, cat's eye and swirl are, too.
+"""
 
 from __future__ import annotations
 

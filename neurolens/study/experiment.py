@@ -23,10 +23,9 @@ from neurolens.readers.any_format import OURS, kind_of, read_any
 from neurolens.readers.lensfile import write_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.rays import PIXELS_ACROSS, frame_width_mm
-from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.fit import ModelSettings, StateSpace, axes_of
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, domain_of
-from neurolens.surrogates.states import StateSpace, axes_of
 
 # Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens), and the object 8 before the
 # front vertex, where a long lens of short focus has less room than that.

@@ -1,4 +1,9 @@
-"""The contents of pages: tables of records, settings as texts, pictures; and the page of a run, `report.html`.
+"""Which camera to use, and the contents of pages: tables of records, settings, pictures; `report.html` of a run.
+
+The camera is the one decision of `train`, `models`, `plan` and the README. The exact lens has no error and needs no
+fit. A model is worth its error where it makes the whole work `SAVING` times as fast; a plan, which measures the scene,
+takes it wherever the times differ by more than their accuracy. In a picture of our renderer the camera is a small part
+of that work; elsewhere it may be all of it.
 
 Templates make HTML of them (`base.html`). The page of a run needs no script and no network. Its pictures are files of
 the run folder, referred to by relative names, so that the folder can be moved or zipped; a picture or link is shown

@@ -1,4 +1,4 @@
-"""Plots of a run: error against time and size, renders beside their errors, illumination, error over zoom and focus."""
+"""Plots of a run: error against time and size, illumination, error over zoom and focus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Scenes of an experiment: renders through every camera, compared with the exact lens's."""
+"""Scenes of an experiment: renders through every camera, compared with the exact lens's, side by side.
+
+The image error is the relative MSE on linear radiance and FLIP on a display, each beside its noise floor.
+"""
 
 from __future__ import annotations
 

@@ -50,9 +50,8 @@ from neurolens.study.speed import (
     time_model,
 )
 from neurolens.surrogates.export import export_states
-from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, StateSettings, StateSpace, fit_states, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs
-from neurolens.surrogates.states import StateSettings, StateSpace, fit_states
 from neurolens.surrogates.terms import pinned_threads
 
 _IDEAL = ("thin lens", "pinhole")

@@ -42,7 +42,7 @@ from neurolens.surrogates.model import Domain, LensModel, Prediction
 from neurolens.surrogates.pairs import FilmRays, sample_domain
 
 if TYPE_CHECKING:
-    from neurolens.surrogates.states import StateModel
+    from neurolens.surrogates.fit import StateModel
 
 UNITS = {
     "rays": ["film_x mm", "film_y mm", "pupil_x mm", "pupil_y mm", "wavelength nm"],

@@ -1,4 +1,7 @@
-"""Ray pairs: camera rays of a domain and their exact images, in five splits."""
+"""Domains, the camera rays (film, pupil, wavelengths, film positions) that a surrogate stands for; their exact images.
+
+Ray pairs are sampled from a domain and traced in float64, in five splits.
+"""
 
 from __future__ import annotations
 

@@ -32,8 +32,8 @@ from neurolens.setting.pupils import camera_rays
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
 from neurolens.study.speed import CompiledSource
+from neurolens.surrogates.fit import gap_axis, zoom_axis
 from neurolens.surrogates.pairs import domain_of, sample_domain
-from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 
