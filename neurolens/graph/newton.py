@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import mul
 
 from neurolens.graph.derive import with_derivatives
 from neurolens.graph.ir import Graph, Value
@@ -18,9 +20,6 @@ SHORTER = 0.25
 # The unknowns stay within this, each: scaled so that passing rays fill the unit disc.
 REACH = 2.0
 _HUGE = 3e38
-
-# Rows a b / c d of a 2 x 2 matrix.
-Block = tuple[Value, Value, Value, Value]
 
 
 def with_jacobian(system: Graph) -> Graph:
@@ -82,61 +81,32 @@ def _limited(step: Value, limit: float) -> Value:
 
 
 def solve(columns: Sequence[Value], b: Value) -> Value:
-    """x of columns x = b, for 2 or 4 unknowns; not finite where the matrix is singular.
-
-    Four are solved in blocks of two, the last two first out: their own block must not be singular.
-    """
-    g = b.graph
-    if len(columns) == 2:
-        return g.concat(*_solve(_block(columns, 0, 0), b[0], b[1]))
-    lower, corner = _block(columns, 2, 0), _block(columns, 2, 2)
-    schur, carry = _schur(columns)
-    right = _apply(carry, b[2], b[3])
-    first = _solve(schur, b[0] - right[0], b[1] - right[1])
-    left = _apply(lower, *first)
-    return g.concat(*first, *_solve(corner, b[2] - left[0], b[3] - left[1]))
+    """x of columns x = b; not finite where the matrix is singular, or the leading block of its last unknowns is."""
+    rows = _eliminated([*columns, b])
+    x: list[Value] = []
+    for k, row in enumerate(rows):
+        left = row[-1]
+        for factor, known in zip(row, x, strict=False):
+            left = left - factor * known
+        x.append(left / row[k])
+    return b.graph.concat(*x)
 
 
 def determinant(columns: Sequence[Value]) -> Value:
-    """The determinant of the matrix with these columns, of 2 or 4 rows each."""
-    if len(columns) == 2:
-        return _determinant(_block(columns, 0, 0))
-    return _determinant(_schur(columns)[0]) * _determinant(_block(columns, 2, 2))
+    """The determinant of the matrix with these columns."""
+    pivots = [row[k] for k, row in enumerate(_eliminated(columns))]
+    return reduce(mul, pivots)
 
 
-def _block(columns: Sequence[Value], row: int, column: int) -> Block:
-    left, right = columns[column], columns[column + 1]
-    return left[row], right[row], left[row + 1], right[row + 1]
-
-
-def _schur(columns: Sequence[Value]) -> tuple[Block, Block]:
-    """upper - right corner^-1 lower, and right corner^-1, of the blocks upper, right / lower, corner."""
-    a, b, c, d = corner = _block(columns, 2, 2)
-    over = 1.0 / _determinant(corner)
-    minus = -over
-    carry = _times(_block(columns, 0, 2), (d * over, b * minus, c * minus, a * over))
-    taken = _times(carry, _block(columns, 2, 0))
-    p, q, r, s = (x - y for x, y in zip(_block(columns, 0, 0), taken, strict=True))
-    return (p, q, r, s), carry
-
-
-def _determinant(m: Block) -> Value:
-    return m[0] * m[3] - m[1] * m[2]
-
-
-def _times(m: Block, n: Block) -> Block:
-    return (*_row(m[0], m[1], n), *_row(m[2], m[3], n))
-
-
-def _row(a: Value, b: Value, n: Block) -> tuple[Value, Value]:
-    return a * n[0] + b * n[2], a * n[1] + b * n[3]
-
-
-def _apply(m: Block, x: Value, y: Value) -> tuple[Value, Value]:
-    return m[0] * x + m[1] * y, m[2] * x + m[3] * y
-
-
-def _solve(m: Block, x: Value, y: Value) -> tuple[Value, Value]:
-    """Cramer's rule."""
-    over = 1.0 / _determinant(m)
-    return (m[3] * x - m[1] * y) * over, (m[0] * y - m[2] * x) * over
+def _eliminated(columns: Sequence[Value]) -> list[list[Value]]:
+    """The rows of a matrix, to the right of whose diagonal the last unknowns are eliminated, the very last first."""
+    count = columns[0].rows
+    rows = [[column[i] for column in columns] for i in range(count)]
+    for k in range(count - 1, 0, -1):
+        over = 1.0 / rows[k][k]
+        for i in range(k):
+            factor = rows[i][k] * over
+            rows[i] = [
+                x if k <= j < count else x - factor * y for j, (x, y) in enumerate(zip(rows[i], rows[k], strict=True))
+            ]
+    return rows

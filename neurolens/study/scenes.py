@@ -190,11 +190,10 @@ def side_by_side(
         path: PNG, PDF or SVG to write.
         captions: name to one or two lines shown below its picture.
     Raises:
-        InputError: no image, shapes that differ, values that are not finite, a map without its image.
+        InputError: values that are not finite.
     """
     pictures = {name: checked_image(image, name) for name, image in images.items()}
     maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
-    _check_shapes(pictures, maps)
     low, high = error_scale(maps.values(), 99.5)
     height, width = next(iter(pictures.values())).shape[:2]
     rows, each = math.ceil(len(pictures) / _COLUMNS), 2 if maps else 1
@@ -221,20 +220,6 @@ def side_by_side(
             bar.outline.set_visible(False)
             plain_log_ticks(bar.ax.yaxis)
     return Path(path)
-
-
-def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
-    if not pictures:
-        raise InputError("side by side", "images", "(none)", "at least one image")
-    first = next(iter(pictures.values())).shape
-    for name, picture in pictures.items():
-        if picture.shape != first:
-            raise InputError("side by side", f"image {name}", f"({picture.shape})", f"the shape of the first, {first}")
-    for name, error in maps.items():
-        if name not in pictures:
-            raise InputError("side by side", "error map", name, "the name of an image: " + ", ".join(pictures))
-        if error.shape != first[:2] or not np.isfinite(error).all():
-            raise InputError("side by side", f"error map {name}", f"({error.shape})", f"finite values, {first[:2]}")
 
 
 EXACT = "exact"

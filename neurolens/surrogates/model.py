@@ -16,10 +16,8 @@ import numpy as np
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.prescription import Lens, Surface
@@ -34,7 +32,6 @@ if TYPE_CHECKING:
     from neurolens.trace.surfaces import Rays
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
-_DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
 # Positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
 
@@ -249,22 +246,6 @@ class LensModel:
         """
         return prediction_of(evaluate(self.graph, self._inputs(rays, stop_radius_mm)), len(rays))
 
-    def differentiate(self, rays: FilmRays, stop_radius_mm: float | None = None) -> tuple[Prediction, Tensor, Tensor]:
-        """Evaluate the model with its derivatives; arguments and errors as `predict`.
-
-        Returns the prediction, the derivatives [6, 5, N] of the scene ray (x, y, z in mm, unit direction) and [2, 5, N]
-        of the stop crossing: per mm of the film point's x, y and of the pupil point's x, y, and per nm, the other
-        arguments held. Where the status is not 0 they mean nothing.
-        """
-        import torch
-
-        out = evaluate(self._derivative_graph, self._inputs(rays, stop_radius_mm))
-        scene, stop = (
-            torch.stack([out[derivative(name, row)].expand(-1, len(rays)) for row in (*RAY, WAVELENGTH)], 1)
-            for name in _DIFFERENTIATED
-        )
-        return prediction_of(out, len(rays)), scene, stop
-
     def _inputs(self, rays: FilmRays, stop_radius_mm: float | None) -> dict[str, Tensor]:
         radius = rays.film_z.new_full((1, 1), self.checked_radius_mm(stop_radius_mm))
         return {"rays": rays.rows, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
@@ -280,10 +261,6 @@ class LensModel:
     def graph(self) -> Graph:
         """For evaluation in float64: inputs and outputs as `assemble` says."""
         return model_graph(self, EXACT)
-
-    @cached_property
-    def _derivative_graph(self) -> Graph:
-        return with_derivatives(self.graph, _DIFFERENTIATED, [("rays", k) for k in range(5)])
 
     @property
     def front(self) -> Surface | None:
