@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
+from experiments.exact_race import exact_candidates
 from experiments.lab import Report
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxlens import open_session
@@ -29,7 +30,7 @@ from neurolens.graph.scalars import lower
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
 from neurolens.study.rays import ray_errors
-from neurolens.study.speed import Call, Candidate, exact_candidates, model_candidate, program_candidate, race
+from neurolens.study.speed import Call, Candidate, model_candidate, program_candidate, race
 from neurolens.surrogates.assemble import ALL, RAY_ONLY
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare

@@ -108,7 +108,7 @@ class Plan:
             return format_toml({"title": title, "camera": camera})
         file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
         choice = LensChoice(file, zoom=asked.zoom, f_number=asked.f_number)
-        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
+        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0)
         return to_toml(Experiment(title, choice, (best.settings,), self.domain, PAIRS, checks, camera=camera))
 
 

@@ -171,15 +171,10 @@ class TargetChoice:
 
 @dataclass(frozen=True)
 class EvaluationChoice:
-    """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread.
-
-    Attributes:
-        compile_exact: whether the exact tracer compiled by torch runs, too: half a minute of compiling.
-    """
+    """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread."""
 
     vignetting_rays: int = 200_000
     rounds: int = 15
-    compile_exact: bool = True
 
 
 @dataclass(frozen=True)
@@ -321,6 +316,6 @@ def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> 
         "title": f"Models of {Path(lens_file).stem}",
         "lens": {"file": str(lens_file)},
         "model": list(_LADDER) if asked else [{"method": "ols", "terms": 64}, {"method": "mlp", "units": 16}],
-        "evaluation": {"rounds": 8, "compile_exact": False},
+        "evaluation": {"rounds": 8},
     }
     return from_dict(Experiment, apply_overrides(tables, overrides), "--set")

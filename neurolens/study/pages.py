@@ -283,7 +283,6 @@ _MODEL_COLUMNS = (
            "--camera fused:MODEL, or neurolens export --to c"),
     Column("onnxruntime (ns/ray)", "ns_per_ray.min", about="the same as an ONNX graph, as most programs run models"),
     Column("C: × exact", "fused_speedup", about="how many times faster than the exact lens as C, in the same race"),
-    Column("× exact compiled by torch", "speedup_over_compiled", about="onnxruntime over the exact tracer of torch"),
     Column("false pass (%)", "false_pass", 100, 2, "rays that the model passes and the lens does not"),
     Column("false block (%)", "false_block", 100, 2, "rays that the model blocks and the lens does not"),
     Column("coefficients", "coefficients_per_vector", digits=6, about="of one vector output of a polynomial"),

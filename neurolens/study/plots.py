@@ -74,7 +74,7 @@ def trade_plot(
         noisy_lines(left, [(e, t["min"], t["median"]) for e, t in timings if t is not None and noisy(t)])
         for tracer in exact:
             if time := number(tracer, "ns_per_ray.min"):
-                look = {"color": INK, "lw": 1.0, "ls": "--" if "compiled" in tracer["name"] else ":"}
+                look = {"color": INK, "lw": 1.0, "ls": ":"}
                 look |= {"color": CHOSEN, "lw": 2.0} if tracer["name"] == use else {}
                 label = f"{tracer['name']} {ns_text(time_of(tracer))}" + ": use" * (tracer["name"] == use)
                 left.axvline(time, label=label, **look)

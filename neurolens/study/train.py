@@ -42,7 +42,7 @@ from neurolens.study.speed import (
     EXACT,
     Race,
     exact_c_candidate,
-    exact_candidates,
+    exact_candidate,
     exact_records,
     ideal_cameras,
     model_candidates,
@@ -155,7 +155,7 @@ def _plan(experiment: Experiment) -> dict[str, float]:
     plan: dict[str, float] = {"trace ray pairs": 3}
     for m in experiment.model:
         plan[f"fit {m.label}"] = 0.06 * m.steps * (m.units * m.layers / 32) ** 2.5 if m.method in NETWORKS else 3
-    plan["race for speed"] = (45 if experiment.evaluation.compile_exact else 5) + 2 * len(experiment.model)
+    plan["race for speed"] = 5 + 2 * len(experiment.model)
     plan |= {"render": 40} if experiment.render.scenes else {}
     return plan
 
@@ -163,23 +163,20 @@ def _plan(experiment: Experiment) -> dict[str, float]:
 def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measured], progress: Progress) -> Race:
     """Time the exact tracers and all models in one run, and add times, speed-ups and break-even to the records.
 
-    Models run in onnxruntime and, with a compiler, as C; the exact lens eager, as C, and compiled by
-    torch where that is asked for.
+    Models run in onnxruntime and, with a compiler, as C; the exact lens by torch and as C.
     """
     chosen, lens, domain = experiment.evaluation, prepared.pairs.lens, prepared.pairs.domain
     if not chosen.rounds:
         return Race({}, {})
     with progress.stage("race for speed") as report:
-        candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
-        candidates += [exact_c_candidate(lens, domain)]
+        candidates = [exact_candidate(lens, domain), exact_c_candidate(lens, domain)]
         candidates += model_candidates({m.settings.label: m.file for m in measured}, domain)
         candidates += ideal_cameras(lens, domain)
         timed = race(candidates, domain, rounds=chosen.rounds, report=report)
     for m in measured:
         cost = m.record["fit_s"], m.record["load_s"]
-        ns, speedup, _ = timed.gain(m.settings.label, EXACT[1], *cost)
-        fused_ns, fused_speedup, pays = timed.gain(f"{m.settings.label} fused", EXACT[2], *cost)
-        m.record.update(ns_per_ray=ns, speedup_over_compiled=speedup)
+        fused_ns, fused_speedup, pays = timed.gain(f"{m.settings.label} fused", EXACT[1], *cost)
+        m.record.update(ns_per_ray=timed.timing(m.settings.label))
         m.record.update(fused_ns_per_ray=fused_ns, fused_speedup=fused_speedup)
         if fused_speedup is not None:
             m.record["break_even_rays"] = pays

@@ -20,7 +20,7 @@ TRIPLET = "cooke_triplet_50"
 SETTINGS = BenchSettings(
     DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=(400.0, 700.0)),
     PairSettings(500, 300, 500),
-    EvaluationChoice(vignetting_rays=2000, rounds=0, compile_exact=False),
+    EvaluationChoice(vignetting_rays=2000, rounds=0),
 )
 ROWS = (
     Row("thick", "paraxial", ModelSettings("thick")),
