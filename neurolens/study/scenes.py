@@ -330,14 +330,3 @@ def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) ->
     with np.errstate(invalid="ignore"):
         depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z
     return np.where(rays.weight > 0, np.where(np.isfinite(distance), depth, np.inf), np.nan)
-
-
-def domain_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
-    """A domain as a flat table, units in the keys."""
-    return {
-        "film_radius_mm": domain.film_radius_mm,
-        "f_number": first_order(lens).f_number,
-        "wavelength_nm": list(domain.wavelength_nm),
-        "focus_m": ["infinity" if f == float("inf") else f for f in domain.focus_m],
-        "nearest_m": domain.nearest_m,
-    }

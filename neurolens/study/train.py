@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +38,7 @@ from neurolens.study.measure import (
 from neurolens.study.pages import CLOSE_UM, exact_of, to_use, write_report
 from neurolens.study.plots import illumination_plot, states_plot, trade_plot
 from neurolens.study.rays import Illumination, pixel_um, relative_illumination
-from neurolens.study.scenes import SETTINGS, Pictures, domain_facts, render_all
+from neurolens.study.scenes import SETTINGS, Pictures, render_all
 from neurolens.study.speed import (
     EXACT,
     Race,
@@ -223,7 +224,11 @@ def _describe_lens(lens: Lens) -> dict[str, Any]:
 def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
     domain = pairs.domain
     return {
-        **domain_facts(lens, domain),
+        "film_radius_mm": domain.film_radius_mm,
+        "f_number": first_order(lens).f_number,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["infinity" if f == math.inf else f for f in domain.focus_m],
+        "nearest_m": domain.nearest_m,
         "pupil_plane_z_mm": domain.pupil_z_mm,
         "pupil_radius_mm": domain.pupil_radius_mm,
         "passing_share": len(pairs.train) / pairs.tested,

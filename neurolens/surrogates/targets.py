@@ -457,18 +457,13 @@ def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE)
 
     Which surface a status names may change with that: the first of those left. `share`: see `IDLE_SHARE`.
     """
-    left = list(range(len(models[0].gates)))
-    sole = [_blocked(m) for m in models]  # [1 + G, N] of each, the stop first
+    left, blocked = list(range(len(models[0].gates))), torch.cat([_blocked(m) for m in models], 1)  # the stop first
     while left:
-        others = [[b[[0, *(1 + k for k in left if k != g)]].any(0) for b in sole] for g in left]
-        counts = [
-            sum(int((b[1 + g] & ~rest).sum()) for b, rest in zip(sole, each, strict=True))
-            for g, each in zip(left, others, strict=True)
-        ]
-        least = min(range(len(left)), key=lambda i: counts[i])
-        if counts[least] > share * sum(b.shape[1] for b in sole):
+        others = (blocked[[0, *(1 + k for k in left if k != g)]].any(0) for g in left)
+        alone = [int((blocked[1 + g] & ~rest).sum()) for g, rest in zip(left, others, strict=True)]
+        if min(alone) > share * blocked.shape[1]:
             break
-        del left[least]
+        del left[alone.index(min(alone))]
     if len(left) == len(models[0].gates):
         return models
     return tuple(
