@@ -25,12 +25,10 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.cli import main
-from neurolens.defocus.atlas import pinhole_of
 from neurolens.defocus.gather import Gathered
-from neurolens.defocus.kernels import kernel_at
+from neurolens.defocus.kernels import kernel_at, own_plate
 from neurolens.defocus.picture import defocus
-from neurolens.defocus.plate import Layer, PlatePinhole
-from neurolens.defocus.read import DepthSettings, Plate, read_plate
+from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_exr, write_png
 from neurolens.render.renderer import render
@@ -182,9 +180,10 @@ def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> Poi
     camera = make_camera(f"fused:{lab.LENSES / LENS}.toml", shot)
     size = round(_STRIP_MM[0] * _PER_MM), round(_STRIP_MM[1] * _PER_MM)
     fine = size[0] * _FINER, size[1] * _FINER  # the kernel's pixels, so that the ball's outline is sharp
-    pinhole, ball = pinhole_of(camera, fine), _BALL_PX * _FINER
+    plate, ball = own_plate(camera, fine), _BALL_PX * _FINER
+    pinhole = plate.pinhole
     place, ahead = (fine[0] / 2, fine[1] / 2 - field_mm * _PER_MM * _FINER), distance_m - pinhole.before_film_mm / 1000
-    kernel = kernel_at(camera, pinhole, fine, place, 1 / ahead, place)
+    kernel = kernel_at(camera, plate, place, 1 / ahead, place)
     assert kernel is not None
     scene = (
         "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 1\n[environment]\ncolour = [0, 0, 0]\n"

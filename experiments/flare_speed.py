@@ -33,8 +33,7 @@ from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
 from neurolens.lens.prescription import Lens
 from neurolens.render.pictures import write_exr
-from neurolens.trace.rays import Rays
-from neurolens.trace.sequence import follow, ghost
+from neurolens.trace.rays import Rays, follow, turning
 
 LENSES = ("laikin_double_gauss_50", "brendel_tessar_100", "ikemori_retrofocus_14", "ogawa_zoom_70_200", "phone_lens_6")
 GOAL_NS = 57.0  # a tenth of what the public CPU tracer was said to take on one quiet core (10 surfaces, all pairs)
@@ -112,7 +111,7 @@ def _row(name: str, rounds: int, report: lab.Report) -> Row:
     tracer = GhostTracer(lens)
     rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, _RAYS)
     start = Rays(*torch.from_numpy(rays).float())
-    paths = [ghost(len(lens.surfaces), *pair) for pair in tracer.pairs]
+    paths = [turning(len(lens.surfaces), pair.reflections) for pair in tracer.pairs]
     some = paths[:: max(1, len(paths) // _PATHS)]
 
     def by_path() -> int:

@@ -363,18 +363,18 @@ def shorten() -> None:
     """Replace steps that take long and read no further file: a survey's processes, a shader's pupil, the field of the
     good lens of plates, which is made once."""
     from neurolens.base.tasks import Here
-    from neurolens.blender.pack import Form
+    from neurolens.blender import Form
     from neurolens.cameras.onnxlens import load_model
-    from neurolens.cli import blender_lenses, flare_run, train
+    from neurolens.cli import blender, flare, train
 
     def form_of(file: Path, **_: Any) -> Form:
         card = load_model(file).card
         return Form("polynomial", card["fit"]["method"], "shader", 1.0, 21.6, 2.0, 0.7)
 
     fields: dict[tuple[Any, ...], Any] = {}
-    field_of = flare_run.Shots._field
+    field_of = flare.Shots._field
 
-    def field(shots: flare_run.Shots, args: Any, *rest: Any) -> Any:
+    def field(shots: flare.Shots, args: Any, *rest: Any) -> Any:
         if args.file != Path("good.toml"):
             return field_of(shots, args, *rest)
         key = args.film, args.state
@@ -382,9 +382,9 @@ def shorten() -> None:
             fields[key] = field_of(shots, args, *rest)
         return fields[key]
 
-    flare_run.Shots._field = field  # type: ignore[assignment,method-assign]
+    flare.Shots._field = field  # type: ignore[assignment,method-assign]
     train.Processes = lambda *_: Here()  # type: ignore[assignment,misc]
-    blender_lenses.form_of = form_of
+    blender.form_of = form_of
 
 
 # ---- Good files. -----------------------------------------------------------------------------------------------------
@@ -443,9 +443,9 @@ def _plates(folder: Path) -> None:
 
 def _pack(folder: Path) -> None:
     """The extension with one lens, as a zip and as a user folder."""
-    from neurolens.blender.pack import Form, PackedLens, add_to_folder, write_pack
+    from neurolens.blender import Form, PackedLens, add_lens, write_pack
 
     form = Form("polynomial", "ols-36", "shader", 1.0, 21.6, 1.8, 0.7)
     lens = PackedLens("gauss", "Gauss", 50.0, 1.8, "US 2 1973", b"PNG", [form])
     write_pack(folder / "pack.zip", [lens])
-    add_to_folder(folder / "user", lens)
+    add_lens(folder / "user", lens)

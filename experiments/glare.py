@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.flare.canvas import axis_irradiance
 from neurolens.flare.ghosts import coated
+from neurolens.flare.layers import axis_irradiance
 from neurolens.flare.lights import front_sphere
 from neurolens.flare.photons import Photons, PhotonTracer
 from neurolens.flare.steps import Floats

@@ -28,7 +28,6 @@ from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import plain
 from neurolens.base.settings import whole
-from neurolens.cli.arguments import QUIET_HELP
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
@@ -88,7 +87,7 @@ def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
     return add
 
 
-QUIET = option("--quiet", action="store_true", help=QUIET_HELP)
+QUIET = option("--quiet", action="store_true", help="neither progress nor warnings on stderr")
 ONLY = option("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
 AGAIN = option("--restart", old=("--again",), action="store_true", help="measure what is chosen again")
 ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")

@@ -13,7 +13,7 @@ from typing import Any
 
 from experiments import lab
 from neurolens.base.files import atomic_write_text, library, sha256_of
-from neurolens.cli.lens_list import INDEX, kept_row, read_index
+from neurolens.cli.lens import INDEX, kept_row, read_index
 from neurolens.readers.any_format import lens_files
 from neurolens.study.describe import library_row
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
 from neurolens.base.lensname import lens_id_of
-from neurolens.cli.arguments import Reporting, check_run_folder, lens, output_path
-from neurolens.cli.lens_list import CHARACTER
+from neurolens.cli.arguments import Reporting, lens, output_path
+from neurolens.cli.lens import CHARACTER
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
@@ -29,6 +29,7 @@ _SHOWN = {
     "mtf-height": "MTF against image height", "distortion": "Distortion", "vignetting": "Vignetting",
     "colour": "Colour",
 }  # fmt: skip
+_NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
 _COLOURS = 96  # in the palette of a picture
 
 
@@ -46,7 +47,6 @@ class Library(Reporting):
         from neurolens.readers.any_format import lens_files
 
         folder = self.out
-        check_run_folder(folder, self.called, "--output")
         files = self.lenses or lens_files(library() / "lenses")
         names = _page_names(files)
         folder.mkdir(parents=True, exist_ok=True)
@@ -100,6 +100,23 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
         return {"lens": file.stem, "page": None, "fault": str(error)}
 
 
+def _section(lens: Lens) -> Any:
+    """The layout of a lens focused at infinity, with rays; an anamorphic one in y-z."""
+    from neurolens.analysis.fields import Scene
+    from neurolens.analysis.layout import layout_profile
+    from neurolens.lens.paraxial import first_order
+    from neurolens.setting.check import film_edge_mm
+    from neurolens.setting.pupils import image_radius_mm
+    from neurolens.setting.states import set_lens
+
+    lens = set_lens(lens)
+    edge = film_edge_mm(lens)
+    if edge is None:
+        no_field = _NO_FIELD * abs(first_order(lens).efl_mm)
+        edge = no_field if lens.half_field_deg is None else image_radius_mm(lens)[0]
+    return layout_profile(Scene(lens, math.inf, "y"), edge)
+
+
 def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     """Draw a lens and write its page; returns what the index shows."""
     from neurolens.analysis.layout import thumbnail
@@ -108,7 +125,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     from neurolens.readers.source import read_text
     from neurolens.setting.check import check_lens
     from neurolens.study import pages
-    from neurolens.study.describe import character_or_none, lens_row, rim_doubts, section
+    from neurolens.study.describe import character_or_none, lens_row, rim_doubts
 
     row = lens_row(lens, check_lens(lens))
     figures, notes = [], []
@@ -145,7 +162,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
         more["discs"] = "discs.png"
         with atomic_path(folder / "discs.png") as part:
             part.write_bytes(discs)
-    return {**{k: row[k] for k in keys}, **more, "layout": thumbnail(section(file))}
+    return {**{k: row[k] for k in keys}, **more, "layout": thumbnail(_section(lens))}
 
 
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:

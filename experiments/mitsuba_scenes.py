@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.mitsuba.library import matrix
+from neurolens.mitsuba.sensor import matrix
 from neurolens.render.colour import table
 from neurolens.render.scene import Scene, scene_from_tables
 

@@ -28,9 +28,9 @@ from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.mitsuba import require_mitsuba
-from neurolens.mitsuba.library import libraries
+from neurolens.mitsuba.sensor import libraries
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 from neurolens.render.settings import FilmSettings

@@ -26,8 +26,8 @@ from typing import Any
 from experiments import lab, osl_in_blender
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
-from neurolens.blender.pack import Form
-from neurolens.cli.blender_lenses import form_of
+from neurolens.blender import Form
+from neurolens.cli.blender import form_of
 from neurolens.lens.paraxial import first_order
 
 PYTHON = lab.ROOT / ".venv-blender" / "bin" / "python"

@@ -23,8 +23,7 @@ from experiments import lab
 from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import PupilTable
+from neurolens.cameras.pupil_outline import PupilOutline, PupilTable
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.plan.costs import cycles_ns

@@ -19,6 +19,7 @@ from neurolens.base.progress import Progress
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import far_field, outline_spectrum, star, starburst_picture
 from neurolens.flare.exit_pupil import Array, ExitPupil, coverage, exit_pupil, outline
+from neurolens.flare.layers import FlareJob
 from neurolens.flare.lights import Light
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
@@ -141,7 +142,7 @@ def _light() -> list[Check]:
 def _seconds(f_number: float, args: argparse.Namespace) -> dict[str, Any]:
     lens, light = lens_at(f_number, Aperture(blades=7)), Light(6.0, 3.0)
     began = time.perf_counter(), time.process_time()
-    film = starburst_picture(lens, [light], Raster(FILM_MM, *LARGE), threads=args.threads)
+    film = starburst_picture(FlareJob(lens, [light], Raster(FILM_MM, *LARGE), threads=args.threads))
     spent = time.perf_counter() - began[0], time.process_time() - began[1]
     pupil = exit_pupil(lens, light, NM)
     assert pupil is not None

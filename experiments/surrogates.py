@@ -27,7 +27,7 @@ from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, versions
 from neurolens.base.settings import add_options, whole
-from neurolens.cli.arguments import Glasses, check_ids, check_run_folder, named_lens
+from neurolens.cli.arguments import Reporting, check_ids, check_written, named_lens
 from neurolens.graph.scalars import MOST_WEIGHTS
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.study.pages import DASH, Column, Record, number, show
@@ -57,7 +57,7 @@ OPTIONS = (
     lab.option("--rounds", metavar="N", type=whole(0), help="rounds of the race, 0 for none (default 10)"),
     lab.option("--restart", action="store_true", help="make the records of the chosen rows again"),
     lab.out(lab.ROOT / "runs" / "surrogates", "folder"),
-    lambda parser: add_options(parser, Glasses),
+    lambda parser: add_options(parser, Reporting, ("glass",)),
 )  # fmt: skip
 
 
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> None:
     """Make the missing records, and write the pages after every lens."""
     rows, settings, out = chosen_rows(args.methods, args.quick), _settings(args), args.out
     benches = [Bench(LensChoice(Path(file)), settings, out) for file in _lenses(args)]
-    check_run_folder(out, "experiments surrogates", "--output")
+    check_written(out, "--output", "FOLDER")
     for bench in benches:
         bench.choice.read()  # a file that cannot be read ends the command, not each of its methods
     out.mkdir(parents=True, exist_ok=True)

@@ -21,7 +21,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import domain_of, sample_domain
-from neurolens.trace.sequence import follow
+from neurolens.trace.rays import follow
 
 COATINGS = {"bare": None, "coated": "quarter-wave"}
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from experiments import lab
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
-from neurolens.blender.pack import extension_library
+from neurolens.blender import extension_library
 from neurolens.cli.keys import _frames as frames_of
 from neurolens.render.mesh import Mesh
 from neurolens.render.primitives import Rays

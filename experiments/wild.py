@@ -30,10 +30,10 @@ from experiments.languages import RUN, Given, Missing, Rows
 from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.model import load_model
-from neurolens.cli.export_lens import lens_program, pupil_planes_mm
 from neurolens.graph import program as arithmetic
 from neurolens.graph.program import RAY, SCENE_RAY, STOP, Program
 from neurolens.lens.shot import Shot
+from neurolens.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.shaders.source import camera_program
 from neurolens.study.speed import CompiledSource
 from neurolens.surrogates.source import fused_program

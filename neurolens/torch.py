@@ -110,23 +110,17 @@ class LensCamera:
                 shot's.
         """
         count = len(film_mm)
-        given = [torch.as_tensor(t, dtype=self.dtype, device=self.device) for t in (film_mm, square, wavelength_nm)]
-        shapes: dict[str, list[tuple[int, ...]]] = {
-            "film_mm": [(count, 2)],
-            "square": [(count, 2)],
-            "wavelength_nm": [(), (count,)],
-        }
+        film, places, light = (
+            torch.as_tensor(t, dtype=self.dtype, device=self.device) for t in (film_mm, square, wavelength_nm)
+        )
+        _check_shape("film_mm", film, (count, 2))
+        _check_shape("square", places, (count, 2))
+        _check_shape("wavelength_nm", light, (), (count,))
         if pose is not None:
             pose = pose.to(self.device, self.dtype)
-            given.append(pose)
-            shapes["pose"] = [(*rays, rows, 4) for rays in ((), (count,)) for rows in (3, 4)]
-        for (name, allowed), tensor in zip(shapes.items(), given, strict=True):
-            if tuple(tensor.shape) not in allowed:
-                expected = "a tensor of shape " + " or ".join(map(str, allowed))
-                raise InputError("LensCamera", name, tuple(tensor.shape), expected)
+            _check_shape("pose", pose, *((*rays, rows, 4) for rays in ((), (count,)) for rows in (3, 4)))
         names = tuple(settings)
         moves = [self._coordinate(name, settings[name]) for name in names]
-        film, places, light = given[:3]
         found: tuple[Tensor, ...] = _Rays.apply(self, names, film, places, light.expand(count), *moves)
         origin, direction, weight, status = found[0].T, found[1].T, found[2], found[3]
         if settings:  # linear steps make directions longer
@@ -230,6 +224,12 @@ class _Lens:
         rays = {"film_mm": film.T, "square": square.T, "wavelength_nm": light[None]}
         found = evaluate(self.graph, rays | self.call)
         return found["ray"][:3], found["ray"][3:], found["weight"][0], found["status"][0]
+
+
+def _check_shape(name: str, tensor: Tensor, *shapes: tuple[int, ...]) -> None:
+    if tuple(tensor.shape) not in shapes:
+        expected = "a tensor of shape " + " or ".join(map(str, shapes))
+        raise InputError("LensCamera", name, tuple(tensor.shape), expected)
 
 
 class _Sides(NamedTuple):

@@ -77,7 +77,7 @@ def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_place_that_cannot_be_written_is_found_before_the_render(
     scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurolens.frames.frame.render", lambda *_, **__: pytest.fail("rendered for nothing"))
+    monkeypatch.setattr("neurolens.frames.render", lambda *_, **__: pytest.fail("rendered for nothing"))
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", _NOWHERE, "--quiet")
     assert str(_NOWHERE) in line and ".tmp" not in line
     with pytest.raises(OSError, match=str(_NOWHERE)) as refused:
@@ -138,13 +138,8 @@ def file() -> Path:
 
 
 def test_c_and_glsl(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = tmp_path / "run" / "models"
-    run.mkdir(parents=True)
-    (run / "one.onnx").write_bytes(file.read_bytes())
     header, shader = tmp_path / "a.h", tmp_path / "a.glsl"
-    assert (
-        main(["export", str(tmp_path / "run"), "--to", "c", "-o", str(header), "--only", "ray", "--name", "gauss"]) == 0
-    )
+    assert main(["export", str(file), "--to", "c", "-o", str(header), "--only", "ray", "--name", "gauss"]) == 0
     assert capsys.readouterr().out.strip() == str(header)
     text = header.read_text()
     assert "gauss_rays(" in text and "stop_radius_mm" not in text[text.index("#ifndef") :]
@@ -179,12 +174,10 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.Captur
         (["export", tmp_path / "no.onnx", "--to", "c", "-o", out], ["no.onnx", "missing"]),
         (["export", old, "--to", "c", "-o", out], ["old.onnx", "export it again"]),
         (["export", bare, "--to", "c", "-o", out], ["card", "refractions"]),
-        (["export", tmp_path / "empty", "--to", "c", "-o", out], ["empty", "name its file"]),
         (["export", file, "--to", "c", "-o", tmp_path / "no" / "a.h"], ["a.h"]),
         (["export", file, "--to", "fortran", "-o", out], ["fortran"]),
         (["export", file, "--to", "c"], ["-o"]),
     ]
-    (tmp_path / "empty").mkdir()
     for args, words in cases:
         line = failure(capsys, *args)
         assert all(word in line for word in words), (args, line)

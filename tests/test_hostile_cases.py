@@ -13,7 +13,7 @@ from command_line import failure
 from lens_models import edited
 
 from experiments.__main__ import main as experiment
-from neurolens.blender.pack import Form
+from neurolens.blender import Form
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.surrogates.card import CARD_KEY
@@ -103,7 +103,7 @@ def test_a_models_method_is_part_of_a_safe_name(case: str, monkeypatch: pytest.M
     def form_of(file: Path, **_: Any) -> Form:
         return Form("polynomial", load_model(file).card["fit"]["method"], "shader", 1.0, 21.6, 1.8, 0.7)
 
-    monkeypatch.setattr("neurolens.cli.blender_lenses.form_of", form_of)
+    monkeypatch.setattr("neurolens.cli.blender.form_of", form_of)
     before = set(Path().rglob("*"))
     assert main(["blender", "add", case, "--to", "inner/folder", "--quiet"]) == 0
     made = set(Path().rglob("*")) - before

@@ -24,7 +24,6 @@ WRITTEN = {
     "output",
     "lens_file",
     "layout",
-    "layouts",
     "breathing",
     "fit",
 }  # what options name that a command writes

@@ -28,7 +28,7 @@ from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArr
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.vignetting import Vignetted
+from neurolens.cameras.reduced import Vignetted
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot as CameraShot

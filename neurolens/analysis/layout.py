@@ -174,33 +174,6 @@ def lens_layout(layout: Layout, path: str | Path) -> None:
         figure.legend(handles, labels, loc="outside lower center", ncols=min(7, len(labels)))
 
 
-_SHEET_COLUMNS, _CELL_IN = 6, (2.6, 2.0)  # width and height of one section with its title
-
-
-def sheet(layouts: Sequence[Layout], path: str | Path) -> None:
-    """Draw lenses in section, light from left to right, each as large as its cell allows, axes of equal scale.
-
-    Args:
-        path: PNG, PDF or SVG to write.
-    Raises:
-        InputError: no lens at all.
-    """
-    if not layouts:
-        raise InputError("lens sheet", "layouts", "(none)", "at least one lens")
-    columns = min(_SHEET_COLUMNS, len(layouts))
-    rows = math.ceil(len(layouts) / columns)
-    with drawing(path, _CELL_IN[0] * columns, _CELL_IN[1] * rows) as figure:
-        for k, layout in enumerate(layouts):
-            axes = figure.add_subplot(rows, columns, k + 1)
-            axes.axis("off")
-            draw_section(axes, layout, lw=0.4)
-            for line in axes.lines:
-                line.set_linewidth(0.6 * line.get_linewidth())
-            for patch in axes.patches:
-                patch.set_linewidth(0.5)
-            axes.set_title(f"{layout.title}\n{layout.subtitle}", fontsize=6, loc="left")
-
-
 def draw_section(axes: Any, layout: Layout, **axis: Any) -> None:
     """Draw the lens, its film and its rays on axes of equal scale; `axis` is the look of the optical axis."""
     z, top = _limits(layout)

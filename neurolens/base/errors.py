@@ -78,3 +78,10 @@ def warned(file: str | Path = "") -> Iterator[list[str]]:
         finally:
             own = (str(w.message) for w in caught if issubclass(w.category, NeurolensWarning))
             texts += dict.fromkeys(text.removeprefix(f"{file}: ") for text in own)
+
+
+def reason(error: BaseException) -> str:
+    """What an error says, of one of the system with its file; the error of a full disk names none."""
+    if not isinstance(error, OSError):
+        return str(error) or type(error).__name__
+    return f"{'' if error.filename is None else f'{error.filename}: '}{error.strerror or error}"

@@ -69,6 +69,7 @@ class Option:
         positional: whether it is an argument without a name. apart: options with the same word exclude each other.
         title: of the group of options in the help.
         last: above 0 for what help shows after all other options, in this order.
+        written: whether it is a path that a command writes.
     """
 
     about: str
@@ -84,6 +85,7 @@ class Option:
     apart: str = ""
     title: str = ""
     last: int = 0
+    written: bool = False
 
 
 def setting(default: Any, about: str, **details: Any) -> Any:
@@ -226,7 +228,7 @@ def _details(
     if option.positional:
         return (f.name,), details
     details |= {"dest": _dest(f, option)} | ({"required": True} if required else {})
-    return tuple(filter(None, (option.short, _spelling(f, option)))), details
+    return tuple(filter(None, (option.short, spelling(f, option)))), details
 
 
 def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False) -> T:
@@ -258,7 +260,7 @@ def changed(settings: Any, *, unset: bool = False) -> dict[str, Any]:
         if is_dataclass(value):
             found |= changed(value, unset=f.metadata.get("more", {}).get("unset", False))
         elif value != (None if unset else f.default) and not f.metadata["option"].positional:
-            found[_spelling(f, f.metadata["option"])] = value
+            found[spelling(f, f.metadata["option"])] = value
     return found
 
 
@@ -266,7 +268,8 @@ def _options(cls: type) -> list[Any]:
     return [f for f in fields(cls) if {"option", "group"} & f.metadata.keys()]
 
 
-def _spelling(f: Any, option: Option) -> str:
+def spelling(f: Any, option: Option) -> str:
+    """The option that a field is, "--f-number"."""
     unit = _UNIT.fullmatch(f.name)
     return f"--{option.option or (unit[1] if unit else f.name).replace('_', '-')}"
 

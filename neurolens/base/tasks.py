@@ -1,4 +1,4 @@
-"""Executors that run tasks: at once in this process, in a process for each task, or on a cluster (`base.cluster`).
+"""Executors that run tasks: in this process, in one for each task, in forked ones, or on a cluster (`base.cluster`).
 
 They have the interface of `concurrent.futures`: `submit` returns a `Future`, and `wait` and `as_completed` of the
 standard library take it. `run_each` hands out the answers of any number of tasks while only a few of them wait in
@@ -8,7 +8,7 @@ memory. An answer must depend on its task alone, because a cluster starts a task
         for task, answer in run_each(executor, work, tasks):
             print(task, answer.reason if isinstance(answer, Failed) else answer)
 
-The workers of a render (`render.renderer`) are not tasks: they are forked, so that each has the scene without a copy.
+Parts of a picture that are summed in a fixed order are `in_order`, by threads.
 """
 
 from __future__ import annotations
@@ -17,13 +17,18 @@ import math
 import multiprocessing
 import os
 import select
+import signal
+import sys
 import threading
+import time
+import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import wait
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from neurolens.base.errors import NeurolensError, one_line
@@ -32,6 +37,7 @@ from neurolens.base.signals import end_at_once, held
 T = TypeVar("T")
 R = TypeVar("R")
 _LONGEST = 600  # characters of a reason
+_POLL_S, _POLL_PARENT_S, _PATIENCE_S = 0.05, 0.5, 5.0
 # Another thread that starts a process asks all processes for their exit codes, which can be read only once.
 _STARTING = threading.Lock()
 
@@ -106,9 +112,7 @@ class Processes(ThreadPoolExecutor):
                 raise NeurolensError(f"took longer than {self._limit_s:g} s")
             return answer_of(pipe.recv())
         except EOFError:
-            code = _exit_code(process)
-            by = f"was killed by signal {-code}: did the memory run out?" if code < 0 else f"ended with code {code}"
-            raise NeurolensError(f"its process {by}") from None
+            raise NeurolensError(f"its process {_end_of(process)}") from None
         finally:
             pipe.close()
             _exit_code(process)
@@ -127,8 +131,73 @@ class Processes(ThreadPoolExecutor):
         return here, process
 
 
+class Forked(ThreadPoolExecutor):
+    """Runs tasks of one function in processes that are forked from this one: each has all that it holds without a copy.
+
+    Args:
+        work: the function of all tasks. jobs: how many processes; each is pinned to a core if there is one for each.
+    """
+
+    def __init__(self, work: Callable[..., Any], jobs: int) -> None:
+        super().__init__(jobs)
+        self.room, self._work = jobs, work
+        self._free, self._processes = SimpleQueue[tuple[Any, Any]](), list[Any]()
+        context: Any = multiprocessing.get_context("fork")
+        with held():  # only this process handles Ctrl-C
+            for number in range(jobs):
+                here, there = context.Pipe()
+                process = context.Process(target=_serve, args=(there, work, number, jobs, os.getpid()), daemon=True)
+                process.start()
+                there.close()
+                self._processes.append(process)
+                self._free.put((here, process))
+
+    def submit(self, work: Callable[..., R], /, *args: Any, **named: Any) -> Future[R]:
+        """Send the arguments, which are pickled, to a free process; `work` must be the executor's function."""
+        assert work == self._work
+        return super().submit(self._answer, args, named)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Wait for the tasks, or with `cancel_futures` kill the processes that run; then end all processes."""
+        if not cancel_futures:
+            super().shutdown(wait)
+        for process in self._processes:
+            process.kill()
+        super().shutdown(cancel_futures=cancel_futures)
+        for process in self._processes:
+            process.join()
+
+    def _answer(self, args: Any, named: Any) -> Any:
+        pipe, process = self._free.get()
+        try:
+            pipe.send((args, named))
+            answer = pipe.recv()
+        except (EOFError, OSError):
+            raise NeurolensError(f"a worker {_end_of(process)}") from None
+        self._free.put((pipe, process))
+        return answer_of(answer)
+
+
+def in_order(threads: int, work: Callable[[T], R], tasks: Iterable[T]) -> Iterator[R]:
+    """Run `work(task)` for each task in threads of this process, and yield the answers in the order of the tasks.
+
+    Tasks are taken while a thread is free. Where the iteration ends early, the tasks under way are the last.
+    """
+    with ThreadPoolExecutor(threads) as pool:
+        running = deque[Future[R]]()
+        try:
+            for task in tasks:
+                running.append(pool.submit(work, task))
+                if len(running) > threads:
+                    yield running.popleft().result()
+            while running:
+                yield running.popleft().result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
 def run_each(
-    executor: Executor, work: Callable[..., R], tasks: Iterable[T], *common: Any
+    executor: Executor, work: Callable[..., R], tasks: Iterable[T], *common: Any, stop: Callable[[], bool] | None = None
 ) -> Iterator[tuple[T, R | Failed]]:
     """Run `work(*common, task)` for each task, and yield tasks with their answers in the order of completion.
 
@@ -138,14 +207,15 @@ def run_each(
     Args:
         executor: any executor of `concurrent.futures`; its attribute `room`, where it has one, bounds the tasks in
             flight (the number of cores elsewhere).
+        stop: is called many times a second; once it is true no task starts, and those that run have five seconds left.
 
     Raises:
         Lost: the executor has failed; the answers so far were yielded.
     """
     waiting, running, done = iter(tasks), dict[Future[R], T](), SimpleQueue[Future[R]]()
-    more = True
+    more, end = True, math.inf
     try:
-        while more or running:
+        while (more or running) and time.monotonic() < end:
             while more and len(running) < getattr(executor, "room", cores()):
                 try:
                     task = next(waiting)
@@ -155,9 +225,12 @@ def run_each(
                 future = executor.submit(work, *common, task)
                 running[future] = task
                 future.add_done_callback(done.put)
-            if running:
-                future = done.get()
-                yield running.pop(future), _result(future)
+            with suppress(Empty):
+                if running:
+                    future = done.get(timeout=None if stop is None else _POLL_S)
+                    yield running.pop(future), _result(future)
+            if stop is not None and end == math.inf and stop():
+                more, end = False, time.monotonic() + _PATIENCE_S
     finally:
         if more or running:
             executor.shutdown(wait=False, cancel_futures=True)
@@ -174,8 +247,13 @@ def _result(future: Future[Any]) -> Any:
 
 def failure(error: Exception) -> Failed:
     """The reason that an error gives, in one line: errors travel between processes as text."""
-    known = isinstance(error, NeurolensError)
-    return Failed(one_line(str(error) if known else f"a fault of neurolens: {type(error).__name__}: {error}", _LONGEST))
+    if isinstance(error, NeurolensError):
+        return Failed(one_line(str(error), _LONGEST))
+    if isinstance(error, MemoryError):
+        return Failed(one_line(f"a worker ran out of memory ({error or 'no more is known'})", _LONGEST))
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    said = one_line(f"a fault of neurolens: {type(error).__name__}: {error}", _LONGEST)
+    return Failed(f"{said} ({os.path.basename(frame.filename)}:{frame.lineno})")
 
 
 def answer_of(outcome: Any) -> Any:
@@ -204,6 +282,39 @@ def _exit_code(process: Any) -> int:
     with _STARTING:
         process.join()
         return int(process.exitcode)
+
+
+def _end_of(process: Any) -> str:
+    """How a process ended that has given no answer."""
+    code = _exit_code(process)
+    if code >= 0:
+        return f"ended with code {code}"
+    return f"was killed by signal {-code}" + (": did the memory run out?" if code == -signal.SIGKILL else "")
+
+
+def _serve(pipe: Any, work: Callable[..., Any], number: int, jobs: int, parent: int) -> None:
+    """The main function of a forked process."""
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    with suppress(AttributeError, OSError):  # fewer processes than cores are left to the scheduler
+        if jobs >= len(free := sorted(os.sched_getaffinity(0))):
+            os.sched_setaffinity(0, {free[number % len(free)]})
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(1)  # a forked process must not enter torch's thread pool: it never returns
+    with suppress(EOFError):
+        while True:
+            args, named = pipe.recv()
+            try:
+                outcome = work(*args, **named)
+            except Exception as error:
+                outcome = failure(error)
+            pipe.send(outcome)
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent is gone, whatever it does: a killed parent can ask nobody to stop."""
+    while os.getppid() == parent:
+        time.sleep(_POLL_PARENT_S)
+    os._exit(1)
 
 
 def _work(pipe: Any, work: Callable[..., Any], args: Any, named: Any) -> None:

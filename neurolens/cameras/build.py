@@ -17,11 +17,9 @@ from neurolens.base.errors import InputError
 from neurolens.base.lensname import FISHEYES, FUSED, IDEAL_OF, is_model, resolve
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.dispersion import ReducedDispersion
-from neurolens.cameras.ideal import ThickLens, ThinLens
-from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole, check_field
+from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, ThinLens, check_field
+from neurolens.cameras.reduced import ReducedDispersion, Vignetted
 from neurolens.cameras.sampling import beyond_circle, refuse
-from neurolens.cameras.vignetting import Vignetted
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
 

@@ -1,6 +1,6 @@
 """Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
 
-The graph of a camera is written here, and in `pupil_outline`, once. onnxruntime and compiled cameras run it whole, with
+The graph of a camera is written here, once. onnxruntime and compiled cameras run it whole, with
 the graph of their lens inside (`whole_camera`); cameras whose lens is a function (a trace) evaluate its two halves.
 """
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.cameras.contract import CameraRays, RayDifferentials
 from neurolens.graph.derive import derivative
+from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import FILM_X_Y
 from neurolens.lens.apertures import Aperture
@@ -32,8 +33,58 @@ _NO_AREA = 1e-30
 # Outputs of a lens's graph with derivatives by the film point.
 D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
 METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
-_HAIR = 1e-18  # keeps the middle of a disc finite
+_HAIR = 1e-18  # mm; keeps the axis and the middle of a disc finite
 _AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
+
+
+@lru_cache(maxsize=16)
+def pupil_graph(segments: int, wavelengths: int) -> Graph:
+    """The pupil point of a film point, of a point of the unit square and a wavelength, and its area, as a graph.
+
+    The square's concentric squares become concentric copies of the polygon, as for Shirley and Chiu's disk (1997):
+    neighbours stay neighbours, and inside each triangle between centre and edge areas stay in proportion.
+
+    Args:
+        segments: K, of the upper half of a polygon. wavelengths: of the outline, 1 or 2.
+
+    Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call the table `outline` (`PupilOutline.table`),
+    `per_radius` (1 / the last film radius), `last_row`, and of two wavelengths `wave_first`, `wave_scale`: the share of
+    the second is (1 / wavelength^2 - first) scale.
+    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but negative or NaN where nothing passes;
+    points mean nothing there.
+    """
+    g = Graph()
+    film, square, wavelength = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
+    per_radius, last_row = (g.input(name, per_call=True) for name in ("per_radius", "last_row"))
+    radius = g.square(film).sqrt()
+    inner = 1.0 - radius * per_radius
+    place = (1.0 - inner.maximum(0.0).sqrt()) * last_row
+    row = place.floor()
+    step = place - row
+    a, b = g.split(square - 0.5, (1, 1))
+    height = b.abs()
+    size = a.abs().maximum(height)
+    # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
+    per_size = 1.0 / size.maximum(1e-30)
+    along = (2.0 - a * per_size * (2.0 - height * per_size)) * (segments / 4)
+    edge = along.floor()
+    cell, weights = row * (segments + 1.0) + edge, g.concat(g.constant(1.0), step)
+    if wavelengths > 1:
+        first, scale = (g.input(name, per_call=True) for name in ("wave_first", "wave_scale"))
+        share = ((1.0 / (wavelength * wavelength) - first) * scale).clip(0.0, 1.0)
+        weights = g.concat(weights, share, share * step)
+    vertex, side, centre = g.split(g.lookup(g.table("outline", 10 * wavelengths), cell, weights), (2, 2, 1))
+    products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
+    area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # none beyond the end
+    sign = (b * 1e30).clip(-1.0, 1.0)
+    x, y = g.split(vertex + side * (along - edge), (1, 1))
+    size = size * 2.0
+    x, y = x * size, y * (size * sign)
+    # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
+    turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
+    pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
+    g.outputs = {"pupil_mm": pupil, "area_mm2": area}
+    return g
 
 
 @lru_cache(maxsize=16)
@@ -104,6 +155,14 @@ def unit_disc(square: Value) -> Value:
     cos = size * g.series(squared, _COS)
     sin = size * angle * g.series(squared, _SIN)
     return g.concat(g.select(flat, cos, sin), g.select(flat, sin, cos))
+
+
+def concentric_disk(square: NDArray[Any]) -> NDArray[Any]:
+    """`unit_disc` of points [2, N], which keeps areas and neighbours."""
+    g = Graph()
+    g.outputs["disc"] = unit_disc(g.input("square", 2))
+    found: NDArray[Any] = evaluate(g, {"square": square})["disc"]
+    return found
 
 
 def _series(function: Callable[[Array], Array]) -> Array:

@@ -46,13 +46,15 @@ class Shift(NamedTuple):
             the points in mm of the same scene ray at the companion wavelength, `ratio` of its light to the hero's, and
             `known`, 0 beyond the film or the reach.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
-        edge_mm: a companion passes if the hero does, and the hero's `margin` of `lanes_graph` is larger than this.
+        edge: a companion passes if the hero does, and crosses the pupil farther inside than the first number (mm), than
+            the second times d and than the third times -d. d is the difference of 1 / wavelength^2 (um) to the hero's,
+            negative on the far side of the pupil's middle: dispersion moves rays to one side.
     """
 
     of_hero: Graph
     graph: Graph
     reach_mm: tuple[float, float]
-    edge_mm: float
+    edge: tuple[float, float, float]
 
 
 def fit_shift(
@@ -63,7 +65,7 @@ def fit_shift(
     Args:
         lens: the graph of the lens (`cameragraph.LensGraph`).
         samples: its inputs for rays that cover film, pupil and wavelengths; half of them measure the error.
-        margin: [N] of these rays, see `lanes_graph`.
+        margin: [N] how far inside the pupil these rays pass, as in `lanes_graph`.
         companion_nm: [N] wavelengths of the companions. film_mm: width and height of the film.
     """
     found = _solved(lens, samples, companion_nm)
@@ -79,8 +81,11 @@ def fit_shift(
     x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
     graphs = _shift_graphs(weights, tint, scale, (middle, spread), (x, y), film_mm)
     on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
-    lost = margin[found.kept][on_film & ~found.passed[found.kept]]
-    return Shift(*graphs, (x, y), max(_BEYOND * float(lost.max(initial=0)), float(np.quantile(margin, _SURELY))))
+    surely, inside = float(np.quantile(margin, _SURELY)), margin[found.kept]
+    lost = on_film & ~found.passed[found.kept] & (inside > surely)
+    away = ((waves[1] - waves[0]) * np.where((rays[:2] * rays[2:4]).sum(axis=0) <= 0, -1, 1))[lost]
+    slopes = (_BEYOND * float(np.max(inside[lost] / way, initial=0, where=way > 0)) for way in (away, -away))
+    return Shift(*graphs, (x, y), (surely, *slopes))
 
 
 def _terms(columns: Array, values: Array) -> tuple[Array, Array, float]:
@@ -141,8 +146,8 @@ def lanes_graph(shift: Shift, companions: int) -> Graph:
     Inputs: those of `Shift.of_hero`, `companion_nm` [companions], and of the hero's ray `square` [2], `area_mm2` and
     `weight`.
     Outputs: `light` [companions], the weights that they would have alone, 0 where they are not `known`; `places`, the
-    film points of all wavelengths, the hero's where there is no light; `margin`, how far inside the pupil the
-    ray passes, about in mm.
+    film points of all wavelengths, the hero's where there is no light; `sure` [companions], above 0 where a companion
+    passes if the hero does.
     """
     g = Graph()
     film, light, weight = g.input("film_mm", 2), g.input("companion_nm", companions), g.input("weight")
@@ -156,7 +161,13 @@ def lanes_graph(shift: Shift, companions: int) -> Graph:
     there = (g.select(lane <= 0.0, film, f["film_there"]) for lane, f in zip(lanes, found, strict=True))
     g.outputs |= {"light": g.concat(*lanes), "places": g.concat(film, *there)}
     inside = (g.input("square", 2) * 2.0 - 1.0).abs()
-    g.outputs["margin"] = (1.0 - inside[0].maximum(inside[1])) * g.input("area_mm2").maximum(0.0).sqrt()
+    margin = (1.0 - inside[0].maximum(inside[1])) * g.input("area_mm2").maximum(0.0).sqrt()  # about in mm
+    surely, *slopes = shift.edge
+    hero, *others = (g.square(1000.0 / nm) for nm in (g.input("wavelength_nm"), *g.split(light, [1] * companions)))
+    side = g.select(g.dot(film, g.input("pupil_mm", 2)) <= 0.0, -1.0, 1.0)
+    aways = [(other - hero) * side for other in others]
+    edges = [(away * slopes[0]).maximum(away * -slopes[1]).maximum(surely) for away in aways]
+    g.outputs["sure"] = g.concat(*(margin - edge for edge in edges))
     return g
 
 

@@ -16,7 +16,7 @@ was sampled uniformly on the area A weighs
 
 with transmittance T and the film-side angle theta to the axis (Kolb et al. 1995, eq. 3). So the film value is the mean
 of weight times radiance over the pupil samples, and every camera, whatever its f-number, shows white surroundings as 1
-on the axis; off it as natural and optical vignetting leave them (`neurolens.cameras.vignetting` switches these off).
+on the axis; off it as natural and optical vignetting leave them (`neurolens.cameras.reduced` switches these off).
 Cameras that are points (pinhole, fisheye projections) are the limit of a small hole.
 
 Light tracing measures the same integral from the other end:

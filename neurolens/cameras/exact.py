@@ -21,19 +21,25 @@ from neurolens.base.files import fingerprint_of, kept_in_cache, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.cameragraph import D_FILM, METRES, LensGraph
 from neurolens.cameras.companions import lanes_graph, shifted
-from neurolens.cameras.contract import FilmPoints, FloatArray
-from neurolens.cameras.front_aim import FrontAim, front_aim
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import GraphRun, Kind, LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
-from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
-from neurolens.cameras.pupil_search import COARSE, FINE, Detail, PupilTable, outline_of
-from neurolens.cameras.sampling import arrived, lens_state
+from neurolens.cameras.pupil_outline import (
+    COARSE,
+    FINE,
+    Detail,
+    PupilOutline,
+    PupilTable,
+    outline_of,
+    wavelength_between,
+)
+from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.paraxial import chief_reach_mm, first_order
-from neurolens.lens.prescription import Lens
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
@@ -88,7 +94,6 @@ class ExactCamera(LensCamera):
         outline = kept_outline(key, lambda: self._outline(bounds, used, detail, progress))
         self.film = LensFilm(outline, float(film_z), used, self._scene)
         self._light_nm = used
-        self._front: FrontAim | None = None
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",
@@ -145,25 +150,23 @@ class ExactCamera(LensCamera):
         there = evaluate(g, rays)["there"]
         return {"status": self._scene(there[:2], there[2:], rays["companion_nm"][0]).status[None]}
 
-    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""
-        if self._front is None:
-            self._front = front_aim(self.film, self.film_mm, self._light_nm, self.lens.surfaces[0])
-        film_z = self.film.film_z_mm
-        aim = self._front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [film_z]], pupil)
+    @property
+    def front(self) -> Surface:
+        """The first surface."""
+        return self.lens.surfaces[0]
+
+    def _traced_back(
+        self, position: NDArray[np.float64], direction: NDArray[np.float64], wavelength_nm: FloatArray
+    ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
         # Light starts a millimetre before the surface, so that it lies ahead; rays that are not finite miss it.
-        rays = np.nan_to_num(np.concatenate([aim.position + aim.direction, -aim.direction]), posinf=0, neginf=0)
+        rays = np.nan_to_num(np.concatenate([position + direction, -direction]), posinf=0, neginf=0)
         with torch.no_grad():
             *light, wavelength = _tensors(self._dtype, *rays, wavelength_nm)
             done = trace(self.lens, Rays(*light), wavelength, towards="film", transmittance=True)
         assert done.transmittance is not None
         x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
-        origin = 1e-3 * (aim.position - [[0], [0], [film_z]])
-        with np.errstate(all="ignore"):
-            film = np.stack([x, y]) + (film_z - z) / dz * np.stack([dx, dy])
-            weight = through * aim.area / (self.film.exposure * ((point_m - origin) ** 2).sum(0))
-        status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
-        return arrived(film, origin, point_m, weight, status, wavelength_nm)
+        film = np.stack([x, y]) + (self.film.film_z_mm - z) / dz * np.stack([dx, dy])
+        return film, through, done.status.numpy()
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """The graph of the lens with its stop; it has one form."""

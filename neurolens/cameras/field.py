@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.pinhole import PROJECTIONS
+from neurolens.cameras.ideal import PROJECTIONS
 from neurolens.lens import film_plane
 
 Array = NDArray[np.float64]

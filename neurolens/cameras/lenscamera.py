@@ -31,12 +31,13 @@ from neurolens.cameras.contract import (
     MANY_RAYS_A_CALL,
     RAYS_A_CALL,
     CameraRays,
+    FilmPoints,
     FloatArray,
     SpectralRays,
 )
 from neurolens.cameras.onnxlens import open_session, run_batches
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.sampling import is_light, stratified
+from neurolens.cameras.sampling import FrontDiscs, arrived, is_light, stratified
 from neurolens.graph.c import Signature, padded_columns, write_blocks
 from neurolens.graph.compiler import load_compiled
 from neurolens.graph.interpret import evaluate
@@ -46,7 +47,11 @@ from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
 from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import Surface
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
+from neurolens.trace.shapes import sag_and_derivatives
+
+Array = NDArray[np.float64]
 
 _ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, not a cylinder
 # Points a side of the quadrature of the exposure on the axis.
@@ -147,6 +152,7 @@ GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 # 7100, and its time grows faster than their number.
 MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
+_EDGE_RAYS = 2**16  # rays that look for where light crosses the front surface
 
 
 class LensCamera:
@@ -166,6 +172,7 @@ class LensCamera:
     film_mm: tuple[float, float]
     settings: dict[str, Any]
     runtime: Runtime
+    _light_nm: tuple[float, float]
     differentials_error: float | None = None
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
@@ -193,6 +200,52 @@ class LensCamera:
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
         return self.film.natural(film_mm, pupil, wavelength_nm)
+
+    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
+        """Film points of scene points [3, N] in m, through points of the front surface that `pupil` chooses.
+
+        Errors of models are those of `_traced_back`.
+        """
+        shape, up = self.front, np.array([[0.0], [0.0], [self.film.film_z_mm]])
+        with np.errstate(all="ignore"):
+            point = 1e3 * point_m.astype(np.float64) + up
+            x, y, area = self._front_discs.aim(point, pupil)
+            z, sx, sy = (0 * x,) * 3 if shape is None else sag_and_derivatives(shape, x, y)
+            position = np.stack([x, y, z])
+            way = point - position
+            direction = way / np.sqrt((way * way).sum(0))
+            # dA cos = dx dy (d . n) / |n_z|, with the outward normal along (sx, sy, -1).
+            facing = sx * direction[0] + sy * direction[1] - direction[2]
+            film, through, status = self._traced_back(position, direction, wavelength_nm)
+            origin = 1e-3 * (position - up)
+            weight = through * area * facing / (self.film.exposure * ((point_m - origin) ** 2).sum(0))
+        aimed = np.where(np.isfinite(point).all(0), st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
+        status = np.where(facing > 0, status, aimed).astype(np.int32)
+        return arrived(film, origin, point_m, weight, status, wavelength_nm)
+
+    @property
+    def front(self) -> Surface | None:
+        """The surface at which light of scene points is aimed; None is the plane z = 0."""
+        raise NotImplementedError
+
+    def _traced_back(
+        self, position: Array, direction: Array, wavelength_nm: FloatArray
+    ) -> tuple[Array, FloatArray, NDArray[np.int32]]:
+        """Film points [2, N], transmittance and status of light that comes from `direction` to points of the front."""
+        raise NotImplementedError
+
+    @cached_property
+    def _front_discs(self) -> FrontDiscs:
+        """Where the film's light crosses the front, by rays at the edges of the pupil, half of them from the film's."""
+        rng, ray = np.random.default_rng(0), np.arange(_EDGE_RAYS)
+        film = (rng.random((2, _EDGE_RAYS)) - 0.5) * np.array(self.film_mm)[:, None]
+        film[:, ::2] *= 0.5 / np.abs(film[:, ::2] / np.array(self.film_mm)[:, None]).max(0)
+        film *= np.minimum(0.9999 * self.film.outline.film_radius_mm / np.hypot(*film), 1)
+        square = rng.random((2, _EDGE_RAYS), np.float32)
+        square[ray // 2 % 2, ray] = np.where(ray // 4 % 2, np.float32(1e-4), np.float32(1 - 1e-4))
+        waves, points = rng.uniform(*self._light_nm, _EDGE_RAYS).astype(np.float32), film.astype(np.float32)
+        found = self.film.scene(points, self.film.outline.sample(points, square, waves)[0], waves)
+        return FrontDiscs.of(found.scene_ray[:, found.status == st.PASSED].astype(np.float64), self.front)
 
     def compiled(self) -> Self:
         """The same camera run as C; its film and pupil are not searched again. Raises InputError: no C compiler."""
@@ -222,15 +275,16 @@ class LensCamera:
         hero = self._run("hero", lanes - 1)(given)
         rays = camera_rays(hero)
         light, places = hero["light"], hero["places"].reshape(lanes, 2, -1)
-        edge = np.flatnonzero((hero["margin"][0] < self._edge_mm) & (rays.weight > 0))
+        doubt = np.flatnonzero((hero["sure"] < self._sure) & (light > 0))  # of all companions, one after the other
+        ray = doubt % film.shape[1]
         same = {"film_mm": film, "pupil_mm": hero["pupil_mm"], "wavelength_nm": nm[:1]}
-        near = {name: np.tile(values.take(edge, axis=1), lanes - 1) for name, values in same.items()}
-        near["companion_nm"] = nm[1:].take(edge, axis=1).reshape(1, -1)
-        passes = (self._run("companion")(near)["status"] == st.PASSED).reshape(lanes - 1, -1)
-        light[:, edge] *= passes
-        places[1:, :, edge] = np.where(passes[:, None], places[1:, :, edge], film[:, edge])
+        near = {name: values.take(ray, axis=1) for name, values in same.items()}
+        near["companion_nm"] = nm[1:].reshape(1, -1).take(doubt, axis=1)
+        lost = self._run("companion")(near)["status"][0] != st.PASSED
+        light.reshape(-1)[doubt[lost]] = 0
+        places[1 + doubt[lost] // film.shape[1], :, ray[lost]] = film[:, ray[lost]].T
         weight = np.concatenate([rays.weight[None], light])
-        weight /= np.maximum(np.count_nonzero(weight, axis=0), 1).astype(np.float32)
+        weight /= np.maximum((weight > 0).sum(axis=0, dtype=np.uint8), 1).astype(np.float32)
         return SpectralRays(rays, weight, places)
 
     @property
@@ -287,9 +341,9 @@ class LensCamera:
         return fit_shift(self.lens_graph().graph, samples, margin, companions, self.film_mm)
 
     @cached_property
-    def _edge_mm(self) -> float:
-        """`Shift.edge_mm`; all of the pupil where a shape in the stop has other edges."""
-        return self._shift.edge_mm if self._shift and self.lens_graph().aperture is None else math.inf
+    def _sure(self) -> float:
+        """The `sure` of `lanes_graph` from which companions need no ray; none where a shape in the stop has edges."""
+        return 0.0 if self.lens_graph().aperture is None else math.inf
 
     def _of_the_lens(self) -> dict[str, float]:
         """The inputs of the lens's graph for a whole call."""
@@ -325,7 +379,7 @@ class LensCamera:
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
     def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
-        """Inputs of the lens's graph for rays all over film, pupil and wavelengths, and their `lanes_graph` margins."""
+        """Inputs of the lens's graph for rays all over film, pupil and light, and their margins as in `lanes_graph`."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))

@@ -14,22 +14,20 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.cameragraph import LensGraph, status_graph
-from neurolens.cameras.contract import FilmPoints, FloatArray
-from neurolens.cameras.front_aim import FrontAim, front_aim
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE, PupilTable, outline_of
+from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
 from neurolens.cameras.sampling import (
-    arrived,
     beyond_circle,
     common_light,
     lens_state,
     refuse,
 )
 from neurolens.graph.interpret import evaluate
-from neurolens.lens import film_plane
+from neurolens.lens import paraxial
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Surface
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.card import DOMAIN_SLACK, state_for
@@ -124,31 +122,23 @@ class OnnxCamera(LensCamera):
         unit = form is ONNX and self.model.fitted.direction == "angle"
         return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status, unit)
 
-    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m through points of the front surface chosen by `pupil`.
+    @property
+    def front(self) -> Surface | None:
+        """The front surface of the lens, as the inverse map has it."""
+        return self.model.fitted.front
 
-        By the model's inverse map of scene rays; what it does not find is NO_SOLUTION.
-
-        Raises:
-            InputError: as `inverse_of`.
-        """
-        inverse, front = self._inverse
+    def _traced_back(
+        self, position: NDArray[np.float64], direction: NDArray[np.float64], wavelength_nm: FloatArray
+    ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
+        """By the model's inverse map of scene rays; what it does not find is NO_SOLUTION."""
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
-        aim = front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [scene.film_z_mm]], pupil)
-        out = inverse.from_scene(aim.position, aim.direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
-        status = np.where(aim.status == st.PASSED, scene.status_of(out), aim.status)
-        origin = 1e-3 * (aim.position - [[0], [0], [scene.film_z_mm]])
-        squared = ((point_m - origin) ** 2).sum(0)
-        with np.errstate(all="ignore"):
-            weight = np.maximum(out.transmittance, 0) * aim.area / (self.film.exposure * squared)
-        return arrived(out.rays[:2].astype(np.float64), origin, point_m, weight, status, wavelength_nm)
+        out = self._inverse.from_scene(position, direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
+        return out.rays[:2], np.maximum(out.transmittance, 0).astype(np.float32), scene.status_of(out)
 
     @cached_property
-    def _inverse(self) -> tuple[InverseModel, FrontAim]:
-        """The inverse maps, and where on the front surface to aim."""
-        model = self.model.fitted
-        return inverse_of(model), front_aim(self.film, self.film_mm, self._light_nm, model.front)
+    def _inverse(self) -> InverseModel:
+        return inverse_of(self.model.fitted)
 
 
 @dataclass(frozen=True)
@@ -252,7 +242,7 @@ class _Spot(NamedTuple):
 
 def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> _Spot:
     domain = scene.model.card["domain"]
-    colours, weights = film_plane.colours(wavelength_nm)
+    colours, weights = paraxial.colours(wavelength_nm)
     reach = float(domain["film_radius_mm"])
     round_ = scene.aperture is None and squeeze_of(scene, _SQUEEZED * reach, wavelength_nm) == 1.0
     spokes = 1 if round_ else _SPOKES  # of a round lens one stands for all
@@ -309,15 +299,15 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
     """The table `lens_state` of the settings, by the first-order data of the card."""
     model, film_z = scene.model, scene.film_z_mm
     lens, radius = model.card["lens"], model.card["domain"]["film_radius_mm"]
-    efl, front_efl = lens["efl_mm"], lens["efl_mm"] * film_plane.index_ratio(lens)
+    efl, front_efl = lens["efl_mm"], lens["efl_mm"] * paraxial.index_ratio(lens)
     focal_points = lens["front_principal_z_mm"] - front_efl, lens["rear_principal_z_mm"] + efl
     exit_z = float(lens.get("exit_pupil_z_mm", math.nan))
-    entrance = film_plane.entrance_pupil_z_mm(efl, front_efl, focal_points, exit_z)
+    entrance = paraxial.entrance_pupil_z_mm(efl, front_efl, focal_points, exit_z)
     breathes = any(a.name == "focus" for a in model.axes)
     return lens_state(
         nominal_mm=None if breathes else efl,
         efl_mm=efl,
-        pinhole_mm=film_plane.reach_mm(efl, front_efl, focal_points, entrance, film_z),
+        pinhole_mm=paraxial.reach_mm(efl, front_efl, focal_points, entrance, film_z),
         entrance_pupil_mm=film_z - entrance,
         f_number=f_number,
         transmittance=axial_transmittance(scene, wavelength_nm),
@@ -338,7 +328,7 @@ def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
         return float(lens["film_z_mm"])  # its groups have moved
-    z = film_plane.film_z_of_card_mm(lens, focus_m)
+    z = paraxial.film_z_of_card_mm(lens, focus_m)
     # A domain may hold the film of best focus alone: a millimetre from the paraxial one, of a singlet.
     least, most = sorted(float(v) for v in model.card["domain"]["focus_m"])
     if not (near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK or least <= focus_m <= most):

@@ -4,21 +4,27 @@ Rays that pass a lens from one film point cross the pupil plane in a region boun
 the stop and of the rims that vignette. A polygon about a centre inside it, interpolated between film radii, holds the
 region so closely that nearly every ray sent through it passes. The arcs move with the wavelength, by 2% of the pupil
 over the visible range in a double Gauss, and so do the polygons.
+
+They are searched from nothing but whether rays pass, which the exact tracer and an exported model both tell, at any
+focus and stop: all rows of the outline at once, ray by ray from a centre outwards.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.cameras.cameragraph import pupil_graph
 from neurolens.cameras.contract import FloatArray
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-
-_HAIR = 1e-18  # mm
+from neurolens.surrogates.card import pupil_rows
 
 
 @dataclass(frozen=True)
@@ -106,59 +112,364 @@ class PupilOutline:
         return np.ascontiguousarray(groups.reshape(10 * len(here), -1), np.float32).T
 
 
-@cache
-def pupil_graph(segments: int, wavelengths: int) -> Graph:
-    """The pupil point of a film point, of a point of the unit square and a wavelength, and its area, as a graph.
-
-    The square's concentric squares become concentric copies of the polygon, as for Shirley and Chiu's disk (1997):
-    neighbours stay neighbours, and inside each triangle between centre and edge areas stay in proportion.
-
-    Args:
-        segments: K, of the upper half of a polygon. wavelengths: of the outline, 1 or 2.
-
-    Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call the table `outline` (`PupilOutline.table`),
-    `per_radius` (1 / the last film radius), `last_row`, and of two wavelengths `wave_first`, `wave_scale`: the share of
-    the second is (1 / wavelength^2 - first) scale.
-    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but negative or NaN where nothing passes;
-    points mean nothing there.
-    """
-    g = Graph()
-    film, square, wavelength = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
-    per_radius, last_row = (g.input(name, per_call=True) for name in ("per_radius", "last_row"))
-    radius = g.square(film).sqrt()
-    inner = 1.0 - radius * per_radius
-    place = (1.0 - inner.maximum(0.0).sqrt()) * last_row
-    row = place.floor()
-    step = place - row
-    a, b = g.split(square - 0.5, (1, 1))
-    height = b.abs()
-    size = a.abs().maximum(height)
-    # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
-    per_size = 1.0 / size.maximum(1e-30)
-    along = (2.0 - a * per_size * (2.0 - height * per_size)) * (segments / 4)
-    edge = along.floor()
-    cell, weights = row * (segments + 1.0) + edge, g.concat(g.constant(1.0), step)
-    if wavelengths > 1:
-        first, scale = (g.input(name, per_call=True) for name in ("wave_first", "wave_scale"))
-        share = ((1.0 / (wavelength * wavelength) - first) * scale).clip(0.0, 1.0)
-        weights = g.concat(weights, share, share * step)
-    vertex, side, centre = g.split(g.lookup(g.table("outline", 10 * wavelengths), cell, weights), (2, 2, 1))
-    products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
-    area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # none beyond the end
-    sign = (b * 1e30).clip(-1.0, 1.0)
-    x, y = g.split(vertex + side * (along - edge), (1, 1))
-    size = size * 2.0
-    x, y = x * size, y * (size * sign)
-    # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
-    turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
-    pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
-    g.outputs = {"pupil_mm": pupil, "area_mm2": area}
-    return g
-
-
 def wavelength_between(wavelength_nm: tuple[float, ...], share: float) -> float:
     """The wavelength in nm at a share of the way from the first to the last, in 1 / wavelength^2."""
     first, last = wavelength_nm[0], wavelength_nm[-1]
     if share in (0, 1):  # no rounding may leave the range
         return last if share else first
     return first if first == last else float((first**-2 + share * (last**-2 - first**-2)) ** -0.5)
+
+
+# ---- the search ----
+
+# Halvings that place the end of the light; lattice on a box that looks for light.
+_END_HALVINGS = 10
+_COARSE_LATTICE = (40, 20)
+
+# Whether light of a wavelength in nm passes from film points [2, N] through pupil points [2, N], both mm: bool [N].
+Passes = Callable[[FloatArray, FloatArray, float], NDArray[np.bool_]]
+Float64Array = NDArray[np.float64]
+# Whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
+PassTest = Callable[[Float64Array, Float64Array], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True)
+class PupilTable:
+    """Boxes on the pupil plane that hold the passing rays of film points at equally spaced radii.
+
+    For a film point at radius r along +x, passing rays lie within low <= u <= high along +x and |v| <= half across.
+
+    Attributes:
+        pupil_z_mm: the plane.
+        film_radius_mm: radius of the last row; the first row is the axis.
+        rows: [3, R]: low, high, half; low > high where nothing passes.
+    """
+
+    pupil_z_mm: float
+    film_radius_mm: float
+    rows: FloatArray
+
+    @staticmethod
+    def of(bounds: Mapping[str, Any]) -> PupilTable:
+        """Make it of the fields of `PupilBounds`, in which a model's card holds them."""
+        return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), pupil_rows(bounds))
+
+
+def tightened(table: PupilTable, passing: PassTest, lattice: tuple[int, int] = (96, 48)) -> PupilTable:
+    """The same rows with boxes cut to what passes now, for example through a closed stop."""
+    last = table.rows.shape[1] - 1
+    place = np.minimum(np.arange(last + 1), last * (1 - 1e-6))
+    found = _lattice(_boxes(table, place), table.film_radius_mm * place / last, passing, lattice)
+    return replace(table, rows=found.boxes.astype(np.float32))
+
+
+class SearchFrame(NamedTuple):
+    """For each row [R]: film radius, centre of the polygon, half widths along and across [2, R], and farthest reach.
+
+    Directions and the reach are those of a frame in which the region is about as wide as it is high.
+    """
+
+    radius: Float64Array
+    centre: Float64Array
+    stretch: Float64Array
+    reach: Float64Array
+
+
+def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
+    """A test whether rays pass at any of the wavelengths."""
+
+    def passing(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
+        film = np.zeros(points.shape, np.float32)
+        film[0] = radius
+        rays = np.concatenate([film, points]).reshape(4, -1).astype(np.float32)
+        passed = np.zeros(rays.shape[1], np.bool_)
+        for wavelength in wavelength_nm:
+            left = np.flatnonzero(~passed)
+            passed[left] = passes(rays[:2, left], rays[2:, left], wavelength)
+        return passed.reshape(points.shape[1:])
+
+    return passing
+
+
+def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
+    """The largest film radius, within those of the table, from which a ray is found to pass."""
+    last = table.rows.shape[1] - 1
+
+    def light(boxes: Float64Array, place: Float64Array) -> Float64Array:
+        """Boxes [3, M] about what passes at fractional rows within boxes."""
+        return _lattice(boxes, table.film_radius_mm * place / last, passing).boxes
+
+    rows = np.minimum(np.arange(last + 1), last * (1 - 1e-6))
+    boxes = light(_boxes(table, rows), rows)
+    some = np.flatnonzero(boxes[0] <= boxes[1])
+    if not some.size:
+        return None
+    lit, box = rows[some[-1:]], boxes[:, some[-1:]]
+    dark = rows[some[-1] + 1 : some[-1] + 2]
+    for _ in range(_END_HALVINGS if dark.size else 0):
+        middle = (lit + dark) / 2
+        # What is left of the pupil mostly lies in what was left before: a lattice there finds smaller regions.
+        found = next((f for b in (box, _boxes(table, middle)) if (f := light(b, middle))[0] <= f[1]), None)
+        lit, dark, box = (lit, middle, box) if found is None else (middle, dark, found)
+    return float(table.film_radius_mm * lit[0] / last) if lit[0] > 0 else None
+
+
+def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
+    """[3, M] low, high and half width that hold what passes at fractional rows of the table."""
+    low, high, half = table.rows.astype(np.float64)
+    empty = low > high
+    low, high = np.where(empty, np.inf, low), np.where(empty, -np.inf, high)
+    a = np.minimum(place.astype(np.intp), low.size - 1)
+    b = np.minimum(a + 1, low.size - 1)
+    return np.stack([np.minimum(low[a], low[b]), np.maximum(high[a], high[b]), np.maximum(half[a], half[b])])
+
+
+class _Found(NamedTuple):
+    """What passes of lattices: boxes [3, M] about it, a step wider (low > high where nothing passes); mean along x."""
+
+    boxes: Float64Array
+    centre: Float64Array
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of empty boxes, and of those near the end of float32, nothing passes
+def _lattice(
+    boxes: Float64Array, radius: Float64Array, passing: PassTest, size: tuple[int, int] = _COARSE_LATTICE
+) -> _Found:
+    """Test lattices of points on boxes [3, M] from film radii [M]."""
+    low, high, half = boxes
+    u, v = ((np.arange(n) + 0.5) / n for n in size)
+    x, y = points = np.empty((2, radius.size, *size))
+    x[:] = low[:, None, None] + (high - low)[:, None, None] * u[:, None]
+    y[:] = half[:, None, None] * v
+    passed = passing(radius[:, None, None], points) & (low <= high)[:, None, None]
+    left, right = np.where(passed, x, np.inf).min((1, 2)), np.where(passed, x, -np.inf).max((1, 2))
+    top = np.where(passed, y, 0).max((1, 2))
+    centre = np.where(passed, x, 0).sum((1, 2)) / np.maximum(passed.sum((1, 2)), 1)
+    step, rise = (high - low) / size[0], half / size[1]
+    return _Found(np.where(passed.any((1, 2)), [left - step, right + step, top + rise], [[1], [-1], [0]]), centre)
+
+
+def frame_of(table: PupilTable, radius: Float64Array, passing: PassTest) -> SearchFrame:
+    """Centroid and extent of what passes at each film radius, from a lattice."""
+    place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
+    boxes, centre = _lattice(_boxes(table, place), radius, passing)
+    # A row whose lattice misses a small region takes what its neighbours have.
+    rows, found = np.arange(radius.size), boxes[0] <= boxes[1]
+    centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, *boxes))
+    centre[radius == 0] = 0.0  # the axis has no azimuth: pupil points must not jump as a film point passes it
+    stretch = np.stack([(high - low) / 2, half])
+    off_centre = np.abs(centre - (low + high) / 2) / stretch[0]
+    return SearchFrame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))
+
+
+_DIRECTIONS = 33  # in which the first outline is sought
+# Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
+# multiples of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
+_BETWEEN_ROWS, _ALONG_EDGE = (0.0, 0.5), (0.0, 0.3, 0.5, 0.7)
+_CHECKS, _CHECK_HALVINGS = (1.0, 1.002, 1.01, 1.03, 1.07, 1.15, 1.35), 5
+_HAIR = 2e-5
+# Where one wavelength's region is less than this share of both together, one outline serves both. Half-planes that do
+# not hold the centroid of a convex region cut off less (Gruenbaum 1960: 1 - 1/e), so that the centre lies inside all.
+_APART = 0.65
+# So it does where a wavelength between reaches so many times farther than the ends of the spectrum let expect.
+_BULGE = 1.04
+
+
+class Detail(NamedTuple):
+    """The fineness of the search for an outline.
+
+    Attributes:
+        rows: film radii. segments: edges of the upper half of a polygon.
+        wavelengths: shares of the way from the shortest to the longest, in 1 / wavelength^2, the ends among them.
+        steps, coarse, fine: steps outwards, and halvings of the one that crosses the boundary, of two searches.
+        reach: how many times farther than the first search found the second looks.
+        tighten: lattice on each box, along and across, for the table may be much wider than what passes.
+    """
+
+    rows: int = 65
+    segments: int = 32
+    wavelengths: tuple[float, ...] = (0.0, 0.4, 0.75, 1.0)
+    steps: int = 24
+    coarse: int = 5
+    fine: int = 12
+    reach: float = math.inf
+    tighten: tuple[int, int] = (96, 48)
+
+
+FINE = Detail()
+# For a lens with cylinders: each test takes tracing at many azimuths, and no outline fits all of them.
+# What is left out errs towards outlines too wide: halvings end outside what passes.
+COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, (48, 24))
+
+
+def outline_of(
+    table: PupilTable,
+    passes: Passes,
+    wavelength_nm: tuple[float, float],
+    detail: Detail = FINE,
+    report: Callable[[float], object] = lambda share: None,
+) -> PupilOutline | None:
+    """The outline of what passes, or None where nothing does.
+
+    Args:
+        table: boxes that hold what passes, wider is slower but no harm.
+        passes: the lens at one focus and stop.
+        wavelength_nm: shortest and longest wavelength; equal ones give an outline for one.
+        detail: how closely.
+        report: takes the share of the search that is done.
+
+    The polygons hold every point found to pass at the rows, between them and between vertices, even where the region
+    is not convex or the outline bends: their vertices are pushed out until they do.
+    """
+    ends = tuple(sorted(set(wavelength_nm)))
+    wavelengths_nm = sorted({wavelength_between(ends, share) for share in detail.wavelengths})
+    passing = pass_test(passes, wavelengths_nm)
+    tight = tightened(table, passing, detail.tighten)
+    end = end_of_light(tight, passing)
+    if end is None:
+        return None
+    rows = detail.rows
+    empty = np.zeros((len(ends), rows, 1), np.float32)
+    outline = PupilOutline(table.pupil_z_mm, end, ends, empty[0, :, 0], empty, empty)
+    frame = frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), passing)
+    start = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
+    reach = np.repeat(frame.reach[:, None], _DIRECTIONS, axis=1)
+    report(0.1)
+    rough = _boundary(passing, frame, start, reach, detail.steps, detail.coarse)
+    report(0.2)
+    angles = _equal_areas(start, rough, detail.segments)
+    if detail.reach < math.inf:
+        reach = np.minimum(reach, np.maximum(detail.reach * rough, reach / detail.steps))
+    reach = np.stack([np.interp(*row) for row in zip(angles, start, reach, strict=True)])
+    found = []
+    for w in wavelengths_nm:
+        found.append(_boundary(pass_test(passes, (w,)), frame, angles, reach, detail.steps, detail.fine))
+        report(0.2 + 0.4 * len(found) / len(wavelengths_nm))
+    fine = _together(np.stack(found), detail.wavelengths)
+    x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
+    y[..., [0, -1]] = 0
+    centre, x, y = (a.astype(np.float32) for a in (frame.centre, x, y))
+    pushed = replace(outline, centre=centre, x=x, y=y)
+    return _pushed_out(pushed, passes, detail.wavelengths, lambda share: report(0.6 + 0.4 * share))
+
+
+def _boundary(
+    passing: PassTest, frame: SearchFrame, angles: Float64Array, reach: Float64Array, steps: int, halvings: int
+) -> Float64Array:
+    """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame.
+
+    Looked for within `reach` [R, D], in so many steps and halvings of one.
+    """
+    direction = np.stack([np.cos(angles), np.sin(angles)]) * frame.stretch[:, :, None]
+    tried = np.linspace(0, 1, steps + 1)[:, None] * reach.ravel()
+    flat = _farthest(passing, *_flat(frame.radius, frame.centre, direction), tried, halvings)
+    return flat.reshape(angles.shape)
+
+
+def _flat(
+    radius: Float64Array, centre: Float64Array, direction: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Film radius [M], origin [2, M] and direction [2, M] of every direction [2, R, D] from the centres of rows."""
+    count = direction.shape[2]
+    origin = np.stack([np.repeat(centre, count), np.zeros(centre.size * count)])
+    return np.repeat(radius, count), origin, direction.reshape(2, -1)
+
+
+def _farthest(
+    passing: PassTest,
+    radius: Float64Array,
+    origin: Float64Array,
+    direction: Float64Array,
+    steps: Float64Array,
+    halvings: int,
+) -> Float64Array:
+    """The largest t [M] at which origin + t direction passes, to the last halving and never less.
+
+    Args:
+        passing: whether rays pass.
+        radius, origin, direction: [M], [2, M], [2, M] mm.
+        steps: [S, M] rising values of t. All are tried, so that a region with a dent is held whole. Where none
+            passes, the first is the answer.
+    """
+    # All in one test: tracing few rays at a time costs more than tracing many.
+    passed = passing(np.broadcast_to(radius, steps.shape), origin[:, None] + steps * direction[:, None])
+    last = len(steps) - 1 - np.argmax(passed[::-1], axis=0)
+    found = np.flatnonzero(passed.any(0))
+    low, high = steps[0].copy(), steps[np.minimum(last + 1, len(steps) - 1), np.arange(radius.size)]
+    low[found] = steps[last[found], found]
+    radius, origin, direction = radius[found], origin[:, found], direction[:, found]
+    a, b = low[found], high[found]
+    for _ in range(halvings):
+        middle = (a + b) / 2
+        now = passing(radius, origin + middle * direction)
+        a, b = np.where(now, middle, a), np.where(now, b, middle)
+    low[found] = b
+    return low
+
+
+def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) -> Float64Array:
+    """Angles [R, segments + 1] between which the outline given by its distance at `angles` encloses equal areas."""
+    wedges = distance[:, 1:] * distance[:, :-1] + 1e-9
+    area = np.concatenate([np.zeros((len(angles), 1)), np.cumsum(wedges, axis=1)], axis=1)
+    wanted = np.linspace(0, 1, segments + 1)
+    return np.stack([np.interp(wanted * a[-1], a, t) for a, t in zip(area, angles, strict=True)])
+
+
+def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array:
+    """Distances at the ends of the spectrum, of those [W, R, D] at shares of it; joined where they part.
+
+    At the edge of the light lateral colour leaves some wavelengths dark before others.
+    """
+    if len(distance) == 1:
+        return distance
+    joined = distance.max(0, keepdims=True)
+    area, whole = ((d[..., 1:] * d[..., :-1]).sum(2) for d in (distance, joined))
+    apart = (area < _APART * whole).any(0)
+    for share, found in zip(shares, distance, strict=True):
+        apart |= (found > _BULGE * ((1 - share) * distance[0] + share * distance[-1])).any(1)
+    return np.where(apart[:, None], joined, distance[[0, -1]])
+
+
+def _pushed_out(
+    outline: PupilOutline, passes: Passes, shares: tuple[float, ...], report: Callable[[float], object]
+) -> PupilOutline:
+    """The outline with its vertices moved outwards until it holds what passes between them, in all three ways."""
+    needed = np.ones(outline.x.shape)
+    both = len(outline.wavelength_nm) > 1
+    for done, share in enumerate(shares if both else (0.0,)):
+        report(done / len(shares))
+        passing = pass_test(passes, (wavelength_between(outline.wavelength_nm, share),))
+        ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
+        x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))
+        for step, found in _excess(outline, (x, y), passing):
+            rows = len(found)
+            for row in (slice(0, rows), slice(1, 1 + rows)) if step else (slice(0, rows),):
+                for edge in (slice(0, -1), slice(1, None)):
+                    needed[ends, row, edge] = np.maximum(needed[ends, row, edge], found)
+    scale = (needed + _HAIR).astype(np.float32)
+    return replace(outline, x=outline.x * scale, y=outline.y * scale)
+
+
+def _excess(
+    outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], passing: PassTest
+) -> list[tuple[float, Float64Array]]:
+    """The reach of passing rays, as a share of the outline, between rows and vertices: each place's part of the
+    step between rows, and the shares [rows, edges]."""
+
+    def between(c: Float64Array, step: float) -> Float64Array:
+        return (1 - step) * c[:-1] + step * c[1:] if step else c
+
+    centres, rows = outline.centre.astype(np.float64), np.arange(outline.centre.size, dtype=np.float64)
+    parts = []
+    for step in _BETWEEN_ROWS:
+        x, y = (between(c, step) for c in vertices)
+        for t in _ALONG_EDGE:
+            point = np.stack([(1 - t) * c[:, :-1] + t * c[:, 1:] for c in (x, y)])
+            parts.append(_flat(outline.radii(between(rows, step)), between(centres, step), point))
+    radius, origin, direction = (np.concatenate(c, axis=-1) for c in zip(*parts, strict=True))
+    steps = np.repeat(np.array(_CHECKS)[:, None], radius.size, axis=1)
+    found = _farthest(passing, radius, origin, direction, steps, _CHECK_HALVINGS)
+    edges = vertices[0].shape[1] - 1
+    shares = np.split(found, np.cumsum([len(part[0]) for part in parts])[:-1])
+    steps_between = np.repeat(_BETWEEN_ROWS, len(_ALONG_EDGE))
+    return [(step, share.reshape(-1, edges)) for step, share in zip(steps_between, shares, strict=True)]

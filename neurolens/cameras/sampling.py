@@ -1,8 +1,9 @@
-"""Helpers of all cameras: the map from the unit square to a disk, finite rays, checks, and the lens data of headers."""
+"""Helpers of all cameras: finite rays, where light from the scene is aimed, checks, and the lens data of headers."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,30 +11,68 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.cameras.cameragraph import concentric_disk
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.lens.prescription import Surface
+from neurolens.trace.shapes import sag_mm
+from neurolens.trace.surfaces import meet_front
 
 _BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
+_ANGLES, _ROOM = (
+    24,
+    1.01,
+)  # intervals of angles of light at a lens's front; how far it may lie beyond the rays that tell
 LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
 
 
-def concentric_disk(square: FloatArray) -> FloatArray:
-    """Map points [2, N] of the unit square to the unit disk [2, N], keeping areas and neighbours.
+@dataclass(frozen=True)
+class FrontDiscs:
+    """Discs on a lens's front surface at which light from the scene is aimed, by its angle to the axis.
 
-    The ideal cameras use it for their pupil; lenses and their models map the square to the outline of what passes
-    (`pupil_outline`). Source: Shirley and Chiu 1997, "A low distortion map between disk and square".
+    Light of a direction that reaches the film crosses a part of the front surface that moves with that angle. What
+    comes from a near scene point has directions far apart: it is aimed at a disc that holds all light of the film.
+
+    Attributes:
+        width_rad: of the equal intervals of the angle, from 0. discs: [B, 2] of each interval with its neighbours,
+            centre along the azimuth of the direction and radius (mm).
+        far_mm: radius of all light, about the axis. reach_mm: from the vertex to its farthest point on the surface.
     """
-    a = square[0] * np.float32(2) - np.float32(1)
-    b = square[1] * np.float32(2) - np.float32(1)
-    swap = np.abs(b) > np.abs(a)
-    radius = np.where(swap, b, a)
-    other = np.where(swap, a, b)
-    angle = other * np.float32(math.pi / 4)
-    # The centre, radius 0, has no direction: dividing by 1 there leaves the angle 0 and the point at the origin.
-    with np.errstate(over="ignore", invalid="ignore"):  # of points outside the square
-        angle /= np.where(radius == 0, np.float32(1), radius)
-        cos, sin = np.cos(angle), np.sin(angle)
-        return np.stack([radius * np.where(swap, sin, cos), radius * np.where(swap, cos, sin)])
+
+    width_rad: float
+    discs: NDArray[np.float64]
+    far_mm: float
+    reach_mm: float
+
+    @staticmethod
+    def of(leaving: NDArray[np.float64], shape: Surface | None) -> FrontDiscs:
+        """The discs of scene rays [6, N] (mm, lens frame); `shape` is that of the surface, None the plane z = 0."""
+        x, y = meet_front(shape, *leaving)
+        side = np.hypot(leaving[3], leaving[4])
+        angle, azimuth = np.arctan2(side, -leaving[5]), (leaving[3] + 1j * leaving[4]) / np.maximum(side, 1e-12)
+        width, place, far = angle.max() / _ANGLES, (x + 1j * y) * azimuth.conj(), float(np.hypot(x, y).max())
+        row, discs = np.minimum(angle / width, _ANGLES - 1).astype(np.intp), np.full((_ANGLES, 2), [0.0, far])
+        for k in np.unique(row):
+            near = place[np.abs(row - k) <= 1]
+            discs[k, 0] = (near.real.min() + near.real.max()) / 2 if k else 0.0  # the axis has no azimuth
+            discs[k, 1] = np.abs(near - discs[k, 0]).max()
+        depth = 0.0 if shape is None else float(sag_mm(shape, far, 0.0, held=True))
+        return FrontDiscs(float(width), discs * [1.0, _ROOM], _ROOM * far, _ROOM * math.hypot(far, depth))
+
+    def aim(self, point_mm: NDArray[np.float64], square: FloatArray) -> tuple[NDArray[np.float64], ...]:
+        """x, y (mm) and the area (mm^2) per unit of the square, [N] each, for scene points [3, N] (mm, lens frame)."""
+        side, distance = np.hypot(point_mm[0], point_mm[1]), np.sqrt((point_mm**2).sum(0))
+        angle = np.nan_to_num(np.arctan2(side, -point_mm[2]))
+        # Directions from the surface differ from that of the vertex by no more than this, and their azimuths.
+        apart = np.arcsin(np.minimum(self.reach_mm / np.maximum(distance, 1e-9), 1))
+        turn = np.minimum(np.sin(apart) / np.maximum(np.sin(angle), 1e-12), 2.0)
+        centre, radius = self.discs[np.minimum(angle / self.width_rad, _ANGLES - 1).astype(np.intp)].T
+        some = apart <= self.width_rad
+        centre, radius = np.where(some, centre, 0.0), np.where(some, radius + np.abs(centre) * turn, self.far_mm)
+        azimuth = np.where(side > 0, (point_mm[0] + 1j * point_mm[1]) / np.where(side > 0, side, 1), 1.0)
+        u, v = concentric_disk(square).astype(np.float64)
+        place = azimuth * (centre + radius * (u + 1j * v))
+        return place.real, place.imag, math.pi * radius * radius
 
 
 def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArray, FloatArray]:

@@ -13,19 +13,53 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable, reason
 from neurolens.base.signals import handled
-from neurolens.cli.arguments import Command, Help, Parser, more_glasses
+from neurolens.cli.arguments import Help, Parser, more_glasses
 
 # Packages of the extra that a base install lacks.
 _TRAIN_PACKAGES = {"torch", "scipy", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
-# Names that commands had: they still work.
-_RENAMED: dict[tuple[str, ...], tuple[str, ...]] = {("merge",): ("render", "--merge"), ("trade",): ("plan", "--trade")}
+_RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--trade")}  # names that commands had still work
+# The commands by the titles of the help: the module and the class of each, and its line.
+_COMMANDS = {
+    "lenses": {
+        "lens": ("lens.Lens", "first-order data, field and layout of a lens file"),
+        "analyse": ("analyse.Analyse", "spots, MTF, distortion and more of a lens file"),
+        "verify": ("photographs.Verify", "hold a lens file against photographs of the product"),
+        "rims": ("photographs.Rims", "fit the rims of a lens file to photographs of the product"),
+        "convert": ("convert.Convert", "read a lens file of another program"),
+        "glass": ("convert.Glass", "look glasses up by name or code"),
+        "survey": ("train.Survey", "every lens file of a folder: read, checked, fitted, measured"),
+        "view": ("view.View", "write a page that runs lenses and models in a browser"),
+    },
+    "camera models of a lens": {
+        "train": ("train.Train", "fit, measure and render the models of an experiment"),
+        "models": ("models.Models", "list models that are here, and the one to use"),
+        "evaluate": ("models.Evaluate", "measure a model against the promises of its card"),
+    },
+    "pictures": {
+        "demo": ("render.Demo", "one scene through a lens, its model, a thin lens and a pinhole"),
+        "plan": ("plan.Plan", "what a scene asks of a lens, and the camera to use"),
+        "render": ("render.Render", "a scene through a lens, a model, a thin lens or a pinhole"),
+        "flare": ("flare.Flare", "ghosts of lights: a table, and a picture with layers"),
+    },
+    "compositing and other programs": {
+        "defocus": ("defocus.Defocus", "the blur of a lens for a sharp picture with depth"),
+        "bokeh": ("defocus.Bokeh", "kernels of a lens's blur over field and distance"),
+        "handover": ("handover.Handover", "a lens as files for Nuke, Blender, USD, OpenTrackIO, lensfun, OpenCV"),
+        "stmap": ("stmap.StMap", "ST maps, which undistort and redistort pictures of a lens"),
+        "projection": ("stmap.Projection", "fit a lens with a projection of OpenCV, nerfstudio or NVIDIA"),
+        "export": ("export.Export", "source code (C, shading languages) of a model; fix what a scene fixes"),
+        "blender": ("blender.Blender", "the extension for Blender, and lenses in it"),
+        "mitsuba": ("mitsuba.Mitsuba", "render a scene of Mitsuba 3 through a neurolens camera"),
+    },
+}
 
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
 _EPILOG = """\
@@ -42,59 +76,34 @@ exit codes: 0 done, 1 a model breaks a promise or none has the error asked for, 
 Help of a command: neurolens COMMAND --help"""
 
 
-def build_parser() -> Parser:
-    """The whole command line.
-
-    Commands are imported here, so that `main` handles an interrupt of the imports.
-    """
-    from neurolens.cli.analyse import Analyse
-    from neurolens.cli.blender import Blender
-    from neurolens.cli.bokeh import Bokeh
-    from neurolens.cli.convert import Convert, Glass
-    from neurolens.cli.defocus import Defocus
-    from neurolens.cli.evaluate import Evaluate
-    from neurolens.cli.export import Export
-    from neurolens.cli.flare import Flare
-    from neurolens.cli.handover import Handover
-    from neurolens.cli.lens import Lens
-    from neurolens.cli.mitsuba import Mitsuba
-    from neurolens.cli.models import Models
-    from neurolens.cli.photographs import Rims, Verify
-    from neurolens.cli.plan import Plan
-    from neurolens.cli.projection import Projection
-    from neurolens.cli.render import Demo, Render
-    from neurolens.cli.stmap import StMap
-    from neurolens.cli.train import Survey, Train
-    from neurolens.cli.view import View
-
-    groups: dict[str, tuple[type[Command], ...]] = {
-        "lenses": (Lens, Analyse, Verify, Rims, Convert, Glass, Survey, View),
-        "camera models of a lens": (Train, Models, Evaluate),
-        "pictures": (Demo, Plan, Render, Flare),
-        "compositing and other programs": (Defocus, Bokeh, Handover, StMap, Projection, Export, Blender, Mitsuba),
-    }
+def build_parser(first: str | None = None) -> Parser:
+    """The whole command line; of a command line with such a first word, only that command is imported."""
     parser = Parser(
         prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,
         formatter_class=partial(Help, indent_increment=4),
     )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     parser.renamed = _RENAMED
-    subparsers = parser.add_subparsers(
+    subparsers: Any = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=Parser, prog="neurolens", help=argparse.SUPPRESS
     )
-    for title, commands in groups.items():
-        for command in commands:
-            command.add_parser(subparsers)
+    for title, commands in _COMMANDS.items():
+        for name, (place, about) in commands.items():
+            own = subparsers.add_parser(name, help=about)
+            if first is None or name in (first, *_RENAMED.get(first, ())):
+                module, _, command = place.partition(".")
+                getattr(import_module(f"{__name__}.{module}"), command).fill(own)
         parser.add_argument_group(title)._group_actions += subparsers._choices_actions  # so that help lists them there
         subparsers._choices_actions = []
     return parser
 
 
-def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_parser) -> int:
+def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None = None) -> int:
     """Run one command and return its exit code; a wrong command line exits with code 2 as argparse does.
 
-    `build` makes the parser; its errors and interrupts are reported like the command's.
+    `build` makes another parser; its errors and interrupts are reported like the command's.
     """
+    words = sys.argv[1:] if argv is None else argv
     args, received = argparse.Namespace(kept="nothing was done"), list[int]()
 
     def interrupt(number: int) -> None:
@@ -103,8 +112,8 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
 
     try:
         with handled(interrupt):
-            _check_words(sys.argv[1:] if argv is None else argv)
-            args = build().parse_args(argv)
+            _check_words(words)
+            args = (build() if build else build_parser(words[0] if words else "")).parse_args(words)
             with _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(getattr(args, "glass", ())):
                 code: int = args.run(args)
         sys.stdout.flush()
@@ -136,9 +145,7 @@ def _failed(error: Exception) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     if isinstance(error, OSError):
-        # The error of a full disk names no file.
-        place = "" if error.filename is None else f"{error.filename}: "
-        return _fail(f"{place}{error.strerror or error}")
+        return _fail(reason(error))
     return _fault(error)
 
 

@@ -9,22 +9,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError, warned
 from neurolens.base.settings import between, setting
-from neurolens.cli.arguments import (
-    Answering,
-    Glasses,
-    LensState,
-    check_run_folder,
-    lens,
-    lens_state,
-    output_path,
-    wavelengths_nm,
-)  # fmt: skip
-from neurolens.cli.output import number, table
+from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
     from neurolens.analysis.fields import Scene
@@ -51,7 +41,7 @@ class Analysis(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Analyse(Glasses, Answering):
+class Analyse(cli.Reporting):
     """Trace a lens from the scene and analyse its image. WHAT is any of:
 
       layout      the section of the lens with rays
@@ -66,24 +56,21 @@ class Analyse(Glasses, Answering):
       seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
       psf         point spread, geometric and by diffraction
 
-    Without WHAT all are shown. Rays fill the real stop, not a paraxial pupil; fields are angles
-    from the axis in degrees, of the chief ray in the scene. The edge is that of the film, or the
-    text says which; one that no chief ray reaches is a warning. Pupils are sampled finer and finer
-    until two samplings agree to the digits that are printed; what does not settle has fewer.
-    Needs the extra "train" (torch)."""
+    Without WHAT all are shown. Rays fill the real stop; fields are angles of the chief ray in the scene, to the edge of
+    the film, or the text says which. Figures that do not settle as the pupil is sampled finer have fewer digits. Needs
+    the extra "train" (torch)."""
 
-    about: ClassVar[str] = "spots, MTF, distortion and more of a lens file"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens analyse lenses/laikin_double_gauss_50.toml
   neurolens analyse lenses/shimizu_fisheye_220.toml distortion vignetting -o pictures
   neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focus-mode best --json"""
-    kept: ClassVar[str] = "finished pictures are kept"
-    intermixed: ClassVar[bool] = True
+    kept = "finished pictures are kept"
+    intermixed = True
 
-    file: Path = lens(positional=True)
+    file: Path = cli.lens(positional=True)
     what: tuple[str, ...] = setting((), "what to show (default: all)", positional=True, metavar="WHAT", nargs="*")
-    state: LensState = lens_state()
+    state: cli.LensState = cli.lens_state()
     field_points: tuple[float, ...] | None = setting(
         None, "angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",
         kind=between(0, 179, "degrees"), nargs="+", metavar="DEG", old=("fields",),
@@ -91,14 +78,14 @@ examples:
     wavelengths: tuple[tuple[float, ...], ...] | None = setting(
         None, f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
         "(default: d, F and C, or the file's own where its range lacks the d line)",
-        kind=wavelengths_nm, nargs="+", metavar="NM",
+        kind=cli.wavelengths_nm, nargs="+", metavar="NM",
     )  # fmt: skip
     frequencies: tuple[float, ...] | None = setting(
         None, "of mtf-height (default: 10 20 40)", kind=between(0, 1000, "cycles per mm"), nargs="+",
         metavar="PER_MM",
     )  # fmt: skip
     axis: Literal["x", "y"] = setting("y", "plane of the field, for anamorphic lenses (default: y)")
-    out: Path | None = output_path("FOLDER", "draw a picture of each in this folder", None)
+    out: Path | None = cli.output_path("FOLDER", "draw a picture of each in this folder", None)
     format: Literal["png", "pdf", "svg"] = setting("png", "of the pictures (default: png)")
     full: bool = setting(False, "with --json: also every ray and every pixel")
 
@@ -113,9 +100,6 @@ examples:
             self.refuse("WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
         if self.full and not self.json:
             self.refuse("--full", "(given)", "this option only with --json")
-        if self.out is not None:
-            check_run_folder(self.out, self.out, "--output")
-
         from neurolens.analysis.layout import state_text
 
         began = time.perf_counter()
@@ -243,93 +227,85 @@ def _layout_text(data: dict[str, Any]) -> str:
     for ray in data["rays"]:
         counts[ray["label"]] = counts.get(ray["label"], 0) + 1
     rows = [(label, str(count)) for label, count in counts.items()]
-    return f"Layout: {len(data['surfaces'])} surfaces\n" + table(("field", "rays drawn"), rows)
+    return f"Layout: {len(data['surfaces'])} surfaces\n" + cli.table(("field", "rays drawn"), rows)
 
 
 def _spots_text(data: dict[str, Any]) -> str:
-    header = ("RMS µm", *_nanometres(data), "largest µm", "passed", "best focus mm", "RMS there")
-
-    def cells(i: int) -> list[str]:
-        off = {key: spread[i] for key, spread in data["spread"].items()}
-        each = zip(data["rms_by_wavelength_um"][i], off["rms_by_wavelength_um"], strict=True)
-        return [
-            _three(data["rms_um"][i], off["rms_um"]),
-            *(_three(*pair) for pair in each),
-            _three(data["geometric_um"][i], 20 * off["geometric_um"]),
-            _percent(data["passed"][i], off["passed"]),
-            _fixed(data["best_shift_mm"][i], _digits(off["best_shift_mm"]) + 1),
-            _three(data["best_rms_um"][i], off["best_rms_um"]),
-        ]
-
-    airy = f"Airy disc radius {number(data['airy_um'], 3)} µm at the working f/{number(data['working_f_number'], 3)}"
+    off = data["spread"]
+    of_waves = zip(*(zip(*d["rms_by_wavelength_um"], strict=True) for d in (data, off)), strict=True)
+    places = [_digits(spread) + 1 for spread in off["best_shift_mm"]]
+    columns = [
+        ("RMS µm", _each(_three, data["rms_um"], off["rms_um"])),
+        *((nm, _each(_three, *both)) for nm, both in zip(_nanometres(data), of_waves, strict=True)),
+        ("largest µm", _each(_three, data["geometric_um"], [20 * spread for spread in off["geometric_um"]])),
+        ("passed", _each(_percent, data["passed"], off["passed"])),
+        ("best focus mm", _each(_fixed, data["best_shift_mm"], places)),
+        ("RMS there", _each(_three, data["best_rms_um"], off["best_rms_um"])),
+    ]
+    airy, working = cli.number(data["airy_um"], 3), cli.number(data["working_f_number"], 3)
+    airy = f"Airy disc radius {airy} µm at the working f/{working}"
     head = f"Spots (radius from the centroid, all wavelengths; each by itself; {airy})"
-    return _over_field(head, data, header, cells, range(len(data["field_deg"])))
+    return _over_field(head, data, columns, every=True)
 
 
 def _fans_text(data: dict[str, Any]) -> str:
-    header = [f"{name} {wave}" for name in ("tang.", "sag.") for wave in _nanometres(data)]
+    def largest(row: Sequence[float]) -> str:
+        return _three(max((abs(v) for v in row if not math.isnan(v)), default=math.nan))
 
-    def cells(i: int) -> list[str]:
-        rows = [row for key in ("tangential_um", "sagittal_um") for row in data[key][i]]
-        return [_three(max((abs(v) for v in row if not math.isnan(v)), default=math.nan)) for row in rows]
-
-    head = "Ray fans (largest transverse aberration, µm)"
-    return _over_field(head, data, header, cells, range(len(data["field_deg"])))
+    columns = [
+        (f"{name} {nm}", _each(largest, [rows[w] for rows in data[key]]))
+        for name, key in (("tang.", "tangential_um"), ("sag.", "sagittal_um"))
+        for w, nm in enumerate(_nanometres(data))
+    ]
+    return _over_field("Ray fans (largest transverse aberration, µm)", data, columns, every=True)
 
 
 def _colour_text(data: dict[str, Any]) -> str:
     some = _some(len(data["spectrum_nm"]), 9)
     zones = ("paraxial", *(f"zone {z:.2f}" for z in data["zone"][1:]))
-    first = [(f"{data['spectrum_nm'][i]:.0f} nm", *(_three(v) for v in data["focus_shift_mm"][i])) for i in some]
+    first = [(f"{data['spectrum_nm'][i]:.0f} nm", *_each(_three, data["focus_shift_mm"][i])) for i in some]
     head = "Lateral colour (height from that of the first line, µm)"
-    lines = [f"{w:.0f} nm" for w in data["line_nm"]]
-    lateral = _over_field(head, data, lines, lambda i: [_three(v) for v in data["lateral_um"][i]])
-    return f"Longitudinal colour (focus from the film, mm)\n{table(('wavelength', *zones), first)}\n\n{lateral}"
+    of_lines = zip(data["line_nm"], zip(*data["lateral_um"], strict=True), strict=True)
+    lateral = _over_field(head, data, [(f"{nm:.0f} nm", _each(_three, values)) for nm, values in of_lines])
+    return f"Longitudinal colour (focus from the film, mm)\n{cli.table(('wavelength', *zones), first)}\n\n{lateral}"
 
 
 def _curvature_text(data: dict[str, Any]) -> str:
-    keys = ("tangential_mm", "sagittal_mm", "petzval_mm")
-    head = f"Field curvature (focus from the film, mm; Petzval radius {number(data['petzval_radius_mm'])} mm)"
-    header = ("tangential", "sagittal", "Petzval")
-    return _over_field(head, data, header, lambda i: [_three(data[key][i]) for key in keys])
+    head = f"Field curvature (focus from the film, mm; Petzval radius {cli.number(data['petzval_radius_mm'])} mm)"
+    columns = [(name, _each(_three, data[f"{name.lower()}_mm"])) for name in ("tangential", "sagittal", "Petzval")]
+    return _over_field(head, data, columns)
 
 
 def _distortion_text(data: dict[str, Any]) -> str:
-    names = list(data["error_percent"])
     head = (
         f"Distortion (%; {_fixed(data['edge_percent'], 2)}% at {data['edge']}, against {data['reference']}; "
-        f"closest is {data['best']}; {number(data['scale_mm'])} mm per radian on the axis)"
+        f"closest is {data['best']}; {cli.number(data['scale_mm'])} mm per radian on the axis)"
     )
-    header = [n.partition(",")[0] for n in names]
-    return _over_field(head, data, header, lambda i: [_three(data["error_percent"][n][i]) for n in names])
+    columns = [(name.partition(",")[0], _each(_three, values)) for name, values in data["error_percent"].items()]
+    return _over_field(head, data, columns)
 
 
 def _vignetting_text(data: dict[str, Any]) -> str:
-    keys = ("relative", "unvignetted", "passed", "cos4")
-    header = ("illumination", "without rims", "rims pass", "cos^4")
-    head = "Vignetting and relative illumination"
-    settled = data["spread"]
-
-    def cells(i: int) -> list[str]:
-        return [_percent(data[key][i], settled[key][i] if key in settled else 0.0) for key in keys]
-
-    return _over_field(head, data, header, cells)
+    names = {"relative": "illumination", "unvignetted": "without rims", "passed": "rims pass", "cos4": "cos^4"}
+    settled = [0.0] * len(data["field_deg"])
+    columns = [(name, _each(_percent, data[key], data["spread"].get(key, settled))) for key, name in names.items()]
+    return _over_field("Vignetting and relative illumination", data, columns)
 
 
 def _mtf_text(data: dict[str, Any], over_height: bool = False) -> str:
     """The contrast at frequencies of `_MTF_PER_MM` for every field, or at all of them over the image height."""
     at = [k for k, f in enumerate(data["frequency_per_mm"]) if over_height or f in _MTF_PER_MM]
-    name = "Geometric MTF" + " against image height" * over_height
-    header = [f"{data['frequency_per_mm'][k]:g}/mm {d}" for k in at for d in "TS"]
     limit = ", ".join(_fixed(data["diffraction_limit"][k]) for k in at)
     waves = ", ".join(f"{w:.0f}" for w in data["wavelength_nm"])
+    name = "Geometric MTF" + " against image height" * over_height
     head = f"{name} ({waves} nm; T tangential, S sagittal; without diffraction, whose limit is {limit})"
-
-    def cells(i: int) -> list[str]:
-        both = ("tangential", "sagittal")
-        return [_fixed(data[key][i][k], _digits(data["spread"][key][i][k])) for k in at for key in both]
-
-    return _over_field(head, data, header, cells, None if over_height else range(len(data["field_deg"])))
+    columns = []
+    for k in at:
+        for key in ("tangential", "sagittal"):
+            values, spreads = ([row[k] for row in d[key]] for d in (data, data["spread"]))
+            heading = f"{data['frequency_per_mm'][k]:g}/mm {key[0].upper()}"
+            columns.append((heading, _each(_fixed, values, _each(_digits, spreads))))
+    return _over_field(head, data, columns, every=not over_height)
 
 
 def _seidel_text(data: dict[str, Any]) -> str:
@@ -338,40 +314,33 @@ def _seidel_text(data: dict[str, Any]) -> str:
     rows.append(("total", *(f"{round(v, 5) + 0.0:.5f}" for v in data["total"])))
     odd = data["odd_powers"]
     note = f"\nNot counted: the odd powers of surface {', '.join(map(str, odd))}" if odd else ""
-    head = f"Seidel sums (mm, {data['wavelength_nm']:.0f} nm, image height {number(data['image_height_mm'])} mm)"
-    return f"{head}\n" + table(header, rows) + note
+    head = f"Seidel sums (mm, {data['wavelength_nm']:.0f} nm, image height {cli.number(data['image_height_mm'])} mm)"
+    return f"{head}\n" + cli.table(header, rows) + note
 
 
 def _psf_text(data: dict[str, Any]) -> str:
     off = data["spread"]
-    rows = [
-        (
-            _angle(data, i),
-            _three(data["half_width_um"][i], 20 * off["half_width_um"][i]),
-            _fixed(data["strehl"][i], _digits(off["strehl"][i])),
-        )
-        for i in range(len(data["field_deg"]))
+    columns = [
+        ("half width µm", _each(_three, data["half_width_um"], [20 * spread for spread in off["half_width_um"]])),
+        ("Strehl ratio", _each(_fixed, data["strehl"], _each(_digits, off["strehl"]))),
     ]
     head = f"Point spread ({data['wavelength_nm'][0]:.0f} nm; Strehl ratio '-' where aberrations rule out diffraction)"
-    return f"{head}\n" + table(("field", "half width µm", "Strehl ratio"), rows)
+    return _over_field(head, data, columns, every=True)
 
 
-def _over_field(
-    head: str,
-    data: dict[str, Any],
-    header: Sequence[str],
-    cells: Callable[[int], Sequence[str]],
-    fields: Iterable[int] | None = None,
-) -> str:
-    """A table with a row per field: its angle, its height and `cells` of it; some fields where none are given."""
-    chosen = _some(len(data["field_deg"])) if fields is None else fields
-    rows = [(_angle(data, i), _fixed(data["height_mm"][i], 2), *cells(i)) for i in chosen]
-    return f"{head}\n{table(('field', 'height mm', *header), rows)}"
+def _each(form: Callable[..., Any], *values: Iterable[Any]) -> list[Any]:
+    """`form` of each value, or of those of several lists at one place."""
+    return [form(*those) for those in zip(*values, strict=True)]
 
 
-def _angle(data: dict[str, Any], i: int) -> str:
-    field = data["field_deg"][i]
-    return "axis" if field == 0 else f"{field:.2f}°"
+def _over_field(head: str, data: dict[str, Any], columns: Sequence[tuple[str, list[str]]], every: bool = False) -> str:
+    """A table of headings and cells with a row for some fields, or for every one: its angle, its height, the cells."""
+    count = len(data["field_deg"])
+    angles = ["axis" if field == 0 else f"{field:.2f}°" for field in data["field_deg"]]
+    heights = [("height mm", _each(partial(_fixed, places=2), data["height_mm"]))] if "height_mm" in data else []
+    shown = [*heights, *columns]
+    rows = [(angles[i], *(cells[i] for _, cells in shown)) for i in (range(count) if every else _some(count))]
+    return f"{head}\n{cli.table(('field', *(heading for heading, _ in shown)), rows)}"
 
 
 def _nanometres(data: dict[str, Any]) -> list[str]:
@@ -400,7 +369,7 @@ def _percent(value: float, spread: float = 0.0) -> str:
 def _three(value: float, spread: float = 0.0) -> str:
     """Three digits, or fewer: two samplings that differ by `spread` of the value differ by one of the last at most."""
     if not 1e-6 <= abs(value) < math.inf:
-        return number(0.0 if abs(value) < 1e-6 else value)  # rounding errors of a zero are 0
+        return cli.number(0.0 if abs(value) < 1e-6 else value)  # rounding errors of a zero are 0
     units = math.ceil(math.log10(max(spread * abs(value), 1e-300)))
     digits = max(min(math.floor(math.log10(abs(value))) - units + 1, 3), 1)
-    return number(float(f"{value:.{digits}g}"))
+    return cli.number(float(f"{value:.{digits}g}"))

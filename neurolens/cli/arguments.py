@@ -1,36 +1,30 @@
-"""The parser, the class of a command, and the options and checks that commands share."""
+"""The parser, the class of a command, the options that commands share, and what they print: JSON, numbers, tables."""
 
 from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
-from neurolens.base.bounds import FILM_MM, WAVELENGTH_NM
-from neurolens.base.errors import InputError, one_line, printable
+from neurolens.base.bounds import WAVELENGTH_NM
+from neurolens.base.errors import InputError, one_line, printable, warn
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
-from neurolens.base.records import program
-from neurolens.base.settings import (
-    add_options,
-    between,
-    from_options,
-    group,
-    setting,
-    setting_of,
-)
-from neurolens.cli.output import print_json
-from neurolens.lens.shot import FocusMode, Shot, StopShape
+from neurolens.base.records import plain, program
+from neurolens.base.settings import add_options, between, from_options, group, setting, setting_of, spelling
+from neurolens.lens.shot import FocusMode, Shot, StopShape, film_size
 
 if TYPE_CHECKING:
+    from neurolens.cameras.contract import Camera
     from neurolens.lens.apertures import Aperture
     from neurolens.lens.prescription import Lens
 
@@ -45,6 +39,7 @@ cameras:
   thin, pinhole                the same of any focal length (--focal-length)
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
                                points with these projections; --field sets the picture's circle"""
+_SUFFIXES = {"png": (".png", ".pdf", ".svg"), "html": (".html", ".htm")}  # of files that a placeholder stands for
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
@@ -68,14 +63,12 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # no option: -12,3 is a value, as -12 is
         self.intermixed = False
-        self.renamed: dict[tuple[str, ...], tuple[str, ...]] = {}
+        self.renamed: Mapping[str, Sequence[str]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse as argparse does; old names of commands work; an intermixed one reports unknown arguments itself."""
         args = sys.argv[1:] if args is None else list(args)
-        for old, new in self.renamed.items():
-            if tuple(args[: len(old)]) == old:
-                args = [*new, *args[len(old) :]]
+        args = [*self.renamed.get(args[0], args[:1]), *args[1:]] if args else args
         if self.intermixed:
             self.intermixed = False  # argparse comes back here for its two passes
             try:
@@ -97,30 +90,34 @@ class Parser(argparse.ArgumentParser):
 class Command:
     """A command: its fields are arguments and options (`base.settings`), its docstring is the text of its help.
 
+    Paths to write are checked before it runs, by the placeholder of their option: OUT.exr is a file of this kind in a
+    folder that exists, FOLDER and DIR are folders, which are made, other words the start of a file's name.
+
     Attributes:
-        about: one line for the list of commands. epilog: the end of the help.
+        called: the command as errors name it. epilog: the end of the help.
         kept: what an interrupted command leaves (see also `keeps`).
-        called: the command as errors name it.
         intermixed: whether options may stand before and between the arguments of a list.
     """
 
-    about: ClassVar[str]
+    called: ClassVar[str]
     epilog: ClassVar[str] = ""
     kept: ClassVar[str] = "nothing is written"
     intermixed: ClassVar[bool] = False
-    called: ClassVar[str]
 
     def __init_subclass__(cls) -> None:
         """Name the command by its class."""
         cls.called = cls.__dict__.get("called", f"neurolens {cls.__name__.lower()}")
 
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            option, path = f.metadata.get("option"), getattr(self, f.name)
+            if option is not None and isinstance(path, Path) and option.written:
+                check_written(path, spelling(f, option), option.metavar)
+
     @classmethod
-    def add_parser(cls, subparsers: Any) -> None:
-        """Add the command to the command line."""
-        parser = subparsers.add_parser(
-            cls.called.rpartition(" ")[2], help=cls.about, description=inspect.getdoc(cls), epilog=cls.epilog
-        )
-        parser.intermixed = cls.intermixed
+    def fill(cls, parser: Parser) -> None:
+        """Give its parser the texts of its help, its arguments and its options."""
+        parser.description, parser.epilog, parser.intermixed = inspect.getdoc(cls), cls.epilog, cls.intermixed
         cls.add_options(parser)
         parser.set_defaults(run=lambda args: cls.of(args).run(), kept=cls.kept)
 
@@ -144,9 +141,14 @@ class Command:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Answering(Command):
-    """A command that prints a text, or with --json one JSON object."""
+class Reporting(Command):
+    """A command that shows its progress and prints a text, or with --json one JSON object."""
 
+    glass: tuple[Path, ...] = setting(
+        (), "glass catalogue of Zemax, whose glasses come before those that ship (repeatable)", metavar="FILE.agf",
+        last=1,
+    )  # fmt: skip
+    quiet: bool = setting(False, "neither progress nor warnings on stderr", last=2)
     json: bool = setting(False, "print one JSON object on stdout instead of the text; keys carry their unit", last=3)
 
     def answer(self, data: Mapping[str, Any], text: Callable[[], str], code: int = 0) -> int:
@@ -156,16 +158,6 @@ class Answering(Command):
         else:
             print(printable(text()))
         return code
-
-
-QUIET_HELP = "neither progress nor warnings on stderr"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reporting(Answering):
-    """A command that shows its progress, unless it has --quiet."""
-
-    quiet: bool = setting(False, QUIET_HELP, last=2)
 
     def progress(self, plan: Mapping[str, float] | None = None) -> Progress:
         """Its progress, with the expected seconds of stages."""
@@ -185,15 +177,23 @@ def keeps(text: str) -> Iterator[None]:
 # Types of arguments
 
 
-def rms_error(text: str) -> tuple[str, float]:
-    """Type of --within: the key of a model card's error, "rms_um" or "rms_px", and its bound."""
-    match = re.fullmatch(r"([0-9.]{1,20}(?:e-?[0-9]{1,3})?)(um|px)", text)
+def amount(text: str, units: Mapping[str, str]) -> tuple[str, float]:
+    """Type of an argument that is a number and its unit, as 0.1px; `units`: what each is called, with an example."""
+    match = re.fullmatch(r"([0-9.]{1,20}(?:e[+-]?[0-9]{1,3})?)([a-z]+)", text)
     try:
-        if match and 0 < float(match[1]) < 1e9:
-            return f"rms_{match[2]}", float(match[1])
+        if match and match[2] in units and 0 <= (value := float(match[1])) < 1e12:
+            return match[2], value
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0 and its unit, as 1um or 0.1px")
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected a number and its unit: {', '.join(units.values())}")
+
+
+def rms_error(text: str) -> tuple[str, float]:
+    """Type of --within: the key of a model card's error, "rms_um" or "rms_px", and its bound."""
+    unit, value = amount(text, {"um": "micrometres, as 1um", "px": "pixels, as 0.1px"})
+    if not value:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0")
+    return f"rms_{unit}", value
 
 
 def wavelengths_nm(text: str) -> tuple[float, ...]:
@@ -201,14 +201,17 @@ def wavelengths_nm(text: str) -> tuple[float, ...]:
     return tuple(between(*WAVELENGTH_NM, "wavelengths in nm")(word) for word in text.split(","))
 
 
-def film_size(text: str) -> tuple[float, float]:
-    """Type of --film: width x height in mm, as in 36x24."""
-    width, _, height = text.lower().partition("x")
-    side = between(*FILM_MM, "the film's width x height in mm, as in 36x24, each")
-    try:
-        return side(width), side(height)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
+def words_of(choices: Sequence[str], least: str = "") -> Callable[[str], tuple[str, ...]]:
+    """Type of an argument that lists some of `choices`, each once, with commas; `least`, where given, is among them."""
+
+    def convert(text: str) -> tuple[str, ...]:
+        words = tuple(word.strip() for word in text.split(","))
+        if set(words) <= set(choices) and len(set(words)) == len(words) and (not least or least in words):
+            return words
+        with_it = f", {least} among them" * bool(least)
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected some of {','.join(choices)}, each once{with_it}")
+
+    return convert
 
 
 def named_lens(models: bool, cameras: bool, text: str) -> Any:
@@ -241,7 +244,19 @@ def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: b
 
 def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
     """-o and --output, the file or folder that a command writes."""
-    return setting(default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title)
+    return setting(
+        default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title, written=True
+    )
+
+
+def plot_path(about: str) -> Any:
+    """An option that names the file of a plot."""
+    return setting(None, f"{about} (.png, .pdf, .svg)", metavar="OUT.png", kind=Path, written=True)
+
+
+def film(default: Any = ..., about: str = "size of the film in mm", title: str = "") -> Any:
+    """--film."""
+    return setting(default, about, option="film", kind=film_size, metavar="WxH", title=title)
 
 
 def within(about: str, default: Any = None, title: str = "") -> Any:
@@ -266,14 +281,9 @@ def exposure(default: float | None = 0.0, said: str = "0", title: str = "") -> A
     return setting(default, f"{about} (default: {said})", within=(-40, 40), unit="stops", metavar="STOPS", title=title)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Glasses:
-    """--glass, for `more_glasses`."""
-
-    glass: tuple[Path, ...] = setting(
-        (), "glass catalogue of Zemax, whose glasses come before those that ship (repeatable)", metavar="FILE.agf",
-        last=1,
-    )  # fmt: skip
+def threads() -> Any:
+    """--threads."""
+    return setting(2, "workers, each pinned to a core if there are as many as cores (default: 2)", within=(1, 256))
 
 
 def more_glasses(files: Sequence[Path]) -> AbstractContextManager[None]:
@@ -283,6 +293,16 @@ def more_glasses(files: Sequence[Path]) -> AbstractContextManager[None]:
     from neurolens.readers import glasses
 
     return glasses.more_glasses(files)
+
+
+def camera(name: str, shot: Shot, progress: Progress) -> Camera:
+    """The camera that an argument names; what it notes, as a film beyond the image circle, is a warning."""
+    from neurolens.cameras.build import make_camera
+
+    made = make_camera(name, shot, progress)
+    for note in made.settings.get("notes", ()):
+        warn(note)
+    return made
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,18 +328,19 @@ class LensState:
 
         return make_aperture(self.stop)
 
-    def camera(self) -> dict[str, Any]:
-        """The settings as `Shot` and `frames.frame.Frame` name them; None is not given."""
+    def settings(self) -> dict[str, Any]:
+        """The settings as `Shot` and `frames.Frame` name them; None is not given."""
         return {k: v for k, v in vars(self).items() if k != "stop"} | {"aperture": self.aperture()}
 
     def shot(self, film_mm: tuple[float, float], **settings: Any) -> Shot:
-        """The settings of a camera with such a film; a focus that is not given is infinity.
+        """The settings of a camera with such a film and further `settings`, of which None counts as not given; a focus
+        that is not given is infinity.
 
         Raises:
             InputError: as `Shot` and `aperture`.
         """
-        given = {name: value for name, value in self.camera().items() if value is not None}
-        return Shot(film_mm, **({"focus_m": math.inf} | given | settings))
+        given = {name: value for name, value in (self.settings() | settings).items() if value is not None}
+        return Shot(film_mm, **({"focus_m": math.inf} | given))
 
     def set_lens(self, tabled: Lens) -> Lens:
         """The lens of a file in this state; raises InputError as `setting.states.set_lens`."""
@@ -363,21 +384,49 @@ def check_ids(files: Sequence[Path], command: str, option: str) -> None:
         raise InputError(command, option, twice, "files whose names differ")
 
 
-def check_folder(path: Path, option: str) -> None:
-    """Refuse a file to write whose folder is missing, before the work; raises InputError."""
-    if not path.parent.is_dir():
-        raise InputError(path, option, str(path.parent), "a folder that exists")
-
-
-def check_run_folder(path: Path, command: str | Path, option: str) -> None:
-    """Refuse a file where a folder is to be made or filled; raises InputError."""
-    if path.exists() and not path.is_dir():
-        raise InputError(command, option, str(path), "a folder, not a file")
-
-
-def check_suffix(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
-    """Refuse a file to write of another kind, and see `check_folder`; raises InputError."""
-    if path.suffix.lower() not in suffixes:
+def check_written(path: Path, option: str, metavar: str) -> None:
+    """Refuse a path that does not fit the placeholder of its option, see `Command`; raises InputError."""
+    if metavar in ("FOLDER", "DIR"):
+        if path.exists() and not path.is_dir():
+            raise InputError(path, option, str(path), "a folder, not a file")
+        return
+    kind = metavar.partition(".")[2]
+    suffixes = _SUFFIXES.get(kind, (f".{kind}",))
+    if kind and path.suffix.lower() not in suffixes:
         expected = suffixes[0] if len(suffixes) == 1 else f"one of {', '.join(suffixes)}"
         raise InputError(path, option, path.suffix or "(no suffix)", expected)
-    check_folder(path, option)
+    if not path.parent.is_dir():
+        raise InputError(path, option, str(path.parent), "a folder that exists")
+    if not path.name:
+        raise InputError(path, option, str(path), "the start of the files' names")
+
+
+# Output
+
+
+def print_json(data: Mapping[str, Any]) -> None:
+    """Print one JSON object on stdout."""
+    print(printable(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False)))
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A number with significant digits, "-" for None and NaN."""
+    if value is None or isinstance(value, str):
+        return value or "-"
+    if isinstance(value, int):
+        return str(value)
+    if math.isnan(value):
+        return "-"
+    return "infinity" if math.isinf(value) else f"{value + 0.0:.{digits}g}"  # no "-0"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Columns aligned by two spaces: the first `left` to the left, the others to the right."""
+    lines = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
+
+    def row(cells: Sequence[str]) -> str:
+        placed = (c.ljust(w) if k < left else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True)))
+        return "  ".join(placed).rstrip()
+
+    return "\n".join(row(line) for line in lines)

@@ -8,13 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens.base.errors import InputError, warned
 from neurolens.base.files import atomic_path
 from neurolens.base.settings import group, setting
-from neurolens.cli.arguments import Answering, Glasses, check_suffix, output_path
-from neurolens.cli.output import number, table
+from neurolens.cli import arguments as cli
 from neurolens.readers.source import ReadOptions
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Convert(Glasses, Answering):
+class Convert(cli.Reporting):
     """Read a lens file of another program and write it as a lens file of neurolens (.toml).
 
     Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), texts of the Optical Bench (.txt), FlareSim
@@ -32,22 +31,20 @@ class Convert(Glasses, Answering):
     assumed or doubtful is printed as a warning and kept in the notes of the new file. Rims that a file does
     not give, and the check of the lens against its own statements, are traced: they need the extra "train" (torch)."""
 
-    about: ClassVar[str] = "read a lens file of another program"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
   neurolens convert wide.22mm.dat -o wide.toml --name "Wide angle 22 mm" --source "Smith p. 360"
   neurolens convert triplet.seq -o triplet.toml --half-field 20 --json"""
-    kept: ClassVar[str] = "only a finished lens file is written"
+    kept = "only a finished lens file is written"
 
     file: Path = setting(..., "lens file of another program", positional=True, metavar="FILE")
-    out: Path = output_path("OUT.toml", "lens file to write")
+    out: Path = cli.output_path("OUT.toml", "lens file to write")
     force: bool = setting(False, "replace an existing file")
     unsaid: ReadOptions = group("what the file does not say")
 
     def run(self) -> int:
         """Convert one file and print what was read."""
-        check_suffix(self.out, "--output", (".toml",))
         if self.out.exists() and not self.force:
             raise InputError(self.out, "--output", "(an existing file)", "a new file, or --force to replace it")
         from neurolens.readers.any_format import read_any
@@ -121,19 +118,22 @@ def _summary(lens: Lens, notes: list[str]) -> dict[str, Any]:
 
 
 def _text(data: dict[str, Any]) -> str:
-    across = "" if data["efl_x_mm"] is None else f" (in y; {number(data['efl_x_mm'], 6)} mm in x)"
+    def mm(key: str) -> str:
+        return f"{cli.number(data[key], 6)} mm"
+
+    across = "" if data["efl_x_mm"] is None else f" (in y; {mm('efl_x_mm')} in x)"
     lines = [
         data["name"],
         data["source"],
         f"surfaces      {data['surfaces']}, stop on {data['stop_surface']}; rims: {data['rims']}",
-        f"focal length  {number(data['efl_mm'], 6)} mm{across}",
-        f"back focus    {number(data['back_focus_mm'], 6)} mm; film tabled at {number(data['film_gap_mm'], 6)} mm",
-        f"f-number      f/{number(data['f_number'])}, stated f/{number(data['stated_f_number'])}",
+        f"focal length  {mm('efl_mm')}{across}",
+        f"back focus    {mm('back_focus_mm')}; film tabled at {mm('film_gap_mm')}",
+        f"f-number      f/{cli.number(data['f_number'])}, stated f/{cli.number(data['stated_f_number'])}",
+        *([f"states        {', '.join(data['configurations'])}"] if data["configurations"] else ()),
+        *(f"warning: {text}" for text in data["warnings"]),
+        f"written to {data['output']}",
     ]
-    if data["configurations"]:
-        lines.append(f"states        {', '.join(data['configurations'])}")
-    lines += [f"warning: {text}" for text in data["warnings"]]
-    return "\n".join([*lines, f"written to {data['output']}"])
+    return "\n".join(lines)
 
 
 _CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")
@@ -143,15 +143,14 @@ _PLATE_MM = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Glass(Glasses, Answering):
+class Glass(cli.Reporting):
     """Look glasses up in the catalogue that ships with neurolens: index, Abbe number, the
     wavelengths that the maker states the index for, and what 10 mm transmit inside (without
     reflections). A name gives the glass of every maker that has one of that name, the one that a
     lens file gets first; a six-digit code (517642) the glasses nearest to it, up to 0.01 in
     n_d and 2 in V_d away."""
 
-    about: ClassVar[str] = "look glasses up by name or code"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens glass N-BK7 "F2 (CDGM)" PMMA
   neurolens glass 517642 --json"""
@@ -167,54 +166,34 @@ examples:
         glasses: list[catalogue.Glass] = []
         for name in self.name:
             if _CODE.fullmatch(name):
-                glasses += _near(name)
+                digits = re.sub("[./]", "", name)
+                n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
+                first, *others = catalogue.by_code(name, 6)
+                found = [g for g in (first, *others) if abs(g.n_d - n_d) <= _NEAR_N_D and abs(g.V_d - V_d) <= _NEAR_V_D]
+                if not found:
+                    near = f"the nearest is {first} (n_d {first.n_d:.4f}, V_d {first.V_d:.1f})"
+                    expected = f"a code within {_NEAR_N_D:g} in n_d and {_NEAR_V_D:g} in V_d of a glass; {near}"
+                    raise InputError("argument", "NAME", name, expected)
+                glasses += found
             else:
                 catalogue.find(name, "argument", "NAME")
                 glasses += catalogue.same_name(name)
         rows = [_record(glass) for glass in dict.fromkeys(glasses)]
-        return self.answer({"glasses": rows}, lambda: _glass_text(rows))
-
-
-def _glass_text(rows: list[dict[str, Any]]) -> str:
-    header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
-    lines = [
-        [
-            *(row["glass"], f"{row['n_d']:.6f}", f"{row['V_d']:.2f}", *(number(v) for v in row["range_nm"])),
-            *(number(row["internal_transmittance_10mm"].get(f"{nm:.0f}")) for nm in _TRANSMITTED_NM),
+        header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
+        cells = [
+            [r["glass"], f"{r['n_d']:.6f}", f"{r['V_d']:.2f}"]
+            + [cli.number(v) for v in (*r["range_nm"], *r["internal_transmittance_10mm"].values())]
+            for r in rows
         ]
-        for row in rows
-    ]
-    return table(header, lines)
-
-
-def _near(code: str) -> list[Any]:
-    """The glasses nearest to a code, those alone that are near it.
-
-    Raises:
-        InputError: none is.
-    """
-    from neurolens.lens import catalogue
-
-    digits = re.sub("[./]", "", code)
-    n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
-    nearest = catalogue.by_code(code, 6)
-    found = [g for g in nearest if abs(g.n_d - n_d) <= _NEAR_N_D and abs(g.V_d - V_d) <= _NEAR_V_D]
-    if not found:
-        near = f"{nearest[0]} (n_d {nearest[0].n_d:.4f}, V_d {nearest[0].V_d:.1f})"
-        expected = f"a code within {_NEAR_N_D:g} in n_d and {_NEAR_V_D:g} in V_d of a glass; the nearest is {near}"
-        raise InputError("argument", "NAME", code, expected)
-    return found
+        return self.answer({"glasses": rows}, lambda: cli.table(header, cells))
 
 
 def _record(glass: Any) -> dict[str, Any]:
-    """Figures of one glass; internal transmittance by wavelength in nm, empty where the source has none."""
-    absorption = {nm: glass.absorption_per_mm(nm) for nm in _TRANSMITTED_NM if glass.absorption}
-    return {
-        "glass": str(glass),
-        "n_d": glass.n_d,
-        "V_d": glass.V_d,
-        "range_nm": [1000 * v for v in glass.range_um],
-        "form": glass.form,
-        "coefficients": glass.coefficients,
-        "internal_transmittance_10mm": {f"{nm:.0f}": math.exp(-_PLATE_MM * a) for nm, a in absorption.items()},
+    """Figures of one glass; internal transmittance by wavelength in nm, None where the source has none."""
+    figures = {name: getattr(glass, name) for name in ("n_d", "V_d", "form", "coefficients")}
+    through = {
+        f"{nm:.0f}": math.exp(-_PLATE_MM * glass.absorption_per_mm(nm)) if glass.absorption else None
+        for nm in _TRANSMITTED_NM
     }
+    range_nm = [1000 * v for v in glass.range_um]
+    return {"glass": str(glass), **figures, "range_nm": range_nm, "internal_transmittance_10mm": through}

@@ -1,63 +1,55 @@
-"""`neurolens defocus PLATE.exr --lens LENS`: the picture that a lens takes of a sharp picture with depth."""
+"""`neurolens defocus PLATE.exr --lens LENS`: the picture that a lens takes of a sharp picture with depth; and
+`neurolens bokeh LENS --distance 1 -o OUT`: kernels of a lens's blur for compositing programs."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from neurolens import __version__
-from neurolens.base.errors import warn
-from neurolens.base.settings import group, setting, setting_of, whole
-from neurolens.cli.arguments import (
-    CAMERAS_HELP,
-    Glasses,
-    LensState,
-    Reporting,
-    check_folder,
-    check_suffix,
-    exposure,
-    film_size,
-    lens,
-    lens_state,
-    output_path,
-)  # fmt: skip
+from neurolens.base.lensname import compiled
+from neurolens.base.settings import group, positive, setting, setting_of, whole
+from neurolens.cameras.field import frame_of
+from neurolens.cli import arguments as cli
+from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
+from neurolens.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
+from neurolens.defocus.picture import check_field, defocus
+from neurolens.defocus.plate import DepthSettings, read_plate
+from neurolens.frames import Files
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.render.pictures import standard_attributes, write_channels, write_exr, write_png
+from neurolens.render.sensor import about, expose
 from neurolens.render.settings import SensorSettings
+
+_MOST = 64  # fields along a side
 
 
 @dataclass(frozen=True, kw_only=True)
-class Defocus(Glasses, Reporting):
+class Defocus(cli.Reporting):
     """Give a sharp picture with depth the blur of a lens, by field, depth and colour, with its distortion and
     vignetting.
 
     PLATE.exr is a pinhole's picture: R, G, B and a channel Z with the distance along the axis in metres (0, 1e9
-    and more, inf: sky), sharp, without motion blur; depth without antialiasing is best. Its pinhole stands where
-    `neurolens stmap` says: focal length and place are printed there. Pictures of `neurolens render --camera
-    pinhole:LENS` need nothing else. A data window larger than the display window is overscan, which a lens with
-    barrel distortion needs.
+    and more, inf: sky), without motion blur; depth without antialiasing is best. Its pinhole stands where
+    `neurolens stmap` says; pictures of `neurolens render --camera pinhole:LENS` need nothing else. A data window
+    larger than the display window is overscan, which a lens with barrel distortion needs. What a lens sees behind the
+    edges of things comes of layers with a depth of their own (behind.R, behind.G, behind.B, behind.Z in the file, or
+    --behind) or deep files; else what is beside an edge is put there, and the share of that light is said."""
 
-    What a lens sees behind the edges of things is not in one picture. Layers with a depth of their own (behind.R,
-    behind.G, behind.B, behind.Z in the file, or the files of --behind) and deep files have it; else what is beside
-    an edge is put there, and the share of that light is said.
-
-    Pixels far brighter than their surroundings are spread as clean discs, without noise. A sensor counts the
-    finished picture, as in `neurolens render`."""
-
-    about: ClassVar[str] = "the blur of a lens for a sharp picture with depth"
-    epilog: ClassVar[str] = f"""{CAMERAS_HELP}
+    epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
   neurolens defocus plate.exr --lens lenses/laikin_double_gauss_50.toml --film 36x20.25 --focus 2 \\
       --f-number 2 -o out.exr
   neurolens defocus beauty.exr --depth Depth.Z --lens fused:models/NAME.onnx --film 36x24 --focus 1.2 -o out.exr"""
-    kept: ClassVar[str] = "no picture was written; older files of that name are untouched"
+    kept = "no picture was written; older files of that name are untouched"
 
     plate: Path = setting(..., "OpenEXR file, sharp, with depth", positional=True, metavar="PLATE.exr")
-    lens: str = lens(models=True, cameras=True, metavar="LENS")
-    film: tuple[float, float] = setting(..., "size of the film in mm", kind=film_size, metavar="WxH")
-    out: Path = output_path("OUT.exr", "picture to write; the preview is OUT.png")
+    lens: str = cli.lens(models=True, cameras=True, metavar="LENS")
+    film: tuple[float, float] = cli.film()
+    out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     behind: tuple[Path, ...] = setting(
         (), "OpenEXR file of what is behind the things of the plate, with depth (repeatable)", metavar="FILE.exr"
     )
@@ -75,41 +67,29 @@ examples:
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
-    exposure: float = exposure()
+    exposure: float = cli.exposure()
     sensor: SensorSettings = group("sensor (any of these adds what it reads as channels raw)", unset=True)
     seed: int = setting(0, "seed of the sensor's noise, for each frame another (default: 0)", kind=whole(0))
-    state: LensState = lens_state()
-    threads: int = setting(2, "workers (default: 2)", within=(1, 256))
+    state: cli.LensState = cli.lens_state()
+    threads: int = cli.threads()
 
     def run(self) -> int:
         """Read the plate, blur it, write the picture."""
-        check_suffix(self.out, "--output", (".exr",))
-        check_folder(self.out, "--output")
-        from neurolens.base.lensname import compiled
-        from neurolens.cameras.build import make_camera
-        from neurolens.cameras.field import frame_of
-        from neurolens.defocus.picture import check_field, defocus
-        from neurolens.defocus.read import DepthSettings, read_plate
-        from neurolens.render.pictures import standard_attributes, write_exr, write_png
-        from neurolens.render.sensor import about, expose
-
-        if self.out.resolve() in {file.resolve() for file in (self.plate, *self.behind)}:
-            self.refuse("--output", str(self.out), "another file than those that are read")
+        files = Files.of(self.out)
+        files.spare((self.plate, *self.behind))
         if self.depth_scale == 0:
             self.refuse("--depth-scale", 0, "metres of a unit")
         progress = self.progress()
-        given = {k: getattr(self, k) for k in ("film_offset_mm", "vignetting", "dispersion")}
-        shot = self.state.shot(self.film, **{k: v for k, v in given.items() if v is not None})
+        settings = {k: getattr(self, k) for k in ("film_offset_mm", "vignetting", "dispersion")}
+        shot = self.state.shot(self.film, **settings)
         # Kernels ask for many rays: compiled, unless the argument says how.
-        camera = make_camera(compiled(self.lens), shot, progress)
-        for note in camera.settings.get("notes", ()):
-            warn(note)
+        camera = cli.camera(compiled(self.lens), shot, progress)
         check_field(camera)
         starts = {"auto": None, "film": True, "pinhole": False}
         depth = DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
         plate = read_plate(self.plate, self.film, frame_of(camera), depth, self.behind)
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
-        data: dict[str, Any] = {"plate": self.plate.name, "layers": len(plate.layers), "file": str(self.out)}
+        data: dict[str, Any] = {"plate": self.plate.name, "layers": len(plate.layers), "file": str(files.out)}
         data |= {name: getattr(found, name) for name in ("highlights", "filled", "beyond")}
         metadata = {"version": __version__, "camera": camera.settings, "defocus": data}
         layers = {}
@@ -119,15 +99,105 @@ examples:
         focus = None if math.isinf(shot.focus_m) else shot.focus_m
         attributes = standard_attributes(camera.settings, *plate.size)
         write_exr(
-            self.out, found.rgb, half=self.half, metadata=metadata | {"focus_m": focus}, space=plate.space,
+            files.out, found.rgb, half=self.half, metadata=metadata | {"focus_m": focus}, space=plate.space,
             layers=layers, attributes=attributes,
         )  # fmt: skip
-        write_png(self.out.with_suffix(".png"), found.rgb, self.exposure)
-        return self.answer(data, lambda: _text(data))
+        write_png(files.preview, found.rgb, self.exposure)
+        return self.answer(data, lambda: _defocus_text(data))
 
 
-def _text(data: dict[str, Any]) -> str:
+def _defocus_text(data: dict[str, Any]) -> str:
     said = (
         f"{data['file']}: {data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread, "
     )
     return said + f"{data['filled']:.2%} of the light filled in, {data['beyond']:.2%} from beyond the plate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bokeh(PictureCommand):
+    """Write the kernels of a lens's blur, float32 OpenEXR, for ZDefocus and Bokeh in Nuke and for programs of your own:
+
+      OUT.0.8m.exr     for things 0.8 m from the film, one kernel a field, in columns and rows as in the picture
+      OUT.0.8m.png     the same, each kernel as bright as the others, to be looked at
+
+    Every kernel has its field's cat's eye, coma and colour fringes, in pixels of the picture, and a sum of 1 in each
+    channel; all cells have the same odd width, the centroid of green in the middle. The light of each field relative to
+    the axis is in the metadata and with --json. For a program that takes one kernel, --grid 1x1 gives the axis's."""
+
+    epilog = f"""{cli.CAMERAS_HELP}
+
+examples:
+  neurolens bokeh lenses/laikin_double_gauss_50.toml --width 1920 --film 36x20.25 --focus 2 --f-number 2 \\
+      --distance 0.8 --distance 5 --distance inf -o bokeh
+  neurolens bokeh lenses/leica_summilux_m_35mm_f1_4_asph_v1.toml --width 3840 --film 36x24 --focus 0.7 \\
+      --distance inf --grid 1x1 --ring-height 5 -o rings
+  neurolens bokeh models/NAME.onnx --width 3840 --film 36x24 --focus 1 --distance inf --grid 1x1 -o kernel"""
+
+    out: Path = cli.output_path("OUT", "start of the files' names")
+    distance: tuple[float, ...] = setting(
+        ..., "of things from the film in metres, or inf (repeatable)",
+        kind=positive("a distance in metres", infinite=True), metavar="M",
+    )  # fmt: skip
+    grid: tuple[int, int] = setting(
+        (5, 3),
+        "columns and rows of places in the picture (default: 5x3)",
+        kind=whole_pair("COLUMNSxROWS", _MOST),
+        metavar="CxR",
+    )
+    wavelengths: tuple[float, float, float] | None = setting(
+        None, "one wavelength for red, green and blue each (default: those that make each channel's light)",
+        kind=channels_nm, metavar="NM",
+    )  # fmt: skip
+    ring_height: float = setting(
+        0.0, "height of the grooves that grinding leaves on aspheres, which draw onion rings: 1 to 20 nm are plain "
+        "(default: 0)", within=(0, 1000), metavar="NM",
+    )  # fmt: skip
+    ring_spacing: float = setting(0.5, "from groove to groove (default: 0.5 mm)", within=(0.01, 100), metavar="MM")
+
+    def run(self) -> int:
+        """Find the kernels of all distances, then write an atlas for each."""
+        progress = self.progress()
+        camera, shot = self.make(self.state, progress, compiled=True)
+        check_field(camera)
+        grooves = Grooves(self.ring_height, self.ring_spacing) if self.ring_height else None
+        if grooves:
+            aspheres(camera)
+        with progress.stage("find the kernels") as report:
+            found = kernels_over(
+                camera, self.picture, tuple(dict.fromkeys(self.distance)), self.grid, self.wavelengths, grooves, report
+            )
+        side = max(cell.width_px for cells in found for cell in cells)
+        facts: dict[str, Any] = {"version": __version__, "camera": camera.settings, "picture_px": list(self.picture)}
+        facts |= {"film_mm": list(self.film), "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m}
+        facts |= {"grooves": vars(grooves)} if grooves else {}
+        files, rows = [], []
+        for cells in found:
+            distance = "inf" if math.isinf(cells[0].distance_m) else f"{cells[0].distance_m:.10g}m"
+            path = self.out.with_name(f"{self.out.name}.{distance}.exr")
+            picture = as_picture(cells, self.grid[0], side)
+            rows += (kernels := [_facts(cell) for cell in cells])
+            more = {"kernel_px": side, "fields": list(self.grid), "kernels": kernels}
+            write_channels(path, {c: picture[..., k] for k, c in enumerate("RGB")}, None, facts | more)
+            write_png(path.with_suffix(".png"), as_preview(picture, side))
+            files.append(str(path))
+        data = {"kernel_px": side, "fields": list(self.grid), "kernels": rows, "files": files}
+        return self.answer(data, lambda: _bokeh_text(data))
+
+
+def _facts(cell: Cell) -> dict[str, Any]:
+    """What the metadata say of a kernel; light beside that of a point on the axis of an ideal lens, of each channel."""
+    distance = None if math.isinf(cell.distance_m) else cell.distance_m
+    facts: dict[str, Any] = {"field": list(cell.field), "distance_m": distance, "place_px": list(cell.place_px)}
+    lit = cell.kernel is not None
+    return facts | {"light": cell.kernel.energy.tolist() if lit else [0.0] * 3, "width_px": cell.width_px if lit else 0}  # type: ignore[union-attr]
+
+
+def _bokeh_text(data: dict[str, Any]) -> str:
+    columns, rows = data["fields"]
+    lines = [f"{columns} x {rows} kernels a picture, {data['kernel_px']} pixels a side each"]
+    for k, file in enumerate(data["files"]):
+        cells = data["kernels"][k * columns * rows : (k + 1) * columns * rows]
+        widths, light = ([row[name] for row in cells] for name in ("width_px", "light"))
+        low, high = (cli.number(by(v[1] for v in light), 3) for by in (min, max))
+        lines.append(f"{file}: blur {min(widths)} to {max(widths)} pixels wide, light {low} to {high}")
+    return "\n".join(lines)

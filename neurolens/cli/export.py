@@ -7,42 +7,46 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.base.lensname import FUSED, is_model
 from neurolens.base.settings import positive, setting
-from neurolens.cli.arguments import Answering, film_size, floats, lens, output_path
+from neurolens.cameras.build import make_camera
+from neurolens.cameras.onnxlens import load_model
+from neurolens.cli import arguments as cli
+from neurolens.graph.c import Extras
+from neurolens.lens.paraxial import film_z_mm
+from neurolens.lens.shot import Shot
+from neurolens.shaders.blender_shader import shader_of
+from neurolens.shaders.source import CAMERA_FRAME, camera_program, model_extras
+from neurolens.surrogates import source
 
 if TYPE_CHECKING:
-    from neurolens.surrogates.source import Written
+    from neurolens.surrogates.model import LensModel
 
-_COMMAND = "neurolens export"
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _CAMERA = "camera: what a whole camera is set to"
+# Rays for the errors of an ONNX file with fixed inputs.
+_HELD_OUT, _VIGNETTING = 20_000, 100_000
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Answering):
-    """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
-    arrays that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an
-    ONNX file. Domain guard, stop, rims,
-    transmittance and status codes are those of the model; the card is a comment at the top. c-double is C in double
-    precision, with which a lens file's rays are those of the tracer within 1e-12 mm. Constants
-    (planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
-    (or of internal focus) the state is an argument. A lens file gives the exact lens.
-    OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
-    zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
-    With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
-    ray out, its pupil's outline as a table in the file (of shading languages but CUDA, data beside it).
-    Needs the extra "train" (torch); without it source code is written from the graph in the file,
-    whole and with nothing fixed."""
+class Export(cli.Reporting):
+    """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for arrays
+    that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an ONNX file.
+    Domain guard, stop, rims, transmittance and status codes are those of the model; the card is a comment at the top,
+    and constants and the film's position for a focus stand beside it. Of a model of a zoom's whole range (or of
+    internal focus) the state is an argument. A lens file gives the exact lens, with c-double within 1e-12 mm of the
+    tracer. OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades, zoom and more are its inputs.
+    With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted ray
+    out, its pupil's outline as a table in the file (of shading languages but CUDA, data beside it).
+    Needs the extra "train" (torch); without it source code is written from the model's file, whole, nothing fixed."""
 
-    about: ClassVar[str] = "source code (C, shading languages) of a model; fix what a scene fixes"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 values fixed by a scene are folded into fewer operations (--fix, repeatable):
   wavelengths=450,550,650   one coefficient table per wavelength, chosen by the argument band (a single one:
                             no argument; an ONNX file takes one)
@@ -52,28 +56,23 @@ values fixed by a scene are folded into fewer operations (--fix, repeatable):
 examples:
   neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
   neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
-  neurolens export runs/quickstart --to c -o ray.h --only ray
-  neurolens export lenses/ZOOM.toml --to c -o zoom.h --zoom range         # gaps as the focal length asks
   neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
   neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface
   neurolens export models/NAME.onnx --to c -o cam.h --whole-camera --focus 2 --f-number 2.8 --derivatives
   neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
-  neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
-  neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials elsewhere
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
-
-    model: str = lens(
-        also="; a run folder with one model, a file of neurolens plan; of --to onnx models alone", models=True,
-        cameras=True, positional=True, metavar="MODEL",
+    model: str = cli.lens(
+        also="; or a file of neurolens plan; of --to onnx models alone", models=True, cameras=True, positional=True,
+        metavar="MODEL",
     )  # fmt: skip
     to: Literal["c", "c-double", "glsl", "slang", "hlsl", "wgsl", "cuda", "vex", "osl", "onnx"] = setting(
         ..., "form to write"
     )
-    out: Path = output_path("FILE", "file to write")
+    out: Path = cli.output_path("FILE", "file to write")
     fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE")
-    only: str = setting(
-        ",".join(_PARTS), f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
-        metavar="PARTS",
+    only: tuple[str, str, str, str] = setting(
+        _PARTS, f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
+        kind=cli.words_of(_PARTS, "ray"), metavar="PARTS",
     )  # fmt: skip
     name: str | None = setting(None, "of the function (default: the lens's id)")
     derivatives: bool = setting(False, "of ONNX and with --whole-camera: additional outputs for ray differentials")
@@ -81,9 +80,7 @@ examples:
         False, "of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked"
     )
     whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA)
-    film: tuple[float, float] = setting(
-        (36.0, 24.0), "film in mm (default: 36x24)", kind=film_size, metavar="WxH", title=_CAMERA
-    )
+    film: tuple[float, float] = cli.film((36.0, 24.0), "film in mm (default: 36x24)", _CAMERA)
     focus_m: float = setting(
         math.inf, "distance from the film to the object in focus in metres (default: inf)",
         kind=positive("a distance in metres", infinite=True), title=_CAMERA,
@@ -98,31 +95,27 @@ examples:
 
     def run(self) -> int:
         """Check the options, then load, fix and write."""
-        from neurolens.surrogates.source import checked_name
-
-        file, parts, fixed = model_file(Path(self.model.removeprefix(FUSED))), _parts(self.only), _fixed(self.fix)
-        whole = set(parts) == set(_PARTS) and not fixed
-        if self.to == "onnx" and (self.name is not None or set(parts) != set(_PARTS)):
-            raise InputError(_COMMAND, "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
+        file, fixed = Path(self.model.removeprefix(FUSED)), _fixed(self.fix)
+        whole = set(self.only) == set(_PARTS) and not fixed
+        if self.to == "onnx" and (self.name is not None or set(self.only) != set(_PARTS)):
+            self.refuse("--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
         if self.to != "onnx" and ((self.derivatives and not self.whole_camera) or self.inverse):
-            raise InputError(_COMMAND, "--derivatives, --inverse", f"(with --to {self.to})", "--to onnx")
+            self.refuse("--derivatives, --inverse", f"(with --to {self.to})", "--to onnx")
         if self.name is not None:
-            checked_name(self.to, "", self.name)
+            source.checked_name(self.to, "", self.name)
         if self.to == "osl":
             if not whole or self.whole_camera or self.f_number is not None or self.focus_m != math.inf:
                 options = "--fix, --only, --whole-camera, --focus, --f-number"
                 expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
-                raise InputError(_COMMAND, options, "(with --to osl)", expected)
+                self.refuse(options, "(with --to osl)", expected)
             write: Callable[[Path], dict[str, Any]] = self._write_osl
         elif self.whole_camera or not is_model(file):
             if self.to == "onnx" or not whole:
                 what = "a camera" if self.whole_camera else "a lens file"
-                raise InputError(
-                    _COMMAND, str(file), f"({what})", "source code (--to c, glsl ...), without --fix, --only"
-                )
+                self.refuse(str(file), f"({what})", "source code (--to c, glsl ...), without --fix, --only")
             write = self._write_camera if self.whole_camera else self._write_lens
         else:
-            write = partial(self._write_model, parts=parts, fixed=fixed)
+            write = partial(self._write_model, fixed=fixed)
         check_writable(self.out)
         about = write(file)
         data = {"file": str(self.out), "to": self.to, "bytes": self.out.stat().st_size, **about}
@@ -130,45 +123,33 @@ examples:
         lines = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
         return self.answer(data, lambda: "\n".join([str(self.out), *lines]))
 
-    def _write_model(self, file: Path, parts: Sequence[str], fixed: dict[str, list[float]]) -> dict[str, Any]:
+    def _write_model(self, file: Path, fixed: dict[str, list[float]]) -> dict[str, Any]:
         """A model as source code or ONNX, some of its inputs fixed."""
-        from neurolens.cameras.onnxlens import load_model
-        from neurolens.shaders.source import model_extras
-        from neurolens.surrogates.source import Fix, Parts, export_source
-
         loaded = load_model(file)
-        if loaded.axes and (self.to == "onnx" or fixed or set(parts) != set(_PARTS)):
+        if loaded.axes and (self.to == "onnx" or fixed or set(self.only) != set(_PARTS)):
             expected = "source code (--to c, glsl ...), without --fix, --only"
-            raise InputError(_COMMAND, str(file), "(a model of many states)", expected)
-        fix, models = Fix(), loaded.file.nodes
-        if fixed:
-            from neurolens.cli.export_lens import fixed_model
-
-            fix, models = fixed_model(fixed, loaded.fitted)
+            self.refuse(str(file), "(a model of many states)", expected)
+        fix, models = _fixed_model(fixed, loaded.fitted) if fixed else (source.Fix(), loaded.file.nodes)
         if self.to == "onnx":
-            from neurolens.cli.export_lens import write_inverse, write_onnx_model
-
-            write_onnx_model(models, self.out, None if fixed else loaded.card, self.derivatives)
-            return write_inverse(models[0], self.out) if self.inverse else {}
-        kept = Parts(*(name in parts for name in _PARTS[1:]))
+            _write_onnx_model(models, self.out, None if fixed else loaded.card, self.derivatives)
+            return _write_inverse(models[0], self.out) if self.inverse else {}
+        kept = source.Parts(*(name in self.only for name in _PARTS[1:]))
         stop = fix.stop_radius_mm if kept.vignetting else models[0].domain.stop_radius_mm
         extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
-        written = export_source(
+        written = source.export_source(
             models, self.out, self.to, loaded.card, parts=kept, fix=fix, name=self.name, extras=extras, notes=notes
         )
         return _about(written, [m.domain.wavelength_nm[0] for m in models])
 
     def _write_lens(self, file: Path) -> dict[str, Any]:
         """The exact lens of a file as source code."""
-        from neurolens.cli.export_lens import write_lens
+        from neurolens.shaders.lens_source import write_lens
 
-        return _about(write_lens(file, self.out, self.to, name=self.name, zoom=self.zoom, quiet=self.json))
+        return _about(write_lens(file, self.out, self.to, name=self.name, zoom=self.zoom, progress=self.progress()))
 
     def _write_osl(self, file: Path) -> dict[str, Any]:
         """A camera for Cycles."""
-        from neurolens.shaders.blender_shader import shader_of
-
-        shader = shader_of(file, zoom=self.zoom, name=self.name, quiet=self.json)
+        shader = shader_of(file, zoom=self.zoom, name=self.name, quiet=self.quiet)
         atomic_write_text(self.out, shader.text)
         return {
             "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
@@ -177,21 +158,14 @@ examples:
 
     def _write_camera(self, file: Path) -> dict[str, Any]:
         """The whole camera of a model or a lens file as source code."""
-        from neurolens.base.progress import Progress
-        from neurolens.cameras.build import make_camera
-        from neurolens.graph.c import Extras
-        from neurolens.lens.shot import Shot
-        from neurolens.shaders.source import CAMERA_FRAME, camera_program
-        from neurolens.surrogates.source import DOUBLE, checked_name, lines_of, write_program
-
         shot = Shot(self.film, self.focus_m, self.f_number, zoom=self.zoom)
-        camera: Any = make_camera(file, shot, Progress(quiet=self.json))
+        camera: Any = make_camera(file, shot, self.progress())
         facts = camera.settings
         lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
-        name = checked_name(self.to, f"{lens['id']}_camera", self.name)
+        name = source.checked_name(self.to, f"{lens['id']}_camera", self.name)
         graph = camera.lens_graph()
         # Compilers of shaders take minutes for an array of 43,000 constants: there the caller brings the table.
-        own_table = self.to in ("c", DOUBLE, "cuda")
+        own_table = self.to in ("c", source.DOUBLE, "cuda")
         program = camera_program(camera.film, graph, self.derivatives, own_table=own_table)
         numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
         constants = {"film_width_mm": self.film[0], "film_height_mm": self.film[1], **numbers}
@@ -208,10 +182,12 @@ examples:
                 temporary.write_bytes(table.astype("<f4").tobytes())
             size = f"{table.shape[1]} wide, {len(table)} high"
             comment.append(f"outline: one float a texel, {size}: {beside.name}, little-endian, line by line.")
-        return _about(write_program(program, self.out, self.to, name, lines_of(comment), Extras(constants)))
+        return _about(
+            source.write_program(program, self.out, self.to, name, source.lines_of(comment), Extras(constants))
+        )
 
 
-def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
+def _about(written: source.Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
     """What --json prints about source code."""
     s = written.signature
     return {
@@ -224,43 +200,66 @@ def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
     }
 
 
-def model_file(path: Path) -> Path:
-    """The model that a path names: a file, or the one model of a run folder.
-
-    Raises:
-        InputError: a folder that holds none, or several.
-    """
-    if not path.is_dir():
-        return path
-    files = sorted(p for folder in (path, path / "models") for p in folder.glob("*.onnx"))
-    # Inverse maps and unfinished files of an interrupted run lie beside models.
-    found = [p for p in files if not p.name.startswith(".") and not p.name.endswith((".stop.onnx", ".scene.onnx"))]
-    if len(found) != 1:
-        names = ", ".join(str(p) for p in found) or "(none)"
-        raise InputError(_COMMAND, str(path), f"({names})", "one exported model: name its file")
-    return found[0]
-
-
-def _parts(text: str) -> list[str]:
-    parts = [word.strip() for word in text.split(",")]
-    unknown = [p for p in parts if p not in _PARTS]
-    if unknown or "ray" not in parts:
-        raise InputError(_COMMAND, "--only", text, f"ray, and of {', '.join(_PARTS[1:])} what is wanted")
-    return parts
-
-
 def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
     """The numbers of --fix by name."""
     fixed: dict[str, list[float]] = {}
     for text in texts:
         key, _, value = text.partition("=")
-        numbers = floats(value)
+        numbers = cli.floats(value)
         good = bool(numbers) and all(v > 0 and (key == "focus" or math.isfinite(v)) for v in numbers)
         if key not in _FIXED or key in fixed or not good or (key != "wavelengths" and len(numbers) > 1):
             expected = f"KEY=NUMBER with KEY of {', '.join(_FIXED)} (wavelengths: a list), each once, above 0"
-            raise InputError(_COMMAND, "--fix", text, expected)
+            raise InputError("neurolens export", "--fix", text, expected)
         fixed[key] = numbers
     for pair in (("film_z", "focus"), ("stop", "f_number")):
         if all(key in fixed for key in pair):
-            raise InputError(_COMMAND, "--fix", f"(both {' and '.join(pair)})", "one of them")
+            raise InputError("neurolens export", "--fix", f"(both {' and '.join(pair)})", "one of them")
     return fixed
+
+
+def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[source.Fix, tuple[LensModel, ...]]:
+    """What the numbers of --fix fix, by name, and the models that know it."""
+    from neurolens.setting.focusing import best_focus_z_mm
+    from neurolens.setting.states import set_lens
+
+    film_z = fixed.get("film_z", [None])[0]
+    stop = fixed.get("stop", [None])[0]
+    if "f_number" in fixed:
+        stop = set_lens(model.lens, f_number=fixed["f_number"][0]).stop_radius_mm
+    if "focus" in fixed:
+        focus_m, lens = fixed["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
+        source.Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)
+        near, far = model.domain.film_z_mm
+        film_z = min(max(best_focus_z_mm(lens, focus_m), near), far)
+    fix = source.Fix(tuple(fixed.get("wavelengths", ())), film_z, stop)
+    return fix, source.fixed_models(model, fix)
+
+
+def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
+    """Write a model as ONNX, with the errors of its card, or with new ones where something was fixed (None)."""
+    from neurolens.study.measure import FRESH, fresh_rays, measure_on
+    from neurolens.surrogates.export import export_onnx
+    from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+    if len(models) > 1:
+        wavelengths = [m.domain.wavelength_nm[0] for m in models]
+        raise InputError("neurolens export", "--fix wavelengths", wavelengths, "one wavelength for an ONNX file")
+    model = models[0]
+    if card is not None:
+        export_onnx(model, out, card["errors"], derivatives=derivatives)
+        return
+    seed = int(model.settings.get("rays_seed") or 0) + FRESH
+    held_out = make_pairs(model.lens, model.domain, PairSettings(1, _HELD_OUT, 1, seed)).held_out
+    with atomic_path(out) as measured:  # a file without its errors never has the final name
+        export_onnx(model, measured, {})
+        rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
+        errors = measure_on(rays, load_model(measured))
+        export_onnx(model, measured, errors, derivatives=derivatives)
+
+
+def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
+    """Write both inverse maps beside the model's file; returns their files and the share of rays that each finds."""
+    from neurolens.surrogates.export import export_inverse
+    from neurolens.surrogates.inverse import inverse_of
+
+    return {"inverse": export_inverse(inverse_of(model), out, load_model(out).card["errors"])}

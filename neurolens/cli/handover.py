@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, warn
@@ -15,15 +15,14 @@ from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
 from neurolens.base.progress import Progress
 from neurolens.base.settings import setting
-from neurolens.cli.arguments import CAMERAS_HELP, check_folder, check_run_folder, output_path
-from neurolens.cli.output import table
-from neurolens.cli.projection import fitted_to, write_projection
+from neurolens.cameras.contract import Camera
+from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import Maker, StMap, TracedFrame
+from neurolens.render.pictures import read_channels, standard_attributes
+from neurolens.render.stmap import illumination_map
 
 if TYPE_CHECKING:
-    from neurolens.cameras.contract import Camera
-    from neurolens.handover.lensfun import Entry
-    from neurolens.handover.shot import Handed
+    from neurolens.handover import Handed, LensfunEntry
 
 _KINDS = "opencv", "opencv-rational", "kannala-brandt", "f-theta"
 
@@ -34,43 +33,35 @@ class Handover(StMap):
 
       shot.undistort.exr, shot.redistort.exr, shot.illumination.exr   ST maps, see neurolens stmap
       shot.nk, shot.blender.py     the maps as node groups of Nuke and Blender, with the pinhole to render CG with
-      shot.usda                    that pinhole in USD, and the lens by NVIDIA's lookup pictures, shot.enter.exr and
-                                   shot.exit.exr
+      shot.usda                    that pinhole in USD, with NVIDIA's lookup pictures, shot.enter.exr and shot.exit.exr
       shot.opentrackio.json        a sample of OpenTrackIO 1.0.1
       shot.lensfun.xml             a profile of lensfun: distortion, lateral colour, light by aperture
       shot.opencv.yaml, .json ...  projections of OpenCV, nerfstudio and NVIDIA, see neurolens projection
       README.md                    how to start, what each file leaves in pixels, what its standard cannot say
 
-    With --frames there is one of each map, sample and projection a frame; cameras are animated. An interrupted run
-    goes on: maps that are whole stay. What a standard has no place for is not written, and said. Needs the extra
-    "train" (scipy)."""
+    With --frames there is one of each map, sample and projection a frame; cameras are animated. What a standard has no
+    place for is not written, and said. Needs the extra "train" (scipy)."""
 
-    about: ClassVar[str] = "a lens as files for Nuke, Blender, USD, OpenTrackIO, lensfun, OpenCV"
-    kept: ClassVar[str] = "files that were written are whole; the same command goes on"
-    epilog: ClassVar[str] = f"""{CAMERAS_HELP}
+    kept = "files that were written are whole; the same command goes on"
+    epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
   neurolens handover laikin_double_gauss_50 --film 36x20.25 --width 3840 --focus 2 --f-number 2.8 -o shot/
   neurolens handover models/NAME.onnx --film 36x20.25 --width 1920 --frames 1:48 --key focus=1:1.2,48:3 -o pull/
   neurolens handover isshiki_fisheye_10 --film 18x18 --width 2000 --projection equidistant -o fisheye/"""
 
-    out: Path = output_path("FOLDER", "folder of the files, which is made")
+    out: Path = cli.output_path("FOLDER", "folder of the files, which is made")
     fps: Fraction = setting(
         Fraction(24), "frames a second, as 24 or 24000/1001 (default: 24)", kind=lambda text: _rate(text), metavar="N"
     )
 
     def run(self) -> int:
         """Trace the fields of all frames, write the maps, then what is fitted to them."""
-        check_folder(self.out, "--output")
-        check_run_folder(self.out, self.called, "--output")
-        self.frames.check(self.called)
-        import neurolens.analysis.projections  # noqa: F401 - fails here where scipy is missing, before the work
-        from neurolens.handover.shot import Handed, Pinhole
-        from neurolens.render.pictures import standard_attributes
+        from neurolens.handover import Handed, Pinhole  # fails here where scipy is missing, before the work
 
         progress = self.progress()
         frames, plates = self.traced(progress)
-        self.out.mkdir(exist_ok=True)
+        self.out.mkdir(parents=True, exist_ok=True)
         data = self.data_of(frames, plates)
         shot = Handed(
             standard_attributes(frames[0].camera.settings), __version__, (self.fps.numerator, self.fps.denominator),
@@ -86,8 +77,7 @@ examples:
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
         """The maps of `stmap`, light as a grey picture with alpha, which all programs multiply by, and NVIDIA's."""
-        from neurolens.handover.usd import enter_map, exit_map
-        from neurolens.render.stmap import illumination_map
+        from neurolens.handover import enter_map, exit_map
 
         def light(*given: Any) -> dict[str, Any]:
             grey = illumination_map(*given)["Y"]
@@ -115,8 +105,7 @@ class _Writer:
 
     def files(self, data: dict[str, Any], progress: Progress) -> list[str]:
         """Write all; their names."""
-        from neurolens.handover import lensfun, usd
-        from neurolens.render.pictures import read_channels
+        from neurolens.handover import LENSFUN_TYPES, exit_residual_px
 
         names, command, shot = [], self.command, self.shot
         with progress.stage("fit projections, OpenTrackIO") as report:
@@ -125,11 +114,11 @@ class _Writer:
                 report((k + 1) / len(self.frames))
         entries = self._entries(progress)
         exits, _ = read_channels(command.out / f"shot.exit{shot.frames[0].name}.exr", "RG")
-        self._worse("exit_px", usd.exit_residual_px(self.frames[0].fields[""], shot.plates, exits))
+        self._worse("exit_px", exit_residual_px(self.frames[0].fields[""], shot.plates, exits))
         self._worse("maps_px", max(row["there_and_back_px"] for row in data["frames"]))
         values = {"shot": shot, "about": f"{shot.lens} ({command.camera}), neurolens {__version__}", "entries": entries}
         values |= {"left": self.left, "fits": self.fits, "notes": self.notes, "projection": command.projection}
-        values |= {"parallax": data["frames"][0]["parallax"], "types": lensfun.TYPES}
+        values |= {"parallax": data["frames"][0]["parallax"], "types": LENSFUN_TYPES}
         for name in ("shot.usda", "shot.nk", "shot.blender.py", "shot.lensfun.xml", "README.md"):
             if entries or name != "shot.lensfun.xml":
                 template = f"handover.{name.removeprefix('shot.')}.jinja"
@@ -139,17 +128,17 @@ class _Writer:
 
     def _of_frame(self, k: int) -> list[str]:
         """Write the sample of OpenTrackIO and the projections of a frame; their names."""
-        from neurolens.handover.opentrackio import sample
+        from neurolens.handover import fitted_projection, opentrackio_sample, write_projection
 
         command, pinhole, traced = self.command, self.shot.frames[k], self.frames[k].fields[""]
-        text, left_px, share = sample(traced, pinhole, self.shot)
+        text, left_px, share = opentrackio_sample(traced, pinhole, self.shot)
         atomic_write_text(path := command.out / f"shot.opentrackio{pinhole.name}.json", text)
         self._worse("opentrackio_px", left_px)
         self._worse("light_share", share)
         names = [str(path)]
         for kind in _KINDS:
             try:
-                fitted, left, data = fitted_to(kind, traced, command.picture, command.film, str(command.camera))
+                fitted, left, data = fitted_projection(kind, traced, command.picture, command.film, str(command.camera))
             except InputError as error:
                 note = f"shot.{kind}: got {error.value}, expected {error.expected}"
                 self.notes.extend([note] if note not in self.notes else [])
@@ -164,9 +153,9 @@ class _Writer:
         if value is not None:
             self.left[name] = max(value, self.left.get(name, 0.0))
 
-    def _entries(self, progress: Progress) -> list[Entry]:
+    def _entries(self, progress: Progress) -> list[LensfunEntry]:
         """The entries of lensfun's profile, by focal length; none of a lens with cylinders."""
-        from neurolens.handover.lensfun import MOST_FRAMES, entry_of
+        from neurolens.handover import MOST_ENTRIES, lensfun_entry
 
         if self.shot.frames[0].squeeze != 1:
             self.notes.append("shot.lensfun.xml: lensfun knows no anamorphic lens")
@@ -174,7 +163,7 @@ class _Writer:
         command, states, found = self.command, self.command.states(), list[Any]()
         by_focal = dict(sorted((float(f"{p.focal_mm:.5g}"), k) for k, p in enumerate(self.shot.frames)))
         rows = list(by_focal.values())
-        chosen = sorted({round(n * (len(rows) - 1) / (MOST_FRAMES - 1)) for n in range(MOST_FRAMES)})
+        chosen = sorted({round(n * (len(rows) - 1) / (MOST_ENTRIES - 1)) for n in range(MOST_ENTRIES)})
         red_blue = command.wavelengths[0], command.wavelengths[2]
         with progress.stage("fit lensfun's profile") as report:
             for n in chosen:
@@ -184,7 +173,7 @@ class _Writer:
                 def at_stop(f_number: float | None, state: Any = state) -> Camera:
                     return command.make(replace(state, f_number=f_number), progress)[0]
 
-                entry = entry_of(frame.fields[""], frame.camera, plane_m, self.shot, red_blue, at_stop)
+                entry = lensfun_entry(frame.fields[""], frame.camera, plane_m, self.shot, red_blue, at_stop)
                 found.append(entry)
                 self._worse("lensfun_px", entry.distortion_px)
                 self._worse("colour_px", entry.colour_px)
@@ -207,4 +196,4 @@ def _text(data: dict[str, Any]) -> str:
     rows = [(name, f"{data['left'][key]:.2g}") for name, key in names.items() if key in data["left"]]
     rows += [(kind, f"{fit['worst_px']:.2g}") for kind, fit in data["projections"].items()]
     heading = f"{data['camera']}: {len(data['files'])} files are written; README.md in their folder explains them"
-    return f"{heading}\n{table(('left at most', 'pixels'), rows)}"
+    return f"{heading}\n{cli.table(('left at most', 'pixels'), rows)}"

@@ -70,10 +70,15 @@ class Frames:
         "is no key", metavar="NAME=FRAME:VALUE,...",
     )  # fmt: skip
 
-    def check(self, command: str) -> None:
-        """Refuse keys without frames."""
-        if self.frames is None and self.key:
+    def states(
+        self, fixed: Mapping[str, Any], command: str, names: Sequence[str] = ALL_KEYS
+    ) -> list[tuple[int | None, str, dict[str, Any]]]:
+        """The frames as `frames_of` yields them; without --frames one: no number, no digits, no settings."""
+        if self.frames is not None:
+            return list(frames_of(self.frames, self.key, fixed, command, names))
+        if self.key:
             raise InputError(command, "--key", self.key[0], "--frames beside it")
+        return [(None, "", {})]
 
 
 def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
@@ -85,7 +90,7 @@ def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
 
 def frames_of(
     frames: range, keys: Sequence[str], fixed: Mapping[str, Any], command: str, names: Sequence[str] = ALL_KEYS
-) -> Iterator[tuple[int, str, dict[str, Any]]]:
+) -> Iterator[tuple[int | None, str, dict[str, Any]]]:
     """The frames of --frames: number, its digits in file names, and the settings that the keys have there.
 
     Args:
@@ -103,11 +108,13 @@ def frames_of(
             raise InputError(command, f"--{name}", value, f"left out: --key {name} sets it")
     digits = max(4, len(str(frames[-1])))
     for frame in frames:
-        yield (
-            frame,
-            f"{frame:0{digits}d}",
-            {_QUANTITIES[n].setting: _at(n, track, frame) for n, track in tracks.items()},
-        )
+        values = {_QUANTITIES[name].setting: _at(name, track, frame) for name, track in tracks.items()}
+        yield frame, f"{frame:0{digits}d}", values
+
+
+def numbered(file: Path, digits: str) -> Path:
+    """The file of a frame, OUT.0001.exr of OUT.exr."""
+    return file.with_name(f"{file.stem}.{digits}{file.suffix}") if digits else file
 
 
 def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str, _Keys]]:

@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, Literal
 
-from neurolens.base.errors import warned
-from neurolens.base.files import library
+from neurolens.base.errors import one_line, warned
+from neurolens.base.files import library, sha256_of
 from neurolens.base.lensname import resolve
 from neurolens.base.settings import changed, setting
-from neurolens.cli.arguments import (
-    Answering,
-    Glasses,
-    LensState,
-    check_folder,
-    check_suffix,
-    lens_state,
-    output_path,
-)  # fmt: skip
-from neurolens.cli.lens_list import list_rows, list_text
-from neurolens.cli.output import number, table
+from neurolens.cli import arguments as cli
 
-if TYPE_CHECKING:
-    from neurolens.lens import prescription
-    from neurolens.setting.rims import Rim
-
-_LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
-_Sort = Literal[
-    "maker", "focal-length", "speed", "year", "cats-eye", "swirl", "bubbles", "softness", "flare"
-]  # those of `cli.lens_list`
+INDEX = "index.jsonl"  # in lenses/: a line a lens, {file, sha256, row}, by `python -m experiments lens-index`
+CHARACTER = {  # keys of --sort: the figure of `study.describe`, and its heading; strongest first
+    "cats-eye": ("cats_eye", "cat's eye"), "swirl": ("swirl", "swirl"), "bubbles": ("bubble", "bubbles"),
+    "softness": ("softness_um", "soft um"), "flare": ("flare", "flare"),
+}  # fmt: skip
+_SORTS = {"maker": "maker", "focal-length": "efl_mm", "speed": "f_number", "year": "year"}
+_Sort = Literal["maker", "focal-length", "speed", "year", "cats-eye", "swirl", "bubbles", "softness", "flare"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lens(Glasses, Answering):
+class Lens(cli.Reporting):
     """Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
     image circle, how much of the light gets through and what stops the rest, and anything
     doubtful about it. Several files, or folders (of all formats that "neurolens convert" reads), are
@@ -46,29 +37,26 @@ class Lens(Glasses, Answering):
     are from the axis in degrees; first-order data is for the d line (587.56 nm). Needs the extra
     "train" (torch)."""
 
-    about: ClassVar[str] = "first-order data, field and layout of a lens file"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens lens laikin_double_gauss_50
   neurolens lens lenses/brendel_tessar_100.toml --focal-length 50 --focus 1.5 --layout tessar.png
   neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
   neurolens lens downloads/ --json
-  neurolens lens list --layouts lenses.png
   neurolens lens list --sort swirl
   neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
-    kept: ClassVar[str] = "only a finished --layout picture is written"
-    intermixed: ClassVar[bool] = True
+    kept = "only a finished --layout picture is written"
+    intermixed = True
 
     files: tuple[Path, ...] = setting(
         ..., 'lens files, names of lenses/, or folders; after the word "list" they are checked (default: those that '
         "ship)", positional=True, metavar="FILE", nargs="+",
     )  # fmt: skip
-    state: LensState = lens_state()
-    layout: Path | None = setting(
-        None, "draw the lens with rays from three field points: axis, 70% and edge of the film (.png, .pdf, .svg)",
-        metavar="OUT.png",
-    )  # fmt: skip
-    layouts: Path | None = setting(None, "of several files: draw all lenses in section on one sheet", metavar="OUT.png")
+    state: cli.LensState = cli.lens_state()
+    layout: Path | None = cli.plot_path(
+        "draw the lens with rays from three field points: axis, 70% and edge of the film"
+    )
+    breathing: Path | None = cli.plot_path("draw field of view, focal length, magnification against the focus distance")
     sort: _Sort | None = setting(
         None, "of several files: the order; the last five are figures of bokeh and flare, the strongest first, which "
         "take seconds a lens that is not of lenses/",
@@ -85,11 +73,7 @@ examples:
         None, "edge of the field, in degrees from the axis (default: as the file states)", within=(0.01, 179),
         unit="an angle in degrees", metavar="DEG", title="rims",
     )  # fmt: skip
-    out: Path | None = output_path("OUT.toml", "write the lens with its derived rims", None, "rims")
-    breathing: Path | None = setting(
-        None, "draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
-        metavar="OUT.png",
-    )  # fmt: skip
+    out: Path | None = cli.output_path("OUT.toml", "write the lens with its derived rims", None, "rims")
 
     def run(self) -> int:
         """Print and draw the data of a lens, or the table of several, or derived rims."""
@@ -102,23 +86,20 @@ examples:
 
     def _check_mode(self, several: bool) -> None:
         """Refuse the options of other modes."""
-        anywhere = {"--glass", "--json"}
+        rims = {"--derive-rims", "--edge-pupil", "--half-field", "--output"}
         if several:
-            modes, allowed = "with one lens file", {"--layouts", "--sort"}
+            modes, allowed = "with one lens file", {"--sort"}
         elif self.derive_rims:
-            modes, allowed = "with one lens file alone", {"--derive-rims", "--edge-pupil", "--half-field", "--output"}
+            modes, allowed = "with one lens file alone", rims
         else:
             modes, allowed = "with --derive-rims", {*changed(self.state), "--layout", "--breathing"}
         for option in changed(self):
-            if option not in allowed | anywhere:
-                where = 'with "list", a folder or several files' if option in ("--layouts", "--sort") else modes
+            if option not in allowed | {"--glass", "--json", "--quiet"}:
+                where = 'with "list", a folder or several files' if option == "--sort" else modes
                 self.refuse(option, "(given)", f"this option only {where}")
 
     def _describe(self, file: Path) -> int:
         """Print and draw one lens."""
-        for option, path in (("--layout", self.layout), ("--breathing", self.breathing)):
-            if path is not None:
-                check_suffix(path, option, _LAYOUT_SUFFIXES)
         from neurolens.readers.any_format import read_any
         from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
         from neurolens.surrogates.pairs import domain_of
@@ -159,21 +140,27 @@ examples:
         return self.answer(data, lambda: _lens_text(data))
 
     def _list(self, paths: tuple[Path, ...], checked: bool) -> int:
-        """Print a table of lenses, and draw their sections."""
+        """Print a table of lenses."""
         from neurolens.readers.any_format import lens_files
 
-        if self.layouts is not None:
-            check_folder(self.layouts, "--layouts")
         files = [file for path in paths for file in (lens_files(path) if path.is_dir() else [_file(path)])]
-        rows = list_rows(files, checked=checked, sort=self.sort, kept=not self.glass, quiet=self.json)
-        if self.layouts is not None:
-            from neurolens.analysis.layout import sheet
-            from neurolens.study.describe import section
+        rows = self._rows(files, checked)
+        return self.answer({"lenses": rows}, lambda: _list_text(rows, self.sort))
 
-            sheet([section(Path(r["file"])) for r in rows if "name" in r], self.layouts)
-        note = "" if self.layouts is None else f"\n\nSections drawn in {self.layouts}"
-        data = {"lenses": rows, "layouts": self.layouts and str(self.layouts)}
-        return self.answer(data, lambda: list_text(rows, self.sort) + note)
+    def _rows(self, files: list[Path], checked: bool) -> list[dict[str, Any]]:
+        """`study.describe.library_row` of each lens, in the order of --sort; the library's index has some of them."""
+        index = read_index() if checked and not self.glass else {}
+        rows = {file: row for file in files if (row := kept_row(file, index))}
+        left = [file for file in files if file not in rows]
+        if left:
+            from neurolens.study.describe import library_row
+
+            with self.progress().stage(f"{len(left)} lenses") as report:
+                for done, file in enumerate(left, start=1):
+                    rows[file] = library_row(file, checked, self.sort in CHARACTER)
+                    report(done / len(left))
+        found = [rows[file] for file in files]
+        return found if self.sort is None else sorted(found, key=partial(_place, self.sort))
 
     def _derive(self, file: Path) -> int:
         """Print the table of rims; write the lens with derived rims only where -o asks for it."""
@@ -181,30 +168,36 @@ examples:
         from neurolens.setting.rims import RimRule, derive_rims, half_field_deg
         from neurolens.study.describe import read_quietly
 
-        out, edge_pupil = self.out, self.edge_pupil
-        if out is not None:
-            check_folder(out, "--output")
         lens = read_quietly(file)
-        rule = RimRule(0.5 if edge_pupil is None else edge_pupil, half_field_deg=self.half_field)
+        rule = RimRule(0.5 if self.edge_pupil is None else self.edge_pupil, half_field_deg=self.half_field)
         derived, rims = derive_rims(lens, rule)
         field = self.half_field or half_field_deg(lens)
-        if out is not None:
+        kept = f"{100 * rule.vignetting:g}% of the pupil's height"
+        if self.out is not None:
             said = (
-                f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
-                f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
-                f"a clear edge of {100 * rule.clear_edge:g}%."
+                "Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
             )
-            write_lens(replace(derived, notes=f"{derived.notes} {said}".strip()), out)
-        data = {
-            "file": str(file),
-            "f_number": lens.f_number,
-            "vignetting": rule.vignetting,
-            "clear_edge": rule.clear_edge,
-            "half_field_deg": field,
-            "rims": [vars(rim) for rim in rims],
-            "output": out and str(out),
-        }
-        return self.answer(data, lambda: _rims_text(lens, data, rims))
+            said += f"{kept} kept at {field:.4g} degrees, a clear edge of {100 * rule.clear_edge:g}%."
+            write_lens(replace(derived, notes=f"{derived.notes} {said}".strip()), self.out)
+
+        def text() -> str:
+            rows = []
+            for rim in rims:
+                note = "trimmed: limited by a neighbour" if rim.trimmed else ""
+                share = f"{100 * (rim.derived_mm / rim.tabled_mm - 1):+.1f}%"
+                cells = (f"{v:.3f}" for v in (rim.tabled_mm, rim.axis_mm, rim.field_mm, rim.derived_mm))
+                rows.append((str(rim.surface), *cells, share, "stop" if lens.surfaces[rim.surface].stop else note))
+            head = (
+                f"{lens.name}\nRims for f/{lens.f_number:g} and {field:.4g} degrees half field, where {kept} is kept; "
+            )
+            head += f"diameters in mm; those of the file are marked as {lens.rims}."
+            header = ("surface", "in the file", "axial beam", "field", "derived", "change", "")
+            tail = f"Written to {self.out}" if self.out else "Nothing is written without -o OUT.toml"
+            return "\n\n".join([head, cli.table(header, rows), tail])
+
+        data = {"file": str(file), "f_number": lens.f_number, "vignetting": rule.vignetting}
+        data |= {"clear_edge": rule.clear_edge, "half_field_deg": field, "rims": [vars(rim) for rim in rims]}
+        return self.answer(data | {"output": self.out and str(self.out)}, text)
 
 
 def _file(name: Path) -> Path:
@@ -218,76 +211,69 @@ def _lens_text(data: dict[str, Any]) -> str:
     """The page of text for the data that --json prints."""
     by = f", {data['designer']}" if data["designer"] else ""
     parts = [f"{data['name']}{by}\n{data['source']}", _first_order(data), _light(data), _surfaces(data["surfaces"])]
-    if data["configurations"]:
-        zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
-        near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
-        parts += [f"Zoom states (--zoom, also mm between them): {', '.join(zoom)}"] if zoom else []
-        parts += [f"Focus states (--zoom, or --focus-mode internal): {', '.join(near)} to the object"] if near else []
+    zooms = [c for c in data["configurations"] if c["object_distance_mm"] is None]
+    nears = [c for c in data["configurations"] if c["object_distance_mm"] is not None]
+    if zooms:
+        states = ", ".join(f"{c['name']} ({cli.number(c['efl_mm'])} mm)" for c in zooms)
+        parts.append(f"Zoom states (--zoom, also mm between them): {states}")
+    if nears:
+        states = ", ".join(f"{c['name']} ({cli.number(c['object_distance_mm'])} mm)" for c in nears)
+        parts.append(f"Focus states (--zoom, or --focus-mode internal): {states} to the object")
     if data["derived"]:
         parts.append(f"Derived: {data['derived']}")
     parts += [f"Warning: {text}" for text in data["warnings"]]
-    if data["layout"]:
-        parts.append(f"Layout drawn in {data['layout']}")
-    if data["breathing_plot"]:
-        parts.append(f"Focus breathing drawn in {data['breathing_plot']}")
-    return "\n\n".join(parts)
-
-
-def _near(configuration: dict[str, Any]) -> bool:
-    return configuration["object_distance_mm"] is not None
+    plots = {"Layout": data["layout"], "Focus breathing": data["breathing_plot"]}
+    return "\n\n".join([*parts, *(f"{what} drawn in {file}" for what, file in plots.items() if file)])
 
 
 def _first_order(data: dict[str, Any]) -> str:
     from neurolens.lens.film_plane import LINE_D_NM
 
+    def mm(*keys: str) -> str:
+        return ", ".join(f"{cli.number(data[key], 6)} mm" for key in keys)
+
     focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
     across = data["efl_x_mm"] is not None
-    planes = f"{_mm(data['front_principal_z_mm'])}, {_mm(data['rear_principal_z_mm'])}"
     rows = [
-        ("focal length", _mm(data["efl_mm"]), "in the y-z plane, as all that follows" if across else ""),
-        *((("", _mm(data["efl_x_mm"]), "in the x-z plane"),) if across else ()),
-        ("back focus", _mm(data["back_focus_mm"]), "last vertex to rear focal point"),
-        ("f-number", f"f/{number(data['f_number'])}", "focal length over entrance pupil"),
-        ("working f-number", f"f/{number(data['working_f_number'])}", "of the real marginal ray at this focus"),
-        ("principal planes", planes, "front H, rear H'"),
-        ("entrance pupil", _mm(data["entrance_pupil_z_mm"]), f"diameter {_mm(data['entrance_pupil_diameter_mm'])}"),
-        ("exit pupil", _mm(data["exit_pupil_z_mm"]), f"diameter {_mm(data['exit_pupil_diameter_mm'])}"),
-        ("film plane", _mm(data["film_z_mm"]), f"focus at {focus}"),
-        ("stop", f"surface {data['stop_surface']}", f"diameter {_mm(data['stop_diameter_mm'])}"),
+        ("focal length", mm("efl_mm"), "in the y-z plane, as all that follows" if across else ""),
+        *((("", mm("efl_x_mm"), "in the x-z plane"),) if across else ()),
+        ("back focus", mm("back_focus_mm"), "last vertex to rear focal point"),
+        ("f-number", f"f/{cli.number(data['f_number'])}", "focal length over entrance pupil"),
+        ("working f-number", f"f/{cli.number(data['working_f_number'])}", "of the real marginal ray at this focus"),
+        ("principal planes", mm("front_principal_z_mm", "rear_principal_z_mm"), "front H, rear H'"),
+        ("entrance pupil", mm("entrance_pupil_z_mm"), f"diameter {mm('entrance_pupil_diameter_mm')}"),
+        ("exit pupil", mm("exit_pupil_z_mm"), f"diameter {mm('exit_pupil_diameter_mm')}"),
+        ("film plane", mm("film_z_mm"), f"focus at {focus}"),
+        ("stop", f"surface {data['stop_surface']}", f"diameter {mm('stop_diameter_mm')}"),
         ("refractions", str(data["refractions"]), ""),
     ]
     medium = data["object_medium"]
     if medium["n_d"] != 1:
         rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
     if data["front_efl_mm"] != data["efl_mm"]:
-        rows.append(("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, in its medium"))
+        rows.append(("front focal", mm("front_efl_mm"), "focal length of the object side, in its medium"))
     if data["wavelength_nm"] != LINE_D_NM:
         note = "of all this: the file's primary one, as its light does not hold the d line"
         rows.append(("wavelength", f"{data['wavelength_nm']:g} nm", note))
     return _columns(rows)
 
 
-def _mm(value: float | None) -> str:
-    return f"{number(value, 6)} mm"
-
-
 def _light(data: dict[str, Any]) -> str:
     stated, anamorphic = data["half_field_deg"], data["efl_x_mm"] is not None
     along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
+    half, half_x = (
+        "-" if v is None else f"{v:.2f} degrees"
+        for v in (data["half_field_reached_deg"], data["half_field_reached_x_deg"])
+    )
     share_of = "of rays uniform over the film and over the disc of all passing rays, 5% wider"
-    reached = f"reached at the edge of the film{along}{states}"
     rows = [
-        ("image radius", f"{number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
-        ("half field", _degrees(data["half_field_reached_deg"]), reached),
-        *((("", _degrees(data["half_field_reached_x_deg"]), "along x"),) if anamorphic else ()),
+        ("image radius", f"{cli.number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
+        ("half field", half, f"reached at the edge of the film{along}{states}"),
+        *((("", half_x, "along x"),) if anamorphic else ()),
         ("rays that pass", f"{100 * data['passing_share']:.1f}%", share_of),
         *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
     ]
     return _columns(rows)
-
-
-def _degrees(angle: float | None) -> str:
-    return "-" if angle is None else f"{angle:.2f} degrees"
 
 
 def _columns(rows: list[tuple[str, str, str]]) -> str:
@@ -306,7 +292,7 @@ def _surfaces(surfaces: list[dict[str, Any]]) -> str:
         rows.append([str(s["surface"]), radius, *size, *glass, name, _surface_words(s)])
     if not any(row[-1] for row in rows):
         header, rows = header[:-1], [row[:-1] for row in rows]
-    return table(header, rows)
+    return cli.table(header, rows)
 
 
 def _surface_words(row: dict[str, Any]) -> str:
@@ -326,18 +312,57 @@ def _surface_words(row: dict[str, Any]) -> str:
     return ", ".join(word for word in words if word)
 
 
-def _rims_text(lens: prescription.Lens, data: dict[str, Any], rims: list[Rim]) -> str:
-    rows = []
-    for rim in rims:
-        note = "stop" if lens.surfaces[rim.surface].stop else "trimmed: limited by a neighbour" if rim.trimmed else ""
-        share = f"{100 * (rim.derived_mm / rim.tabled_mm - 1):+.1f}%"
-        cells = (f"{v:.3f}" for v in (rim.tabled_mm, rim.axis_mm, rim.field_mm, rim.derived_mm))
-        rows.append((str(rim.surface), *cells, share, note))
-    head = (
-        f"{lens.name}\nRims for f/{lens.f_number:g} and {data['half_field_deg']:.4g} degrees half field, where "
-        f"{100 * data['vignetting']:g}% of the pupil's height is kept; diameters in mm; "
-        f"those of the file are marked as {lens.rims}."
+def read_index() -> dict[str, dict[str, Any]]:
+    """The entries of the library's index by file; none without an index."""
+    file = library() / "lenses" / INDEX
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else ()
+    return {entry["file"]: entry for entry in map(json.loads, lines)}
+
+
+def kept_row(file: Path, index: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
+    """The row of a lens of the library as its index keeps it; None of another lens, or where the file has changed."""
+    entry = index.get(file.name)
+    if entry is None or file.resolve().parent != (library() / "lenses").resolve() or entry["sha256"] != sha256_of(file):
+        return None
+    return {"lens": file.stem, "file": str(file), **entry["row"]}
+
+
+def _place(sort: str, row: dict[str, Any]) -> tuple[Any, ...]:
+    """Where a row stands: those without the value last."""
+    figure = CHARACTER[sort][0] if sort in CHARACTER else _SORTS[sort]
+    value = ((row.get("character") or {}) if sort in CHARACTER else row).get(figure)
+    if value in (None, ""):
+        return (True, 0.0, row["lens"])
+    strongest_first = -1 if sort in CHARACTER and sort != "cats-eye" else 1
+    return (False, value.casefold() if isinstance(value, str) else strongest_first * value, row.get("efl_mm", 0.0))
+
+
+def _list_text(rows: list[dict[str, Any]], sort: str | None) -> str:
+    """The table; sorted by a character it shows these in place of other data."""
+    middle = (
+        [heading for _, heading in CHARACTER.values()]
+        if sort in CHARACTER
+        else ["half field", "film mm", "refr.", "states"]
     )
-    header = ("surface", "in the file", "axial beam", "field", "derived", "change", "")
-    tail = f"\n\nWritten to {data['output']}" if data["output"] else "\n\nNothing is written without -o OUT.toml"
-    return head + "\n\n" + table(header, rows) + tail
+    header = ("lens", "name", "maker", "year", "EFL mm", "f/", *middle, "rims", "verdict")
+    text = cli.table(header, [_cells(row, sort in CHARACTER, len(header)) for row in rows], left=3)
+    doubtful = [row for row in rows if row["doubts"]]
+    guess = "\n\n~ follows rims that the source does not state" if sort in CHARACTER and "~" in text else ""
+    found = f"{guess}\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful or unreadable"
+    lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
+    return text + found + (":\n" + "\n".join(lines) if lines else "")
+
+
+def _cells(row: dict[str, Any], character: bool, count: int) -> list[str]:
+    if "name" not in row:
+        return [row["lens"], *["-"] * (count - 2), row["verdict"]]
+    efl = cli.number(row["efl_mm"]) + ("" if row["efl_x_mm"] is None else f" / {cli.number(row['efl_x_mm'], 3)}")
+    begin = [row["lens"], one_line(row["believed_to_be"] or row["name"], 40), one_line(row["maker"] or "-", 16)]
+    begin += [str(row["year"] or "-"), efl, cli.number(row["f_number"], 3)]
+    field = "-" if row["half_field_deg"] is None else f"{row['half_field_deg']:.4g}°"
+    middle = [field, cli.number(row["image_radius_mm"]), *(str(row[key] or "-") for key in ("refractions", "states"))]
+    if character:
+        figures, guessed = row.get("character") or {}, row["rims"] in ("derived", "estimated")
+        marked = [key for key in ("cats_eye", "swirl") if guessed and figures.get(key) is not None]
+        middle = ["~" * (key in marked) + cli.number(figures.get(key), 3) for key, _ in CHARACTER.values()]
+    return [*begin, *middle, row["rims"], row["verdict"]]

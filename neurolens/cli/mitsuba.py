@@ -5,92 +5,68 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 from neurolens import __version__
-from neurolens.base.errors import warn
 from neurolens.base.progress import duration
 from neurolens.base.records import plain
 from neurolens.base.settings import positive, setting, setting_of, whole
-from neurolens.cli.arguments import (
-    Glasses,
-    LensState,
-    Reporting,
-    exposure,
-    film_size,
-    lens,
-    lens_state,
-    output_path,
-)  # fmt: skip
+from neurolens.cli import arguments as cli
+from neurolens.frames import Files
 from neurolens.lens.shot import Dispersion, Shot
+from neurolens.mitsuba import load_scene, render
+from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, libraries
+from neurolens.render.pictures import standard_attributes, write_exr, write_png
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mitsuba(Glasses, Reporting):
+class Mitsuba(cli.Reporting):
     """Render a scene of Mitsuba 3 (.xml, or its own cornell-box) with its integrator and its film, through
     a lens where its camera stands, and write OpenEXR with a PNG preview beside it.
     Needs the extra "mitsuba"; its llvm variants need libLLVM too, scalar ones trace one lens ray at a time."""
 
-    about: ClassVar[str] = "render a scene of Mitsuba 3 through a neurolens camera"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens mitsuba cornell-box --camera models/NAME.onnx --film 28x28 --focus 3.6 -o box.exr
   neurolens mitsuba scene.xml --camera thin --f-number 2 --focus 4 --variant llvm_ad_rgb -o thin.exr"""
-    kept: ClassVar[str] = "no picture was written; older files of that name are untouched"
+    kept = "no picture was written; older files of that name are untouched"
 
     scene: str = setting(..., "scene file (.xml), or cornell-box", positional=True, metavar="SCENE")
-    camera: str = lens(models=True, cameras=True)
-    out: Path = output_path("OUT.exr", "picture to write; the preview is OUT.png")
+    camera: str = cli.lens(models=True, cameras=True)
+    out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     variant: str | None = setting(None, "of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)")
     samples: int | None = setting(None, "a pixel (default: the scene's)", within=(1, 1 << 20))
-    film: tuple[float, float] | None = setting(
-        None, "size in mm (default: 36 wide, the picture's shape)", kind=film_size, metavar="WxH"
-    )
+    film: tuple[float, float] | None = cli.film(None, "size in mm (default: 36 wide, the picture's shape)")
     seed: int = setting(0, "default: 0", kind=whole(0, 1 << 15))
     units_per_m: float = setting(
         1.0, "of the scene (default: 1; 1000 for one in millimetres)", option="units-per-m", metavar="N",
         kind=positive("scene units in a metre"),
     )  # fmt: skip
-    exposure: float = exposure()
+    exposure: float = cli.exposure()
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
-    state: LensState = lens_state()
+    state: cli.LensState = cli.lens_state()
 
     def run(self) -> int:
         """Render, write both pictures, print a summary."""
-        from neurolens.cameras.build import make_camera
-        from neurolens.frames.frame import Files
-        from neurolens.mitsuba import load_scene, render
-        from neurolens.mitsuba.library import libraries
-        from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM
-        from neurolens.render.pictures import standard_attributes, write_exr, write_png
-
         preview = Files.of(self.out).preview
         scene = load_scene(self.scene, self.variant)
         width, height = (int(v) for v in scene.sensors()[0].film().size())
         progress = self.progress()
         film = self.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width)
-        shot = self.state.shot(film, wavelength_nm=LIGHT_NM, dispersion=self.dispersion or "full")
-        camera = make_camera(self.camera, shot, progress)
-        for note in camera.settings.get("notes", ()):
-            warn(note)
+        shot = self.state.shot(film, wavelength_nm=LIGHT_NM, dispersion=self.dispersion)
+        camera = cli.camera(self.camera, shot, progress)
         began = time.perf_counter()
         with progress.stage(f"render {self.scene}, {camera.name}") as report:
             picture = render(
                 scene, camera, spp=self.samples, seed=self.seed, units_per_m=self.units_per_m, progress=report
             )
         mi, _ = libraries()
-        stats = {
-            "scene": self.scene,
-            "width": picture.shape[1],
-            "height": picture.shape[0],
-            "samples": self.samples,
-            "seed": self.seed,
-            "seconds": time.perf_counter() - began,
-            "mitsuba": mi.__version__,
-            "variant": mi.variant(),
-        }
+        height, width = picture.shape[:2]
+        stats: dict[str, Any] = {"scene": self.scene, "width": width, "height": height, "samples": self.samples}
+        stats |= {"seed": self.seed, "seconds": time.perf_counter() - began}
+        stats |= {"mitsuba": mi.__version__, "variant": mi.variant()}
         metadata = {"version": __version__, "camera": plain(camera.settings), "render": plain(stats)}
-        attributes = standard_attributes(camera.settings, picture.shape[1], picture.shape[0])
+        attributes = standard_attributes(camera.settings, width, height)
         write_exr(self.out, picture, metadata=metadata, attributes=attributes)
         write_png(preview, picture, self.exposure)
         size = f"{width} x {height} in {duration(float(stats['seconds']))} ({mi.variant()})"

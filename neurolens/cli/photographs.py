@@ -5,23 +5,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import setting
-from neurolens.cli.arguments import Answering, Glasses, check_suffix, lens, output_path
-from neurolens.cli.output import number, table
+from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
-    from neurolens.photographs.compare import Comparison, Curve
-    from neurolens.photographs.faults import Checked
+    from neurolens.photographs.compare import Comparison
     from neurolens.photographs.rims import FittedRims
     from neurolens.photographs.verify import Verified
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verify(Glasses, Answering):
+class Verify(cli.Reporting):
     """Compare a lens file with photographs: lensfun's measured profiles of 1,300 lenses, found by maker, focal length,
     f-number and name (what the file says it is believed to be, its name, the file's own name).
 
@@ -30,35 +27,33 @@ class Verify(Glasses, Answering):
     photographs' distance is not known. Needs the extras "train" and "photographs" (lensfunpy, which brings the
     profiles; their licence is CC BY-SA 3.0)."""
 
-    about: ClassVar[str] = "hold a lens file against photographs of the product"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens verify lenses/sony_sonnar_55.toml -o sonnar.png
   neurolens verify "Nikon AF Nikkor 28mm f1.4D.zmx" --json
   neurolens verify my_lens.toml --check
   neurolens verify my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --lens-file my_verified_lens.toml"""
-    kept: ClassVar[str] = "only a finished picture or lens file is written"
+    kept = "only a finished picture or lens file is written"
 
-    file: Path = lens(positional=True)
+    file: Path = cli.lens(positional=True)
     check: bool = setting(False, "look for wrong figures in the table, and try single changes that make it sound")
     profile: str | None = setting(None, "lensfun's name of the lens, where it is not found by itself", metavar="NAME")
-    out: Path | None = output_path("OUT.png", "draw measured points and computed curves (png, pdf, svg)", None)
+    out: Path | None = cli.output_path("OUT.png", "draw measured points and computed curves (png, pdf, svg)", None)
     lens_file: Path | None = setting(
         None, "write the lens with the result in its table [measured], which its models keep", metavar="OUT.toml",
-        kind=Path,
+        kind=Path, written=True,
     )  # fmt: skip
 
     def run(self) -> int:
         """Compare, draw, write."""
-        if self.out is not None:
-            check_suffix(self.out, "--output", (".png", ".pdf", ".svg"))
-        if self.lens_file is not None:
-            check_suffix(self.lens_file, "--lens-file", (".toml",))
-        from neurolens.photographs.verify import FREE, plot_verified, verify
+        from neurolens.photographs.faults import check
+        from neurolens.photographs.verify import FREE, found_for, plot_verified, verify
         from neurolens.readers.any_format import read_any
 
         tabled = read_any(self.file)
-        checked = _checked(tabled, self.profile) if self.check and not tabled.anamorphic else None
+        checked = None
+        if self.check and not tabled.anamorphic:
+            checked = check(tabled, found_for(tabled, self.profile, any_focal=True)[1][0])
         try:
             found = verify(tabled, self.profile)
         except InputError as error:
@@ -81,19 +76,12 @@ examples:
         return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, last))
 
 
-def _checked(tabled: Lens, profile: str | None) -> Checked:
-    from neurolens.photographs.faults import check
-    from neurolens.photographs.verify import found_for
-
-    return check(tabled, found_for(tabled, profile, any_focal=True)[1][0])
-
-
 def _text(found: Verified, name: str, last: list[str]) -> str:
     other = f"; also possible: {', '.join(found.also)}" if found.also else ""
     head = f"against lensfun's {found.profile}, crop {found.crop:g} (match of names: {found.certainty}{other})"
     lines = [f"{name}\n{head}"]
     header = "mm|distortion %|red µm|measured|blue µm|measured|f/8 stops|measured|widest|measured".split("|")
-    lines.append(table(header, [_row(c) for c in found.comparisons]))
+    lines.append(cli.table(header, [_row(c) for c in found.comparisons]))
     lines.append("distortion: residual of its shape; colour and light: computed and measured at the largest height")
     return "\n".join([*lines, *(f"- {sentence}" for sentence in found.verdict), *last])
 
@@ -101,22 +89,18 @@ def _text(found: Verified, name: str, last: list[str]) -> str:
 def _row(c: Comparison) -> list[str]:
     from neurolens.photographs.compare import near_f8
 
-    cells = [f"{c.focal_mm:g}", number(c.distortion_percent and c.distortion_percent.rms, 2)]
-    eight, widest = (
-        (c.light_stops[near_f8(c.light_stops)], c.light_stops[min(c.light_stops)]) if c.light_stops else (None, None)
-    )
+    cells = [f"{c.focal_mm:g}", cli.number(c.distortion_percent and c.distortion_percent.rms, 2)]
+    light = c.light_stops
+    eight, widest = (light[near_f8(light)], light[min(light)]) if light else (None, None)
     for curve, digits in ((c.red_um, 2), (c.blue_um, 2), (eight, 3), (widest, 3)):
-        cells += [number(v, digits) for v in _last(curve)]
+        # At the largest height.
+        last = (None, None) if curve is None else (float(curve.computed[-1]), float(curve.measured[-1]))
+        cells += [cli.number(v, digits) for v in last]
     return cells
 
 
-def _last(curve: Curve | None) -> tuple[Any, Any]:
-    """The computed and the measured figure at the largest height."""
-    return (None, None) if curve is None else (float(curve.computed[-1]), float(curve.measured[-1]))
-
-
 @dataclass(frozen=True, kw_only=True)
-class Rims(Glasses, Answering):
+class Rims(cli.Reporting):
     """Fit the rims of a lens file to photographs: on each side of the stop either the rims are scaled, or a ring of the
     mount is added, so that the light over image height is the measured one at all apertures together.
 
@@ -124,25 +108,22 @@ class Rims(Glasses, Answering):
     sensor's shading, or a product that differs from the table. The profile is found as `neurolens verify` finds it.
     Needs the extras "train" and "photographs"."""
 
-    about: ClassVar[str] = "fit the rims of a lens file to photographs of the product"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens rims lenses/nikon_zoom_70_200.toml -o zoom.toml
   neurolens rims my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --unused 1.4 2"""
-    kept: ClassVar[str] = "only a finished lens file is written"
+    kept = "only a finished lens file is written"
 
-    file: Path = lens(positional=True)
+    file: Path = cli.lens(positional=True)
     profile: str | None = setting(None, "lensfun's name of the lens, where it is not found by itself", metavar="NAME")
     unused: tuple[float, ...] = setting(
         (), "f-numbers that the fit leaves out, to see what it is worth for them", within=(0.1, 100.0), nargs="+",
         metavar="N",
     )  # fmt: skip
-    out: Path | None = output_path("OUT.toml", "write the lens with these rims", None)
+    out: Path | None = cli.output_path("OUT.toml", "write the lens with these rims", None)
 
     def run(self) -> int:
         """Fit, tell, write."""
-        if self.out is not None:
-            check_suffix(self.out, "--output", (".toml",))
         from neurolens.photographs.rims import fit_rims, with_fitted_rims
         from neurolens.photographs.verify import found_for
         from neurolens.readers.any_format import read_any
@@ -167,7 +148,7 @@ def _rims_text(found: FittedRims, head: str) -> str:
     for f, before in found.before_stops.items():
         left_out = "left out" if f in found.unused else ""
         rows.append([f"f/{f:g}", f"{before:.3f}", f"{found.after_stops[f]:.3f}", left_out])
-    lines = [head, table(("aperture", "before", "after (stops RMS)", ""), rows)]
+    lines = [head, cli.table(("aperture", "before", "after (stops RMS)", ""), rows)]
     for name, factor in (("in front of the stop", found.front), ("behind it", found.rear)):
         lines.append(f"rims {name}: {'as they are' if factor == 1 else f'times {factor:.3f}'}")
     for ring in found.rings:

@@ -12,41 +12,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any
 
 from neurolens.base.cluster import Dask
 from neurolens.base.errors import NeurolensError, printable, warn
 from neurolens.base.files import atomic_write_text, library
+from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
 from neurolens.base.records import plain, program
-from neurolens.base.settings import changed, group, positive, setting, setting_of, whole
+from neurolens.base.settings import changed, group, positive, setting, setting_of
 from neurolens.base.signals import Stopping, Unfinished
-from neurolens.cli.arguments import (
-    CAMERAS_HELP,
-    Command,
-    Glasses,
-    LensState,
-    Parser,
-    Reporting,
-    check_run_folder,
-    check_suffix,
-    dask,
-    exposure,
-    film_size,
-    keeps,
-    lens,
-    lens_state,
-    output_path,
-)  # fmt: skip
-from neurolens.cli.keys import Frames, frames_group, frames_of
+from neurolens.cameras.contract import FloatArray
+from neurolens.cli import arguments as cli
+from neurolens.cli.keys import Frames, frames_group, numbered
+from neurolens.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
+from neurolens.frames.farm import how_to_resume, render_frames
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.render.pictures import write_png
+from neurolens.render.renderer import RenderResult, Watch, merge_tiles, tile_path
 from neurolens.render.settings import FilmSettings, SensorSettings
-
-if TYPE_CHECKING:
-    from neurolens.cameras.contract import FloatArray
-    from neurolens.frames.frame import Files, Frame, Prepared
-    from neurolens.render.renderer import RenderResult, Watch
-
 
 _FARMS, _LONG = "farms", "long renders"  # titles in the help
 
@@ -62,34 +46,7 @@ def _tile(text: str) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
-    """Settings of the picture in the names of `frames.frame.Frame`; None leaves a setting to the scene."""
-
-    samples: int | None = setting(None, "per pixel (default: the scene's)", within=(1, 2**20))
-    width: int | None = setting(
-        None, "width (default: the scene's, or from --height and the film's shape)", within=(1, 16384),
-        metavar="PIXELS",
-    )  # fmt: skip
-    height: int | None = setting(
-        None, "height (default: the scene's, or from --width and the film's shape)", within=(1, 16384),
-        metavar="PIXELS",
-    )  # fmt: skip
-    film_mm: tuple[float, float] | None = setting(
-        None, "width and height of the film in mm (default: the scene's)", option="film", kind=film_size,
-        metavar="WxH",
-    )  # fmt: skip
-    seed: int = setting(0, "of the random numbers (default: 0)", kind=whole(0))
-    max_depth: int | None = setting(None, "bounces (default: the scene's)", within=(1, 1000))
-    half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
-    exposure: float = exposure()
-    channels: Literal["all", "beauty"] = setting(
-        "all", "of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along "
-        "the axis from the film) and blocked (share of camera rays that do not pass) (default: all)", old=("layers",),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class Render(Glasses, Reporting):
+class Render(cli.Reporting):
     """Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
     a PNG preview beside it. The settings, the camera and the card of a model are kept in the EXR's
     metadata, attribute "neurolens", as JSON.
@@ -101,14 +58,10 @@ class Render(Glasses, Reporting):
     The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
     command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
 
-    about: ClassVar[str] = "a scene through a lens, a model, a thin lens or a pinhole"
-    epilog: ClassVar[str] = f"""{CAMERAS_HELP}
+    epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
-  neurolens render experiments/scenes/room.toml --camera pinhole --samples 4 -o quick.exr
   neurolens render experiments/scenes/room.toml --camera lenses/laikin_double_gauss_50.toml -o exact.exr
-  neurolens render experiments/scenes/lights.toml --camera models/NAME.onnx --f-number 2.8 \\
-      --half -o lights.exr
   neurolens render experiments/scenes/grid.toml --camera lenses/ogawa_zoom_70_200.toml \\
       --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
   neurolens render experiments/scenes/room.toml --camera thin --samples 64 --keep-checkpoint -o room.exr
@@ -117,16 +70,16 @@ examples:
   neurolens render --merge room.tile-*.exr -o room.exr
   neurolens render experiments/scenes/room.toml --camera fused:models/NAME.onnx --frames 1:48 \\
       --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
-    kept: ClassVar[str] = "no picture was written; older files of that name are untouched"
+    kept = "no picture was written; older files of that name are untouched"
 
     scene: tuple[Path, ...] = setting(
         (), "scene file (.toml), or tiles of --merge", positional=True, metavar="SCENE", nargs="*"
     )
-    camera: str | None = lens(None, models=True, cameras=True)
+    camera: str | None = cli.lens(None, models=True, cameras=True)
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
-    out: Path = output_path("OUT.exr", "picture to write; the preview is OUT.png")
+    out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
     colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)
     sensor: SensorSettings = group(
@@ -145,7 +98,7 @@ examples:
         "times are summed; of tiles of frames a picture a frame. Takes -o and --exposure alone, and no tile of other "
         "settings, missing, doubled or unfinished", title=_FARMS,
     )  # fmt: skip
-    dask: str | None = dask(_FARMS)
+    dask: str | None = cli.dask(_FARMS)
     checkpoint_every: float = setting(
         30.0, "seconds between checkpoints, OUT.exr.part; inf: only when the render is stopped (default: 30)",
         kind=positive("seconds", infinite=True), metavar="S", title=_LONG,
@@ -155,10 +108,8 @@ examples:
         False, "keep OUT.exr.part, so that the same command with more --samples adds them (from a multiple of 16)",
         title=_LONG,
     )  # fmt: skip
-    state: LensState = lens_state()
-    threads: int = setting(
-        2, "workers, each pinned to a core if there are as many as cores (default: 2)", within=(1, 256)
-    )
+    state: cli.LensState = cli.lens_state()
+    threads: int = cli.threads()
 
     def run(self) -> int:
         """Render frames, or merge tiles; returns the exit code of the first frame that fails."""
@@ -171,14 +122,14 @@ examples:
             raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
 
     def _run(self) -> int:
-        self.frames.check(self.called)
         frame = self.frame()
-        frames = {self.out: frame} if self.frames.frames is None else self._by_file(frame)
+        frames = {
+            numbered(self.out, digits): replace(frame, **values, number=number, seed=frame.seed + (number or 0))
+            for number, digits, values in self.frames.states(vars(frame), self.called)
+        }
         missing = frames if self.frames.frames is None else self._missing(frames)
         if self.dask is not None:
             return self._run_on_dask(self.dask, frames, missing)
-        from neurolens.frames.frame import flare_choice, flare_of, prepare
-
         choice = None
         for number, (out, frame) in enumerate(missing.items()):
             progress = self.progress()
@@ -191,23 +142,12 @@ examples:
 
     def frame(self) -> Frame:
         """The frame that the options describe."""
-        from neurolens.frames.frame import Frame
-
         assert self.camera is not None
+        same = ("film_offset_mm", "vignetting", "dispersion", "colour", "sensor", "tile")
         return Frame.of(
-            self.scene[0], self.camera, **self.state.camera(), **vars(self.picture), **vars(self.colour),
-            film_offset_mm=self.film_offset_mm, vignetting=self.vignetting, dispersion=self.dispersion,
-            sensor=self.sensor, glass_files=self.glass, tile=self.tile,
+            self.scene[0], self.camera, **self.state.settings(), **vars(self.picture), glass_files=self.glass,
+            **{name: getattr(self, name) for name in same},
         )  # fmt: skip
-
-    def _by_file(self, frame: Frame) -> dict[Path, Frame]:
-        """The frames of --frames by the files of their pictures; `frame` has the settings that no key sets."""
-        assert self.frames.frames is not None
-        frames = {}
-        for number, digits, values in frames_of(self.frames.frames, self.frames.key, vars(frame), self.called):
-            out = self.out.with_name(f"{self.out.stem}.{digits}{self.out.suffix}")
-            frames[out] = replace(frame, **values, number=number, seed=frame.seed + number)
-        return frames
 
     def _missing(self, frames: Mapping[Path, Frame]) -> dict[Path, Frame]:
         """The frames that are to be rendered: without --restart those that do not exist, or that have a checkpoint.
@@ -215,9 +155,6 @@ examples:
         Warns:
             NeurolensWarning: frames that exist are kept, whatever keys they were rendered by.
         """
-        from neurolens.frames.frame import Files
-        from neurolens.render.tiles import tile_path
-
         missing = {}
         for out, frame in frames.items():
             written = tile_path(out, frame.tile)
@@ -232,8 +169,6 @@ examples:
 
     def _render(self, prepared: Prepared, flare: Mapping[str, FloatArray], progress: Progress) -> int:
         """Render a frame until it is done or a signal asks to stop, write its pictures, and print a summary."""
-        from neurolens.frames.frame import write_pictures
-
         files = prepared.files
         with Stopping() as stopping, progress.stage(f"render {prepared.name}") as report:
             result = prepared.render(self.threads, report, self._watch(files, stopping))
@@ -242,7 +177,7 @@ examples:
         kept = files.kept() if stopping() else self.kept
         if not result.stats["paths"]:
             return _interrupted(stopping, kept)
-        with keeps(kept):
+        with cli.keeps(kept):
             write_pictures(prepared, result, flare)
         if dropped := result.stats["dropped_samples"]:
             warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
@@ -256,9 +191,6 @@ examples:
 
     def _watch(self, files: Files, stop: Stopping) -> Watch:
         """Preview, checkpoint and stop."""
-        from neurolens.render.pictures import write_png
-        from neurolens.render.renderer import Watch
-
         return Watch(
             preview=partial(write_png, files.preview, exposure=self.picture.exposure), checkpoint=files.checkpoint,
             checkpoint_s=self.checkpoint_every, restart=self.restart, keep=self.keep_checkpoint,
@@ -267,15 +199,13 @@ examples:
 
     def _run_on_dask(self, address: str, frames: Mapping[Path, Frame], missing: Mapping[Path, Frame]) -> int:
         """Render frames by tiles on a cluster."""
-        from neurolens.frames.farm import how_to_resume, render_frames
-
         for option, value in (("--tile", self.tile), ("--keep-checkpoint", self.keep_checkpoint or None)):
             if value is not None:
                 self.refuse(option, value, "left out beside --dask")
         if not missing:
             return 0
         folder = self.out.with_name(f"{self.out.name}.tiles")
-        with keeps(how_to_resume(folder)), Dask(address) as executor:
+        with cli.keeps(how_to_resume(folder)), Dask(address) as executor:
             pictures = render_frames(
                 missing, executor, folder, shown=list(frames.values()), restart=self.restart,
                 progress=self.progress(),
@@ -290,9 +220,6 @@ examples:
                 self.refuse(option, "(beside --merge)", "tiles, -o and --exposure alone")
         if not self.scene:
             self.refuse("--merge", "(no tiles)", "the tiles of a render")
-        check_suffix(self.out, "--output", (".exr",))
-        from neurolens.render.tiles import merge_tiles
-
         return self._say_pictures(merge_tiles(list(self.scene), self.out, self.picture.exposure))
 
     def _say_pictures(self, pictures: Sequence[Mapping[str, Any]]) -> int:
@@ -337,35 +264,32 @@ _MORE = {"thin": f"{_SIZE} --f-number 1.8", "pinhole": _SIZE, "fisheye": "--film
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Command):
+class Demo(cli.Command):
     """Render lights at many depths through a model of a 50 mm f/1.8 double Gauss, the lens itself (where the extra
     "train" is installed), a thin lens and a pinhole that show the plane in focus at the same size, then through a
     fisheye's model, and write them on one page, each with its command. Needs no checkout: the library ships."""
 
-    about: ClassVar[str] = "one scene through a lens, its model, a thin lens and a pinhole"
-    kept: ClassVar[str] = "pictures so far are kept; the same command goes on"
+    kept = "pictures so far are kept; the same command goes on"
 
-    out: Path = output_path("FOLDER", "default: neurolens-demo", Path("neurolens-demo"))
+    out: Path = cli.output_path("FOLDER", "default: neurolens-demo", Path("neurolens-demo"))
     width: int = setting(480, "(default: 480)", within=(1, 4096), metavar="PIXELS")
     samples: int = setting(32, "a pixel (default: 32)", within=(1, 2**16))
 
     def run(self) -> int:
         """Render and write the page."""
-        from neurolens.base.html import html
         from neurolens.study.pages import figures_of
 
-        check_run_folder(self.out, self.called, "--output")
         self.out.mkdir(parents=True, exist_ok=True)
-        parser = Parser()
-        Render.add_parser(parser.add_subparsers())
+        parser = cli.Parser()
+        Render.fill(parser)
         scene = str(library() / "experiments" / "scenes" / "lights.toml")
         figures, traced = [], importlib.util.find_spec("torch") is not None
         for name, camera, caption in _PICTURES:
             if name == "exact" and not traced:
                 continue
             size = ["--width", str(self.width), "--samples", str(self.samples), "-o", str(self.out / f"{name}.exr")]
-            words = ["render", scene, "--camera", camera, *_MORE.get(name, "").split(), *size]
-            command = f"{program()} {shlex.join(words)}"
+            words = [scene, "--camera", camera, *_MORE.get(name, "").split(), *size]
+            command = f"{program()} render {shlex.join(words)}"
             print(command, flush=True)
             args = parser.parse_args(words)
             args.run(args)

@@ -6,9 +6,9 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from neurolens.base.cluster import Dask
 from neurolens.base.errors import NeurolensError, one_line, printable
@@ -18,56 +18,39 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import NOISY, noisy
 from neurolens.base.settings import setting, whole
 from neurolens.base.tasks import Processes, cores
-from neurolens.cli.arguments import (
-    Glasses,
-    Reporting,
-    check_ids,
-    check_run_folder,
-    dask,
-    lens,
-    output_path,
-    within,
-)  # fmt: skip
-from neurolens.cli.output import number, table
+from neurolens.cli import arguments as cli
 from neurolens.study.pages import advice, ns_text
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Glasses, Reporting):
-    """Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
-    measure errors and speed against the exact tracer, render the scenes, and write one report.
-    Needs the extra "train" (torch).
+class Train(cli.Reporting):
+    """Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX, measure errors and
+    speed against the exact tracer, render the scenes, and write one report. Needs the extra "train" (torch).
 
-    Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
-    full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
-    for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
-    lens is too long for that). It takes a minute; --within asks for an error instead. A file of another
-    program (Zemax, CODE V, ...) is read as "neurolens convert" reads it; where that lacks something, convert
-    first, with its options.
+    Without an experiment file, --lens fits a polynomial and a network to that lens in its default state: full aperture,
+    its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated for less; one where no
+    dispersion is known), focus from infinity to 14 focal lengths (further where the lens is too long for that). It
+    takes a minute; --within asks for an error instead.
 
     An interrupted run resumes where it stopped: existing models of the same settings are kept."""
 
-    about: ClassVar[str] = "fit, measure and render the models of an experiment"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
-  neurolens train --lens lenses/cooke_triplet_50.toml
   neurolens train --lens lenses/cooke_triplet_50.toml --within 0.1px --rounds 0
   neurolens train --lens lenses/*_50.toml -o runs/fifties
   neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range -o runs/zoom
-  neurolens train --lens lenses/brendel_tessar_100.toml -o runs/tessar \\
-      --set lens.focal_length_mm=50
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
 lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
-    kept: ClassVar[str] = "fitted models are kept in the run folder; the same command resumes"
+    kept = "fitted models are kept in the run folder; the same command resumes"
 
     experiment: Path | None = setting(None, "experiment file", positional=True, metavar="EXPERIMENT.toml", nargs="?")
-    lens: tuple[Path, ...] | None = lens(
+    lens: tuple[Path, ...] | None = cli.lens(
         None, ", instead of an experiment; of several, each has a run folder in DIR (runs)", nargs="+"
     )
-    out: Path | None = output_path(
+    out: Path | None = cli.output_path(
         "DIR", "run folder, made if needed (default: runs/NAME of the experiment or lens file)", None
     )
     set: tuple[str, ...] = setting(
@@ -80,7 +63,7 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     internal_focus: bool = setting(
         False, 'of --lens: one model of internal focus, infinity to the near limit (input "state", in 1/m)'
     )
-    within: tuple[str, float] | None = within(
+    within: tuple[str, float] | None = cli.within(
         "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
         "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)"
     )
@@ -91,99 +74,68 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     rounds: int | None = setting(
         None, "of the race, 0 for none (default: the setting's)", kind=whole(0), metavar="N", old={"no-race": 0}
     )
-    named: bool = True  # whether the command line names `out`
 
     def run(self) -> int:
         """Run the experiment, or one a lens, and print a summary."""
-        if self.lens is not None and len(self.lens) > 1:
-            return self._run_many(self.lens)
-        one = self._one(None if self.lens is None else self.lens[0], self.out)
-        folder, results = one.folder, one.train(self.progress())
+        lenses = self.lens or ()
+        if (self.experiment is None) == (not lenses):
+            self.refuse("EXPERIMENT.toml or --lens", "(both)" if lenses else "(neither)", "one of them")
+        if not lenses and (self.within or self.zoom_range or self.internal_focus):
+            option = "--within" if self.within else "--zoom-range, --internal-focus"
+            self.refuse(option, "(without --lens)", "--lens FILE")
+        if len(lenses) > 1:
+            return self._run_many(lenses)
+        folder, results = self._train(self.experiment or lenses[0], self.out, self.progress())
         data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
         met = (results.get("target") or {"met": True})["met"]
         return self.answer(data, lambda: _text(results, folder), 0 if met else 1)
 
-    @property
-    def folder(self) -> Path:
-        """The run folder of one training."""
-        assert self.out is not None
-        return self.out
-
-    def _one(self, lens: Path | None, out: Path | None) -> Train:
-        """The training of a lens, or of the experiment where there is none.
-
-        Raises:
-            InputError: both or neither of experiment and lens, options that take a lens, a run folder that is a file.
-        """
-        file = self.experiment or lens
-        if file is None or None not in (self.experiment, lens):
-            self.refuse("EXPERIMENT.toml or --lens", "(neither)" if file is None else "(both)", "one of them")
-        folder = Path("runs") / lens_id_of(file) if out is None else out
-        check_run_folder(folder, self.called, "--output")
-        if lens is None and (self.within or self.zoom_range or self.internal_focus):
-            self.refuse(
-                "--within" if self.within else "--zoom-range, --internal-focus", "(without --lens)", "--lens FILE"
-            )
-        return replace(self, lens=None if lens is None else (lens,), out=folder, named=out is not None)
-
-    @property
-    def settings(self) -> list[str]:
-        """The options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
-        states = ['lens.zoom="range"'] * self.zoom_range + ['lens.focus_mode="internal"'] * self.internal_focus
-        if self.within is not None:
-            unit = self.within[0].removeprefix("rms_")
-            states.append(f"target.{unit}={self.within[1]!r}")
-            states += [f"target.pixels_across={self.pixels_across}"] * (unit == "px")
-        rounds = [] if self.rounds is None else [f"evaluation.rounds={self.rounds}"]
-        return [*states, *rounds, *self.set]
-
-    @property
-    def command(self) -> str:
-        """The command line that makes one run."""
-        parts = ["neurolens", "train"]
-        parts += ["--lens", str(self.lens[0])] if self.lens else [str(self.experiment)]
-        parts += ["--output", str(self.out)] if self.named else []
-        for change in self.settings:
-            parts += ["--set", change]
-        return shlex.join(parts)
-
-    def train(self, progress: Progress) -> dict[str, Any]:
-        """Run one experiment; its results."""
+    def _train(self, file: Path, out: Path | None, progress: Progress) -> tuple[Path, dict[str, Any]]:
+        """Run one experiment, or that of a lens file, in a folder; the folder and the results."""
         from neurolens.study.experiment import default_experiment, read_experiment
         from neurolens.study.train import run_experiment
 
-        if self.lens:
-            experiment = default_experiment(self.lens[0], self.settings)
-        else:
-            assert self.experiment is not None
-            experiment = read_experiment(self.experiment, self.settings)
-        return run_experiment(experiment, self.folder, progress=progress, command=self.command)
+        folder = Path("runs") / lens_id_of(file) if out is None else out
+        cli.check_written(folder, "--output", "DIR")
+        changes = self._changes()
+        experiment = (read_experiment if self.experiment else default_experiment)(file, changes)
+        words = ["neurolens", "train", *["--lens"] * (self.experiment is None), str(file)]
+        words += [] if out is None else ["--output", str(out)]
+        command = shlex.join([*words, *(word for change in changes for word in ("--set", change))])
+        return folder, run_experiment(experiment, folder, progress=progress, command=command)
+
+    def _changes(self) -> list[str]:
+        """The options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
+        changes = ['lens.zoom="range"'] * self.zoom_range + ['lens.focus_mode="internal"'] * self.internal_focus
+        if self.within is not None:
+            unit = self.within[0].removeprefix("rms_")
+            changes.append(f"target.{unit}={self.within[1]!r}")
+            changes += [f"target.pixels_across={self.pixels_across}"] * (unit == "px")
+        return [*changes, *([] if self.rounds is None else [f"evaluation.rounds={self.rounds}"]), *self.set]
 
     def _run_many(self, lenses: Sequence[Path]) -> int:
         """One run a lens; a lens that fails is a line, and the exit code is 2 then."""
-        check_ids(lenses, self.called, "--lens")
-        base = self.out if self.out is not None else Path("runs")
-        check_run_folder(base, self.called, "--output")
-        progress, failed, done = self.progress(), dict[str, str](), list[str]()
-        for one in [self._one(file, base / lens_id_of(file)) for file in lenses]:
+        cli.check_ids(lenses, self.called, "--lens")
+        base, progress, failed, done = self.out or Path("runs"), self.progress(), dict[str, str](), list[str]()
+        for file in lenses:
+            lens_id = lens_id_of(file)
             try:
-                one.train(progress)
-                done.append(str(one.folder))
+                done.append(str(self._train(file, base / lens_id, progress)[0]))
             except NeurolensError as error:
-                failed[one.folder.name] = str(error)
-                print(f"neurolens: {one_line(f'{one.folder.name}: {error}', 3000)}", file=sys.stderr)
+                failed[lens_id] = str(error)
+                print(f"neurolens: {one_line(f'{lens_id}: {error}', 3000)}", file=sys.stderr)
         return self.answer({"folders": done, "failed": failed}, lambda: "\n".join(done), 2 if failed else 0)
 
 
 def _text(results: Mapping[str, Any], folder: Path) -> str:
     header = ("model", "rms um", "p99 um", "angle rms deg", "false pass", "false block", "ns/ray", "C ns/ray", "fit s")
     rows = [_row(model) for model in results.get("models", ())]
-    parts = [str(results.get("title") or folder.name), table(header, rows)]
+    parts = [str(results.get("title") or folder.name), cli.table(header, rows)]
     target = results.get("target")
     if target:
         reached = "reached" if target["met"] else "no model tried reaches it, the closest is"
         said = f"Asked for {target['within_um']:.3g} um RMS"
-        parts.append(f"{said}: {reached} {target['model']}, {number(target['rms_um'], 3)} um.")
+        parts.append(f"{said}: {reached} {target['model']}, {cli.number(target['rms_um'], 3)} um.")
     parts += ["\n  ".join(filter(None, (str(found), found.command))) for found in advice(results, folder)]
     timings = [model.get(key) for model in results["models"] for key in ("ns_per_ray", "fused_ns_per_ray")]
     if any(map(noisy, timings)):
@@ -197,33 +149,32 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
 
 
 def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
-    errors = (number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
+    errors = (cli.number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
     shares = (model.get(key) for key in ("false_pass", "false_block"))
     times = (ns_text(model.get(key) or {}).removesuffix(" ns") for key in ("ns_per_ray", "fused_ns_per_ray"))
     percent = ("-" if share is None else f"{100 * share:.2f}%" for share in shares)
-    return (str(model.get("name")), *errors, *percent, *times, number(model.get("fit_s"), 3))
+    return (str(model.get("name")), *errors, *percent, *times, cli.number(model.get("fit_s"), 3))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Survey(Glasses, Reporting):
+class Survey(cli.Reporting):
     """Read every lens file of a folder (all formats of `neurolens convert`, and folders inside), check it against its
     own statements, derive rims where it gives none, fit a polynomial by the default settings, and measure it on
     rays that the fit has not seen. Nothing is left out silently: what cannot be read is one line with the reason.
 
     Every file is a process of its own. A finished file is not done again: the same command goes on."""
 
-    about: ClassVar[str] = "every lens file of a folder: read, checked, fitted, measured"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens survey lenses/
   neurolens survey my_patents/ -o runs/patents --jobs 8
   neurolens survey my_patents/ --no-fit
 
 DIR holds survey.html (a table with sections of the lenses, to sort and filter), survey.csv, survey.json, records/."""
-    kept: ClassVar[str] = "finished files are kept; the same command goes on"
+    kept = "finished files are kept; the same command goes on"
 
     folder: Path = setting(..., "folder of lens files", positional=True, metavar="FOLDER")
-    out: Path = output_path("DIR", "default: runs/survey", Path("runs/survey"))
+    out: Path = cli.output_path("DIR", "default: runs/survey", Path("runs/survey"))
     no_fit: bool = setting(False, "read and check only")
     verify: bool = setting(False, "hold each lens against photographs (neurolens verify; extra photographs)")
     terms: int = setting(64, "coefficients (default 64)", within=(1, 400))
@@ -234,7 +185,7 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
         unit="degrees", metavar="DEG",
     )  # fmt: skip
     jobs: int = setting(cores(), "files at a time, about 1 GB of memory each (default: all cores)", within=(1, 256))
-    dask: str | None = dask()
+    dask: str | None = cli.dask()
     restart: bool = setting(False, "do finished files again", old=("again",))
 
     def run(self) -> int:
@@ -243,7 +194,6 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
         from neurolens.readers.source import MAX_BYTES
         from neurolens.study.survey import TIME_LIMIT_S, SurveySettings, summary_lines, summary_of, survey
 
-        check_run_folder(self.out, self.called, "--output")
         if self.out.resolve() == self.folder.resolve():
             self.refuse("--output", str(self.out), "a folder other than that of the lenses")
         collection = collection_of(self.folder)

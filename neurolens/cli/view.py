@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
+from neurolens.analysis.fields import Scene
+from neurolens.analysis.layout import layout_profile
+from neurolens.base.bounds import RANGE
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.files import TemporaryFolder
+from neurolens.base.files import library as shipped
+from neurolens.base.lensname import is_model
+from neurolens.base.progress import Progress
 from neurolens.base.settings import setting, setting_of
-from neurolens.cli.arguments import Answering, Glasses, check_suffix, lens, output_path
-from neurolens.cli.blender import Build
+from neurolens.cameras.onnxlens import load_model
+from neurolens.cli import arguments as cli
+from neurolens.cli.blender import Build, forms_of, key_of, kind_of, library, squeeze_of
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import VISIBLE_NM, Lens
+from neurolens.readers import lensfile
+from neurolens.readers.any_format import read_any
+from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
+from neurolens.setting.states import set_lens
+from neurolens.shaders.lens_source import write_lens
+from neurolens.shaders.source import model_extras
+from neurolens.surrogates.card import read_card
+from neurolens.surrogates.source import Written, export_source
+from neurolens.view import Form, ViewLens, ghosts_glsl, path_glsl, section_svg, write_page
 
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
-
-
-def _kinds(text: str) -> list[str]:
-    words = text.split(",")
-    if words[0] != "glsl" or len(set(words)) < len(words) or not set(words) <= set(_DOWNLOADS):
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected glsl, and of {', '.join(_DOWNLOADS[1:])} what is wanted"
-        )
-    return words
+_ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
+_NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
+_SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
+_GHOSTS = 24  # of a lens at most: the brightest
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Glasses, Answering):
+class View(cli.Reporting):
     """Write one page for a browser, which needs neither server nor network: lenses traced exactly and their
     models as GLSL in a path tracer of WebGPU, or of WebGL2 where the browser has no WebGPU, side by side or
     as their difference, at any focus, stop, blades and wavelength; their layout with the rays of a pixel,
@@ -35,21 +51,20 @@ class View(Glasses, Answering):
     model, shown with the lens of its name. Without any, every lens of lenses/ with the best polynomial and
     the best network of models/."""
 
-    about: ClassVar[str] = "write a page that runs lenses and models in a browser"
-    epilog: ClassVar[str] = """\
+    epilog = """\
 examples:
   neurolens view -o view.html
   neurolens view petzval_portrait_100 laikin_double_gauss_50 -o two.html
   neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html
   neurolens view laikin_double_gauss_50 --ghosts -o flare.html"""
-    kept: ClassVar[str] = "nothing was written"
+    kept = "nothing was written"
 
-    lenses: tuple[Path, ...] = lens((), models=True, positional=True, metavar="LENS|MODEL", nargs="*")
-    out: Path = output_path("FILE.html", "page (default: view.html)", Path("view.html"))
+    lenses: tuple[Path, ...] = cli.lens((), models=True, positional=True, metavar="LENS|MODEL", nargs="*")
+    out: Path = cli.output_path("FILE.html", "page (default: view.html)", Path("view.html"))
     downloads: Sequence[str] = setting(
         _DOWNLOADS, "of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds "
         "a form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, or 40 kB a lens, "
-        "exact lenses' first", kind=_kinds, metavar="KINDS",
+        "exact lenses' first", kind=cli.words_of(_DOWNLOADS, "glsl"), metavar="KINDS",
     )  # fmt: skip
     ghosts: bool = setting(
         False, "a lamp that can be dragged draws its ghosts, the 24 brightest of each LENS; needs a C compiler"
@@ -58,7 +73,165 @@ examples:
 
     def run(self) -> int:
         """Write the page."""
-        check_suffix(self.out, "--output", (".html", ".htm"))
-        from neurolens.cli.view_run import run_view
+        if self.ghosts and not self.lenses:
+            self.refuse("--ghosts", "(no lens)", "the lenses whose ghosts are wanted beside it")
+        entries = list(_named(self.lenses) if self.lenses else _library())
+        for entry in entries:
+            own = [kind_of(read_card(file)) for file in entry.models]
+            if len(set(own)) < len(own):
+                raise InputError("neurolens view", entry.key, f"({' and '.join(own)})", "one model of each kind")
+        kinds, progress, made = ["glsl", *(k for k in self.downloads if k != "glsl")], self.progress(), list[ViewLens]()
+        with TemporaryFolder() as place, warnings.catch_warnings():
+            # The lens's own file has warned already.
+            warnings.filterwarnings("ignore", re.escape(place), NeurolensWarning)
+            entries = [_with_file(entry, Path(place) / str(number)) for number, entry in enumerate(entries)]
+            shaders = _shaders(entries, self.jobs, progress) if "osl" in kinds else {}
+            with progress.stage(f"{len(entries)} lenses") as report:
+                for entry in entries:
+                    made.append(_view_lens(entry, Path(place), kinds, shaders, self.ghosts))
+                    report(len(made) / len(entries))
+        about = write_page(self.out, made, kinds)
+        left = about["left_out"]
+        data = {"file": str(self.out), **about, "lenses": [lens.key for lens in made]}
+        more = f"; left out for its size: {', '.join(left)}" if left else ""
+        return self.answer(data, lambda: f"{self.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
 
-        return run_view(self)
+
+@dataclass(frozen=True)
+class _Entry:
+    """A lens with its models, in one state; `zoom` "range" is all of a zoom. `file` holds the lens for writers."""
+
+    key: str
+    models: Sequence[Path]
+    lens: Lens | None
+    zoom: str | None = None
+    file: Path | None = None
+
+
+def _with_file(entry: _Entry, folder: Path) -> _Entry:
+    if entry.lens is None:
+        return entry
+    folder.mkdir()
+    file = folder / f"{entry.lens.lens_id}.toml"
+    lensfile.write_lens(entry.lens, file)
+    return replace(entry, file=file)
+
+
+def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mapping[Path, str]:
+    """OSL of lens files and models. A warning names those that cannot be OSL, which are left out."""
+    zooms = {e.file: e.zoom for e in entries if e.file is not None}
+    files = [*zooms, *(model for entry in entries for model in entry.models)]
+    with progress.stage("shaders") as report:
+        forms, left = forms_of(files, min(jobs, len(files)), report, zooms)
+    for file, why in left.items():
+        warnings.warn(f"no OSL: {why.replace(str(file), file.name)}", NeurolensWarning, stacklevel=2)
+    return {file: form.osl for file, form in forms.items()}
+
+
+def _library() -> Iterator[_Entry]:
+    """Every lens of lenses/ with its best models; zooms over their range where a model has it."""
+    root = shipped()
+    for models, file in library(root / "models", root / "lenses", ()):
+        base, _, state = key_of(models[0]).partition("-")
+        if state in ("", "range"):  # other states are second models of a lens that is here already
+            file = file or root / "lenses" / f"{base}.toml"
+            lens = read_any(file) if file.is_file() else None
+            yield _Entry(key_of(models[0]), models, lens, RANGE if state else None)
+
+
+def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
+    """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
+    lenses, models = dict[str, Lens | None](), dict[str, list[Path]]()
+    for path in paths:
+        if is_model(path):
+            lens_id = str(read_card(path)["lens"]["id"])
+            lenses.setdefault(lens_id, None)
+            models.setdefault(lens_id, []).append(path)
+        else:
+            lens = read_any(path)
+            lenses[lens.lens_id] = lens
+    folder, ships = shipped() / "lenses", shipped() / "models"
+    for lens_id, one in lenses.items():
+        own = models.get(lens_id, [])
+        # A lens of the library brings its models.
+        ours = one is not None and Path(one.path).resolve().parent == folder.resolve()
+        if ours and not own and any(ships.glob(f"{lens_id}.*.onnx")):
+            ((own, _),) = library(ships, folder, [lens_id])
+        yield _Entry(lens_id, own, one, RANGE if any(read_card(m).get("states") for m in own) else None)
+
+
+def _view_lens(
+    entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mapping[Path, str], with_ghosts: bool
+) -> ViewLens:
+    """A lens of the page.
+
+    Raises:
+        InputError: models of another state; a lens that the exact tracer's code cannot hold, without any model.
+    """
+    forms = [_model_form(file, folder, kinds, shaders.get(file)) for file in entry.models]
+    section: dict[str, Any] = {}
+    path, squeeze, ghosts = None, 1.0, None
+    if entry.lens is not None and entry.file is not None:
+        lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
+        try:
+            forms.append(_exact_form(entry.zoom, entry.file, lens, kinds, shaders.get(entry.file)))
+            path = path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM) if entry.zoom != RANGE else None
+        except NeurolensError:
+            if not forms:
+                raise  # a model of the lens stands in for it
+        section, squeeze = section_svg(replace(layout_profile(Scene(lens, axis="y")), rays=())), squeeze_of(lens)
+        ghosts = ghosts_glsl(lens, image_radius_mm(lens)[0], _GHOSTS) if with_ghosts else None
+    best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
+    if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
+        raise InputError("neurolens view", f"{entry.key}: efl_mm", focal_mm, "models of the lens file, in its state")
+    return ViewLens(
+        entry.key, str(best.card["name"]), str(best.card["source"]), float(best.card["efl_mm"]),
+        min(float(f.card["film_radius_mm"]) for f in forms), squeeze, best.card["f_numbers"],
+        max(float(f.card["nearest_m"]) for f in forms), section, path, forms, ghosts,
+    )  # fmt: skip
+
+
+def _model_form(file: Path, folder: Path, kinds: Sequence[str], osl: str | None) -> Form:
+    loaded = load_model(file)
+    card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
+    if any(axis.name != "zoom" for axis in loaded.axes):
+        raise InputError(file, "states", [axis.name for axis in loaded.axes], "a zoom, or a model of one state")
+    extras, notes = model_extras(loaded)
+    written = [
+        export_source(loaded.file.nodes, folder / f"model.{to}", to, card, extras=extras, notes=notes)
+        for to in ("glsl", "c")
+        if to in kinds
+    ]
+    states = [node["lens"] for node in card["states"]["nodes"]] if card.get("states") else [card["lens"]]
+    facts = {
+        **{key: card["lens"][key] for key in ("name", "source", "efl_mm")},
+        "film_radius_mm": domain["film_radius_mm"],
+        "nearest_m": domain["focus_m"][1],
+        "f_numbers": [(float(lens["efl_mm"]), float(lens["f_number"])) for lens in states],
+        "errors": {key: errors[key] for key in _ERRORS if isinstance(errors.get(key), (int, float))},
+        "zones": errors.get("zones") or {},
+        "poor": list(errors.get("poor") or ()),
+    }
+    return _form(kind_of(card), str(card["fit"]["method"]), written, facts, {"onnx": file.read_bytes()}, osl)
+
+
+def _exact_form(zoom: str | None, file: Path, lens: Lens, kinds: Sequence[str], osl: str | None) -> Form:
+    written = [write_lens(file, file.with_suffix(f".{to}"), to, zoom=zoom) for to in ("glsl", "c") if to in kinds]
+    data = first_order(lens)
+    facts = {
+        "name": lens.name, "source": lens.source, "efl_mm": float(data.efl_mm),
+        "film_radius_mm": image_radius_mm(lens)[0],
+        "nearest_m": _NEAR_EFL * abs(float(data.efl_mm)) / 1000 * 1.05,
+        "f_numbers": [(float(data.efl_mm), float(data.f_number))],
+        "errors": {}, "zones": {}, "poor": [],
+    }  # fmt: skip
+    return _form("exact", "every surface traced", written, facts, {}, osl)
+
+
+def _form(
+    kind: str, method: str, written: Sequence[Written], facts: dict[str, Any], files: dict[str, bytes], osl: str | None
+) -> Form:
+    glsl, *others = written
+    files |= {w.path.suffix.removeprefix("."): w.path.read_bytes() for w in others}
+    files |= {} if osl is None else {"osl": osl.encode()}
+    return Form(kind, method, glsl.path.read_text("utf-8"), glsl.signature, facts, files)

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -21,8 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.tasks import in_order
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
-from neurolens.defocus.plate import FINEST, FloatArray, Layer, PlatePinhole, as_structs
+from neurolens.defocus.plate import FINEST, FloatArray, Plate
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.render.colour import SpectralRange
 from neurolens.render.sampler import sobol
@@ -109,12 +109,10 @@ class RayTable:
     A point of the pupil is the same place in the lens for all film points.
     """
 
-    def __init__(
-        self, camera: Camera, pinhole: PlatePinhole, size: tuple[int, int], pupil: FloatArray, hue: FloatArray
-    ) -> None:
-        self.camera, self.pinhole, self.size, self.pupil = camera, pinhole, size, pupil
-        pitch = max(_PITCH, max(size) / _NODES)
-        self.cells = tuple(max(1, math.ceil(n / pitch)) for n in size)
+    def __init__(self, camera: Camera, plate: Plate, pupil: FloatArray, hue: FloatArray) -> None:
+        self.camera, self.pinhole, self.size, self.pupil = camera, plate.pinhole, plate.size, pupil
+        pitch = max(_PITCH, max(plate.size) / _NODES)
+        self.cells = tuple(max(1, math.ceil(n / pitch)) for n in plate.size)
         self.turns = turns_pupil(camera)
         low, high = camera.wavelength_nm or LIGHT_NM
         if camera.dispersive and high > low:
@@ -176,11 +174,11 @@ def _points(count: int, numbers: int) -> FloatArray:
     return ((sobol(count, numbers) + 2.0**31 / count) / 2.0**32).astype(np.float32)
 
 
-def spread_over(camera: Camera, pinhole: PlatePinhole, size: tuple[int, int]) -> NDArray[np.float64]:
+def spread_over(camera: Camera, plate: Plate) -> NDArray[np.float64]:
     """The variance of the places at which rays of each node [rows, columns, 3] see a point: of a, 2 covariances, of b;
     summed over x and y, so that its root is the radius of an even disc over sqrt(2)."""
     points, found = _points(_FEW, 3), []
-    table = RayTable(camera, pinhole, size, points[:2], points[2])
+    table = RayTable(camera, plate, points[:2], points[2])
     for j in range(table.cells[1] + 1):
         rays = table.row(j)[..., :_NUMBERS].astype(np.float64)
         weight = rays[..., 4:] / np.maximum(rays[..., 4:].sum(axis=1, keepdims=True), 1e-30)
@@ -195,11 +193,9 @@ def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float6
     return np.sqrt(np.maximum(2 * (a + (ab + b * w) * w), 0))
 
 
-def _sizes(
-    layers: list[Layer], pinhole: PlatePinhole, spread: NDArray[np.float64], size: tuple[int, int], samples: int
-) -> NDArray[np.uint8]:
+def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[np.uint8]:
     """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel."""
-    width, height = size
+    width, height = plate.size
     places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
     nodes = [
         np.minimum((p / n * (k - 1)).round().astype(int), k - 1)
@@ -207,7 +203,7 @@ def _sizes(
     ]
     here = spread[np.ix_(*nodes)]
     widest = np.zeros(here.shape[:2])
-    for layer in layers:
+    for layer in plate.layers:
         low, high = np.zeros(widest.shape), np.full(widest.shape, max(layer.nearest, 0.0))
         for _ in range(2):
             reach = np.maximum(radius_px(here, low), radius_px(here, high))
@@ -217,7 +213,7 @@ def _sizes(
                 cell = FINEST << int(k)
                 rows, columns = (
                     np.clip(((p + border) / cell).astype(int), 0, n - 1)
-                    for p, border, n in zip(places, pinhole.border_px(size)[::-1], bounds.shape, strict=False)
+                    for p, border, n in zip(places, plate.border_px[::-1], bounds.shape, strict=False)
                 )
                 least, most = _around(bounds[..., 0], np.minimum), _around(bounds[..., 1], np.maximum)
                 inside = level == k
@@ -236,24 +232,28 @@ def _around(values: FloatArray, by: np.ufunc) -> FloatArray:
 
 
 def gather(
-    layers: list[Layer], pinhole: PlatePinhole, camera: Camera, size: tuple[int, int], spread: NDArray[np.float64],
-    samples: int = 64, threads: int = 1, report: Callable[[float], None] = lambda _: None,
+    plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = 64, threads: int = 1,
+    report: Callable[[float], None] = lambda _: None,
 ) -> Gathered:  # fmt: skip
-    """The picture of size (width, height) that a camera takes of a plate's layers, by at most `samples` a pixel.
-
-    `spread`: `spread_over` of the camera.
-    """
-    width, height = size
+    """The picture that a camera takes of a plate by at most `samples` a pixel; `spread`: `spread_over` of both."""
+    width, height = plate.size
     points = _points(_SET, 5)
     jitter = np.ascontiguousarray(points[2:4].T)
-    table = RayTable(camera, pinhole, size, points[:2], points[4])
-    (across, down), (structs, kept) = table.cells, as_structs(layers)
-    sizes = _sizes(layers, pinhole, spread, size, samples)
+    table = RayTable(camera, plate, points[:2], points[4])
+    (across, down), structs, sizes = table.cells, plate.structs(), _sizes(plate, spread, samples)
     rgb = np.empty((height, width, 3), np.float32)
     lost = np.zeros(3)
     edges = [round(j * height / down) for j in range(down + 1)]
 
-    def band(j: int, rays: FloatArray) -> NDArray[np.float64]:
+    def tasks() -> Iterator[tuple[int, FloatArray]]:
+        before = table.row(0)
+        for j in range(down):
+            after = table.row(j + 1)
+            yield j, np.stack([before, after])
+            before = after
+
+    def band(task: tuple[int, FloatArray]) -> NDArray[np.float64]:
+        j, rays = task
         first, stop = edges[j], edges[j + 1]
         sums = np.empty((stop - first, width, 8), np.float32)
         struct = _Table(
@@ -261,7 +261,7 @@ def gather(
             rays.ctypes.data, jitter.ctypes.data, first - j * height / down,
         )  # fmt: skip
         part = sizes[first:stop]
-        compiled().gather(structs, len(layers), struct, width, first, stop - first, part.ctypes.data, sums.ctypes.data)
+        compiled().gather(structs, len(structs), struct, width, first, stop - first, part.ctypes.data, sums.ctypes.data)
         weights = rays[..., _NUMBERS - 1 : len(table.nm) * _NUMBERS : _NUMBERS].mean(axis=2, dtype=np.float64)
         weights = weights[..., [1, 0, 2]] if len(table.nm) > 1 else weights
         x, share = (np.arange(width) + 0.5) / width * across, (np.arange(first, stop) + 0.5) / height * down - j
@@ -271,16 +271,8 @@ def gather(
         rgb[first:stop] = light * np.divide(sums[..., :3], weight, out=np.zeros_like(weight), where=weight > 0)
         return sums[..., [4, 6, 7]].sum(axis=(0, 1), dtype=np.float64)
 
-    with ThreadPoolExecutor(threads) as pool:
-        before, running = table.row(0), []
-        for j in range(down):
-            after = table.row(j + 1)
-            running.append(pool.submit(band, j, np.stack([before, after])))
-            before = after
-            if len(running) > 2 * threads:
-                lost += running.pop(0).result()
-            report((j + 1 - len(running)) / down)
-        lost += sum(f.result() for f in running)
-    del kept
+    for j, part in enumerate(in_order(threads, band, tasks()), 1):
+        lost += part
+        report(j / down)
     filled, beyond = lost[1:] / max(lost[0], 1e-30)
     return Gathered(rgb, float(filled), float(beyond))

@@ -3,11 +3,20 @@
 A point is named by its place in a plate and its inverse depth. Each point of the pupil sends its light to the film
 point whose ray sees it there, found by Newton's method on the camera's own rays; cells of a grid of the pupil are drawn
 as the areas that they cover. So a kernel has no noise, and cat's eyes, coma and colour fringes are the lens's.
+
+Onion rings: concentric grooves, which grinding leaves on aspheres, move the light within a blur disc. A groove raises
+the surface along the axis by h(r). The path of a ray through it changes by W = h (n d_z - n' d'_z), d and d' the
+directions before and after the surface. By Fermat's principle the light of a point that passes the same place of the
+lens then arrives on the film beside its old place, by the gradient of W over the direction cosines with which rays
+leave that place. This is exact to first order in h; diffraction by the grooves is left out, as by Joo et al. 2016
+("Efficient ray tracing through aspheric lenses and imperfect bokeh synthesis"), who measured such rings.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,12 +25,13 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.field import frame_of
 from neurolens.defocus.gather import LIGHT_NM, RayTable, channel_wavelengths, turned
-from neurolens.defocus.plate import FloatArray, PlatePinhole
-from neurolens.defocus.rings import Grooves, moves, responses
-from neurolens.flare.areas import LOST, draw_edges, edges_of
+from neurolens.defocus.plate import FloatArray, Plate, PlatePinhole
+from neurolens.flare.canvas import LOST, draw_edges, edges_of
 
 Array = NDArray[np.float64]
+_STEP_MM = 0.01  # on the pupil's plane, of differences
 GRID = 48  # cells of the pupil along a side
 COLOURS = 5  # wavelengths of a channel
 _STEPS = 5  # of Newton's method
@@ -32,6 +42,55 @@ LARGEST = 2048  # pixels a side of a kernel
 _RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
 _MARGIN = 2  # pixels around it
 _A_GROOVE, _FINEST = 8, 1536  # cells for each groove of an asphere, and the most along a side
+_LARGEST = 16384  # pixels a side of an atlas
+
+
+@dataclass(frozen=True)
+class Grooves:
+    """Grooves of the height H sin(2 pi r / spacing)."""
+
+    height_nm: float
+    spacing_mm: float
+
+    def heights(self, radius_mm: Array) -> tuple[Array, Array]:
+        """The heights in mm, and their derivatives by the radius."""
+        turn, height = 2 * math.pi / self.spacing_mm, 1e-6 * self.height_nm
+        return height * np.sin(turn * radius_mm), height * turn * np.cos(turn * radius_mm)
+
+
+def aspheres(camera: Any) -> list[int]:
+    """The surfaces of a camera's lens that are round aspheres. Raises InputError: there is none."""
+    lens = getattr(camera, "lens", None)
+    surfaces = lens.surfaces if lens is not None else ()
+    found = [k for k, s in enumerate(surfaces) if s.cylinder is None and (s.asphere or s.conic)]
+    if not found:
+        raise InputError(
+            camera.name, "ring_height", "(no asphere)", "the file of a lens with aspheres, to have grooves"
+        )
+    return found
+
+
+def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDArray[Any]) -> Array:
+    """How light moves: [aspheres, 5, N] for rays of film points [2, N] by points of the pupil's square [2, N].
+
+    Of each asphere the distance in mm from the axis at which the ray meets it, and by how many mm light moves on the
+    film, x and y, for a slope of 1 there, then for a height of 1 mm.
+    """
+    surfaces, outline = aspheres(camera), camera.film.outline
+    pupil, _ = outline.sample(*(v.astype(np.float32) for v in (film_mm, square, nm)))
+
+    steps = _STEP_MM * np.array([[0, 0], [1, 0], [0, 1]])[..., None]
+    (q, here), *moved = (camera.path_by_height(surfaces, film_mm, pupil + step, nm) for step in steps)
+    (ax, ay), (bx, by) = (m[0] - q for m in moved)
+    to_a, to_b = (m[1] - here for m in moved)
+    gradient = np.stack([to_a * by - to_b * ay, to_b * ax - to_a * bx], 2) / (ax * by - ay * bx)
+    return np.concatenate([here[:, :1], here[:, 1:] * gradient[:, 0], gradient[:, 1]], 1)
+
+
+def moves(response: Array, grooves: Grooves) -> Array:
+    """By how many mm [2, N] grooves on all aspheres move light on the film; `response` as of `responses`."""
+    height, slope = grooves.heights(response[:, 0])
+    return np.asarray((response[:, 1:3] * slope[:, None] + response[:, 3:] * height[:, None]).sum(axis=0))
 
 
 @dataclass(frozen=True)
@@ -79,11 +138,11 @@ class Kernel:
 
 
 def kernel_at(
-    camera: Camera, pinhole: PlatePinhole, size: tuple[int, int], place_px: tuple[float, float], inverse_depth: float,
-    guess_px: tuple[float, float], cells: int = GRID, colours: int = COLOURS,
-    wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
+    camera: Camera, plate: Plate, place_px: tuple[float, float], inverse_depth: float, guess_px: tuple[float, float],
+    cells: int = GRID, colours: int = COLOURS, wavelengths_nm: tuple[float, float, float] | None = None,
+    grooves: Grooves | None = None,
 ) -> Kernel | None:  # fmt: skip
-    """The kernel of a point at a place of the plate, in pixels of a film of `size`; None where no light arrives.
+    """The kernel of a point at a place of the plate, in pixels of the camera's picture; None where no light arrives.
 
     Args:
         guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths a channel.
@@ -94,7 +153,7 @@ def kernel_at(
         InputError: a kernel of over 2048 pixels a side; grooves on a lens without aspheres, or too many.
     """
     pupil = _square(_RIM * _disk(np.linspace(-1, 1, cells + 1)))
-    table = RayTable(camera, pinhole, size, pupil, np.zeros(pupil.shape[1], np.float32))
+    table = RayTable(camera, plate, pupil, np.zeros(pupil.shape[1], np.float32))
     if wavelengths_nm is not None:
         nm = np.array(wavelengths_nm, np.float32)[:, None]
     elif len(table.nm) > 1:
@@ -252,3 +311,87 @@ def _aimed(
     # The light of rays that Newton's method leaves beside the point goes where the others' goes.
     share = kept.sum() / max(light.sum(), 1e-30)
     return _Aimed(place, kept / share if share > _SURE else light, slope, film_by_plate)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One kernel: its field (-1 to 1 from left to right and from bottom to top of the film), its distance from the film
+    in m, the film place that is its centre, and the kernel; None where no light arrives."""
+
+    field: tuple[float, float]
+    distance_m: float
+    place_px: tuple[float, float]
+    kernel: Kernel | None
+
+    @property
+    def width_px(self) -> int:
+        """Pixels a side, odd, that hold the kernel about its place."""
+        if self.kernel is None:
+            return 1
+        first = np.subtract(self.kernel.corner_px, np.floor(self.place_px))
+        return 2 * int(np.abs([first, first + self.kernel.light.shape[1::-1] - 1]).max()) + 1
+
+
+def own_plate(camera: Camera, size: tuple[int, int]) -> Plate:
+    """An empty plate of the camera's own pinhole, that of `neurolens stmap`, with `size` pixels on its film."""
+    frame = frame_of(camera)
+    per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
+    reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
+    return Plate([], PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1]), size)
+
+
+def kernels_over(
+    camera: Camera, size: tuple[int, int], distances_m: Sequence[float], fields: tuple[int, int],
+    wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
+    report: Callable[[float], None] = lambda _: None,
+) -> list[list[Cell]]:  # fmt: skip
+    """The kernels of each distance, row by row from the top of the picture.
+
+    Args:
+        size: of the picture in pixels. distances_m: from the film, along the axis; inf is far.
+        fields: columns and rows of places, in the middles of equal parts of the picture.
+        wavelengths_nm, grooves: as for `kernel_at`.
+
+    Raises:
+        InputError: a distance within the lens; kernels too large for memory.
+    """
+    plate, found = own_plate(camera, size), []
+    places = [
+        ((i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1])
+        for j, i in itertools.product(range(fields[1]), range(fields[0]))
+    ]
+    for number, distance in enumerate(distances_m):
+        ahead, cells = distance - plate.pinhole.before_film_mm / 1000, list[Cell]()
+        if not ahead > 0:
+            expected = f"above {plate.pinhole.before_film_mm / 1000:g}, the entrance pupil"
+            raise InputError("kernels", "distance_m", distance, expected)
+        for place in places:
+            kernel = kernel_at(camera, plate, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves)
+            field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
+            cells.append(Cell(field, distance, place if kernel is None else kernel.middle_px, kernel))
+            if max(fields) * (side := cells[-1].width_px) > _LARGEST:
+                got = f"({fields[0] * side} x {fields[1] * side} pixels)"
+                expected = f"at most {_LARGEST} pixels a side: fewer fields, or less blur"
+                raise InputError("kernels", "size", got, expected)
+            report((number + len(cells) / len(places)) / len(distances_m))
+        found.append(cells)
+    return found
+
+
+def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
+    """The atlas [rows side, columns side, 3] of the kernels of one distance, each of sum 1 in each channel."""
+    picture = np.zeros((len(cells) // columns * side, columns * side, 3), np.float32)
+    for k, cell in enumerate(cells):
+        j, i = divmod(k, columns)
+        if cell.kernel is not None:
+            picture[j * side :, i * side :][:side, :side] = cell.kernel.centred(side, cell.place_px)
+    return picture
+
+
+def as_preview(picture: FloatArray, side: int) -> FloatArray:
+    """An atlas with each kernel as bright as the others, to be looked at."""
+    found = picture.copy()
+    for j, i in itertools.product(range(0, len(found), side), range(0, found.shape[1], side)):
+        part = found[j : j + side, i : i + side]
+        part /= float(np.percentile(part[part > 0], 90)) if part.any() else 1.0
+    return found

@@ -1,22 +1,39 @@
-"""A plate as a lens would have photographed it."""
+"""A plate as a lens would have photographed it: all of its pixels gathered, and its highlights spread as clean discs.
+
+Highlights are pixels that are far brighter than their surroundings. Few of a pixel's samples would find them, which is
+noise. Their light above that of the surroundings is taken out of the plate and spread by the lens's own kernels, one
+for all points of a place and a depth that are alike; from film pixels where something nearer hides a point it is left
+out.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
-from neurolens.defocus.gather import Gathered, gather, spread_over
-from neurolens.defocus.highlights import spread_highlights, take_highlights
-from neurolens.defocus.read import Plate
+from neurolens.defocus.gather import Gathered, compiled, gather, radius_px, spread_over
+from neurolens.defocus.kernels import LARGEST, kernel_at
+from neurolens.defocus.plate import FloatArray, Plate
 
 _SAID = 0.002  # share of the light that was made up, from which it is said
 _EDGE = 9  # points of each side of the film that are tried
+_WINDOW = 33  # pixels about which surroundings are meant
+_BRIGHTER, _ABOVE = 8.0, 3.0  # than the geometric mean of the surroundings, and than their mean
+_LEAST_PX = 1.5  # radius of the blur: what is sharper has no noise
+_PLACES = 32  # kernels along the longer side of the film
+_FINE_PX, _FINE = 0.25, 0.03  # steps of the radius between kernels, absolute and relative
+_MOST_WORK = 4e9  # pixels of kernels
+_SAME = 0.01  # of inverse depth, within which two layers show the same thing
+_CELLS, _COLOURS = 24, 2
 
 
 def defocus(
@@ -37,16 +54,15 @@ def defocus(
     """
     progress = progress or Progress(quiet=True)
     check_field(camera)
-    layers, pinhole, size = plate.layers, plate.pinhole, plate.size
-    spread = spread_over(camera, pinhole, size)
-    taken = [take_highlights(v, pinhole, spread, size, layers[:k]) for k, v in enumerate(layers) if highlights]
+    spread = spread_over(camera, plate)
+    taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:
-        found = gather(layers, pinhole, camera, size, spread, 1 << (samples - 1).bit_length(), threads, report)
+        found = gather(plate, camera, spread, 1 << (samples - 1).bit_length(), threads, report)
     for some in taken:
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                spread_highlights(found.rgb, some, layers, pinhole, camera, report)
-    _say(found, len(layers))
+                spread_highlights(found.rgb, some, plate, camera, report)
+    _say(found, len(plate.layers))
     return replace(found, highlights=sum(len(some.radius_px) for some in taken))
 
 
@@ -75,3 +91,92 @@ def check_field(camera: Camera) -> None:
     if widest > WIDEST_DEG:
         expected = f"at most {WIDEST_DEG:g}: a plate is a plane, on which no wider field has room"
         raise InputError(camera.name, "half field, degrees", round(widest, 1), expected)
+
+
+@dataclass(frozen=True)
+class Highlights:
+    """Light [N, 3] taken out of a layer at places [N, 2] in its pixels, inverse depths [N], radii of blur [N], and its
+    sign [N], by the side of the plane in focus."""
+
+    place_px: NDArray[np.float64]
+    inverse_depth: FloatArray
+    radius_px: NDArray[np.float64]
+    side: NDArray[np.float64]
+    light: FloatArray
+
+
+def take_highlights(plate: Plate, number: int, spread: NDArray[np.float64]) -> Highlights:
+    """Take the highlights out of a layer of a plate, which is changed, for a camera of such a spread at its nodes.
+
+    What the layers before it show, too, at the same place and depth, is taken out and left to them.
+    """
+    layer, size = plate.layers[number], plate.size
+    rgb, w = layer.texel[..., :3], layer.texel[..., 3]
+    bright = rgb.max(axis=2)
+    log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
+    geometric = np.exp(_around(log))
+    mean = _around(np.minimum(bright, _BRIGHTER * geometric))
+    cap = np.maximum(_BRIGHTER * geometric, _ABOVE * mean)
+    row, column = np.nonzero((bright > cap) & (w >= 0))
+    nodes = [
+        np.clip(((v + 0.5 - border) / n * (k - 1)).round().astype(int), 0, k - 1)
+        for v, border, n, k in zip((row, column), plate.border_px[::-1], size[::-1], spread.shape[:2], strict=True)
+    ]
+    radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
+    _, ab, b = np.moveaxis(spread[nodes[0], nodes[1]], -1, 0)
+    side = np.sign(ab + 2 * b * w[row, column])  # of the growth of the radius's square with the inverse depth
+    wide = (radius > _LEAST_PX) & (radius < LARGEST / 3)  # still larger discs have little noise
+    order = np.flatnonzero(wide)[np.argsort(-(bright / cap)[row, column][wide])]  # the brightest first
+    some = np.sort(order[np.cumsum(math.pi * radius[order] ** 2) <= _MOST_WORK])  # as many as there is time for
+    row, column, radius, side = row[some], column[some], radius[some], side[some]
+    light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
+    rgb[row, column] -= light
+    own = np.ones(len(row), bool)
+    for other in plate.layers[:number]:
+        own &= np.abs(other.texel[row, column, 3] - w[row, column]) > _SAME * w[row, column]
+    row, column = row[own], column[own]
+    place = np.stack([column, row], axis=1) + np.float64(0.5)
+    return Highlights(place, w[row, column], radius[own], side[own], light[own])
+
+
+def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The mean of the window about each pixel; the picture's border goes on beyond it."""
+    found = values.astype(np.float64)
+    for axis in (0, 1):
+        found = np.pad(found, [(_WINDOW // 2 + 1, _WINDOW // 2) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+        sums = np.cumsum(found, axis=axis)
+        count = sums.shape[axis] - _WINDOW
+        found = (sums.take(range(_WINDOW, _WINDOW + count), axis) - sums.take(range(count), axis)) / _WINDOW
+    return found
+
+
+def spread_highlights(
+    picture: FloatArray,
+    found: Highlights,
+    plate: Plate,
+    camera: Camera,
+    report: Callable[[float], None] = lambda _: None,
+) -> None:
+    """Add the light of highlights to a picture [H, W, 3]."""
+    (width, height), border = plate.size, np.array(plate.border_px)
+    groups = defaultdict(list)
+    cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
+    radius, near = np.maximum(found.radius_px, 1e-3), 4.0 * _FINE_PX / _FINE
+    step = np.where(radius < near / 4, radius / _FINE_PX, near + np.log(radius) / _FINE).round().astype(int)
+    for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), found.side.tolist(), strict=True)):
+        groups[key].append(k)
+    structs = plate.structs()
+    for number, rows in enumerate(groups.values()):
+        place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
+        kernel = kernel_at(camera, plate, (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS)
+        if kernel is not None:
+            points = np.empty((len(rows), 8), np.float32)
+            points[:, :2], points[:, 2] = found.place_px[rows], found.inverse_depth[rows]
+            points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.film_by_plate.T
+            points[:, 5:] = found.light[rows]
+            sweep, light = np.ascontiguousarray(kernel.sweep, np.float32), np.ascontiguousarray(kernel.light)
+            compiled().splat(
+                structs, len(structs), points.ctypes.data, len(rows), light.ctypes.data, *light.shape[1::-1],
+                sweep.ctypes.data, width, height, picture.ctypes.data,
+            )  # fmt: skip
+        report((number + 1) / len(groups))

@@ -1,17 +1,38 @@
-"""Plates: pictures of a pinhole camera with depth, in layers, made ready for rays to be followed through them.
+"""Plates: pictures of a pinhole camera with depth, in layers, read from OpenEXR and ready for rays to be followed.
 
 Inverse depth is linear along the straight line that a ray draws in such a picture, and over every plane of the scene.
 Steps of inverse depth that go on as the surface does on either side join two pixels; others are edges of things.
+
+A layer of a file is what has red, green, blue and depth under one name: R, G, B, Z of the picture itself, "behind.R"
+and "behind.Z", or "ViewLayer.Combined.R" and "ViewLayer.Depth.Z" of Blender. Of a deep file the first sample of each
+pixel is one layer, the second the next. The picture's own layer is the front; a ray takes whatever it meets first.
 """
 
 from __future__ import annotations
 
 import ctypes
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+import OpenEXR
 from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError, warn
+from neurolens.cameras.field import Frame
+from neurolens.render.colour import SRGB, ColourSpace, conversion, converted
+from neurolens.render.pictures import (
+    COLOURS,
+    check_size,
+    decoded_channels,
+    header_of,
+    metadata_of,
+    read_colour_space,
+    whole_file,
+)
 
 FloatArray = NDArray[np.float32]
 FINEST = 4  # pixels a side of the smallest cells with bounds
@@ -19,6 +40,16 @@ _STEEPEST = 0.2  # of the inverse depth: a larger step to a neighbour is an edge
 _LEVEL = 1e-4  # of the inverse depth: a smaller one is none
 _SLOPES = 1.5
 _MIXED = 4.0  # steps of the surfaces beside an edge, below which the pixel between them is a mixture of both
+Along = Literal["axis", "ray"]
+_DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # after the name of a layer
+_COMBINED = ("Combined.", "combined.")
+_SKY_M = 1e9  # and beyond it
+_MOST_LAYERS = 8  # of a deep file
+_LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
+_MOST_VALUES = 1 << 29  # of the later parts of a file
+_MOST_DEEP = 1 << 25  # pixels of a deep file, which is read whole
+_OPAQUE = 0.5  # opacity from which a deep sample hides what is behind it
+_SAME = 1e-3  # relative: shapes of plate and film
 
 
 @dataclass(frozen=True)
@@ -33,10 +64,6 @@ class PlatePinhole:
     reach_px: tuple[float, float]
     centre_px: tuple[float, float]
     before_film_mm: float
-
-    def border_px(self, size: tuple[int, int]) -> tuple[float, float]:
-        """How far a plate's first pixel lies beyond that of a film of `size` whose pixels are as large: overscan."""
-        return self.centre_px[0] - size[0] / 2, self.centre_px[1] - size[1] / 2
 
     def lines(self, origin_m: FloatArray, direction: FloatArray) -> FloatArray:
         """Rays [3, N] in the camera frame as lines [4, N] in the plate: x = ax + bx w, y = ay + by w, w in 1/m."""
@@ -79,19 +106,33 @@ class _Struct(ctypes.Structure):
     ]
 
 
-def as_structs(layers: list[Layer]) -> tuple[Any, list[Any]]:
-    """The layers as an array of C's structures, and what must be kept while these are used."""
-    kept: list[Any] = []
-    structs = (_Struct * len(layers))()
-    for layer, struct in zip(layers, structs, strict=True):
-        flat = np.concatenate([level.reshape(-1, 2) for level in layer.bounds])
-        start = np.cumsum([0, *(level[..., 0].size for level in layer.bounds)])[:-1].astype(np.int64)
-        kept += [flat, start, layer]
-        struct.width, struct.height = layer.size
-        struct.levels, struct.nearest = len(layer.bounds), layer.nearest
-        for name, array in (("texel", layer.texel), ("jump", layer.jump), ("bounds", flat), ("start", start)):
-            setattr(struct, name, array.ctypes.data)
-    return structs, kept
+@dataclass(frozen=True)
+class Plate:
+    """A plate: its layers, the front first, its pinhole, and the size and colour space of a camera's picture of it."""
+
+    layers: list[Layer]
+    pinhole: PlatePinhole
+    size: tuple[int, int]
+    space: ColourSpace = SRGB
+
+    @property
+    def border_px(self) -> tuple[float, float]:
+        """How far the first pixel lies beyond that of the picture, whose pixels are as large: overscan."""
+        return self.pinhole.centre_px[0] - self.size[0] / 2, self.pinhole.centre_px[1] - self.size[1] / 2
+
+    def structs(self) -> Any:
+        """The layers as an array of C's structures, which keeps what these point at."""
+        structs: Any = (_Struct * len(self.layers))()
+        structs.kept = []
+        for layer, struct in zip(self.layers, structs, strict=True):
+            flat = np.concatenate([level.reshape(-1, 2) for level in layer.bounds])
+            start = np.cumsum([0, *(level[..., 0].size for level in layer.bounds)])[:-1].astype(np.int64)
+            structs.kept += [flat, start, layer]
+            struct.width, struct.height = layer.size
+            struct.levels, struct.nearest = len(layer.bounds), layer.nearest
+            for name, array in (("texel", layer.texel), ("jump", layer.jump), ("bounds", flat), ("start", start)):
+                setattr(struct, name, array.ctypes.data)
+        return structs
 
 
 def _lesser(step: FloatArray, axis: int) -> FloatArray:
@@ -136,3 +177,213 @@ def _reduced(values: FloatArray, step: int, by: np.ufunc) -> FloatArray:
     for axis in (0, 1):
         values = by.reduceat(values, np.arange(0, values.shape[axis], step), axis=axis)
     return values
+
+
+@dataclass(frozen=True)
+class DepthSettings:
+    """What the depth of a plate means.
+
+    Attributes:
+        channel: its name; "" finds it. scale_m: metres of its unit; None is 1, and refuses
+            what looks like no metres. along: the camera's axis, or each pixel's ray.
+        from_film: whether it counts from the film, as pictures of `neurolens render` have it, or from the pinhole; None
+            asks the file.
+    """
+
+    channel: str = ""
+    scale_m: float | None = None
+    along: Along = "axis"
+    from_film: bool | None = None
+
+
+def read_plate(
+    path: Path, film_mm: tuple[float, float], frame: Frame, depth: DepthSettings, behind: Sequence[Path] = ()
+) -> Plate:
+    """A plate for a camera of such a film and frame (`cameras.field.frame_of`).
+
+    The display window is the film; a larger data window is overscan. A picture of `neurolens render --camera pinhole`
+    says itself what its pinhole and its film were: a larger film is overscan, too. Any other is that of the camera's
+    own frame: its hole in the paraxial entrance pupil, its focal length the lens's paraxial size in the plane in focus,
+    which `neurolens stmap` prints.
+
+    Args:
+        behind: files of the same size that show what is behind the things of the plate.
+
+    Raises:
+        InputError: no depth; depth that is negative, or from 0 to 1 only; a shape other than the film's; files of
+            different sizes.
+    """
+    header = header_of(path)
+    (left, top), (last, bottom) = header["displayWindow"]
+    size = int(last) - int(left) + 1, int(bottom) - int(top) + 1
+    ours = _pinhole(metadata_of(path, header))
+    plate_mm = film_mm if ours is None else ours["film_mm"]
+    if not math.isclose(size[0] / size[1], plate_mm[0] / plate_mm[1], rel_tol=_SAME + 1 / min(size)):
+        squeeze = frame.reach_mm[1] / frame.reach_mm[0]
+        more = "" if abs(squeeze - 1) < _SAME else f", squeezed: pixels {squeeze:.3g} times as wide as high"
+        expected = f"a picture of the film's shape, {plate_mm[0]:g} x {plate_mm[1]:g} mm{more}"
+        raise InputError(path, "displayWindow", f"({size[0]} x {size[1]} pixels)", expected)
+    reach, before = frame.reach_mm, frame.pupil_mm[1]
+    if ours is not None:
+        reach, before = (ours["efl_mm"], ours["efl_mm"]), ours["efl_mm"]
+    per_mm = size[0] / plate_mm[0], size[1] / plate_mm[1]
+    film_px = max(1, round(film_mm[0] * per_mm[0])), max(1, round(film_mm[1] * per_mm[1]))
+    for pixels in (size, film_px):
+        check_size(path, "displayWindow", f"({pixels[0]} x {pixels[1]} pixels)", pixels, _LARGEST, _MOST_PIXELS)
+    start = [int(v) for v in header["dataWindow"][0]]
+    centre = size[0] / 2 + int(left) - start[0], size[1] / 2 + int(top) - start[1]
+    pinhole = PlatePinhole((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
+    space = read_colour_space(path) or SRGB
+    layers = list[Layer]()
+    for file in (path, *behind):
+        own = header if file == path else header_of(file)
+        if not np.array_equal(own["dataWindow"], header["dataWindow"]):
+            raise InputError(file, "dataWindow", f"({own['dataWindow']})".replace("\n", " "), "that of the plate")
+        settings, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
+        from_film = settings is not None if depth.from_film is None else depth.from_film
+        for rgb, metres in _layers(file, depth, several=file == path):
+            w, cosine = _inverse_depth(file, metres, depth, pinhole, 1e-3 * before if from_film else 0.0)
+            light = np.maximum(_finite(file, rgb), 0)
+            light = light if colours is SRGB else converted(light, conversion(colours, SRGB)).astype(np.float32)
+            if settings is not None and settings.get("vignetting", "both") in ("both", "natural"):
+                light /= (cosine**4)[..., None]
+            layers.append(Layer(light, w))
+    return Plate(layers, pinhole, film_px, space)
+
+
+def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The settings of our pinhole, where it took the picture."""
+    camera = metadata.get("camera")
+    if not isinstance(camera, dict) or camera.get("camera") != "pinhole":
+        return None
+    film = camera.get("film_mm")
+    lengths = [camera.get("efl_mm"), *(film if isinstance(film, list) and len(film) == 2 else [None])]
+    return camera if all(isinstance(v, float | int) and 0 < v < math.inf for v in lengths) else None
+
+
+def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[FloatArray, FloatArray]]:
+    """Colours and depths of the layers of a file."""
+    if header_of(path)["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
+        return _deep(path)
+    planes = _planes(path)
+    found = list[tuple[str, str]]()
+    for name in planes:
+        prefix = name.removesuffix("R")
+        if name != f"{prefix}R" or not {prefix + "G", prefix + "B"} <= planes.keys():
+            continue
+        root = next((prefix.removesuffix(end) for end in _COMBINED if prefix.endswith(end)), prefix)
+        channel = next((root + end for end in _DEPTHS if root + end in planes), None)
+        if depth.channel and not found:
+            if depth.channel not in planes:
+                raise InputError(path, "channel", depth.channel, f"one of: {', '.join(planes)}")
+            channel = depth.channel
+        if channel is not None:
+            found.append((prefix, channel))
+    if not found:
+        expected = "R, G, B and a channel Z with the depth in metres; --depth names another"
+        raise InputError(path, "channels", f"({', '.join(planes)[:200]})", expected)
+    found.sort(key=lambda pair: (pair[0] != "", not pair[0].endswith(_COMBINED)))
+    layers = []
+    for prefix, channel in found if several else found[:1]:
+        rgb, metres = np.stack([planes[prefix + c] for c in COLOURS], axis=2), planes[channel]
+        if (alpha := planes.get(prefix + "A")) is not None:  # colours are premultiplied
+            solid = alpha >= _OPAQUE
+            rgb = np.where(solid[..., None], rgb / np.where(solid, np.minimum(alpha, 1), 1)[..., None], 0)
+            metres = np.where(solid, metres, np.float32(-np.inf))
+        layers.append((rgb.astype(np.float32), metres))
+    return layers
+
+
+def _planes(path: Path) -> dict[str, FloatArray]:
+    """The channels of all parts; of two with one name the later one has the name of its part before it."""
+    planes, _ = decoded_channels(path, path, "file")
+    with whole_file(path, "file", path), OpenEXR.File(str(path), header_only=True) as file:
+        kinds, count = {part.type() for part in file.parts}, sum(len(p.header["channels"]) for p in file.parts[1:])
+    if count and kinds <= {OpenEXR.scanlineimage, OpenEXR.tiledimage}:
+        shape = next(iter(planes.values())).shape
+        check_size(path, "file", f"{path}, {count} channels of later parts", (*shape, count), _LARGEST, _MOST_VALUES)
+        with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
+            for part in file.parts[1:]:
+                for name, channel in part.channels.items():
+                    if channel.pixels.shape == shape:
+                        known = f"{part.name()}.{name}" if name in planes else name
+                        planes[known] = np.asarray(channel.pixels, np.float32)
+    return planes
+
+
+def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
+    """The layers of a deep file: the opaque samples of each pixel, sorted by depth."""
+    size = [int(last) + 1 - int(first) for first, last in zip(*header_of(path)["dataWindow"], strict=True)]
+    check_size(path, "file", str(path), size, _LARGEST, _MOST_DEEP)
+    with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {name: c.pixels for name, c in file.parts[0].channels.items()}
+    if not {*COLOURS, "Z"} <= channels.keys():
+        raise InputError(path, "channels", f"({', '.join(channels)[:200]})", "R, G, B and Z")
+    height, width = channels["Z"].shape
+    counts = np.array([[0 if v is None else len(v) for v in row] for row in channels["Z"]])
+    none = np.zeros(0, np.float32)
+    flat = {
+        name: np.concatenate([none, *(np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None)])
+        for name in channels.keys() & {*COLOURS, "Z", "A"}
+    }
+    alpha = flat.get("A", np.ones_like(flat["Z"]))
+    pixel = np.repeat(np.arange(height * width), counts.reshape(-1))
+    kept = np.flatnonzero((alpha >= _OPAQUE) & ~np.isnan(flat["Z"]) & ~np.isneginf(flat["Z"]))
+    kept = kept[np.lexsort((flat["Z"][kept], pixel[kept]))]
+    place = pixel[kept]
+    starts = np.flatnonzero(np.diff(place, prepend=-1))
+    rank = np.arange(len(place)) - np.repeat(starts, np.diff(starts, append=len(place)))
+    layers = []
+    for k in range(min(int(rank.max(initial=0)) + 1, _MOST_LAYERS)):
+        rows = kept[rank == k]
+        rgb = np.zeros((height * width, 3), np.float32)
+        metres = np.full(height * width, -np.inf if k else np.inf, np.float32)
+        rgb[place[rank == k]] = np.stack([flat[c][rows] for c in COLOURS], axis=1) / alpha[rows, None]
+        metres[place[rank == k]] = flat["Z"][rows]
+        layers.append((rgb.reshape(height, width, 3), metres.reshape(height, width)))
+    return layers
+
+
+def _finite(path: Path, rgb: FloatArray) -> FloatArray:
+    """Colours without NaN and infinity, which become black, with a warning."""
+    bad: NDArray[np.bool_] = np.asarray(~np.isfinite(rgb).all(axis=2))
+    if bad.any():
+        warn(f"{path}: {int(bad.sum())} of {bad.size} pixels are not finite; they are black")
+        rgb = np.where(bad[..., None], np.float32(0), rgb)
+    return rgb
+
+
+def _inverse_depth(
+    path: Path, metres: FloatArray, depth: DepthSettings, pinhole: PlatePinhole, pinhole_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Inverse depth from the pinhole, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
+
+    `pinhole_m`: the pinhole's distance before the place from which depth counts.
+    """
+    height, width = metres.shape
+    x, y = (
+        (np.arange(n, dtype=np.float32) + 0.5 - c) / r
+        for n, c, r in zip((width, height), pinhole.centre_px, pinhole.reach_px, strict=True)
+    )
+    cosine = (1 / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)).astype(np.float32)
+    nothing = np.isneginf(metres)
+    z = metres * np.float32(depth.scale_m or 1.0)
+    solid = np.isfinite(z) & (z != 0) & (np.abs(z) < _SKY_M)
+    if missing := int(np.isnan(metres).sum()):
+        if missing == z.size:
+            raise InputError(path, "depth", "(not a number in any pixel)", "depth in metres")
+        warn(f"{path}: the depth of {missing} of {z.size} pixels is not a number; they count as sky")
+    if solid.any():
+        least, most = float(z[solid].min()), float(z[solid].max())
+        if least < 0:
+            expected = "depth that grows away from the camera; --depth-scale -1 turns it"
+            raise InputError(path, "depth", f"({least:g} m)", expected)
+        if most <= 1 and depth.scale_m is None and not nothing.any():
+            expected = "depth in metres; this looks like inverse or normalised depth (--depth-scale 1: it is none)"
+            raise InputError(path, "depth", f"({least:g} to {most:g} m)", expected)
+    z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(pinhole_m)
+    if (close := solid & (z <= 1e-3)).any():
+        least = float(z[close].min())
+        raise InputError(path, "depth", f"({least:g} m)", "metres from the pinhole on, over 0.001, not their inverse")
+    w = np.divide(1, z, out=np.zeros_like(z), where=solid)
+    return np.where(nothing, np.float32(-1), w).astype(np.float32), cosine

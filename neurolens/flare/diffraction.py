@@ -23,22 +23,25 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.canvas import Raster, axis_irradiance, smear_of, smeared
+from neurolens.base.tasks import in_order
+from neurolens.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
-from neurolens.flare.lights import Light, patches
-from neurolens.flare.steps import Floats
+from neurolens.flare.lights import Floats, Light, patches
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.lens.prescription import Lens
-from neurolens.render.colour import SpectralRange, in_gamut
+from neurolens.render.colour import in_gamut
+
+if TYPE_CHECKING:
+    from neurolens.flare.layers import FlareJob
 
 _PER_CYCLE = 2.5  # cells a cycle of the field
 _NEAR, _FAR = 2.0, 4.0  # pixels from the centre between which the sum over cells gives way to the outline
@@ -105,12 +108,7 @@ class Spectrum:
         total = np.zeros((len(y_mm), len(x_mm)), np.float32)
         for found, edges in zip(self.values, self.edges, strict=True):
             for axis, place in ((0, y_mm), (1, x_mm)):
-                at = place * (1e6 / wavelength_nm / self.step) + found.shape[axis] // 2
-                first = np.floor(at).astype(int)
-                part = (at - first).astype(np.float32)
-                part = part[:, None] if axis == 0 else part
-                low, high = (found.take(first + k, axis, mode="clip") for k in (0, 1))
-                found = low * (1 - part) + high * part
+                found = resampled(found, axis, place * (1e6 / wavelength_nm / self.step) + found.shape[axis] // 2)
             total += found / np.maximum(4 * math.pi**2 * _squares(edges, x_mm, y_mm), 1e-30)
         return np.maximum(total, 0)
 
@@ -203,42 +201,29 @@ def _elements(pupil: ExitPupil, lines: Sequence[Array], spacing: float) -> tuple
     return np.concatenate(places, 1), np.concatenate(normals, 1)
 
 
-def starburst_picture(
-    lens: Lens,
-    lights: Sequence[Light],
-    raster: Raster,
-    *,
-    wavelength_nm: tuple[float, float] = (400.0, 700.0),
-    wavelengths: int = 15,
-    threads: int = 2,
-    done: Callable[[float], None] = lambda share: None,
-) -> Floats:
+def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda share: None) -> Floats:
     """The stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
 
     For a point it is 0 where rays make the image itself, and at the pixels next to that: there a render has the light.
     Energy is kept if the render's light is less by the sum of this layer on a film without edges. An extended light has
     the sum of its points' stars, also within its image. Diffracted light is taken to pass the rear of the lens
     unhindered. A light whose rays do not reach the film has no star. Fringes of one wavelength lie beyond the gamut of
-    sRGB: see `in_gamut`.
-
-    Args:
-        wavelengths: of equal shares of the range. done: is called with the share of the work that is done.
+    sRGB: see `in_gamut`. `done` is called with the share of the work.
     """
-    spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
-    exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm)) if lights else 1.0
+    raster, spectral = job.raster, job.spectral()
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
-    parts = [patch for light in lights for patch in patches(light, _PATCH_DEG)]
+    parts = [patch for light in job.lights for patch in patches(light, _PATCH_DEG)]
     for number, patch in enumerate(parts):
-        colours = spectral.response * spectral.spectrum(patch.light.rgb) / (wavelengths * exposure)
-        moved = raster.per_mm * image_moves(lens, patch, float(spectral.centres_nm.mean())) * (-1, 1)
+        colours = spectral.response * spectral.spectrum(patch.light.rgb) / (spectral.bins * job.exposure)
+        moved = raster.per_mm * image_moves(job.lens, patch, float(spectral.centres_nm.mean())) * (-1, 1)
         smear = smear_of(patch, moved)
         kernel = np.ones((1, 1), np.float32) if smear is None else smear.kernel(max(raster.width, raster.height) // 2)
         height, width = (n + k - 1 for n, k in zip((raster.height, raster.width), kernel.shape, strict=True))
         canvas = np.zeros((height, width, 3), np.float32)
         around = Raster((width / raster.per_mm, height / raster.per_mm), width, height)
-        for k, film in enumerate(_stars(lens, patch.light, spectral.centres_nm, around, threads)):
+        for k, film in enumerate(_stars(job.lens, patch.light, spectral.centres_nm, around, job.threads)):
             canvas += film[..., None] * colours[:, k].astype(np.float32)
-            done((number + (k + 1) / wavelengths) / len(parts))
+            done((number + (k + 1) / spectral.bins) / len(parts))
         picture += canvas if smear is None else smeared(canvas, kernel)
         done((number + 1) / len(parts))
     return in_gamut(picture)
@@ -262,12 +247,11 @@ def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, thre
         return star(pupil, lines, far, x - pupil.centre_mm[0], y - pupil.centre_mm[1], pixel)
 
     parts = np.array_split(wavelengths_nm, 1 if middle.blur_mm < pixel / 8 else min(_PARTS, len(wavelengths_nm)))
-    with ThreadPoolExecutor(threads) as pool:
-        for number, part in enumerate(parts):
-            # Their mean phase, which is as 1 / wavelength.
-            like = exit_pupil(lens, light, float(1 / np.mean(1 / part)), middle) or middle
-            far = outline_spectrum(like, lines, float(part.min()), pixel, reach + pixel, (number, len(parts)))
-            yield from pool.map(partial(one, far=far), part)
+    for number, part in enumerate(parts):
+        # Their mean phase, which is as 1 / wavelength.
+        like = exit_pupil(lens, light, float(1 / np.mean(1 / part)), middle) or middle
+        far = outline_spectrum(like, lines, float(part.min()), pixel, reach + pixel, (number, len(parts)))
+        yield from in_order(threads, partial(one, far=far), part)
 
 
 def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: Array, pixel_mm: float) -> Floats:

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.flare.ghosts import GhostRays, GhostTracer, Pair
+from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.lights import Light, Patch, light_towards, rays_across
-from neurolens.flare.steps import LOST, Floats
+from neurolens.flare.steps import LOST, Floats, entering
 from neurolens.lens.paraxial import first_order
 
+Array = NDArray[np.float64]
 FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.follow`: rims are cut between rays inside and outside
 _SCOUTS = 48  # cells a side of the grid of scouts, the rays that look for ghosts
@@ -49,7 +50,7 @@ class Grid:
     spectrum: tuple[tuple[float, float], ...] = ()
 
     @property
-    def places(self) -> NDArray[np.float64]:
+    def places(self) -> Array:
         """The corners of cells, [2, (rows + 1) (columns + 1)], row after row."""
         u, v = (
             np.linspace(a, b, n + 1) for a, b, n in zip(self.low, self.high, (self.columns, self.rows), strict=True)
@@ -86,41 +87,33 @@ def grids_of(
         wavelengths_nm: of light, increasing.
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
-    start = tracer.start(rays_across(tracer.lens, light, whole.places)[0])
+    start = entering(rays_across(tracer.lens, light, whole.places)[0])
     few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
     nodes = sorted({wavelengths_nm[round(at)] for at in np.linspace(0, len(wavelengths_nm) - 1, _NODES)})
     ghosts: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
     pairs = tracer.pairs if only is None else only
     for k in range(0, len(pairs), _AT_ONCE):
         some = pairs[k : k + _AT_ONCE]
-        rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
+        rows = tracer.follow(start, wavelength_nm, only=some, reach=REACH).rows
         each = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in nodes]
-        looks = zip(
-            some, _kept(rays, half_mm), rays.rows, _spread(each, half_mm), _swept(each, half_mm), _spectra(each, nodes),
-            strict=True,
-        )  # fmt: skip
-        ghosts += [
-            (pair, kept, _look(kept, of_one, spread, half_mm)._replace(swept_mm=swept, spectrum=spectrum))
-            for pair, kept, of_one, spread, swept, spectrum in looks
-            if kept.any()
-        ]
+        for pair, kept, of_one, *by_colour in zip(
+            some, _kept(rows, half_mm), rows, *_colours(each, half_mm), strict=True
+        ):  # fmt: skip
+            if kept.any():
+                ghosts.append((pair, kept, _look(kept, of_one, tuple(by_colour), nodes, half_mm)))
     work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in ghosts])
     most = min(_ERROR * cell_mm / half_mm[0], _WORST)
     error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
     film = 4 * half_mm[0] * half_mm[1]
     band = _BAND * sum(k.light / k.size_mm**2 * min(k.size_mm**2 / film, 1.0) ** 2 for *_, k in ghosts)
-    return {
-        pair: _around(
-            kept, look, each,
-            math.ceil(min(look.swept_mm / (_STEP * cell_mm), look.light / max(look.size_mm**2 * band, 1e-300))),
-        )
-        for (pair, kept, look), each in zip(ghosts, error.tolist(), strict=True)
-    }  # fmt: skip
+    grids = {}
+    for (pair, kept, look), each_error in zip(ghosts, error.tolist(), strict=True):
+        least = min(look.swept_mm / (_STEP * cell_mm), look.light / max(look.size_mm**2 * band, 1e-300))
+        grids[pair] = _around(kept, look, each_error, math.ceil(least))
+    return grids
 
 
-def ghost_moves(
-    tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ghost_moves(tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float) -> tuple[Array, Array]:
     """How far the middle of a ghost's light moves on the film (mm) along the sides of a light's patch, [2, 2]; and how
     much of its light comes or goes along the side where that is most, and its light, [2].
 
@@ -131,12 +124,12 @@ def ghost_moves(
     """
     coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
 
-    def seen(off: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float] | None:
+    def seen(off: Array) -> tuple[Array, float, float] | None:
         light = light_towards(patch.light.towards + off, patch.light.rgb, patch.light.distance_m)
         if light is None:
             return None
         rays, area = rays_across(tracer.lens, light, coarse.places)
-        x, y, power, worst = tracer.follow_each(tracer.start(rays), [wavelength_nm], pair)[0].astype(np.float64)
+        x, y, power, worst = tracer.follow_each(entering(rays), [wavelength_nm], pair)[0].astype(np.float64)
         weight = np.where(power > 0, power * np.clip((1 - worst) / _SOFT, 0, 1), 0)
         lit, whole = weight > 0, float(weight.sum())
         if not lit.any():
@@ -177,12 +170,14 @@ class _Look(NamedTuple):
     size_mm: float
     lit: float
     light: float
-    swept_mm: float = 0.0
-    spectrum: tuple[tuple[float, float], ...] = ()
+    swept_mm: float
+    spectrum: tuple[tuple[float, float], ...]
 
 
-def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[float, float]) -> _Look:
-    """Measure a ghost by its scouts `rows` [4, N] and the cells that are kept."""
+def _look(
+    kept: NDArray[np.bool_], rows: Floats, colours: tuple[Any, ...], nm: Sequence[float], half_mm: tuple[float, float]
+) -> _Look:
+    """Measure a ghost by the cells that are kept, its scouts `rows` [4, N], and its `_colours` at wavelengths."""
     x, y, power, worst = rows.reshape(4, _SCOUTS + 1, _SCOUTS + 1).astype(np.float64)
     lit, half = worst <= 1, np.array(half_mm)[:, None]
     whole = kept & _corners(lit, np.logical_and)
@@ -203,63 +198,52 @@ def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[f
     share = (lit.sum() + 0.5) / ((box[0] + 1) * (box[1] + 1))
     size, whole_light = max(float(np.ptp(places, 1).max()), 1e-3 * half_mm[0]), float(light.sum())
     along_u, along_v = (max(v, _EVEN * whole_light) for v in off)
-    return _Look(along_u, along_v, whole_light * min(max(spread / size, _EVEN), 1.0), size, share, whole_light)
+    moved, swept, power_at = colours
+    spectrum = tuple(zip(nm, power_at.tolist(), strict=True))
+    of_colours = whole_light * min(max(moved / size, _EVEN), 1.0)
+    return _Look(along_u, along_v, of_colours, size, share, whole_light, swept, spectrum)
 
 
 def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray[Any]:
     return of(a[1:], a[:-1]) if axis == 0 else of(a[:, 1:], a[:, :-1])
 
 
-def _spread(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
-    """How far each ghost moves from the first to the last wavelength in mm; inf for a ghost without light.
+def _colours(each: Sequence[Floats], half_mm: tuple[float, float]) -> tuple[Array, Array, Array]:
+    """How ghosts differ by the wavelength, by the rows [P, 4, N] of their rays at each wavelength.
 
-    Args:
-        each: rows [P, 4, N] of the ghosts' rays at each wavelength.
+    The first array [P] is how far each ghost moves from the first to the last wavelength in mm, inf for a ghost without
+    light; the second [P], about how far in mm the shadows of rims move on the film, summed from wavelength to
+    wavelength. A rim may cut a ghost at another place in each colour even where the rays themselves do not move.
+    Between two wavelengths a shadow moves by the share of the rays on the film that pass at only one of them, times the
+    ghost's width. The third [P, W] is the power at each wavelength over that at the first, by the rays that pass at
+    both of two neighbours.
     """
     one, other = each[0], each[-1]
     here = (one[:, 3] <= _NEAR) & (other[:, 3] <= _NEAR) & (np.abs(one[:, :2]).max(1) < 2 * max(half_mm))
     off = np.where(here, ((other[:, :2] - one[:, :2]).astype(np.float64) ** 2).sum(1), 0).sum(1)
-    return np.where(here.any(1), np.sqrt(off / np.maximum(here.sum(1), 1)), np.inf).tolist()
+    moved = np.where(here.any(1), np.sqrt(off / np.maximum(here.sum(1), 1)), np.inf)
 
-
-def _swept(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
-    """About how far in mm the shadows of rims move on the film, summed from wavelength to wavelength.
-
-    A rim may cut a ghost at another place in each colour even where the rays themselves do not move. Between two
-    wavelengths a shadow moves by the share of the rays on the film that pass at only one of them, times the ghost's
-    width.
-
-    Args:
-        each: rows [P, 4, N] of the ghosts' rays at each wavelength.
-    """
     half = np.array(half_mm, np.float32)[:, None]
     passed = [(rows[:, 3] <= 1) & (np.abs(rows[:, :2]) < half).all(1) for rows in each]
-    share = sum(((a ^ b).sum(1) / np.maximum((a | b).sum(1), 1) for a, b in pairwise(passed)), np.zeros(len(each[0])))
+    share = sum(((a ^ b).sum(1) / np.maximum((a | b).sum(1), 1) for a, b in pairwise(passed)), np.zeros(len(one)))
     inside = [np.where(lit[:, None], rows[:, :2], np.nan) for lit, rows in zip(passed, each, strict=True)]
     low, high = (of(np.concatenate(inside, 2), 2) for of in (np.fmin.reduce, np.fmax.reduce))
-    return (share * np.nan_to_num((high - low).max(1))).tolist()
+    swept = share * np.nan_to_num((high - low).max(1))
 
-
-def _spectra(each: Sequence[Floats], nm: Sequence[float]) -> list[tuple[tuple[float, float], ...]]:
-    """Each ghost's power at some wavelengths over that at the first, by the rays that pass at both of two neighbours.
-
-    Args:
-        each: rows [P, 4, N] of the ghosts' rays at each wavelength.
-    """
-    ratios = [np.ones(len(each[0]))]
-    for one, other in pairwise(rows[:, 2].astype(np.float64) for rows in each):
-        sums = [np.where((one > 0) & (other > 0), power, 0).sum(1) for power in (one, other)]
+    ratios = [np.ones(len(one))]
+    for before, after in pairwise(rows[:, 2].astype(np.float64) for rows in each):
+        sums = [np.where((before > 0) & (after > 0), power, 0).sum(1) for power in (before, after)]
         ratios.append(np.divide(sums[1], sums[0], out=np.ones_like(sums[0]), where=sums[0] > 0))
-    return [tuple(zip(nm, of_one, strict=True)) for of_one in np.cumprod(ratios, 0).T.tolist()]
+    return moved, np.asarray(swept), np.cumprod(ratios, 0).T.astype(np.float64)
 
 
-def _kept(rays: GhostRays, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
-    """Whether light of each cell may reach the film, [P, S, S].
+def _kept(rows: Floats, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
+    """Whether light of each cell may reach the film, [P, S, S], by the rows [P, 4, N] of the scouts.
 
     A cell all of whose corners a rim stops is kept where `worst`, extrapolated by its change in the cell, reaches 1.
     """
-    shape = (len(rays.rows), 4, _SCOUTS + 1, _SCOUTS + 1)
-    xy, worst = np.split(rays.rows.reshape(shape)[:, [0, 1, 3]], [2], 1)
+    shape = (len(rows), 4, _SCOUTS + 1, _SCOUTS + 1)
+    xy, worst = np.split(rows.reshape(shape)[:, [0, 1, 3]], [2], 1)
     lost = ~(worst < LOST)
     inf = np.float32(np.inf)
     low, high = _corners(np.where(lost, inf, xy), np.minimum), _corners(np.where(lost, -inf, xy), np.maximum)

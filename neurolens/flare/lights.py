@@ -1,7 +1,10 @@
-"""The lights of flare: points and extended lights, over frames, in lists, and the rays that they send into the lens.
+"""The lights of flare: points and extended lights, over frames, in lists, in scenes and pictures, and their rays.
 
 Rays go through a disc across the light's direction that holds the whole front surface, at the points of a
 low-discrepancy sequence that is the same every time: an animated light has no noise of its own.
+
+A scene's lights are its rectangles, discs, spheres, points, spots and the sun, as far as the lens's front vertex sees
+them; a picture's are regions brighter than a threshold. The sky and other surroundings are no lights.
 """
 
 from __future__ import annotations
@@ -14,13 +17,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.flare.steps import Floats
+from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.field import Array, Field
+from neurolens.flare.canvas import CELLS, FADE, Floats
 from neurolens.lens.prescription import Lens
+from neurolens.render.colour import SpectralRange, balance
+from neurolens.render.job import camera_axes
+from neurolens.render.scene import Scene
+from neurolens.render.world import World
 from neurolens.trace.shapes import sag_mm
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
@@ -32,15 +40,15 @@ _COLUMNS: dict[str, tuple[float, float, float]] = {
     "frame": (0.0, -1e7, 1e7),
     "azimuth_deg": (math.nan, -360.0, 360.0),
     "elevation_deg": (math.nan, -90.0, 90.0),
-    "r": (SUN, 0.0, 1e30),
-    "g": (SUN, 0.0, 1e30),
-    "b": (SUN, 0.0, 1e30),
+    **dict.fromkeys("rgb", (SUN, 0.0, 1e30)),
     "diameter_deg": (0.0, 0.0, 90.0),
     "distance_m": (math.inf, 1e-6, math.inf),
     "visible": (1.0, 0.0, 1.0),
 }
-CELLS = 8  # along each side of an extended light
-FADE = 8  # parts of a cell's side where patches of a light fade into each other
+_CELL = 1 / 48  # of the picture's width: larger highlights are several lights
+_FADES = 1.25  # lights fade from so many times the energy of the brightest light that is left out
+_MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # above the threshold; at a time, each of some 500 bytes
+_DIMMEST = 0.02  # relative illumination below which a highlight's radiance is not known
 
 
 class Shape(NamedTuple):
@@ -48,12 +56,11 @@ class Shape(NamedTuple):
 
     Attributes:
         corners: [CELLS + 1, CELLS + 1, 3] directions (lens frame) of the cells' corners.
-        weights: [CELLS, CELLS] at least 0, of any sum.
-        round: whether the light is the whole ellipse that fits into the cells.
+        weights: [CELLS, CELLS] at least 0, of any sum. round: whether the light is the whole ellipse in the cells.
     """
 
-    corners: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    corners: Array
+    weights: Array
     round: bool
 
 
@@ -64,8 +71,7 @@ class Light:
     Attributes:
         azimuth_deg: to the right of the axis, seen by the camera; elevation_deg: above it.
         rgb: linear sRGB irradiance that it makes at the front vertex across its way: radiance times solid angle in sr.
-        distance_m: from the front vertex; inf allowed.
-        shape: of an extended light, whose middle the angles are; None for a point.
+        distance_m: from the front vertex; inf allowed. shape: of an extended light, in whose middle the angles are.
 
     Raises:
         InputError: angles that do not come from the front (the light lies behind the lens), a distance that is not
@@ -88,7 +94,7 @@ class Light:
             raise InputError("light", "rgb", self.rgb, "three finite numbers of at least 0")
 
     @property
-    def towards(self) -> NDArray[np.float64]:
+    def towards(self) -> Array:
         """Unit vector from the lens to the light, lens frame."""
         a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
         return np.array([math.sin(a) * math.cos(e), math.sin(e), -math.cos(a) * math.cos(e)])
@@ -135,8 +141,8 @@ class Patch(NamedTuple):
     """
 
     light: Light
-    sides: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    sides: Array
+    weights: Array
     round: bool
 
 
@@ -154,7 +160,9 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
     counts = [min(math.ceil(math.degrees(side) / most_deg + 1e-9), most) for side in _lengths(corners)]
     if 1 < max(counts) and most != CELLS:
         weights = weights.repeat(FADE, 0).repeat(FADE, 1)
-        corners = ndimage.zoom(corners, [(len(weights) + 1) / len(corners)] * 2 + [1], order=1)
+        at, nodes = np.linspace(0, CELLS, len(weights) + 1), np.arange(CELLS + 1)
+        for axis in (0, 1):
+            corners = np.apply_along_axis(lambda v: np.interp(at, nodes, v), axis, corners)
     middles = 0.25 * (corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1])
     parts = []
     for along in _shares(counts[0], len(weights)):
@@ -170,14 +178,14 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
     return parts
 
 
-def _shares(count: int, cells: int) -> NDArray[np.float64]:
+def _shares(count: int, cells: int) -> Array:
     """The share [count, cells] of each cell along a side that each of so many patches has: their sum is 1."""
     at = (np.arange(cells) + 0.5) * count / cells - 0.5
     far = np.abs(at.clip(0, count - 1) - np.arange(count)[:, None]).clip(0, 1)
     return 0.5 + 0.5 * np.cos(math.pi * far)
 
 
-def _lengths(corners: NDArray[np.float64]) -> tuple[float, float]:
+def _lengths(corners: Array) -> tuple[float, float]:
     """Lengths in radians of the middles of a shape's two kinds of sides."""
     half = CELLS // 2
     along, across = corners[-1, half] - corners[0, half], corners[half, -1] - corners[half, 0]
@@ -194,13 +202,12 @@ class Track:
     """
 
     name: str
-    keys: NDArray[np.float64]
+    keys: Array
 
     def at(self, frame: float) -> Light | None:
         """The light at a frame; None while it stands behind the lens."""
-        azimuth, elevation, r, g, b, diameter, near, shown = (
-            float(np.interp(frame, self.keys[:, 0], c)) for c in self.keys.T[1:]
-        )
+        values = (float(np.interp(frame, self.keys[:, 0], column)) for column in self.keys.T[1:])
+        azimuth, elevation, r, g, b, diameter, near, shown = values
         if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
             return None
         rgb = shown * r, shown * g, shown * b
@@ -273,14 +280,14 @@ def light_rays(
     return np.concatenate(rays, 1), sum(areas)
 
 
-def front_sphere(lens: Lens) -> tuple[NDArray[np.float64], float]:
+def front_sphere(lens: Lens) -> tuple[Array, float]:
     """Centre [3] (lens frame) and radius in mm of a sphere that holds the front surface."""
     front = lens.surfaces[0]
     depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
     return np.array([0.0, 0.0, depth / 2]), math.hypot(front.semi_diameter_mm, depth / 2)
 
 
-def sides_across(ahead: NDArray[np.float64]) -> NDArray[np.float64]:
+def sides_across(ahead: Array) -> Array:
     """Two unit vectors [2, 3] across a direction before the lens, which turn smoothly while the direction moves (Duff
     et al. 2017, for one hemisphere)."""
     x, y, z = ahead
@@ -302,9 +309,8 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
     source = 1000 * light.distance_m * ahead
     far = float(np.linalg.norm(source - centre))
     if not 1.01 * radius < far < math.inf:
-        raise InputError(
-            "light", "distance_m", light.distance_m, f"one beyond {radius / 1000:.3g} m, outside the lens, or inf"
-        )
+        expected = f"one beyond {radius / 1000:.3g} m, outside the lens, or inf"
+        raise InputError("light", "distance_m", light.distance_m, expected)
     # Uniform in solid angle over the cone that holds the sphere about the front surface.
     solid = 1 - math.sqrt(1 - (radius / far) ** 2)
     off = across * np.sqrt(solid * (2 - solid * (across**2).sum(0)))
@@ -317,7 +323,7 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
     return np.concatenate([source[:, None] + direction * (far - radius), direction]), area
 
 
-def disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDArray[np.float64]:
+def disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> Array:
     """Points [2, count] of equal shares of the unit disc: the R2 sequence from a number on, shifted.
 
     `jitter` moves each point by up to so much of the square's side, because regular points make patterns in a picture.
@@ -326,3 +332,169 @@ def disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDA
     moved = jitter * np.random.default_rng([first, int(shift * 2**32)]).random((2, count))
     u, v = (n / _PLASTIC + shift + moved[0]) % 1, (n / _PLASTIC**2 + 0.5 * shift + moved[1]) % 1
     return np.sqrt(u) * np.stack([np.cos(2 * math.pi * v), np.sin(2 * math.pi * v)])
+
+
+class SceneLights:
+    """The lights of a scene, as any camera in it sees them."""
+
+    def __init__(self, scene: Scene) -> None:
+        low, high = scene.settings.camera.wavelength_nm
+        spectral = SpectralRange(low, high)
+        self._world, self._spectral, every = World(scene, spectral), spectral, np.arange(spectral.bins)
+        rows, palette = self._world.light_emission_row, self._world.palette
+        each, self._colour = np.unique(rows, return_inverse=True)
+        self._rgb = [spectral.film_rgb(palette.look_up(np.full_like(every, row), every)[0]) for row in each]
+
+    def balance(self, illuminant: str | None) -> Array:
+        """Matrix [3, 3] on linear sRGB that makes an illuminant neutral, as renders of the scene have it."""
+        if illuminant is None or not self._spectral.colours:
+            return np.eye(3)
+        return balance(self._spectral.film_rgb(self._world.palette.illuminant(illuminant)))
+
+    def seen(self, scene: Scene, film_z_mm: float, most: int | None = None) -> list[Light]:
+        """The lights before the lens of the camera of `scene`, which may stand anywhere in this scene.
+
+        Args:
+            film_z_mm: of the lens: the front vertex lies so far before the film.
+            most: how many lights to test, those that are strongest there if nothing hides them; None tests all.
+        """
+        pose = scene.settings.camera
+        axes = camera_axes(pose).astype(np.float64)
+        front = np.array(pose.position_m) - axes[:, 2] * film_z_mm / 1000
+        middle, corner = ((2 * np.arange(CELLS + k) + 1 - k) / CELLS - 1 for k in (0, 1))
+        place = np.concatenate([np.stack(np.meshgrid(a, a, indexing="ij")).reshape(2, -1) for a in (middle, corner)], 1)
+        point = np.repeat(front[:, None], place.shape[1], 1).astype(np.float32)
+        lights, own, found = self._world.lights, CELLS * CELLS, list[Light]()
+        numbers = range(lights.count) if most is None else lights.strongest(tuple(front.tolist()), most)
+        for number, (is_round, aimed) in zip(numbers, lights.each(numbers, point, place), strict=True):
+            direction, distance, scale = (a[..., :own] for a in aimed)
+            inside = (place[:, :own] ** 2).sum(0) < 1 if is_round else np.ones(own, bool)
+            seen = np.where(inside & self._world.visible(point[:, :own], direction, distance), scale, 0).astype(float)
+            shape = Shape(
+                (axes.T @ aimed[0][:, own:]).T.reshape(CELLS + 1, CELLS + 1, 3), seen.reshape(CELLS, CELLS),
+                is_round and bool(seen[inside].all()),
+            )  # fmt: skip
+            rgb = self._rgb[self._colour[number]] * (seen.sum() / inside.sum())
+            if not rgb.any():
+                continue
+            mean = float(np.average(distance, weights=seen)) if np.isfinite(distance).all() else math.inf
+            extended = np.ptp(shape.corners, axis=(0, 1)).any()  # those of a light without size are one direction
+            towards = axes.T @ (direction @ seen)
+            if light := light_towards(towards, rgb.tolist(), mean, shape if extended else None):
+                found.append(light)
+        return found
+
+
+class KeptLights(NamedTuple):
+    """The lights that are kept, brightest first; of how many; and the share of the energy that is left out."""
+
+    lights: list[Light]
+    of: int
+    dropped: float
+
+
+def keep(lights: Sequence[Light], most: int, fade: bool = False) -> KeptLights:
+    """The lights of the most energy at the lens.
+
+    Args:
+        fade: whether lights fade as their energy approaches that of the brightest light that is left out, so that none
+            comes or goes at once over frames. Where all would be dark, none fades.
+    """
+    ordered = sorted(lights, key=lambda light: sum(light.rgb), reverse=True)
+    kept = ordered[:most]
+    cut = sum(ordered[most].rgb) if fade and len(ordered) > most else 0.0
+    if 0 < cut < sum(ordered[0].rgb):
+        shares = [min((sum(k.rgb) / cut - 1) / (_FADES - 1), 1.0) for k in kept]
+        faded = ((k, s, *k.rgb) for k, s in zip(kept, shares, strict=True) if s > 0)
+        kept = [replace(k, rgb=(s * r, s * g, s * b)) for k, s, r, g, b in faded]
+    whole = sum(sum(k.rgb) for k in ordered)
+    left = 1 - sum(sum(k.rgb) for k in kept) / max(whole, 1e-300) if len(kept) < len(ordered) else 0.0
+    return KeptLights(kept, len(ordered), left)
+
+
+def highlights(
+    picture: FloatArray, field: Field, film_mm: tuple[float, float], threshold: float, most: int, fade: bool = False
+) -> KeptLights:
+    """The regions of a picture [H, W, 3] (linear; 1 is a white card of radiance 1) that reach a threshold in a colour.
+
+    A region of connected pixels is a light far away with the region's radiance times solid angle; a large region is
+    several lights. Radiance is the picture's value over the relative illumination. Pixels count in full from twice the
+    threshold on, and less the nearer they are to it, so that over frames no light switches on at once.
+
+    Args:
+        field: of the camera that took the picture, laid out as equidistant. most, fade: as for `keep`.
+
+    Raises:
+        InputError: values that are not finite; more than `_MOST_PIXELS` pixels that reach the threshold.
+    """
+    if bad := int((~np.isfinite(picture)).any(-1).sum()):
+        raise InputError("picture", "pixels", f"({bad} with NaN or infinity)", "finite values")
+    height, width = picture.shape[:2]
+    value = picture.max(-1)
+    bright = value >= threshold
+    if np.count_nonzero(bright) > _MOST_PIXELS:
+        found = f"{threshold:g} ({np.count_nonzero(bright)} pixels)"
+        raise InputError("picture", "threshold", found, f"one that at most {_MOST_PIXELS} pixels reach")
+    row, column = np.nonzero(bright)
+    region = _regions(bright, max(1, round(_CELL * width)))
+    count = int(region.max(initial=-1)) + 1
+    colour, moments = np.zeros((count, 3)), np.zeros((13, count))
+    for start in range(0, row.size, _AT_ONCE):
+        r, c, of = (a[start : start + _AT_ONCE] for a in (row, column, region))
+        energy, towards, solid = _pixels(picture[r, c], r, c, field, film_mm, (height, width))
+        energy *= np.minimum(value[r, c] / threshold - 1, 1)[:, None]
+        colour += np.stack([np.bincount(of, e, count) for e in energy.T], 1)
+        squares = (towards[:, None] * towards).reshape(9, -1)
+        moments += np.stack([np.bincount(of, energy.sum(1) * t, count) for t in (*towards, *squares, solid)])
+    middle, each = moments[:3], colour.sum(1)
+    seen = np.flatnonzero((each > 0) & (middle[2] < -1e-6 * np.linalg.norm(middle, axis=0)))
+    first = seen[np.argsort(-each[seen], kind="stable")][: most + 1]  # one more tells how they fade
+    shapes = [_spread_of(moments[:, k] / each[k]) for k in first]
+    lights = [light_towards(middle[:, k], colour[k], shape=shape) for k, shape in zip(first, shapes, strict=True)]
+    kept = keep([light for light in lights if light], most, fade).lights
+    left = 1 - sum(sum(k.rgb) for k in kept) / float(each[seen].sum()) if len(seen) > most else 0.0
+    return KeptLights(kept, len(seen), left)
+
+
+def _spread_of(means: Array) -> Shape:
+    """The parallelogram with the variances of a region, from means [13] of directions, their products, solid angles."""
+    towards = means[:3] / np.linalg.norm(means[:3])
+    across = sides_across(towards)
+    variance = across @ (means[3:12].reshape(3, 3) - np.outer(means[:3], means[:3])) @ across.T
+    pixel = means[12] / 12 * np.eye(2)  # its own variance, with that of its middles
+    half = np.linalg.cholesky(variance + pixel)
+    return flat_shape(towards, math.sqrt(12) * half.T @ across)
+
+
+def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
+    """The number of the connected region of each bright pixel, [N] row by row; a region larger than two cells has a
+    number for each of its cells. Time and memory grow with the pixels alone, not with the regions."""
+    from scipy import ndimage  # type: ignore[import-untyped]
+
+    label, _ = ndimage.label(bright, np.ones((3, 3)))
+    number = label[bright] - 1
+    boxes = np.array([[(s.start, s.stop) for s in box] for box in ndimage.find_objects(label)]).reshape(-1, 2, 2)
+    large = np.ptp(boxes, axis=2).max(1) > 2 * cell
+    # The cell of each pixel, counted from its region's corner; a row has fewer cells than the picture has columns.
+    row, column = (place - boxes[number, axis, 0] for axis, place in enumerate(np.nonzero(bright)))
+    part = np.where(large[number], row // cell * label.shape[1] + column // cell, 0)
+    _, numbers = np.unique(number * np.int64(bright.size) + part, return_inverse=True)
+    return np.asarray(numbers.reshape(-1), np.intp)
+
+
+def _pixels(
+    colour: FloatArray, row: NDArray[np.intp], column: NDArray[np.intp], field: Field, film_mm: tuple[float, float],
+    size: tuple[int, int],
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Irradiance at the lens [N, 3], unit direction [3, N] (lens frame) and solid angle [N] of pixels, by the
+    directions of their corners."""
+    x = (np.array([[0], [1], [1], [0]]) + column) * (film_mm[0] / size[1]) - film_mm[0] / 2
+    y = film_mm[1] / 2 - (np.array([[0], [0], [1], [1]]) + row) * (film_mm[1] / size[0])
+    corner = field.directions((x + 1j * y).reshape(-1)).reshape(3, 4, -1)
+    corner[2] *= -1
+    across, down = corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1]
+    solid = np.linalg.norm(np.cross(across, down, axis=0), axis=0) / 2
+    light = field.relative_light(x.mean(0) + 1j * y.mean(0))
+    radiance = np.where(light[:, None] > _DIMMEST, np.maximum(colour, 0) / np.maximum(light, _DIMMEST)[:, None], 0)
+    towards = corner.sum(1)
+    return radiance * solid[:, None], towards / np.linalg.norm(towards, axis=0), solid

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.areas import LOST, Floats
+from neurolens.flare.canvas import LOST, Floats
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.ir import Graph, Value
@@ -29,12 +29,11 @@ from neurolens.graph.scalars import lower
 from neurolens.lens import glass
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, same_medium
-from neurolens.trace import coatings
 from neurolens.trace.arithmetic import TINY, Graphs
 from neurolens.trace.shapes import Figure, figure_of, is_plain
 from neurolens.trace.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
 from neurolens.trace.tracegraph import transmitted
-from neurolens.trace.transmission import path_mm
+from neurolens.trace.transmission import Layers, path_mm, reflectance
 
 Action = Literal["T", "R"]
 STATE = 8  # rows of a ray: x, y, z (mm, this step's frame), direction, power, `worst` (largest r^2 / R^2 at a rim)
@@ -162,7 +161,7 @@ def _coated(g: Graph, call: Value, cos_i: Value, cos_t: Value, n_step: Value) ->
 
 @lru_cache(maxsize=4096)  # the same for every frame, stop and tracer, and for surfaces that are coated alike
 def reflectance_fit(
-    layers: coatings.Layers, n_before: float, n_after: float, wavelength_nm: float, sense: int
+    layers: Layers, n_before: float, n_after: float, wavelength_nm: float, sense: int
 ) -> tuple[float, ...]:
     """Coefficients, lowest first, of a coating's reflectance in 1 - c, c being the cosine on the lower index's side.
 
@@ -173,7 +172,7 @@ def reflectance_fit(
     low, high = min(n_before, n_after), max(n_before, n_after)
     there = np.sqrt(1 - (low / high) ** 2 * (1 - c * c))
     cos_i = torch.from_numpy(c if n_before <= n_after else there)
-    exact = coatings.reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
+    exact = reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
     return tuple(np.polynomial.polynomial.polyfit(1 - c, exact, DEGREE, w=1 / (exact + _FAINT)).tolist())
 
 

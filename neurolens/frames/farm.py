@@ -10,7 +10,8 @@ the next run takes those that are there.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -24,9 +25,10 @@ from neurolens.base.errors import NeurolensError
 from neurolens.base.files import noted_files
 from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
-from neurolens.frames.frame import Frame, Prepared, flare_choice, prepare, render_frame
+from neurolens.frames import Frame, Prepared, flare_choice, prepare, render_frame
+from neurolens.readers.glasses import more_glasses
 from neurolens.render.film import digest
-from neurolens.render.tiles import read_tile, tile_path, write_picture
+from neurolens.render.renderer import read_tile, tile_path, write_picture
 
 if TYPE_CHECKING:
     from neurolens.flare.layers import Choice
@@ -44,11 +46,6 @@ class TileTask:
     out: Path
     choice: Choice | None
 
-    @property
-    def number(self) -> int:
-        """The number of the tile, from 1."""
-        return self.frame.tile[0] if self.frame.tile else 1
-
 
 @dataclass
 class _Picture:
@@ -56,7 +53,7 @@ class _Picture:
 
     frame: Frame
     out: Path
-    tiles: list[Path]
+    tiles: dict[int, Path]
     missing: set[int]
 
 
@@ -79,7 +76,7 @@ def render_frames(
     Args:
         frames: of one scene and one camera, by the files of their pictures (.exr); without tiles of their own.
         folder: where tiles are kept (default: OUT.exr.tiles for the first picture OUT.exr).
-        shown: the frames that decide which lights and ghosts the flare has, see `flare_choice`; None: these frames.
+        shown: the frames that decide which ghosts the flare has as layers, see `flare_choice`; None: these frames.
         restart: render tiles that are there again.
 
     Returns:
@@ -91,30 +88,33 @@ def render_frames(
     """
     out, frame = next(iter(frames.items()))
     progress = progress or Progress(quiet=True)
-    folder = folder or out.with_name(f"{out.name}.tiles")
-    with noted_files() as files, frame.glasses():
+    folder = Path(os.path.abspath(folder or out.with_name(f"{out.name}.tiles")))
+    with noted_files() as files, more_glasses(frame.glass_files):
         prepared = prepare(frame, out, progress)
         choice = flare_choice(shown or list(frames.values()), prepared)
     common = packed(files | {path for path in (frame.scene, frame.camera.file, *frame.glass_files) if path is not None})
-    shared = sha256(common).hexdigest(), None if choice is None else (sorted(map(repr, choice.lights)), choice.single)
-    todo = [_picture(each, out, folder, shared, prepared, restart) for out, each in frames.items()]
+    shared = sha256(common).hexdigest(), choice
+    todo = dict(_picture(each, out, folder, shared, prepared, restart) for out, each in frames.items())
     folder.mkdir(exist_ok=True)
-    pictures, done, count = dict[Path, dict[str, Any]](), 0, sum(len(picture.tiles) for picture in todo)
+    pictures, done, count = dict[Path, dict[str, Any]](), 0, sum(len(picture.tiles) for picture in todo.values())
+    tasks = (
+        absolute(TileTask(f"{p.out.name}, tile {k} of {n}", replace(p.frame, tile=(k, n)), place, choice))
+        for place, p, n in [(place, p, len(p.tiles)) for place, p in todo.items()]
+        for k in sorted(p.missing)
+    )
     with progress.stage(f"render {prepared.name}: {count} tiles") as report:
-        waiting: dict[Path, _Picture] = {}
-        tasks = _tasks(todo, waiting, choice)
         for task, answer in run_each(executor, run_with_files, tasks, render_tile, Shared(common)):
             if isinstance(answer, Failed):
                 raise NeurolensError(f"{task.name}: {answer.reason}; {how_to_resume(folder)}")
             unpack(answer, folder)
-            picture = waiting[task.out]
-            picture.missing.discard(task.number)
+            picture = todo[task.out]
+            picture.missing -= {task.frame.tile[0]} if task.frame.tile else set()
             if not picture.missing:
-                pictures[picture.out] = _finish(picture, prepared)
+                pictures[picture.out] = _finish(todo.pop(task.out), prepared)
             done += 1
             report(done / count)
         # Pictures whose tiles were all there.
-        pictures |= {picture.out: _finish(picture, prepared) for picture in todo if picture.tiles}
+        pictures |= {picture.out: _finish(picture, prepared) for picture in todo.values()}
     with suppress(OSError):
         for stale in folder.glob("*.tile-*.exr"):
             stale.unlink()
@@ -127,39 +127,28 @@ def how_to_resume(folder: Path) -> str:
     return f"tiles that are done are kept in {folder}: the same command goes on"
 
 
-def _picture(frame: Frame, out: Path, folder: Path, shared: Any, prepared: Prepared, restart: bool) -> _Picture:
-    """A picture cut into tiles; the cut depends on the picture alone, so that the next command has the same."""
+def _picture(
+    frame: Frame, out: Path, folder: Path, shared: Any, prepared: Prepared, restart: bool
+) -> tuple[Path, _Picture]:
+    """The name that the tiles of a picture have for it, and the picture; the cut into tiles depends on the picture
+    alone, so that the next command has the same."""
     width, height = prepared.size
     paths = width * height * (frame.samples or prepared.scene.settings.camera.samples)
     few = min(_FEW, math.ceil(paths / _PATHS_OF_FEW))
     count = min(max(math.ceil(paths / _PATHS_A_TILE), few), _MOST_TILES, height)
-    mark = digest((__version__, out.name, replace(frame, exposure=0.0), shared))
-    tiles = [tile_path(folder / f"{mark}.exr", (k, count)) for k in range(1, count + 1)]
-    return _Picture(frame, out, tiles, {k for k, tile in enumerate(tiles, 1) if restart or not tile.is_file()})
-
-
-def _tasks(todo: list[_Picture], waiting: dict[Path, _Picture], choice: Choice | None) -> Iterator[TileTask]:
-    """The tiles that are missing; `waiting` gets their pictures by the names that the tasks have of these."""
-    for picture in todo:
-        count = len(picture.tiles)
-        for k in sorted(picture.missing):
-            mark = picture.tiles[0].name.partition(".")[0]
-            name = f"{picture.out.name}, tile {k} of {count}"
-            out = picture.tiles[0].with_name(f"{mark}.exr")
-            task = absolute(TileTask(name, replace(picture.frame, tile=(k, count)), out, choice))
-            waiting[task.out] = picture
-            yield task
+    place = folder / f"{digest((__version__, out.name, replace(frame, exposure=0.0), shared))}.exr"
+    tiles = {k: tile_path(place, (k, count)) for k in range(1, count + 1)}
+    return place, _Picture(frame, out, tiles, {k for k, tile in tiles.items() if restart or not tile.is_file()})
 
 
 def _finish(picture: _Picture, prepared: Prepared) -> dict[str, Any]:
     """Put a picture together, with the paths as they are here, and remove its tiles."""
-    tiles = [read_tile(tile) for tile in picture.tiles]
+    tiles = [read_tile(tile) for tile in picture.tiles.values()]
     for tile in tiles:
         tile.metadata["scene"] = str(picture.frame.scene)
         if "model" in tile.metadata["camera"]:
             tile.metadata["camera"]["model"] = prepared.camera.settings["model"]
     written = write_picture(tiles, picture.out, picture.frame.exposure)
-    for file in picture.tiles:
+    for file in picture.tiles.values():
         file.unlink()
-    picture.tiles = []
     return written

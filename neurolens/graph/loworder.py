@@ -1,4 +1,4 @@
-"""Derivatives of a lens's graph as sparse polynomials of low order, for ray differentials.
+"""Few polynomial terms in place of a lens's derivatives, and of its tests whether a ray passes.
 
 A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: an error of a few
 percent does no harm. Derivatives of the graph itself double its work; polynomials of some ten terms each are a few
@@ -7,9 +7,10 @@ products.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from functools import reduce
+from itertools import combinations_with_replacement, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value, live_rows
+from neurolens.graph.ir import Graph, Node, Value, live_rows, pruned
 from neurolens.graph.program import FILM_X_Y
 
 Array = NDArray[np.float64]
@@ -29,7 +30,6 @@ _STEP_MM = 1e-4  # of differences, in double precision
 _ONE_WAVELENGTH = 1e-3  # relative spread of 1 / wavelength^2 below which it is one
 _GROUPS = (slice(0, 3), slice(3, 6))  # rows of point and direction: each has one scale
 _NAMES = [derivative("scene_ray", by) for by in FILM_X_Y]
-Monomial = tuple[int, ...]  # numbers of the variables in it, ascending
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,14 @@ def low_orders(
 
 @dataclass(frozen=True)
 class _Fitted:
-    """A lens in one state while it is fitted: `products` [M, N], the monomials of the rays that pass, the derivatives
-    `wanted` [6, 2, N], and the weights [6, 2, M]."""
+    """A lens in one state while it is fitted: `products` [M, N], monomials of these exponents of the rays that pass,
+    the derivatives `wanted` [6, 2, N], and the weights [6, 2, M]."""
 
     graph: Graph
     samples: Mapping[str, NDArray[np.float32]]
     passed: NDArray[np.bool_]
     variables: Value
-    monomials: list[Monomial]
+    exponents: NDArray[np.int64]
     products: Array
     wanted: Array
     weights: Array
@@ -122,20 +122,20 @@ class _Fitted:
         found = Graph()
         found.outputs = found.inline(graph, {})
         columns, variables = _variables(found, doubles["rays"][:, passed])
-        monomials = _monomials(len(columns))
-        one = np.ones(int(passed.sum()))
-        products = np.stack([np.prod([one, *(columns[k] for k in m)], axis=0) for m in monomials])
-        weights = np.zeros((6, 2, len(monomials)))
+        exponents = np.pad(_exponents(_DEGREE, 4), ((0, 0), (0, len(columns) - 4)))
+        if len(columns) > 4:
+            by_wave = exponents[exponents.sum(1) <= _DEGREE_WAVE] + np.eye(5, dtype=np.int64)[4]
+            exponents = np.concatenate([exponents, by_wave])
+        products = np.prod(columns ** exponents[:, :, None], axis=1)
+        weights = np.zeros((6, 2, len(exponents)))
         wanted = np.broadcast_to(wanted, (6, 2, len(passed)))[..., passed]
         samples = {name: rows.astype(np.float32) for name, rows in doubles.items()}  # as it will be used
-        return _Fitted(found, samples, passed, variables, monomials, products, wanted, weights)
+        return _Fitted(found, samples, passed, variables, exponents, products, wanted, weights)
 
     def finished(self, used: NDArray[np.bool_], reach_mm: float) -> LowOrder:
         """The graph with its derivatives, by the monomials that any state uses."""
-        count = self.variables.rows
-        exponents = np.array([np.bincount(m, minlength=count) for m in self.monomials], np.int64)[used]
         weights = self.weights[..., used].transpose(1, 0, 2).reshape(12, -1)
-        rows = self.graph.polynomial(exponents, weights, self.variables)
+        rows = self.graph.polynomial(self.exponents[used], weights, self.variables)
         self.graph.outputs |= dict(zip(_NAMES, self.graph.split(rows, (6, 6)), strict=True))
         fitted = _matrices(evaluate(self.graph, self.samples), self.passed)  # in float32, as it will be used
         point, direction = (np.linalg.norm(self.wanted[group], axis=(0, 1)) for group in _GROUPS)
@@ -182,9 +182,10 @@ def _variables(g: Graph, rays: Array) -> tuple[Array, Value]:
     return rays[:4], inputs[0:4]
 
 
-def _monomials(count: int) -> list[Monomial]:
-    points = [m for n in range(_DEGREE + 1) for m in combinations_with_replacement(range(4), n)]
-    return points + [(*m, 4) for m in points if len(m) <= _DEGREE_WAVE and count > 4]
+def _exponents(degree: int, count: int) -> NDArray[np.int64]:
+    """Exponents [M, count] of the monomials of so many variables up to a degree."""
+    chosen = [m for n in range(degree + 1) for m in combinations_with_replacement(range(count), n)]
+    return np.array([np.bincount(np.array(m, np.int64), minlength=count) for m in chosen])
 
 
 def pursue(
@@ -213,3 +214,187 @@ def pursue(
         ]
         left = [w - own @ c[chosen] for w, own, c in zip(wanted, weights, columns, strict=True)]
     return chosen, weights
+
+
+# ---- tests of few terms ----
+#
+# A surrogate spends as many terms on whether a ray passes as on where it goes, all over its domain. A camera that
+# samples the pupil needs to know only where the pupil ends: a few polynomial terms, fitted to its own rays in the
+# variables that the surrogate computes anyway, decide whether such a ray is vignetted, and give stop point and
+# transmittance. The directions of rays stay as they are.
+
+Truths = NDArray[np.bool_]
+_TEST_DEGREE, _TEST_TERMS = 3, 20
+_NEAR = 0.03  # of a test's value: what lies nearer to 0 decides
+_GATE, _SMOOTH = 1.5e-3, 1e-3  # weighted RMS error of a test, and of others relative to their size
+_CHANGED, _LOST = 5e-3, 3e-3  # of the rays that pass, that new tests may tell otherwise, and by how much fewer or more
+_ZONES = 4  # of the film, as many rays in each, in which they may be so few, with the stop open and with any
+_IDLE = 5e-4  # of the rays, that tests which are left out stop alone
+_UNIT = 1e-4  # by which squared lengths of directions may differ from 1
+
+
+@dataclass(frozen=True)
+class _GateSamples:
+    """Samples of one graph: values [R, N] of the node whose rows are fitted, monomials [M, N] of its variables, weights
+    [R, N] of errors, and which rays pass."""
+
+    graph: Graph
+    values: Array
+    products: Array
+    weights: Array
+    passed: Truths
+
+
+def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np.float32]]]) -> list[Graph] | None:
+    """Graphs of a lens, in one state or in several, with tests, stop point and transmittance of few terms.
+
+    Their status says whether a ray passes, but no longer which rim stops it. They test no domain, for rays are those
+    that the camera samples.
+
+    Args:
+        samples: inputs of the rays of a camera, as of `low_orders`.
+
+    Returns None where the lens is no surrogate of a few variables, where its directions may not be of unit length, or
+    where so few terms change the answer for too many rays.
+    """
+    number = _shared(graphs[0])
+    variables = None if number is None else _forms(graphs[0], number)
+    if number is None or variables is None or [n.kind for n in graphs[0].nodes].count("first_failure") != 1:
+        return None
+    kept = live_rows(graphs[0], {"scene_ray": graphs[0].outputs["scene_ray"]})[number]
+    gates, exponents = _gates(graphs[0], number), _exponents(_TEST_DEGREE, graphs[0].nodes[variables].rows)
+    seen = [_gate_samples(g, number, variables, gates, exponents, s) for g, s in zip(graphs, samples, strict=True)]
+    if any(s is None for s in seen):
+        return None
+    known = [s for s in seen if s is not None]
+    idle = _idle(known, gates)
+    told = live_rows(graphs[0], {"status": graphs[0].outputs["status"]})[number]
+    fitted = dict[int, list[Array]]()
+    for row in (r for r in range(graphs[0].nodes[number].rows) if r not in kept and r not in idle):
+        own, enough = _low_row(known, row, _GATE if row in gates else _SMOOTH)
+        if enough or row in told:  # rays that pass are counted below; transmittance is not
+            fitted[row] = own
+    for weights in (
+        fitted,
+        dict[int, list[Array]](),
+    ):  # where few terms do not do, idle tests are left out all the same
+        made = [_written(s, number, variables, exponents, idle, {r: w[k] for r, w in weights.items()})
+                for k, s in enumerate(known)]  # fmt: skip
+        if all(_same(_passed(g, given), s.passed, given) for g, s, given in zip(made, known, samples, strict=True)):
+            return made
+    return None
+
+
+def _low_row(seen: Sequence[_GateSamples], row: int, good: float) -> tuple[list[Array], bool]:
+    """Weights [M] of few monomials in each state, and whether they come as near as `good`."""
+    columns, wanted = [s.products * s.weights[row] for s in seen], [s.values[row] * s.weights[row] for s in seen]
+    chosen, own = pursue(columns, wanted, [good] * len(seen), _TEST_TERMS)
+    weights = [np.zeros(len(c)) for c in columns]
+    for w, values in zip(weights, own, strict=True):
+        w[chosen] = values
+    left = [float(np.sqrt(np.mean((v - w @ c) ** 2))) for v, w, c in zip(wanted, weights, columns, strict=True)]
+    return weights, max(left) <= good
+
+
+def _same(found: Truths, wanted: Truths, samples: Mapping[str, NDArray[np.float32]]) -> bool:
+    """Check that two tests agree on nearly all rays, and pass as many in every zone."""
+    order = np.argsort(np.hypot(*samples["rays"][:2]))
+    stop = np.broadcast_to(samples["stop_radius_mm"][0], wanted.shape)
+    good = np.sum(found != wanted) <= _CHANGED * wanted.sum()
+    for zone in np.array_split(order, _ZONES):
+        for part in (zone, zone[stop[zone] >= stop.max()]):
+            more = found[part].astype(int) - wanted[part]
+            chance = 2 * np.sqrt(np.abs(more).sum())
+            good &= abs(more.sum()) <= _LOST * wanted[part].sum() + chance
+    return bool(good)
+
+
+def _shared(graph: Graph) -> int | None:
+    """The node that gives rows to where rays go, and other rows to the rest."""
+    kept = live_rows(graph, {"scene_ray": graph.outputs["scene_ray"]})
+    every = live_rows(graph, graph.outputs)
+    shared = [
+        k for k, node in enumerate(graph.nodes)
+        if node.kind in ("polynomial", "affine") and kept.get(k) and every[k] > kept[k]
+    ]  # fmt: skip
+    return shared[-1] if shared else None
+
+
+def _forms(graph: Graph, number: int) -> int | None:
+    """The node of the forms that a polynomial or a network is a function of."""
+    while graph.nodes[number].kind in ("polynomial", "affine", "tanh"):
+        number = graph.nodes[number].inputs[0]
+    return number if graph.nodes[number].kind == "quadratic" else None
+
+
+def _gates(graph: Graph, number: int) -> dict[int, int]:
+    """The rows that are tested to be at most 0, and the places of their tests."""
+    found = {}
+    for place, k in enumerate(_tests(graph).inputs[::2]):
+        test = graph.nodes[k]
+        if test.kind == "take" and test.inputs[0] == number:
+            found[test.static[0]] = place
+    return found
+
+
+def _tests(graph: Graph) -> Node:
+    (node,) = (n for n in graph.nodes if n.kind == "first_failure")
+    return node
+
+
+def _idle(seen: Sequence[_GateSamples], gates: Mapping[int, int]) -> set[int]:
+    """Rows whose tests alone stop next to no ray."""
+    idle: set[int] = set()
+    while left := [g for g in gates if g not in idle]:
+        lost = dict.fromkeys(left, 0.0)
+        for g, s in product(left, seen):
+            others = (s.values[[k for k in left if k != g]] <= 0).all(0)
+            lost[g] = max(lost[g], float(np.mean((s.values[[*idle, g]] > 0).any(0) & others)))
+        least = min(left, key=lost.__getitem__)
+        if lost[least] > _IDLE:
+            break
+        idle.add(least)
+    return idle
+
+
+def _gate_samples(
+    graph: Graph, number: int, variables: int, gates: Collection[int], exponents: NDArray[np.int64],
+    samples: Mapping[str, NDArray[np.float32]],
+) -> _GateSamples | None:  # fmt: skip
+    """None where a direction is not of unit length."""
+    wanted = {"values": Value(graph, number), "variables": Value(graph, variables), "ray": graph.outputs["scene_ray"]}
+    given = evaluate(pruned(graph, wanted), samples)
+    if not (np.abs(np.square(given["ray"][3:], dtype=np.float64).sum(0) - 1) <= _UNIT).all():
+        return None
+    values, x = (given[name].astype(np.float64) for name in ("values", "variables"))
+    weights = np.repeat(1 / np.sqrt(np.mean(values**2, axis=1, keepdims=True)), values.shape[1], 1)
+    for g in gates:  # what others stop need not be told exactly
+        far = [values[g], *(values[other].clip(0) for other in gates if other != g)]
+        weights[g] = np.prod([1 / np.hypot(1, v / _NEAR) for v in far], axis=0)
+    return _GateSamples(graph, values, np.prod(x ** exponents[:, :, None], axis=1), weights, _passed(graph, samples))
+
+
+def _passed(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> Truths:
+    status = evaluate(pruned(graph, {"status": graph.outputs["status"]}), samples)["status"][0]
+    return np.broadcast_to(status == st.PASSED, samples["rays"].shape[1:])
+
+
+def _written(
+    state: _GateSamples, number: int, variables: int, exponents: NDArray[np.int64], idle: Collection[int],
+    weights: Mapping[int, Array],
+) -> Graph:  # fmt: skip
+    """The graph with rows of a node as polynomials with these weights [M], by row, and without idle tests."""
+    graph, g, place, rows = state.graph, Graph(), list[Value](), list(weights)
+    for k, node in enumerate(graph.nodes):
+        value = g.like(node, [place[i] for i in node.inputs])
+        if k == number and rows:
+            own = g.polynomial(exponents, np.stack([*weights.values()]), place[variables])
+            value = g.concat(*(own[rows.index(r)] if r in rows else value[r] for r in range(node.rows)))
+        place.append(value)
+    tests, gates = _tests(graph), _gates(graph, number)
+    pairs = zip(tests.inputs[::2], tests.inputs[1::2], strict=True)
+    without = {gates[r] for r in idle}
+    worst = reduce(Value.maximum, (place[a] - place[b] for n, (a, b) in enumerate(pairs) if n not in without))
+    g.outputs = {name: place[v.number] for name, v in graph.outputs.items()}
+    g.outputs["status"] = g.select(worst <= 0.0, float(st.PASSED), float(tests.static[0])).whole()
+    return g

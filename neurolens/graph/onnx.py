@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Node, pruned, same_structure
-from neurolens.graph.monomials import Block, Exponent, Pair, blocks_alone, by_block, plan_products
 from neurolens.graph.protobuf import FLOAT, INT32, INT64, ML, model_proto, node_proto, tensor_proto, value_proto
+from neurolens.graph.scalars import Block, Exponent, Pair, blocks_alone, by_block, plan_products
 
 Array = NDArray[np.float64]
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from argparse import ArgumentTypeError
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from neurolens.base.bounds import F_NUMBER, FILM_MM, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
-from neurolens.base.settings import check_bounds, setting
+from neurolens.base.settings import between, check_bounds, setting
 
 FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
@@ -39,8 +40,8 @@ class Shot:
         cover_glass_mm: thickness of a plate of N-BK7 that is put before the film of a lens file, which is focused anew.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error for a model, and
             opens the stop of a lens file as far as the rims let light through.
-        vignetting: the part that is kept; see `neurolens.cameras.vignetting`.
-        dispersion: the part that is kept; see `neurolens.cameras.dispersion`.
+        vignetting: the part that is kept; see `neurolens.cameras.reduced`.
+        dispersion: the part that is kept; see `neurolens.cameras.reduced`.
 
     Raises:
         InputError: a film, focus, f-number, focus mode, vignetting or dispersion that no camera has.
@@ -104,6 +105,16 @@ class Shot:
         """The f-number of a lens that opens to `widest`; None stands for its widest."""
         too_wide = self.clamp_f_number and self.f_number is not None and self.f_number < widest
         return None if too_wide else self.f_number
+
+
+def film_size(text: str) -> tuple[float, float]:
+    """Type of an option: a film's width x height in mm, as in 36x24."""
+    width, _, height = text.lower().partition("x")
+    side = between(*FILM_MM, "the film's width x height in mm, as in 36x24, each")
+    try:
+        return side(width), side(height)
+    except ArgumentTypeError as error:
+        raise ArgumentTypeError(f"{text!r}: {error}") from None
 
 
 def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:

@@ -28,8 +28,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.shot import Dispersion, Shot
-from neurolens.mitsuba.library import matrix, require_mitsuba
-from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, register
+from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, matrix, register, require_mitsuba
 
 __all__ = ["camera", "load_scene", "register", "render", "require_mitsuba"]
 PASS_RAYS = 1 << 20  # of one wavefront: numpy holds some 200 bytes per ray
@@ -49,7 +48,7 @@ def camera(
     Args:
         film_mm: width and height; they have the shape of the scene's picture.
         focus_m: distance from the film to the object in focus.
-        f_number: None is the widest. dispersion: "off" has the least noise, see `neurolens.cameras.dispersion`.
+        f_number: None is the widest. dispersion: "off" has the least noise, see `neurolens.cameras.reduced`.
 
     Other settings: see `neurolens.cameras.build`.
 

@@ -23,18 +23,21 @@ vignettes. Scalar variants ask for one ray at a time, which takes a model about 
 
 from __future__ import annotations
 
+import importlib
 import math
+import warnings
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.lens.shot import Shot, StopShape
-from neurolens.mitsuba.library import libraries, matrix, number, require_mitsuba, rows, vector
 from neurolens.render.colour import SpectralRange
 from neurolens.render.film import PixelGrid
 from neurolens.render.images import make_aperture
@@ -42,8 +45,104 @@ from neurolens.render.job import mode_for
 from neurolens.render.sampler import hash32
 from neurolens.render.settings import FilmSettings
 
-BATCH = RAYS_A_CALL  # of the camera
+PLUGIN = "neurolens"
+LIGHT_NM = (400.0, 700.0)  # which sets the exposure, and the wavelengths of RGB variants; as our scenes have it
+FILM_WIDTH_MM = 36.0
+_MIDDLE_NM = 550.0
+_CLASSES: dict[str, type] = {}
+DEFAULT_VARIANT, WITHOUT_LLVM = "llvm_ad_spectral", "scalar_spectral"
+# LLVM 15 and 16, which Dr.Jit takes, abort the process on Mitsuba's kernels (seen with AVX-512); 19 works.
+_OLDEST_LLVM = 17
 _TURNED = np.array([[-1], [1], [-1]], np.float32)  # half a turn about y
+
+
+def libraries() -> tuple[Any, Any]:
+    """The modules mitsuba and drjit, untyped: what Mitsuba has depends on its variant.
+
+    NeurolensError: they are not installed.
+    """
+    try:
+        return importlib.import_module("mitsuba"), importlib.import_module("drjit")
+    except ImportError as error:
+        raise NeurolensError(
+            f"Mitsuba 3 cannot be imported ({error}): pip install 'neurolens[mitsuba]', or '.[mitsuba]' in a checkout"
+        ) from None
+
+
+def require_mitsuba(variant: str | None = None) -> Any:
+    """The module mitsuba with a variant set: `variant`, else the current one, else llvm_ad_spectral.
+
+    Warns:
+        NeurolensWarning: no LLVM, or one so old that compiled variants may end the process; where no variant was asked
+            for, scalar_spectral is taken in its place.
+
+    Raises:
+        NeurolensError: Mitsuba is not installed, or the variant's compiler (LLVM, CUDA) is missing.
+        InputError: a variant that this Mitsuba does not have, or one that carries neither RGB nor plain spectra.
+    """
+    mi, dr = libraries()
+    wanted = variant or mi.variant() or DEFAULT_VARIANT
+    if wanted.startswith("llvm") and (doubt := _llvm_doubt(dr)):
+        asked = variant or mi.variant()
+        told = f"{doubt}; the variant {WITHOUT_LLVM} needs none{'' if asked else ' and is taken'}"
+        warnings.warn(told, NeurolensWarning, stacklevel=2)
+        wanted = asked or WITHOUT_LLVM
+    known = [v for v in mi.variants() if v.endswith(("_rgb", "_spectral"))]
+    if wanted not in known:
+        raise InputError("mitsuba", "variant", wanted, f"one of: {', '.join(known)}")
+    try:
+        if mi.variant() != wanted:
+            mi.set_variant(wanted)
+        if not wanted.startswith("scalar"):
+            _compile(wanted)
+    except Exception as error:  # the library's exception types
+        reason = " ".join(str(error).split())[:200]
+        needed = "libLLVM" if wanted.startswith("llvm") else "CUDA"
+        raise NeurolensError(f"mitsuba variant {wanted}: no {needed} ({reason}); a scalar variant needs none") from None
+    return mi
+
+
+def _llvm_doubt(dr: Any) -> str:
+    """The fault of the LLVM that Dr.Jit loads; empty if it has none."""
+    version = dr.detail.llvm_version()
+    if version[0] >= _OLDEST_LLVM:
+        return ""
+    found = (
+        f"LLVM {'.'.join(map(str, version))} is too old for Mitsuba"
+        if version[0] > 0
+        else "Mitsuba found no LLVM that it takes"
+    )
+    return f"{found} (19 works; DRJIT_LIBLLVM_PATH names the library)"
+
+
+@cache
+def _compile(variant: str) -> None:
+    """Compile one small kernel: a missing LLVM is detected only then."""
+    mi, dr = libraries()
+    dr.eval(mi.Float(dr.arange(mi.UInt32, 2)) + 1)
+
+
+def rows(*values: Any) -> FloatArray:
+    """Numbers of the current variant, one wide or N, as [len(values), N] float32; evaluates them."""
+    arrays = [np.atleast_1d(np.asarray(value, np.float32)) for value in values]
+    return np.stack(np.broadcast_arrays(*arrays))
+
+
+def number(values: FloatArray) -> Any:
+    """Numbers [N] as the variant's Float; in scalar variants N is 1."""
+    mi, dr = libraries()
+
+    return mi.Float(np.ascontiguousarray(values)) if dr.is_jit_v(mi.Float) else float(values[0])
+
+
+def vector(kind: Any, values: FloatArray) -> Any:
+    """Numbers [D, N] as a vector, point, colour or spectrum `kind` of D parts."""
+    return kind(*(number(row) for row in values))
+
+
+def matrix(transform: Any) -> NDArray[np.float64]:
+    """A transform of any variant as float64 [4, 4]."""
+    return np.array(transform.matrix, np.float64).reshape(4, 4, -1)[..., 0]
 
 
 class LocalRays(NamedTuple):
@@ -82,8 +181,8 @@ class FilmRays:
         accepted = self.camera.wavelength_nm
         if accepted is not None:
             wavelength_nm = np.clip(wavelength_nm, *accepted)
-        for start in range(0, count, BATCH):
-            part = slice(start, start + BATCH)
+        for start in range(0, count, RAYS_A_CALL):
+            part = slice(start, start + RAYS_A_CALL)
             film = self._film_points(position[:, part])
             pupil = np.ascontiguousarray(aperture[:, part], np.float32)
             rays = self.camera.sample(film, pupil, np.ascontiguousarray(wavelength_nm[part], np.float32))
@@ -119,7 +218,7 @@ class ChannelWavelengths:
     def draw(self, sample: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Wavelengths [N] in nm and weights [3, N] for uniform samples [N] in [0, 1)."""
         weights = self._weights.take(self._range.bin_of(sample), axis=1)
-        return self._range.wavelengths_nm(sample), weights
+        return self._range.wavelengths_nm(sample)[0], weights
 
 
 def wavelength_samples(position: FloatArray, aperture: FloatArray) -> FloatArray:
@@ -135,13 +234,6 @@ def wavelength_samples(position: FloatArray, aperture: FloatArray) -> FloatArray
         start = hash32(start + value)
     steps = np.arange(position.shape[1], dtype=np.uint32) * np.uint32(0x9E3779B9) + start
     return (steps >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
-
-
-PLUGIN = "neurolens"
-LIGHT_NM = (400.0, 700.0)  # which sets the exposure, and the wavelengths of RGB variants; as our scenes have it
-FILM_WIDTH_MM = 36.0
-_MIDDLE_NM = 550.0
-_CLASSES: dict[str, type] = {}
 
 
 def register() -> type:
@@ -200,20 +292,15 @@ def _camera_of(props: Any, shape: float) -> Camera:
     name = props.get("camera", None)
     if not isinstance(name, str):
         raise InputError(PLUGIN, "camera", "(missing)", "a model (.onnx), a lens file (.toml), thin or pinhole")
-    names = ("blades", "blade_rotation_deg", "blade_curvature", "aperture_mask")
-    blades, rotation, curvature, mask = (props.get(k, None) for k in names)
+    mask = props.get("aperture_mask", None)
     mask = Path(_found(mask)) if isinstance(mask, str) else mask
-    aperture = make_aperture(StopShape(blades, rotation, curvature, mask))
+    blades = (props.get(k, None) for k in ("blades", "blade_rotation_deg", "blade_curvature"))
+    size = props.get("focal_length_mm", props.get("efl_mm", None))
+    more = {k: props.get(k) for k in ("f_number", "zoom", "dispersion") if props.get(k, None) is not None}
     shot = Shot(
-        film_mm=(width_mm, height_mm),
-        focus_m=_number_of(props, "focus_m", math.inf),
-        f_number=props.get("f_number", None),
-        focal_length_mm=props.get("focal_length_mm", props.get("efl_mm", None)),
-        zoom=props.get("zoom", None),
-        aperture=aperture,
-        wavelength_nm=LIGHT_NM,
-        dispersion=props.get("dispersion", "full"),
-    )
+        (width_mm, height_mm), _number_of(props, "focus_m", math.inf), focal_length_mm=size,
+        aperture=make_aperture(StopShape(*blades, mask)), wavelength_nm=LIGHT_NM, **more,
+    )  # fmt: skip
     return make_camera(_found(name), shot)
 
 

@@ -42,7 +42,9 @@ _STEP_NS, _DEAR_NS, _DEAR = 0.2761, 2.324, ("div", "sqrt")
 # Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
-_STRIPS, _STRIP_PATHS, _SAMPLES = 3, 180_000, 16  # of a picture, to measure noise: number, paths of all, of a pixel
+# Of a picture, to measure noise: number of strips, paths of all; samples of a pixel at most. What thin lenses and those
+# that disperse gain by more samples differs: their noise is compared at the scene's own number.
+_STRIPS, _STRIP_PATHS, _SAMPLES = 6, 180_000, 16
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 _MOST_DARK = 0.05  # of the places
 
@@ -104,12 +106,12 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
         plain, colours: cameras of the same lens, without and with its dispersion. weights: theirs at the places, as
             for `noise`.
     """
-    strips = strips_of(scene, _STRIP_PATHS, 2)
+    strips, samples = strips_of(scene, _STRIP_PATHS, 1, _STRIPS), min(scene.settings.camera.samples, _SAMPLES)
     rest, calls, variance = [], [], []
     for camera, weight in zip((plain, colours), weights, strict=True):
-        _strip(scene, camera, 0, (0, 1))  # what is fitted or compiled once is no part of a path
-        jobs = [[_strip(scene, camera, seed, rows) for rows in strips] for seed in (0, 1)]
-        ns = [[1e9 * j.film.seconds[1] / (j.tiling.pixels * _SAMPLES) for j in some] for some in jobs]
+        _strip(scene, camera, 0, (0, 1), samples)  # what is fitted or compiled once is no part of a path
+        jobs = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
+        ns = [[1e9 * j.film.seconds[1] / (j.tiling.pixels * samples) for j in some] for some in jobs]
         several = jobs[0][0].mode == "companions" and not getattr(camera, "lateral", False)
         calls.append(float(LANES) if several else 1.0)
         besides = float(np.min(ns, axis=0).mean()) - calls[-1] * ns_a_ray(camera, places)["min"]
@@ -123,19 +125,19 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
     return Work((rest[0], rest[1]), (calls[0], calls[1]), (1.0, ratio))
 
 
-def strips_of(scene: Scene, paths: int, least: int) -> list[tuple[int, int]]:
+def strips_of(scene: Scene, paths: int, least: int, count: int = 3) -> list[tuple[int, int]]:
     """The first row of each of some strips of a picture, and the one after its last: for so many paths in all."""
     shot = scene.settings.camera
-    rows = min(max(paths // (_STRIPS * _SAMPLES * shot.width), least), shot.height)
-    firsts = np.unique(np.linspace(0, shot.height - rows, _STRIPS + 2).astype(int)[1:-1])
+    rows = min(max(paths // (count * min(shot.samples, _SAMPLES) * shot.width), least), shot.height)
+    firsts = np.unique(np.linspace(0, shot.height - rows, count + 2).astype(int)[1:-1])
     return [(int(first), int(first) + rows) for first in firsts]
 
 
-def _strip(scene: Scene, camera: Camera, seed: int, rows: tuple[int, int]) -> Job:
+def _strip(scene: Scene, camera: Camera, seed: int, rows: tuple[int, int], samples: int) -> Job:
     """Rows of a picture, rendered on one thread."""
     shot = scene.settings.camera
     grid = PixelGrid(shot.width, shot.height, camera.film_mm)
-    job = Job(scene, camera, grid, _SAMPLES, seed, shot.max_depth, scene.settings.film, rows)
+    job = Job(scene, camera, grid, samples, seed, shot.max_depth, scene.settings.film, rows)
     run(job, 1)
     return job
 

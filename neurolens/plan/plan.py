@@ -85,6 +85,11 @@ class Plan:
         return "whole picture" if any(self.work.rest) else "camera"
 
     @property
+    def front(self) -> list[Choice]:
+        """The cameras that no other betters, see `front`."""
+        return front(self.choices)
+
+    @property
     def unit_s(self) -> str:
         """The unit of `Choice.seconds`."""
         return "s" if self.unit == "ns" else "10^9 operations"
@@ -459,7 +464,7 @@ def _cameras(axes: Any, plan: Plan) -> None:
 
 def plot_trade(plan: Plan, path: Path, title: str) -> None:
     """Error of every camera against its seconds, with the front of those that no other betters."""
-    best = front(plan.choices)
+    best = plan.front
     subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
     with drawing(path, 8.5, 5.0, title, subtitle) as figure:
         axes = figure.subplots()

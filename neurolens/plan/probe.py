@@ -29,8 +29,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import Field, field_of
 from neurolens.flare.canvas import Raster
 from neurolens.flare.layers import FlareJob, flare_layers
-from neurolens.flare.lights import Light
-from neurolens.flare.sources import SceneLights, highlights, keep
+from neurolens.flare.lights import Light, SceneLights, highlights, keep
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.film_plane import PupilBounds, colours
 from neurolens.lens.paraxial import first_order

@@ -315,7 +315,7 @@ class SpectralRange:
 
     def _set_edges(self, edges: FloatArray64) -> None:
         self.edges_nm, self.centres_nm = edges, 0.5 * (edges[1:] + edges[:-1])
-        self._edges, self._widths = edges[:-1].astype(np.float32), np.diff(edges).astype(np.float32)
+        self._edges, self._widths = (self.rotated(t.astype(np.float32)) for t in (edges[:-1], np.diff(edges)))
         nm = table("wavelength_nm")
         basis = np.stack([self.means(nm, table(name)) for name in ("red", "green", "blue")])
         self.basis = basis / basis.sum(axis=0)
@@ -350,14 +350,15 @@ class SpectralRange:
         integral = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(x))])
         return np.diff(integral[np.searchsorted(x, self.edges_nm)]) / np.diff(self.edges_nm)
 
-    def wavelengths_nm(self, sample: FloatArray) -> FloatArray:
-        """Wavelengths [N] in nm for uniform samples [N] in [0, 1)."""
+    def wavelengths_nm(self, sample: FloatArray, lanes: int = 1) -> FloatArray:
+        """Wavelengths [lanes, N] in nm of the first lanes, for uniform samples [N] in [0, 1)."""
         place = sample * np.float32(self.bins)
         number = place.astype(np.intp)
         place -= number
-        place *= self._widths.take(number)
-        place += self._edges.take(number)
-        return place
+        wavelengths = self._widths[:lanes].take(number, axis=1)
+        wavelengths *= place
+        wavelengths += self._edges[:lanes].take(number, axis=1)
+        return wavelengths
 
     def bin_of(self, sample: FloatArray) -> NDArray[np.intp]:
         """Bins [N] of uniform samples [N] in [0, 1)."""

@@ -200,11 +200,6 @@ class Film:
         with self._lock:
             return next(self._missing, None)
 
-    def stop(self) -> None:
-        """Give out no more tiles."""
-        with self._lock:
-            self._missing = iter(())
-
     def add(
         self, tile: int, part: int, sums: NDArray[np.float64], spill: Spill | None, seconds: NDArray[np.float64]
     ) -> None:

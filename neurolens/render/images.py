@@ -4,9 +4,8 @@ Their sizes are checked before they are decoded. Radiance (.hdr) has three manti
 text header, an empty line, a line with the size, then rows of pixels, each row in one of two forms (Greg Ward, "Real
 Pixels", Graphics Gems II, 1991; the Radiance reference manual, "Picture file format"):
 
-old     4 bytes a pixel; a pixel 1, 1, 1, n repeats the one before it n times, or n * 256^k times where k such pixels
-        stand before it
-new     2, 2, width in two bytes, then the row of each of the four bytes by itself, as runs: n > 128 repeats the next
+plain   4 bytes a pixel (runs of whole pixels, which programs wrote before 1991, are refused)
+runs    2, 2, width in two bytes, then the row of each of the four bytes by itself, as runs: n > 128 repeats the next
         byte n - 128 times, any other n is followed by n bytes
 
 A mantissa m with the exponent e is m * 2^(e - 136), as Blender, OpenImageIO and OpenCV read it; e = 0 is black.
@@ -26,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, warn
 from neurolens.base.files import read_bytes
 from neurolens.cameras.contract import FloatArray
 from neurolens.lens.apertures import MAX_MASK, THRESHOLD, Aperture
@@ -43,8 +42,7 @@ _MAGIC = (b"#?RADIANCE", b"#?RGBE")
 _RGBE = "32-bit_rle_rgbe"
 _SIZE = re.compile(rb"([-+])Y (\d{1,9}) ([-+])X (\d{1,9})")
 _LONGEST_LINE, _MOST_LINES = 4096, 1000  # of the header
-_NEW = range(8, 1 << 15)  # widths of rows in the new form
-_REPEAT = b"\1\1\1"
+_NEW = range(8, 1 << 15)  # widths of rows with runs
 Bytes = NDArray[np.uint8]
 
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # Pillow logs what our errors say of damaged files
@@ -103,7 +101,8 @@ def read_picture(
                 data, lambda *size: check_size(scene, field, str(path), size, most, pixels)
             )
         if ignored:
-            _warn(scene, field, f"{path.name}: its pixels are taken as they are stored, without {', '.join(ignored)}")
+            unused = ", ".join(ignored)
+            warn(f"{scene}: {field}: {path.name}: its pixels are taken as they are stored, without {unused}")
         return radiance
     with _opened(scene, field, path, most, pixels) as picture:
         if picture.mode.startswith("I;16"):
@@ -126,18 +125,12 @@ def _clamped(scene: Path, field: str, path: Path, picture: FloatArray, most: flo
     bad = ~((picture >= 0) & (picture <= most)).all(axis=-1)  # so that NaN is bad
     if bad.any():
         row, column = divmod(int(bad.argmax()), bad.shape[1])
-        _warn(
-            scene, field,
-            f"{path.name}: {int(bad.sum())} of {bad.size} pixels have values that are negative, not a number or "
-            f"above {most:g}, the first in row {row + 1} from the top, column {column + 1}: they are clamped",
-        )  # fmt: skip
+        count, place = f"{int(bad.sum())} of {bad.size} pixels", f"row {row + 1} from the top, column {column + 1}"
+        said = f"{count} have values that are negative, not a number or above {most:g}, the first in {place}"
+        warn(f"{scene}: {field}: {path.name}: {said}: they are clamped")
         np.nan_to_num(picture, copy=False, nan=0.0, posinf=most, neginf=0.0)
         np.clip(picture, 0, most, out=picture)
     return picture
-
-
-def _warn(scene: Path, field: str, said: str) -> None:
-    warnings.warn(f"{scene}: {field}: {said}", NeurolensWarning, stacklevel=3)
 
 
 def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:
@@ -246,10 +239,13 @@ def _row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
         if int.from_bytes(start[2:], "big") != width:
             raise ValueError("one of its rows has another width")
         return _new_row(data, place + 4, width)
-    whole = np.frombuffer(data[place : place + 4 * width], np.uint8)
-    if whole.size == 4 * width and not (whole.reshape(width, 4)[:, :3] == 1).all(axis=1).any():
-        return whole.reshape(width, 4), place + 4 * width
-    return _old_row(data, place, width)
+    row = np.frombuffer(data[place : place + 4 * width], np.uint8)
+    if row.size < 4 * width:
+        raise ValueError("it is cut short")
+    row = row.reshape(width, 4)
+    if (row[:, :3] == 1).all(axis=1).any():
+        raise ValueError("it has runs of whole pixels, which programs wrote before 1991: write it again")
+    return row, place + 4 * width
 
 
 def _new_row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
@@ -269,22 +265,3 @@ def _new_row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
         if len(planes) > end:
             raise ValueError("one of its runs is longer than its row")
     return np.frombuffer(planes, np.uint8).reshape(4, width).T, place
-
-
-def _old_row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
-    pixels, shift = bytearray(), 0
-    while len(pixels) < 4 * width:
-        pixel = data[place : place + 4]
-        if len(pixel) < 4:
-            raise ValueError("it is cut short")
-        place += 4
-        if pixel[:3] != _REPEAT:
-            pixels += pixel
-            shift = 0
-            continue
-        count = pixel[3] << shift
-        if not pixels or shift > 24 or 4 * count > 4 * width - len(pixels):
-            raise ValueError("one of its runs is longer than its row, or repeats nothing")
-        pixels += pixels[-4:] * count
-        shift += 8
-    return np.frombuffer(pixels, np.uint8).reshape(width, 4), place

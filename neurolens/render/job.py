@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
-from neurolens.cameras.dispersion import film_shift
+from neurolens.cameras.reduced import film_shift
 from neurolens.graph.compiler import c_source, has_compiler, load_compiled
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
-from neurolens.render.environment import sun_spectrum, total_spectrum
 from neurolens.render.film import Film, PixelGrid, Spill, Tiling
 from neurolens.render.integrator import trace
+from neurolens.render.lights import sun_spectrum, total_spectrum
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
 from neurolens.render.scene import CameraSettings, Scene
 from neurolens.render.scenetables import Vector
@@ -145,10 +145,10 @@ class Job:
         size = {"width": self.grid.width, "height": self.grid.height}
         return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
-    def render_tile(self, tile: int, part: int) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
+    def render_tile(self, which: tuple[int, int]) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
         """Sums [pixels, columns] of one pass of one tile, what belongs to other pixels, and the seconds [2] spent in
         the camera, and in all."""
-        began = time.perf_counter()
+        began, (tile, part) = time.perf_counter(), which
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
         pixels = np.arange(within.start, within.stop) + self.tiling.start
@@ -167,7 +167,7 @@ class Job:
         bins, distance = self.spectral.bin_of(hue), np.full(len(hue), np.inf, np.float32)
         rays, shared = (lens.origin, lens.direction, lens.weight, bins), None
         if lens.places is not None:
-            shared = np.count_nonzero(lens.weight, axis=0).astype(np.float32)
+            shared = (lens.weight > 0).sum(axis=0, dtype=np.uint8).astype(np.float32)
         value = trace(self.world, self.sampler, keys, *rays, self.max_depth, first_distance=distance, shared=shared)
         sums = np.empty((len(pixels), columns.COLUMNS))
         spill = self._sum_light(sums, value, bins, lens, within)
@@ -225,8 +225,7 @@ class Job:
     def _hero_rays(self, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> LensRays:
         """Rays of the hero wavelengths, with the weights of all lanes."""
         lanes = self.spectral.lanes
-        used = lanes if self._tints is None or self.mode == "companions" else 1
-        nm = np.stack([self._camera_wavelengths(_turned(hue, np.float32(k / lanes))) for k in range(used)])
+        nm = self._camera_wavelengths(hue, lanes if self._tints is None or self.mode == "companions" else 1)
         if self.mode == "companions":
             return self._camera_rays(film_mm, pupil, nm)
         hero = self._camera_rays(film_mm, pupil, nm[:1])
@@ -242,37 +241,32 @@ class Job:
 
     def _camera_rays(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> LensRays:
         """Rays in the scene for wavelengths [lanes, N]; their weight is 0 where they do not pass."""
-        lanes, count = wavelength_nm.shape
-        origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
-        weight = np.empty((lanes, count), np.float32)
-        places = np.empty((lanes, 2, count), np.float32) if lanes > 1 else None
-        at_once = getattr(self.camera, "rays_a_call", RAYS_A_CALL)
-        for start in range(0, count, at_once):
+        at_once, parts = getattr(self.camera, "rays_a_call", RAYS_A_CALL), list[LensRays]()
+        for start in range(0, film_mm.shape[1], at_once):
             part = slice(start, start + at_once)
             film, square, nm = (np.ascontiguousarray(x[:, part]) for x in (film_mm, pupil, wavelength_nm))
-            if places is None:
-                rays = self.camera.sample(film, square, nm[0])
-                weight[0, part] = np.where(rays.status == 0, rays.weight, np.float32(0))
+            if len(nm) == 1:
+                rays, places = self.camera.sample(film, square, nm[0]), None
+                weight = np.where(rays.status == 0, rays.weight, np.float32(0))[None]
             else:
                 found = self.camera.sample_spectrum(film, square, nm)  # type: ignore[attr-defined]
-                rays, weight[:, part], places[..., part] = found.rays, found.weight, found.film_mm
-            np.add(self._axes @ rays.origin_m, self._position[:, None], out=origin[:, part])
-            np.matmul(self._axes, rays.direction, out=direction[:, part])
-        return LensRays(origin, direction, weight, places)
+                rays, weight, places = found.rays, found.weight, found.film_mm
+            origin = self._axes @ rays.origin_m
+            origin += self._position[:, None]
+            parts.append(LensRays(origin, self._axes @ rays.direction, weight, places))
+        if len(parts) == 1:
+            return parts[0]
+        return LensRays(
+            *(None if some[0] is None else np.concatenate(some, axis=-1) for some in zip(*parts, strict=True))
+        )
 
-    def _camera_wavelengths(self, hue: FloatArray) -> FloatArray:
-        """Wavelengths for the camera, clipped to its range if it does not disperse."""
-        wavelengths = self.spectral.wavelengths_nm(hue)
+    def _camera_wavelengths(self, hue: FloatArray, lanes: int) -> FloatArray:
+        """Wavelengths [lanes, N] for the camera, clipped to its range if it does not disperse."""
+        wavelengths = self.spectral.wavelengths_nm(hue, lanes)
         accepted = self.camera.wavelength_nm
         if accepted is not None:
             np.clip(wavelengths, accepted[0], accepted[1], out=wavelengths)
         return wavelengths
-
-
-def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
-    turned = hue + by
-    turned -= turned >= 1
-    return turned
 
 
 # Of the layers, for the metadata of a picture.

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, warn
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.meshfile import TriangleSet, read_file, read_library, read_triangles, whole_values
+from neurolens.render.meshfile import TriangleSet, read_file, read_library, whole_values
 from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Rays, slabs
 from neurolens.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshSettings, Texture, Vector
 
@@ -169,8 +168,7 @@ def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> T
         k = int(np.flatnonzero(flat)[0])
         expected = "a triangle with an area, not a degenerate one"
         raise InputError(scene, f"{field}.faces[{k}]", faces[k].tolist(), expected)
-    text = f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out"
-    warnings.warn(text, NeurolensWarning, stacklevel=2)
+    warn(f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out")
     return replace(mesh, faces=faces[~flat])
 
 
@@ -201,21 +199,22 @@ def _is_closed(corners: NDArray[np.float64]) -> bool:
     return forth[0].shape == back[0].shape and all(np.array_equal(x, y) for x, y in zip(forth, back, strict=True))
 
 
-@dataclass
 class Parts:
-    """Meshes of one material each, and the materials and textures that come with them."""
+    """The meshes of a scene in parts of one material each, and the materials and textures that come with them.
 
-    meshes: list[MeshSettings] = field(default_factory=list)
-    triangles: list[TriangleSet] = field(default_factory=list)
-    materials: dict[str, Material] = field(default_factory=dict)
-    textures: dict[str, Texture] = field(default_factory=dict)
+    A mesh that has a material is one part, another is cut by the materials of its file. `known`: those of the scene.
 
-    def add(self, scene: Path, place: str, mesh: MeshSettings, known: Mapping[str, Material]) -> None:
-        """Add a mesh: as it is where it has a material, else cut by the materials of its file.
+    Raises:
+        InputError: as of `read_mesh`; a file without materials, or with some that are defined nowhere.
+    """
 
-        Raises:
-            InputError: as of `read_mesh`; a file without materials, or with some that are defined nowhere.
-        """
+    def __init__(self, scene: Path, meshes: Sequence[MeshSettings], known: Mapping[str, Material]) -> None:
+        self.meshes, self.triangles = list[MeshSettings](), list[TriangleSet]()
+        self.materials, self.textures = dict[str, Material](), dict[str, Texture]()
+        for k, mesh in enumerate(meshes):
+            self._add(scene, f"meshes[{k}]", mesh, known)
+
+    def _add(self, scene: Path, place: str, mesh: MeshSettings, known: Mapping[str, Material]) -> None:
         if mesh.material is not None:
             self.meshes.append(mesh)
             self.triangles.append(read_mesh(scene, place, mesh))
@@ -223,16 +222,16 @@ class Parts:
         if mesh.file is None or mesh.file.suffix.lower() != ".obj":
             expected = "the name of a material; only an OBJ file with usemtl brings its own"
             raise InputError(scene, f"{place}.material", "(missing)", expected)
-        whole, used = read_triangles(scene, f"{place}.file", scene.parent / mesh.file)
-        libraries = list(dict.fromkeys(used.libraries))
+        whole = read_file(scene, f"{place}.file", scene.parent / mesh.file, whole=False)
+        libraries = list(dict.fromkeys(whole.libraries))
         found = read_library(scene, mesh.file, libraries)
         # Faces of a material that have texture coordinates or normals are apart from those that have none.
         has_uv, has_normals = (
             np.zeros(len(whole.faces), np.bool_) if v is None else np.isfinite(v[whole.faces[:, 0]]).all(1)
             for v in (whole.uv, whole.normals)
         )
-        numbers = {name: k for k, name in enumerate(dict.fromkeys(used.names))}
-        number = np.array([4 * numbers[name] for name in used.names], np.int64) + 2 * ~has_uv + ~has_normals
+        numbers = {name: k for k, name in enumerate(dict.fromkeys(whole.materials))}
+        number = np.array([4 * numbers[name] for name in whole.materials], np.int64) + 2 * ~has_uv + ~has_normals
         names = list(numbers)
         for form in np.unique(number):
             name, chosen = names[form // 4], number == form
@@ -241,7 +240,7 @@ class Parts:
                 if name not in found:
                     expected = f"a material of the scene or of {', '.join(libraries) or 'an MTL file'}"
                     raise InputError(scene, f"{place}.file, usemtl", name or "(none before a face)", expected)
-                objects = dict.fromkeys(used.objects[k] for k in np.flatnonzero(chosen))
+                objects = dict.fromkeys(whole.objects[k] for k in np.flatnonzero(chosen).tolist())
                 which = f"{scene.parent / mesh.file}, {', '.join(filter(None, objects)) or name}"
                 material = self._defined(f"{mesh.file.stem}:{name}", found[name], not form & 2, which)
             part = replace(mesh, material=material)
@@ -256,8 +255,7 @@ class Parts:
             self.materials[name] = Material("diffuse", texture=name)
             return name
         if picture is not None:
-            text = f"{which[:300]}: no texture coordinates: {picture.name} is left out there"
-            warnings.warn(text, NeurolensWarning, stacklevel=2)
+            warn(f"{which[:300]}: no texture coordinates: {picture.name} is left out there")
             name += " without coordinates" if name in self.materials else ""
         self.materials[name] = Material("diffuse", reflectance=colour)
         return name

@@ -16,7 +16,7 @@ import os
 import re
 import warnings
 from array import array
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -47,7 +47,6 @@ _INDEX = r"-?[1-9][0-9]{0,9}"
 _CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
 # Of each kind of line: the fewest and most words after it, how many are used, what is expected.
 _OBJ_LINES = {"v": (3, 7, 3, "v X Y Z"), "vt": (2, 3, 2, "vt U V"), "vn": (3, 3, 3, "vn X Y Z")}
-_FACE = "f I J K, counted from 1, or back from -1"
 _LARGEST_MTL, _MOST = 4_000_000, 1000  # bytes of an MTL file, materials
 _GREY: Vector = (0.8, 0.8, 0.8)  # of a material that says nothing
 
@@ -59,29 +58,16 @@ class TriangleSet:
     Attributes:
         vertices: [V, 3] float64 m. faces: [T, 3] counted from 0. uv: [V, 2] texture coordinates, from the lower left
             corner of a picture, or None. normals: [V, 3] unit vectors to interpolate, or None.
+        libraries: MTL files that an OBJ file names. materials, objects: of each of its triangles, by name.
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     uv: NDArray[np.float64] | None = None
     normals: NDArray[np.float64] | None = None
-
-
-class Used(NamedTuple):
-    """Materials of an OBJ file: the MTL files that it names, and the material and the object of each triangle."""
-
-    libraries: list[str]
-    names: list[str]
-    objects: list[str]
-
-
-def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
-    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units, polygons cut into triangles.
-
-    Errors as of `read_mesh`.
-    """
-    mesh = read_triangles(scene, field, path)[0]
-    return replace(mesh, uv=whole_values(mesh.uv), normals=whole_values(mesh.normals))
+    libraries: Sequence[str] = ()
+    materials: Sequence[str] = ()
+    objects: Sequence[str] = ()
 
 
 def whole_values(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
@@ -89,55 +75,53 @@ def whole_values(values: NDArray[np.float64] | None) -> NDArray[np.float64] | No
     return None if values is None or np.isnan(values).any() else values
 
 
-def read_triangles(scene: Path, field: str, path: Path) -> tuple[TriangleSet, Used]:
+def read_file(scene: Path, field: str, path: Path, whole: bool = True) -> TriangleSet:
+    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units, polygons cut into triangles.
+
+    Without `whole`, texture coordinates and normals of an OBJ file are NaN at corners that have none; with it they
+    count where all corners have them. Errors as of `read_mesh`.
+    """
     kind = path.suffix.lower()
     try:
         if kind not in (".obj", ".ply"):
             raise InputError(scene, field, str(path), "a mesh file that ends in .obj or .ply")
         content = read_bytes(path, LARGEST_FILE, "a mesh file", (scene, field))
-        if kind == ".obj":
-            return _read_obj(scene, field, path, content)
-        return read_polygons(content), Used([], [], [])
+        mesh = _read_obj(scene, field, path, content) if kind == ".obj" else read_polygons(content)
     except ValueError as error:
         raise InputError(scene, field, str(path), f"a whole PLY file ({error})") from None
+    return replace(mesh, uv=whole_values(mesh.uv), normals=whole_values(mesh.normals)) if whole else mesh
 
 
-def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, Used]:
-    """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans.
-
-    Texture coordinates and normals are NaN at corners that have none.
-    """
+def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSet:
+    """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans."""
     if b"\0" in content:
         raise InputError(scene, field, str(path), "a text file, without zero bytes")
     # Only comments and names can hold more than ASCII, in any encoding. A line may go on after a backslash.
     text = content.decode("utf-8-sig", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
     values: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: dict[tuple[int, ...], int] = {}
-    faces, name, thing, materials = [], "", "", Used([], [], [])
+    faces, libraries, materials, objects = list[tuple[int, ...]](), list[str](), list[str](), list[str]()
+    names = {"usemtl": "", "o": ""}  # of the material and of the object
     for number, line in enumerate(text.splitlines(), 1):
         bare = line.partition("#")[0].strip()
         kind, *words = bare.split() or [""]
-        if kind == "mtllib":
-            materials.libraries.append(bare[len(kind) :].strip())  # names may hold blanks
-        elif kind == "usemtl":
-            name = bare[len(kind) :].strip()
-        elif kind == "o":
-            thing = bare[len(kind) :].strip()
-        if kind not in ("f", *_OBJ_LINES):
-            continue
         place = f"{field} {path.name}, line {number}"
-        if kind == "f":
+        if kind == "mtllib":
+            libraries.append(bare[len(kind) :].strip())  # names may hold blanks
+        elif kind in names:
+            names[kind] = bare[len(kind) :].strip()
+        elif kind == "f":
             if len(words) < 3 or not all(len(word) <= _LONGEST and _CORNER.fullmatch(word) for word in words):
-                raise InputError(scene, place, line[:60], _FACE)
+                raise InputError(scene, place, line[:60], "f I J K, counted from 1, or back from -1")
             first, *rest = (corners.setdefault(c, len(corners)) for c in _corners(scene, place, words, values))
             faces += [(first, *edge) for edge in pairwise(rest)]
-            materials.names.extend([name] * (len(rest) - 1))
-            materials.objects.extend([thing] * (len(rest) - 1))
-            continue
-        least, most, used, form = _OBJ_LINES[kind]
-        if not least <= len(words) <= most or not all(map(_is_number, words)):
-            raise InputError(scene, place, line[:60], form)
-        values[kind].append([float(word) for word in words[:used]])
+            materials += [names["usemtl"]] * (len(rest) - 1)
+            objects += [names["o"]] * (len(rest) - 1)
+        elif kind in _OBJ_LINES:
+            least, most, used, form = _OBJ_LINES[kind]
+            if not least <= len(words) <= most or not all(map(_is_number, words)):
+                raise InputError(scene, place, line[:60], form)
+            values[kind].append([float(word) for word in words[:used]])
     rows = np.array(list(corners), np.intp).reshape(-1, 3).T
     vertices, uv, normals = (
         None
@@ -146,7 +130,8 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[Tria
         for kind, row in zip(values, rows, strict=True)
     )
     assert vertices is not None  # every corner has one
-    return TriangleSet(vertices, np.array(faces, np.int64).reshape(-1, 3), uv, normals), materials
+    triangles = np.array(faces, np.int64).reshape(-1, 3)
+    return TriangleSet(vertices, triangles, uv, normals, libraries, materials, objects)
 
 
 def _is_number(word: str) -> bool:
@@ -201,31 +186,24 @@ def _read_mtl(path: Path, folder: Path) -> dict[str, tuple[Vector, Path | None]]
     name = ""
     for number, line in enumerate(content.decode("utf-8-sig", "replace").splitlines(), 1):
         word, _, rest = line.partition("#")[0].strip().partition(" ")
-        rest = rest.strip()
+        place, rest = f"line {number}, {word}", rest.strip()
         if word == "newmtl":
             name = rest
             found[name] = (_GREY, None)
         elif word in ("Kd", "map_Kd") and name not in found:
-            raise InputError(path, f"line {number}, {word}", rest[:60], "newmtl before it")
-        elif word == "Kd":
-            found[name] = (_colour(path, number, rest), found[name][1])
+            raise InputError(path, place, rest[:60], "newmtl before it")
+        elif word == "Kd":  # linear RGB; one number stands for three
+            words = rest.split()
+            values = [float(w) for w in words if _is_number(w) and 0 <= float(w) <= 1]
+            if len(words) not in (1, 3) or len(values) != len(words):
+                raise InputError(path, place, rest[:60], "three numbers from 0 to 1")
+            red, green, blue = (values * 3)[:3]
+            found[name] = ((red, green, blue), found[name][1])
         elif word == "map_Kd":
             if not rest or rest.startswith("-"):
-                raise InputError(path, f"line {number}, map_Kd", rest[:60], "the name of a picture, without options")
+                raise InputError(path, place, rest[:60], "the name of a picture, without options")
             found[name] = (found[name][0], folder / PurePosixPath(rest.replace("\\", "/")))
     return found
-
-
-def _colour(path: Path, number: int, text: str) -> Vector:
-    """Linear RGB; one number stands for three."""
-    words = text.split()
-    try:
-        values = [float(word) for word in words * (3 if len(words) == 1 else 1)] if len(text) < 100 else []
-    except ValueError:
-        values = []
-    if len(values) != 3 or not all(0 <= v <= 1 for v in values):
-        raise InputError(path, f"line {number}, Kd", text[:60], "three numbers from 0 to 1")
-    return values[0], values[1], values[2]
 
 
 class Property(NamedTuple):
@@ -244,6 +222,11 @@ class Element:
     count: int
     properties: list[Property]
 
+    @property
+    def plain(self) -> bool:
+        """Whether it has no lists."""
+        return not any(p.length for p in self.properties)
+
 
 def read_polygons(content: bytes) -> TriangleSet:
     """Read the bytes of a PLY file; polygons are cut into fans.
@@ -258,28 +241,22 @@ def read_polygons(content: bytes) -> TriangleSet:
     for element in elements:
         if element.count > len(content):
             raise ValueError(f"{element.count} elements {element.name} in {len(content)} bytes")
-    columns: dict[str, NDArray[np.float64]] = {}
-    faces = np.empty((0, 3), np.int64)
+    columns, faces = dict[str, NDArray[np.float64]](), np.empty((0, 3), np.int64)
     try:
         body = _Body(content[content.index(b"\n", len(head)) + 1 :], order)
         for element in elements:
-            plain = not any(p.length for p in element.properties)
-            found = body.columns(element) if plain else {}
-            lists = {} if plain else body.lists(element)
-            if element.name == "vertex":
-                columns = found
-            corners = next((p for p in element.properties if p.name in _CORNERS and p.length), None)
-            if element.name == "face" and corners is not None:
-                faces = _fans(body, corners, *lists[corners.name])
+            found, fans = (body.columns(element), faces) if element.plain else ({}, body.fans(element))
+            columns = found if element.name == "vertex" else columns
+            faces = fans if element.name == "face" else faces
     except (IndexError, OverflowError):
         raise ValueError("the file ends before its last element") from None
 
-    def stacked(names: Iterable[str]) -> NDArray[np.float64]:
-        return np.stack([columns[name] for name in names], 1)
+    def stacked(*names: str) -> NDArray[np.float64] | None:
+        return np.stack([columns[name] for name in names], 1) if columns.keys() >= set(names) else None
 
-    uv = next((pair for pair in _COORDINATES if columns.keys() >= set(pair)), None)
-    normals = ("nx", "ny", "nz") if columns.keys() >= {"nx", "ny", "nz"} else None
-    return TriangleSet(stacked("xyz"), faces, uv and stacked(uv), normals and stacked(normals))
+    vertices, uvs = stacked(*"xyz"), (stacked(*pair) for pair in _COORDINATES)
+    assert vertices is not None  # the header has them
+    return TriangleSet(vertices, faces, next((uv for uv in uvs if uv is not None), None), stacked("nx", "ny", "nz"))
 
 
 def _header(text: str) -> tuple[str, list[Element]]:
@@ -292,6 +269,8 @@ def _header(text: str) -> tuple[str, list[Element]]:
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,12}", count):
                 elements.append(Element(name, int(count), []))
             case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys() and elements:
+                if _TYPES[length][0] == "f" or (name in _CORNERS and _TYPES[kind][0] == "f"):
+                    raise ValueError("lists whose length is a fraction, or faces that name vertices by fractions")
                 elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[length]))
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1].properties.append(Property(name, _TYPES[kind]))
@@ -300,7 +279,7 @@ def _header(text: str) -> tuple[str, list[Element]]:
             case _:
                 raise ValueError(f"{line[:60]!r} in its header")
     vertex = next((e for e in elements if e.name == "vertex"), None)
-    if order is None or vertex is None or any(p.length for p in vertex.properties):
+    if order is None or vertex is None or not vertex.plain:
         raise ValueError("its header names no format, or no vertices of plain numbers")
     if not {p.name for p in vertex.properties} >= set("xyz"):
         raise ValueError("its vertices have no x, y and z")
@@ -325,7 +304,7 @@ class _Body:
 
     def __init__(self, content: bytes, order: str) -> None:
         self._content, self._order, self._at = content, order, 0
-        self._values = np.frombuffer(content, np.uint8) if order else _numbers(content)
+        self._values: NDArray[Any] = np.frombuffer(content, np.uint8) if order else _numbers(content)
 
     def _size(self, kind: str) -> int:
         return int(kind[1]) if self._order else 1
@@ -345,46 +324,35 @@ class _Body:
         with np.errstate(invalid="ignore"):  # NaN, which the mesh is refused for
             return {p.name: v.astype(np.float64) for p, v in zip(element.properties, values, strict=True)}
 
-    def lists(self, element: Element) -> dict[str, tuple[array[int], array[int]]]:
-        """The lists of the next elements by name: where the values of each begin, and how many there are."""
-        found = {p.name: (array("q"), array("q")) for p in element.properties if p.length}
-        if any(p.length[:1] == "f" for p in element.properties):
-            raise ValueError("lists whose length is a fraction")
+    def fans(self, element: Element) -> NDArray[np.int64]:
+        """The polygons of the next elements, in their order, as fans of triangles [T, 3]; none without corners."""
         big: Literal["big", "little"] = "big" if self._order == ">" else "little"
+        starts, counts, form = array("q"), array("q"), ""  # where the corners of each begin, and how many there are
         at, end = self._at, self._values.size
         for _ in range(element.count):
             for name, kind, length in element.properties:
                 count = 1
                 if length:
-                    start, at = at, at + self._size(length)
-                    number = self._content[start:at] if self._order else self._values[start]
+                    first, at = at, at + self._size(length)
+                    number = self._content[first:at] if self._order else self._values[first]
                     count = int.from_bytes(number, big) if isinstance(number, bytes) else int(number)
-                    found[name][0].append(at)
-                    found[name][1].append(count)
+                    if name in _CORNERS:
+                        starts.append(at)
+                        counts.append(count)
+                        form = kind
                 at += count * self._size(kind)
                 if count < 0 or at > end:
                     raise IndexError
         self._at = at
-        return found
-
-    def integers(self, starts: NDArray[np.int64], count: int, kind: str) -> NDArray[np.int64]:
-        """Lists [n, count] of one length that begin at some places [n]."""
-        taken = self._values[starts[:, None] + np.arange(count * self._size(kind))]
-        return (taken.view(self._order + kind) if self._order else taken).astype(np.int64)
-
-
-def _fans(body: _Body, corners: Property, starts: array[int], counts: array[int]) -> NDArray[np.int64]:
-    """Fans [T, 3] of polygons, in their order."""
-    if corners.kind[0] == "f":
-        raise ValueError("its faces name vertices by fractions")
-    start, many = np.frombuffer(starts, np.int64), np.frombuffer(counts, np.int64)
-    if (few := many[many < 3]).size:
-        raise ValueError(f"a face of {few[0]} corners")
-    fans, face = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
-    for count in np.unique(many):
-        rows = np.flatnonzero(many == count)
-        index = body.integers(start[rows], int(count), corners.kind)
-        triangles = np.stack([np.broadcast_to(index[:, :1], index[:, 2:].shape), index[:, 1:-1], index[:, 2:]], 2)
-        fans.append(triangles.reshape(-1, 3))
-        face.append(np.repeat(rows, count - 2))
-    return np.concatenate(fans)[np.argsort(np.concatenate(face), kind="stable")]
+        start, many = np.frombuffer(starts, np.int64), np.frombuffer(counts, np.int64)
+        if (few := many[many < 3]).size:
+            raise ValueError(f"a face of {few[0]} corners")
+        fans, face = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+        for count in np.unique(many).tolist():
+            rows = np.flatnonzero(many == count)
+            taken = self._values[start[rows][:, None] + np.arange(count * self._size(form))]
+            index = (taken.view(self._order + form) if self._order else taken).astype(np.int64)
+            corner = np.broadcast_to(index[:, :1], (len(rows), count - 2))
+            fans.append(np.stack([corner, index[:, 1:-1], index[:, 2:]], 2).reshape(-1, 3))
+            face.append(np.repeat(rows, count - 2))
+        return np.concatenate(fans)[np.argsort(np.concatenate(face), kind="stable")]

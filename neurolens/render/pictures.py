@@ -15,7 +15,6 @@ import json
 import math
 import os
 import sys
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
@@ -27,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from neurolens import __version__
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_path, open_regular
 from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
@@ -190,8 +189,7 @@ def read_colour_space(path: str | Path) -> ColourSpace | None:
         if np.allclose(stated, space.chromaticities, rtol=0, atol=_ROUNDED):
             return space
     names = " nor ".join(COLOUR_SPACES)
-    text = f"{path}: its chromaticities are those of neither {names}; its colours are read as sRGB"
-    warnings.warn(text, NeurolensWarning, stacklevel=2)
+    warn(f"{path}: its chromaticities are those of neither {names}; its colours are read as sRGB")
     return SRGB
 
 

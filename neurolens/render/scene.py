@@ -152,12 +152,16 @@ def load_scene(path: str | Path) -> Scene:
 def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> Scene:
     """Make a scene from tables in memory, as `load_scene` does; `path` is for messages and for finding files."""
     path = Path(path)
-    settings, triangles = _with_meshes(path, from_dict(SceneSettings, _with_film(tables, path), path))
+    settings = from_dict(SceneSettings, _with_film(tables, path), path)
+    parts = Parts(path, settings.meshes, settings.materials)
+    materials, textures = parts.materials | settings.materials, parts.textures | settings.textures
+    settings = replace(settings, meshes=tuple(parts.meshes), materials=materials, textures=textures)
+    triangles = tuple(parts.triangles)
     _check_references(path, settings, triangles)
     _check_camera(path, settings, triangles)
-    textures = {name: t.file for name, t in settings.textures.items() if t.file is not None}
-    pictures = read_pictures(path, {f"textures.{name}.file": path.parent / file for name, file in textures.items()})
-    images = dict(zip(textures, pictures.values(), strict=True))
+    named = {name: t.file for name, t in textures.items() if t.file is not None}
+    pictures = read_pictures(path, {f"textures.{name}.file": path.parent / file for name, file in named.items()})
+    images = dict(zip(named, pictures.values(), strict=True))
     around, scale = settings.environment.file, settings.environment.scale
     return Scene(
         path.stem,
@@ -181,17 +185,6 @@ def _with_film(tables: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
     film_mm = [camera.get(side, default) for side, default in zip(sides, _FILM_MM, strict=True)]
     rest = {key: value for key, value in camera.items() if key not in sides}
     return {**tables, "camera": {**rest, "film_mm": film_mm}}
-
-
-def _with_meshes(path: Path, settings: SceneSettings) -> tuple[SceneSettings, tuple[TriangleSet, ...]]:
-    """The meshes, one a material, and the tables with the materials that their files bring."""
-    parts, materials = Parts(), settings.materials
-    for k, mesh in enumerate(settings.meshes):
-        parts.add(path, f"meshes[{k}]", mesh, materials)
-    more: dict[str, Any] = {"meshes": tuple(parts.meshes)}
-    if parts.materials:
-        more |= {"materials": parts.materials | materials, "textures": parts.textures | settings.textures}
-    return replace(settings, **more), tuple(parts.triangles)
 
 
 def seen_from(scene: Scene, path: str | Path, position_m: Vector | None, look_at_m: Vector | None) -> Scene:

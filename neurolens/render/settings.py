@@ -90,6 +90,11 @@ _MOST_PHOTONS = 1 << 30
 _QUICK_BINS, _QUICK_CELL_PX, _QUICK_PHOTONS = 5, 24.0, 1 << 16
 
 
+# Titles of the options of flare in the help.
+OF_LIGHTS, OF_PICTURE, OF_LAYERS = "lights, at least one; all of them together", "picture", "layers"
+OF_PHOTONS = "photons, and what scatters them"
+
+
 @dataclass(frozen=True)
 class Scatter:
     """The parts of a lens that scatter light, and how much; none by default.
@@ -107,20 +112,22 @@ class Scatter:
 
     barrel: float = setting(
         0.0, "of light that the barrel reflects, its rings and the stop, a fifth glossily", within=(0, 1),
-        metavar="SHARE",
+        metavar="SHARE", title=OF_PHOTONS,
     )  # fmt: skip
     gloss: float = 0.2
     sensor: float = setting(
-        0.0, "of light that the film reflects, half of it as a mirror", within=(0, 0.9), metavar="SHARE"
-    )
+        0.0, "of light that the film reflects, half of it as a mirror", within=(0, 0.9), metavar="SHARE",
+        title=OF_PHOTONS,
+    )  # fmt: skip
     mirror: float = 0.5
     dust: float = setting(
-        0.0, "of the front that is dusty: light scatters there, mean cosine 0.98", within=(0, 1), metavar="SHARE"
-    )
+        0.0, "of the front that is dusty: light scatters there, mean cosine 0.98", within=(0, 1), metavar="SHARE",
+        title=OF_PHOTONS,
+    )  # fmt: skip
     dust_forward: float = 0.98
     haze_per_mm: float = setting(
-        0.0, "scattering in glass, inverse of the mean free path, mean cosine 0.9", within=(0, 10)
-    )
+        0.0, "scattering in glass, inverse of the mean free path, mean cosine 0.9", within=(0, 10), title=OF_PHOTONS,
+    )  # fmt: skip
     haze_forward: float = 0.9
 
     def __post_init__(self) -> None:
@@ -157,42 +164,46 @@ class FlareSettings:
         "wavelengths of stars and photons, in equal steps over the range of light, 400 to 700 nm; ghosts take what "
         "their colours need, at most four times as many (default: 15)",
         within=(1, 256),
-        old=("wavelengths",),
-    )
+        old=("wavelengths",), title=OF_PICTURE,
+    )  # fmt: skip
     cell_px: float = setting(
         8.0, "size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
-        within=(1, 256), unit="pixels",
+        within=(1, 256), unit="pixels", title=OF_PICTURE,
     )  # fmt: skip
     brightest: int = setting(
         0, "ghosts with a layer of their own, those with the greatest values on the film",
-        within=(0, 64), option="layers",
+        within=(0, 64), option="layers", title=OF_LAYERS,
     )  # fmt: skip
     most: int = setting(
         32,
-        "of --image and of a scene: the lights of the most energy; what is left out is said. With --frames a scene has "
-        "the same ones in all frames, and those of pictures fade before they are left out",
-        within=(1, 10_000),
+        "of --image and of a scene: the lights of the most energy; what is left out is said. With --frames they fade "
+        "before they are left out",
+        within=(1, 10_000), title=OF_LIGHTS,
+    )  # fmt: skip
+    without: tuple[str, ...] = setting(
+        (), f"layer that is not made: {', '.join(LAYERS)}; repeatable", metavar="LAYER", title=OF_LAYERS
     )
-    without: tuple[str, ...] = setting((), f"layer that is not made: {', '.join(LAYERS)}; repeatable", metavar="LAYER")
     gains: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    starburst: bool = setting(False, "the layer starburst; some seconds a light")
+    starburst: bool = setting(False, "the layer starburst; some seconds a light", title=OF_LAYERS)
     photons: int = setting(
         0, "instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
-        within=(0, _MOST_PHOTONS),
+        within=(0, _MOST_PHOTONS), title=OF_PHOTONS,
     )  # fmt: skip
     most_reflections: int = setting(
-        10, "of photons and glare at most (default: 10)", within=(1, 1000), option="reflections"
-    )
+        10, "of photons and glare at most (default: 10)", within=(1, 1000), option="reflections", title=OF_PHOTONS,
+    )  # fmt: skip
     kernel_px: float = setting(
         3.0, "radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
-        within=(0, 100), unit="pixels",
+        within=(0, 100), unit="pixels", title=OF_PHOTONS,
     )  # fmt: skip
     glare: int = setting(
         0, f"photons a light and wavelength of the layer glare (default: {GLARE} if anything scatters, else none)",
-        within=(0, _MOST_PHOTONS),
+        within=(0, _MOST_PHOTONS), title=OF_PHOTONS,
     )  # fmt: skip
     scatter: Scatter = setting(Scatter(), "what scatters photons")
-    seed: int = setting(0, "of the chances of photons, the same in all frames; ghosts have none", within=(0, 1 << 20))
+    seed: int = setting(
+        0, "of the chances of photons, the same in all frames; ghosts have none", within=(0, 1 << 20), title=OF_PHOTONS
+    )
 
     def __post_init__(self) -> None:
         check_bounds(self, "flare")

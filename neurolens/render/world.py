@@ -13,12 +13,19 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.colour import Index, Palette, SpectralRange
-from neurolens.render.environment import SunLight, make_surroundings
-from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
+from neurolens.render.lights import (
+    FlatLights,
+    Lights,
+    LightSamples,
+    PointLights,
+    SphereLights,
+    SunLight,
+    Surroundings,
+)
 from neurolens.render.materials import CoatTable
 from neurolens.render.mesh import Mesh, has_embree, triangle_planes
 from neurolens.render.primitives import (
@@ -35,7 +42,7 @@ from neurolens.render.primitives import (
     Spheres,
 )
 from neurolens.render.scene import Scene
-from neurolens.render.scenetables import BLACK, Emitter, Material, Texture, Vector
+from neurolens.render.scenetables import BLACK, Emitter, Material, Texture
 
 Frame = NDArray[np.float64]
 _STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still finite in float32
@@ -44,41 +51,20 @@ _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS
 _MANY_QUADS = 128  # beyond, a mesh is faster than testing one after the other
 
 
-def _frame(origin: Frame, u: Frame, v: Frame, size: tuple[float, float]) -> Frame:
-    """Coordinates in metres along unit vectors u and v as affine functions of a point, [2, 4], and the size [2, 1]."""
-    rows = [[*axis, -(origin @ axis), length] for axis, length in zip((u, v), size, strict=True)]
-    return np.array(rows)
+def _frame(origin: Frame, u: Frame, v: Frame, size: Sequence[float] = (1.0, 1.0)) -> Frame:
+    """Coordinates in metres along unit vectors u and v as affine functions of a point, and the size, [1, 2, 5]."""
+    return np.array([[[*axis, -(origin @ axis), length] for axis, length in zip((u, v), size, strict=True)]])
 
 
-def quad_frame(corner: Frame, edge_u: Frame, edge_v: Frame) -> Frame:
-    """The frame of a rectangle: it begins at the corner and runs along the edges."""
-    lengths = float(np.linalg.norm(edge_u)), float(np.linalg.norm(edge_v))
-    return _frame(corner, edge_u / lengths[0], edge_v / lengths[1], lengths)
-
-
-def plane_frame(point: Frame, normal: Frame) -> Frame:
+def _plane_frame(point: Frame, normal: Frame) -> Frame:
     """The frame of a plane: it begins at a point and follows the scene's x axis, or z where that is steeper."""
     axis = np.eye(3)[2 if abs(normal[0]) > 0.9 else 0]
     u = axis - normal * (axis @ normal)
     u /= np.linalg.norm(u)
-    return _frame(point, u, np.cross(normal, u), (1.0, 1.0))
+    return _frame(point, u, np.cross(normal, u))
 
 
-def disc_frame(centre: Frame, normal: Frame, radius: float) -> Frame:
-    """The frame of a disc's texture, from the lower left corner of the square around the disc."""
-    frame = plane_frame(centre, normal)
-    frame[:, 3] += radius
-    frame[:, 4] = 2 * radius
-    return frame
-
-
-def box_frame(low: Frame, axis: int) -> Frame:
-    """The frame of a box's face from the lowest corner: x or z across, y up; on floor and ceiling x and z."""
-    u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
-    return _frame(low, np.eye(3)[u], np.eye(3)[v], (1.0, 1.0))
-
-
-def triangle_frames(planes: Frame, uv: Frame) -> Frame:
+def _triangle_frames(planes: Frame, uv: Frame) -> Frame:
     """Texture coordinates [T, 3 corners, 2] of triangles as affine functions of a point, [T, 2, 5], in pictures.
 
     `planes`: [T, 3, 4] from `mesh.triangle_planes`; rows 1 and 2 are the weights of corners 1 and 2.
@@ -94,8 +80,8 @@ class TextureTable:
 
     Args:
         textures: by name. images: linear RGB [H, W, 3] of those of kind "image".
-        surfaces: for surfaces in a row how many, the name of their texture and their frames [count, 2, 5] (one of the
-            functions above), or None. palette: with the rows of their colours.
+        surfaces: for surfaces in a row how many, the name of their texture and their frames [count, 2, 5], or None.
+        palette: with the rows of their colours.
     """
 
     def __init__(
@@ -168,8 +154,8 @@ class Surfaces:
     emitter: Emitter | None = None  # what shines
 
 
-def _unit(vector: Vector) -> NDArray[np.float64]:
-    return np.array(vector) / np.linalg.norm(vector)
+def _unit(vector: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(vector, np.float64) / np.linalg.norm(vector)
 
 
 class Assembly:
@@ -208,42 +194,44 @@ class Assembly:
 
     def _add_flat(self) -> None:
         settings = self._scene.settings
-        many = len(settings.quads) > _MANY_QUADS and has_embree()
+        quads = np.array([(q.corner_m, q.edge_u_m, q.edge_v_m) for q in settings.quads], np.float64).reshape(-1, 3, 3)
+        many = len(quads) > _MANY_QUADS and has_embree()
         if many:
-            corners = np.array([(q.corner_m, q.edge_u_m, q.edge_v_m) for q in settings.quads], np.float64)
-            corners[:, 1:] += corners[:, :1]
-            self.primitives.append(Mesh.of_rectangles(self._count, corners))
-        for quad in settings.quads:
-            corner, u, v = (np.array(x, np.float64) for x in (quad.corner_m, quad.edge_u_m, quad.edge_v_m))
-            normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+            self.primitives.append(Mesh.of_rectangles(self._count, quads + quads[:, :1] * [[[0], [1], [1]]]))
+        for quad, (corner, u, v) in zip(settings.quads, quads, strict=True):
+            normal, lengths = _unit(np.cross(u, v)), np.linalg.norm((u, v), axis=1)
             if not many:
                 aligned = np.count_nonzero(u) == 1 and np.count_nonzero(v) == 1
                 axis, first = int(np.argmax(np.abs(normal))), self._count
                 shape = AxisQuad(first, corner, corner + u + v, axis) if aligned else Quad(first, corner, u, v)
                 self.primitives.append(shape)
-            self._add(normal[None], quad.material, quad_frame(corner, u, v)[None], quad)
+            # It begins at the corner and runs along the edges.
+            frame = _frame(corner, u / lengths[0], v / lengths[1], lengths)
+            self._add(normal[None], quad.material, frame, quad)
         for disc in settings.discs:
             centre, normal = np.array(disc.centre_m, np.float64), _unit(disc.normal)
             self.primitives.append(Disc(self._count, centre, normal, disc.radius_m))
-            frame = disc_frame(centre, normal, disc.radius_m)
-            self._add(normal[None], disc.material, frame[None], disc)
+            frame = _plane_frame(centre, normal)
+            # It begins at the lower left corner of the square around the disc.
+            frame[..., 3:] = np.stack([frame[..., 3] + disc.radius_m, np.full((1, 2), 2 * disc.radius_m)], axis=-1)
+            self._add(normal[None], disc.material, frame, disc)
         for plane in settings.planes:
             point, normal = np.array(plane.point_m, np.float64), _unit(plane.normal)
             self.primitives.append(Plane(self._count, point, normal))
-            self._add(normal[None], plane.material, plane_frame(point, normal)[None])
+            self._add(normal[None], plane.material, _plane_frame(point, normal))
 
     def _add_boxes(self) -> None:
         rooms = [(room, room.walls(), True) for room in self._scene.settings.rooms]
         boxes = [(box, (box.material,) * 6, False) for box in self._scene.settings.boxes]
         for table, materials, inside in [*rooms, *boxes]:
             low, high = np.array(table.min_m, np.float64), np.array(table.max_m, np.float64)
-            box = Box(self._count, low, high, inside)
-            self.primitives.append(box)
-            self.boxes.append(box)
+            self.boxes.append(Box(self._count, low, high, inside))
+            self.primitives.append(self.boxes[-1])
             for face, name in enumerate(materials):
-                normal = np.zeros((1, 3))
-                normal[0, face // 2] = 1.0 if face % 2 else -1.0
-                self._add(normal, name, box_frame(low, face // 2)[None])
+                # From the lowest corner x or z across, y up; on floor and ceiling x and z.
+                across, up = ((2, 1), (0, 2), (0, 1))[face // 2]
+                normal = np.eye(3)[face // 2] * (1.0 if face % 2 else -1.0)
+                self._add(normal[None], name, _frame(low, np.eye(3)[across], np.eye(3)[up]))
 
     def _add_spheres(self) -> None:
         if spheres := self._scene.settings.spheres:
@@ -259,8 +247,7 @@ class Assembly:
             corners = triangles.vertices[triangles.faces]
             self.primitives.append(Mesh(first, corners))
             planes = triangle_planes(corners)
-            uv = triangles.uv
-            frames = None if uv is None else triangle_frames(planes, uv[triangles.faces])
+            frames = None if triangles.uv is None else _triangle_frames(planes, triangles.uv[triangles.faces])
             self._add(planes[:, 0, :3], mesh.material, frames)
             if triangles.normals is not None:
                 normals = triangles.normals[triangles.faces].astype(np.float32)
@@ -361,7 +348,7 @@ class World:
         discs = [disc for disc in settings.discs if any(disc.emission)]
         spheres = [sphere for sphere in settings.spheres if any(sphere.emission)]
         points = [*settings.points, *settings.spots]
-        self._sky = make_surroundings(settings.environment, settings.sky, self.scene.environment, self.palette)
+        self._sky = Surroundings(settings, self.scene.environment, self.palette)
         self._sun = SunLight(settings.sky)
         sizeless = PointLights(settings.points, settings.spots)
         groups = (FlatLights(quads, discs), SphereLights(spheres), sizeless, self._sun, self._sky)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,14 @@ from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
-from neurolens.cameras.onnxlens import OnnxLens, load_model
-from neurolens.cameras.pupil_search import PupilTable
-from neurolens.graph.ir import Graph
+from neurolens.cameras.onnxlens import load_model
+from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.shaders.osl import FOCUS_AXIS, OslLens, model_lens, osl_lens, parameters, states_between, write_camera
 from neurolens.shaders.shader_lens import ShaderLens
 from neurolens.shaders.source import Focusing
-from neurolens.surrogates.assemble import SCALARS, model_graph
 from neurolens.surrogates.axes import product, weights
 from neurolens.surrogates.card import state_for
 from neurolens.surrogates.source import OSL, checked_name, lines_of
@@ -30,7 +27,6 @@ from neurolens.surrogates.source import OSL, checked_name, lines_of
 # Of an exact lens: its wavelengths; its nearest focus in focal lengths; best focus lies beside the paraxial one by less
 # than this share of the film's travel.
 LIGHT_NM, _NEAR_EFL, _SPARE = (400.0, 700.0), 10.0, 0.1
-IDLE = 5e-4  # of the domain's rays: gates that alone block fewer go, and darken no pixel by a thousandth
 MAX_STEPS = 12_000  # of a ray: compilers take minutes for more
 
 
@@ -108,18 +104,8 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
     lens, fit = model.card["lens"], model.card["fit"]
     state = ", ".join(f"{a.name} {v:.5g}" for a, v in zip(model.axes, model.state, strict=True))
     lines = [f"{lens['name']}: {fit['method']}, {lens['source']} (sha256 {lens['sha256'][:16]})."]
-    made = model_lens(model, _smallest(model), report, fixed=fixed)
+    made = model_lens(model, report, fixed=fixed)
     return str(lens["id"]), made, lines + [f"State: {state}."] * bool(state and fixed)
-
-
-def _smallest(model: OnnxLens) -> Graph | None:
-    """The graph of a model without the rims that block next to nothing, which need torch to be known; None without."""
-    if model.axes or find_spec("torch") is None:
-        return None
-    from neurolens.surrogates.targets import without_idle_gates
-
-    (smallest,) = without_idle_gates((model.fitted,), IDLE)
-    return model_graph(smallest, SCALARS)
 
 
 def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:

@@ -30,20 +30,19 @@ from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.lenscamera import squeeze_of, stratified
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
-from neurolens.cameras.pupil_search import PupilTable
+from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
-from neurolens.graph.loworder import low_orders, with_film_derivatives
-from neurolens.graph.osl import Parameter, write_osl
-from neurolens.graph.program import STOP_RADIUS, Mixture, Program
+from neurolens.graph.loworder import low_orders, low_tests, with_film_derivatives
+from neurolens.graph.program import Mixture, Program
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import Parameter, write_osl
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.prescription import VISIBLE_NM
-from neurolens.shaders.lowtests import low_tests
-from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles, PupilDisc
+from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
-from neurolens.shaders.source import FOCUS, SMALLEST, Focusing, film_function, followed_rows, model_focusing
+from neurolens.shaders.source import SMALLEST, Focusing, followed_rows, model_focusing
 from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_names, weights
 
 Array = NDArray[np.float64]
@@ -52,10 +51,10 @@ _FAR_M = 1e-4  # Blender's focus distance below this means that depth of field i
 _NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
 _LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it
 _QUADRATURE = 64  # points a side of the exposure on the axis
-_NEAR, _ROUNDS = 0.999, 4  # of the near limit, for rounding; of finding the film's position
+_NEAR = 0.999  # of the near limit, for rounding
 # Errors of derivatives, whose mean size Cycles takes, by output and in all; nothing is nearer than this share of focus.
 _DERIVATIVES, _WORST, _SEEN = 0.05, 0.05, 0.25
-_ACROSS, _FILM_POWERS = 16, (7, 5)  # distances and stops at which the film is placed; powers of stop and distance
+_ACROSS, _FILM_POWERS = 12, (7, 5)  # distances and stops at which the film is placed; powers of stop and distance
 _BESIDE = 0.01  # of the film radius: near the axis
 FOCUS_AXIS = "focus"
 _FRAME = """\
@@ -90,7 +89,7 @@ class OslCamera:
 
     lens: ShaderLens
     graph: Graph
-    pupil: PupilCircles | PupilDisc
+    pupil: PupilCircles
     film: Array
     nearest_m: tuple[float, float]
     limit_m: float
@@ -133,10 +132,9 @@ class OslLens:
         """Radius of the picture that all states fill."""
         return min(c.pupil.film_radius_mm for c in self.nodes)
 
-    def states(self) -> list[tuple[ShaderLens, PupilCircles | PupilDisc]]:
+    def states(self) -> list[tuple[ShaderLens, PupilCircles]]:
         """The lens and its pupil at each node, and in states between them."""
-        pupils: list[Any] = [c.pupil for c in self.nodes]  # all are of one kind
-        first, *others = pupils
+        first, *others = (c.pupil for c in self.nodes)
         nodes = zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True)
         return [(lens, first.mixed(others, weights)) for weights, lens in [*nodes, *self.between]]
 
@@ -303,7 +301,7 @@ def _film_position(camera: OslCamera) -> tuple[float, float]:
     return (low + high) / 2, max((high - low) / 2, 1e-6)
 
 
-def _samples(lens: ShaderLens, pupil: PupilCircles | PupilDisc, count: int = 32768) -> dict[str, NDArray[np.float32]]:
+def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[str, NDArray[np.float32]]:
     """Rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of samples."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * pupil.film_radius_mm * np.sqrt(rng.random(count))
@@ -349,35 +347,25 @@ def _powers(at: Array, values: Array, shape: tuple[int, int]) -> Array:
 def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, float]]:
     """Best focus (mm) by powers [2, N, M] of the stop's share and of the nearest distance over the distance, from the
     film and from the entrance pupil; and that distance from either."""
-    function, moves = film_function([focusing]), math.isfinite(focusing.nearest_m)
+    moves = math.isfinite(focusing.nearest_m)
     side = (1 - np.cos(np.pi * (np.arange(_ACROSS) + 0.5) / _ACROSS)) / 2
-    share, vergence = (a.ravel() for a in np.meshgrid(SMALLEST + (1 - SMALLEST) * side, side if moves else [0.0]))
-
-    def position(share: Array, away_m: Array, at_pupil: bool) -> Array:
-        z = np.full(share.shape, entrance_mm)
-        for _ in range(_ROUNDS):  # distances are from the film there
-            away = away_m + (z - entrance_mm) * (at_pupil * 1e-3)
-            call = {FOCUS: away, STOP_RADIUS: share * focusing.stop_radius_mm}
-            film = evaluate(function.graph, {name: value[None] for name, value in call.items()})["film_z_mm"][0]
-            z = np.broadcast_to(film.astype(np.float64), share.shape)
-        return z
-
-    nearest = ahead = focusing.nearest_m if moves else 1.0
-    if moves:
-        ahead -= float(position(np.ones(1), np.full(1, nearest), False)[0] - entrance_mm) * 1e-3
-    powers, at = (_FILM_POWERS[0], _FILM_POWERS[1] if moves else 1), np.stack([share, vergence], 1)
-    positions = [position(share, near / np.maximum(vergence, 1e-9), near != nearest) for near in (nearest, ahead)]
-    return np.stack([_powers(at, z, powers) for z in positions]), (nearest, ahead)
+    side[[0, -1]] = 0.0, 1.0
+    shares, vergence = SMALLEST + (1 - SMALLEST) * side, side if moves else np.zeros(1)
+    z = focusing.places(vergence, shares)  # [D, S]
+    nearest, powers = (focusing.nearest_m if moves else 1.0), (_FILM_POWERS[0], _FILM_POWERS[1] if moves else 1)
+    # The same places by the distance from the entrance pupil: 1 / distance = v / (nearest - v way).
+    way = (z - entrance_mm) * 1e-3
+    ahead = nearest - float(way[-1, -1]) * moves
+    by_pupil = vergence[:, None] * ahead / (nearest - vergence[:, None] * way)
+    rows = [np.broadcast_to(v, z.shape).ravel() for v in (shares, vergence[:, None], by_pupil)]
+    fits = [_powers(np.stack([rows[0], v], 1), z.ravel(), powers) for v in rows[1:]]
+    return np.stack(fits), (nearest, ahead)
 
 
-def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: bool = False) -> OslLens:
-    """An exported model.
-
-    Args:
-        graph: of a model of one state; None takes its own. fixed: in its state alone.
-    """
+def model_lens(model: OnnxLens, report: Report, *, fixed: bool = False) -> OslLens:
+    """An exported model; `fixed`: in its state alone."""
     if not model.axes or fixed:
-        return osl_lens([shader_lens(model, graph)], report)
+        return osl_lens([shader_lens(model)], report)
     axes = model.axes
     between = [(weights(axes, state), shader_lens(model.at(*state))) for state in states_between(axes)]
     return osl_lens([shader_lens(model.at(*state)) for state in product(axes)], report, axes, between)
@@ -389,20 +377,18 @@ def states_between(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
     return list(itertools.product(*middles))
 
 
-def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
-    """A model in its state; its graph, where that is not the one in its file."""
+def shader_lens(model: OnnxLens) -> ShaderLens:
+    """A model in its state."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
     all_nm = short, long = tuple(map(float, d["wavelength_nm"]))
     visible = max(short, VISIBLE_NM[0]), min(long, VISIBLE_NM[1])
     short, long = visible if visible[0] < visible[1] else all_nm
     stop = float(d["stop_radius_mm"])
-    if graph is None:
-        graph = model.graph()
     height = _BESIDE * float(d["film_radius_mm"])
     squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
     return ShaderLens(
-        graph=graph,
+        graph=model.graph(),
         table=PupilTable.of(d["bounds"]),
         film_z_mm=(float(low), float(high)),
         wavelength_nm=(short, long),
@@ -424,7 +410,7 @@ def osl_lens(
     Raises:
         InputError: no ray passes.
     """
-    pupils: list[PupilCircles | PupilDisc] = [*fit_pupil(nodes, report, between)]
+    pupils = fit_pupil(nodes, report, between)
     samples = [_samples(*pair) for pair in zip(nodes, pupils, strict=True)]
     graphs = [lens.graph for lens in nodes]
     graphs = (tested := low_tests(graphs, samples)) or graphs
@@ -441,10 +427,8 @@ def osl_lens(
     return OslLens(cameras, axes, between)
 
 
-def _blade_margin(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
+def _blade_margin(lens: ShaderLens, pupil: PupilCircles) -> float:
     """The margin, in stop radii, by which the sampler widens blades: a fit may put a passing ray beyond one."""
-    if isinstance(pupil, PupilDisc):
-        return 0.0
     inputs = _samples(lens, pupil)
     ray = evaluate(lens.graph, inputs)
     passed = np.broadcast_to(ray["status"][0] == st.PASSED, inputs["at_stop"].shape[1:])

@@ -2,7 +2,7 @@
 
 The rays that pass a lens cross its stop within the opening, and within what the rims before and behind the stop leave
 of it. Seen in points of the stop, rims are circles whose centres and radii are short polynomials of the film point.
-Samples fill what the circles have in common, and `stop_image` maps them to the pupil.
+Samples fill what the circles have in common, and `shader_lens.StopImage` maps them to the pupil.
 
 Nothing here is a table: in a renderer's shader a table costs more than all of this. `pupil_outline` fits the pupil more
 closely, at one stop and focus.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.cameragraph import unit_disc
 from neurolens.graph.ir import Exponents, Graph, Value
-from neurolens.shaders.stop_image import HAIR, StopImage, frame_of_film_point, moving_polynomial
+from neurolens.shaders.shader_lens import HAIR, StopImage, frame_of_film_point, moving_polynomial
 
 MAX_BLADES = 16
 _CLOSEST = 0.05  # of the stop's radius: the middle of a pupil to an edge; nearer, or beyond it, points stay apart
@@ -78,7 +78,6 @@ class Blades:
 Array = NDArray[np.float64]
 _NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))  # Gauss's nodes and weights over a disc, on a diameter
 _TIP = 1e-7  # of 1 - x^2 near the ends of a diameter
-_LEAST = 0.01  # of the widest stop's radius: a disc is nowhere narrower
 _ROUNDS = 2  # of finding the blades from the pupil's middle: the pupil's width there depends on where they are
 
 
@@ -89,7 +88,8 @@ class PupilCircles:
     Attributes:
         film_radius_mm: beyond it no light passes. image: from points of the stop to the pupil.
         wide: how wide the stop's disc is, in units of the stop's radius: on the axis, and what is added by the square
-            of the film radius squared times the stop.
+            of the film radius squared times the stop; and what is added at all stops, in units of `image.stop_mm`,
+            where the stop's image folds: there is no circle then, and the image but moves and scales the stop.
         exponents: [M, 3] of film x and y, scaled as the image does, and of the film position.
         numbers: [K, 3, M] of each rim's circle: u^2 + v^2 <= c + 2 a u + 2 b v with c, a, b of these monomials.
         squeeze: film points' y is scaled by it for the direction in which the pupil of an anamorphic lens is filled.
@@ -97,7 +97,7 @@ class PupilCircles:
 
     film_radius_mm: float
     image: StopImage
-    wide: tuple[float, float]
+    wide: tuple[float, float, float]
     exponents: Exponents
     numbers: Array
     squeeze: float = 1.0
@@ -135,7 +135,7 @@ class PupilCircles:
             return (turn * x + aside * y) * (1.0 / size)
 
         disc, share = unit_disc(square), g.constant(1.0)
-        if blades is not None:
+        if blades is not None and not self.wide[2]:  # a point of a folded image is no place in the stop
             share = _within_blades(disc, shape, at_stop, blades(g), margin)
             disc = disc * share
         x, y, tall = shape.point(disc, disc[0])
@@ -157,8 +157,9 @@ class PupilCircles:
         g = film.graph
         grown = g.square(film * (1 / self.image.film_mm)) * size
         # Named: states whose numbers equal others of the graph have the same structure as the rest.
-        first, second = (g.constant(value, f"wide {k}") for k, value in enumerate(self.wide))
-        return size * (grown * grown * second + first)
+        first, second, more = (g.constant(value, f"wide {k}") for k, value in enumerate(self.wide))
+        disc = size * (grown * grown * second + first)
+        return disc + more if self.wide[2] else disc
 
     def _rims(self, field: Value, film_z: Value, turn: Value) -> list[_Circle]:
         """The rims' circles in the frame in which the disc is filled."""
@@ -220,9 +221,9 @@ class PupilCircles:
             film_z_mm=(float(mean(middle)), 1 / float(mean([1 / h for h in half]))),
             numbers=mean([s.image.numbers for s in states]),
         )
-        first, second = mean([np.array(s.wide) for s in states])
+        first, second, more = mean([np.array(s.wide) for s in states])
         radius, numbers = float(mean([s.film_radius_mm for s in states])), mean([s.numbers for s in states])
-        return replace(self, film_radius_mm=radius, image=image, wide=(first, second), numbers=numbers)
+        return replace(self, film_radius_mm=radius, image=image, wide=(first, second, more), numbers=numbers)
 
 
 @dataclass(frozen=True)
@@ -289,54 +290,3 @@ def _within_blades(
         x, y, _ = shape.point(direction, direction[0] * share)
         share = blades.drawn(start, at_stop(x, y) - start, margin)
     return share
-
-
-@dataclass(frozen=True)
-class PupilDisc:
-    """An ellipse that holds the passing rays of film points, in the frame of the film point (x towards it).
-
-    Attributes:
-        film_radius_mm: beyond it no light passes. unit_mm, stop_mm: units of film radius and stop, the same in all
-            states of a lens.
-        exponents: [M, 2] of film radius and stop. numbers: [3, M]: centre, half width along x and half height (mm).
-    """
-
-    film_radius_mm: float
-    unit_mm: float
-    stop_mm: float
-    exponents: Exponents
-    numbers: Array
-
-    @cached_property
-    def graph(self) -> Graph:
-        """`sampler`."""
-        return self.sampler()
-
-    def sampler(self, blades: type[Blades] | None = None, margin: float = 0.0) -> Graph:
-        """See `PupilCircles.sampler`; blades do not move points, and there is no `at_stop`."""
-        g = Graph()
-        film, disc = g.input("film_mm", 2), unit_disc(g.input("square", 2))
-        radius, turn, aside = frame_of_film_point(film)
-        size = g.input("stop_radius_mm", per_call=True) * (1 / self.stop_mm)
-        centre, wide, tall = self._rows(radius * (1 / self.unit_mm), size)
-        area = wide * tall * math.pi
-        g.outputs["pupil_mm"] = turn * (centre + wide * disc[0]) + aside * (tall * disc[1])
-        g.outputs["area_mm2"] = g.select(radius <= self.film_radius_mm, area, 0.0)
-        g.outputs["mean_area_mm2"] = area
-        return g
-
-    def _rows(self, radius: Value, size: Value) -> list[Value]:
-        """Centre and half widths, with coefficients of the call."""
-        g, powers = radius.graph, np.unique(self.exponents[:, 0])
-        rows = []
-        for numbers in self.numbers:
-            weights = np.stack([numbers[self.exponents[:, 0] == p] for p in powers])
-            coefficients = g.polynomial(np.unique(self.exponents[:, 1])[:, None], weights, size)
-            rows.append(g.dot(coefficients, g.polynomial(powers[:, None], np.eye(len(powers)), radius)))
-        return [rows[0], *(row.maximum(_LEAST * self.stop_mm) for row in rows[1:])]
-
-    def mixed(self, others: Sequence[PupilDisc], weights: Array) -> PupilDisc:
-        """The disc of a state between states, with these weights of itself and of others of the same lens."""
-        states = [self, *others]
-        radius = float(weights @ [s.film_radius_mm for s in states])
-        return replace(self, film_radius_mm=radius, numbers=np.tensordot(weights, [s.numbers for s in states], 1))

@@ -1,9 +1,9 @@
 """The fit of a shader's pupil to the rays that pass a lens: circles in the stop, or one wide disc.
 
-In points of the stop, whether a ray lies within a rim's circle is linear in the circle's numbers: logistic regression
-separates the rays that pass from those that this rim blocks. Rays that pass weigh more, zone by zone of the film and
-the stop, until few enough of them are lost. Where the stop's image folds, or circles lose too much, one disc holds
-them all.
+In points of the stop, how far a ray lies within a rim's circle is linear in the circle's numbers: least squares put the
+circle through rays that this rim all but stops. Rays beyond it weigh more, and new rays widen it until few enough of
+those that pass are lost in any zone of film and stop. Where the stop's image folds, or circles lose too much, one disc
+holds them all.
 """
 
 from __future__ import annotations
@@ -19,37 +19,28 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Exponents, Graph
-from neurolens.shaders.pupil import PupilCircles, PupilDisc
-from neurolens.shaders.shader_lens import ShaderLens, passing_share
-from neurolens.shaders.stop_image import StopImage, draw_rays, fit_stop_images
+from neurolens.graph.ir import Exponents
+from neurolens.shaders.pupil import PupilCircles
+from neurolens.shaders.shader_lens import ShaderLens, StopImage, draw_rays, fit_stop_images, passing_share
 
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]
-_RAYS, _FIRST = 6_000, 15_000  # random rays of a zone; those of all to which circles are fitted first
+_RAYS = 6_000  # random rays of a zone
 _STOPS = (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.0, 1.0)  # of the widest stop
 _AROUND = 1.1  # stop radii, within which rays are drawn
 _BESIDE, _FOLDED = 0.25, 0.01  # of the pupil's size, and the share of rays that may lie so far from the image
 # Highest powers of the film point of round lenses and anamorphic ones; of terms with the film position and its square.
 _DEGREE, _MOVING = (8, 4), (3, 1)
-_RARE = 0.006  # of rays, which a rim has to block to have a circle
+_EDGES, _HALVINGS, _CODES, _RARE = 20_000, 12, 4000, 300  # rays between which edges are sought; edges of a rim
 _ZONES, _FEW = (8, 3, 3), 2500  # of film radius squared, azimuth and stop; rays that tell about a zone
 _ALL = int(np.prod(_ZONES))
 _SQUEEZES = (1.0, 0.7, 0.5, 0.35, 1.4, 2.0)  # those that are tried
-_WITHIN = 0.97  # stop radii: what is blocked further out may be blocked by the stop
-_PARTS, _NEAR = 16, 12.0  # of many rays; margins of rays near a circle
-_ROUNDS, _STRIDE, _HALVINGS = 25, 30.0, 6  # of Newton's rule; the longest change of a margin in a step
-_WEIGHTS, _HEAVIER = (2.0, 5.0, 3e4), 1.6  # of rays that pass: least, first and greatest; its greatest step
-_GOAL = 2e-4  # the share of a zone's rays that a circle may lose while it is fitted
-_RIDGE, _LEAST, _FLATTEST = 1e-9, 1e-4, 0.02  # of Newton's matrix; of a circle's curvature by its greatest number
-_CALM = 1e-3  # rays, by whose force numbers stay at those that all states share
+_ROUNDS, _HEAVIER = 8, 20.0  # of least squares; by how much rays that a circle would lose weigh more
+_RIDGE, _CALM = 1e-9, 1e-3  # of the equations' diagonal; rays, by whose force numbers stay at those of all states
 _ALLOWED = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
 LOST = 1e-3  # of a zone's rays are lost in all
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
-# Discs: film radii and stops at which extents are measured, with so many rays; highest powers of film radius and stop.
-_DISC_RADII, _DISC_STOPS, _DISC_RAYS, _DISC_POWERS = 17, (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 1.0), 20_000, (6, 3)
-_RCOND = 1e-4  # of least squares: numbers stay small enough for float32
-_DISC_CHECKED, _DISC_LOST, _DISC_STEP = 400_000, 8e-4, 1.02  # rays that check; what may be lost; widening
+_DRAWN, _DISC_LOST = 24, 6e-4  # draws of rays that tell how wide a disc has to be; what may be lost
 _INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
 
 
@@ -65,13 +56,14 @@ class _Rays:
     def passed(self) -> Truths:
         return np.asarray(self.codes == st.PASSED)
 
-    def first(self, count: int) -> _Rays:
-        return _Rays({name: row[:, :count] for name, row in self.inputs.items()}, self.codes[:count], self.zone[:count])
+    def at(self, rows: NDArray[np.intp]) -> _Rays:
+        """Some of the rays."""
+        return _Rays({name: row[:, rows] for name, row in self.inputs.items()}, self.codes[rows], self.zone[rows])
 
 
 def fit_pupil(
     lenses: Sequence[ShaderLens], report: Report, between: Sequence[tuple[Array, ShaderLens]] = ()
-) -> Sequence[PupilCircles] | Sequence[PupilDisc]:
+) -> list[PupilCircles]:
     """The pupil of a lens in each of its states. All but 1 in 1000 of the rays that pass, in any zone, lie inside.
 
     Args:
@@ -88,7 +80,7 @@ def fit_pupil(
         pupils, lost = _fit_circles(lenses, images, report, between)
         if lost <= LOST:
             return pupils
-    return fit_discs(lenses, report, between)
+    return _wide_discs(lenses, between)
 
 
 def _fit_circles(
@@ -97,13 +89,16 @@ def _fit_circles(
 ) -> tuple[list[PupilCircles], float]:  # fmt: skip
     """Circles, and the share of the rays of the worst zone that they lose."""
     exponents, pairs = _exponents(lenses[0].anamorphic), list(zip(lenses, images, strict=True))
-    pupils = [PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0), exponents[:0, :3], np.zeros((0, 3, 0)))
+    pupils = [PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0, 0.0), exponents[:0, :3], np.zeros((0, 3, 0)))
               for lens, image in pairs]  # fmt: skip
     rays = [_drawn(lens, pupil, 0) for lens, pupil in zip(lenses, pupils, strict=True)]
-    rims = _rims(lenses[0], rays)
-    first = _fit_first(rays, pupils, exponents, rims)
+    edges = [_edges(*each) for each in zip(lenses, pupils, rays, strict=True)]
+    counts = np.max([np.bincount(e.codes, minlength=_CODES) for e in edges], axis=0)
+    counts[: st.NO_SOLUTION + 1] = counts[st.blocked(lenses[0].stop_surface, st.RIM)] = 0
+    rims = np.flatnonzero(counts > _RARE)
+    fits = [_fit_rims(edges, pupils, exponents, int(code)) for code in rims]
     for k, (pupil, drawn) in enumerate(zip(pupils, rays, strict=True)):
-        numbers = _fit_rims(drawn, pupil, exponents, rims, first)
+        numbers = np.array([fit[k] for fit in fits]).reshape(len(rims), -1)
         pupils[k] = _with_circles(replace(pupil, wide=_disc(pupil, drawn, len(rims))), exponents, numbers)
         report((k + 1) / (len(pupils) + 1))
     pupils, lost = _widened(pupils, lenses, between)
@@ -143,54 +138,54 @@ def _wider(pupil: PupilCircles, more: Array) -> PupilCircles:
     return replace(pupil, numbers=numbers)
 
 
-def _rims(lens: ShaderLens, rays: Sequence[_Rays]) -> list[int]:
-    """Status codes of the rims that block more than a few rays in some state."""
-    codes = np.unique(np.concatenate([r.codes for r in rays]))
-    others = [int(c) for c in codes if c > st.NO_SOLUTION and c != st.blocked(lens.stop_surface, st.RIM)]
-    return [c for c in others if max(np.mean(r.codes == c) for r in rays) > _RARE]
+def _edges(lens: ShaderLens, pupil: PupilCircles, rays: _Rays) -> _Rays:
+    """Rays that rims all but stop, each with the code of the rim: halfway, again and again, between a ray that a rim
+    stops and the point of one that passes, from about the same film point."""
+    inputs, size = rays.inputs, rays.inputs["stop_radius_mm"][0]
+    place = inputs["film_mm"][0] ** 2 + inputs["film_mm"][1] ** 2 / 3
+    blocked = np.flatnonzero(~rays.passed & (np.hypot(*inputs["point_mm"]) < size))[:_EDGES]
+    lit = np.flatnonzero(rays.passed)
+    lit = lit[np.argsort(place[lit])]
+    near = lit[np.searchsorted(place[lit], place[blocked]).clip(max=lit.size - 1)] if lit.size else lit
+    edges = rays.at(blocked[: near.size])
+    inside, outside, codes = inputs["point_mm"][:, near], edges.inputs["point_mm"], edges.codes
+    sound = passed = _codes(lens, pupil, edges, inside) == st.PASSED
+    for _ in range(_HALVINGS):
+        point = (inside + outside) / 2
+        found = _codes(lens, pupil, edges, point)
+        passed = found == st.PASSED
+        inside, outside = np.where(passed, point, inside), np.where(passed, outside, point)
+        codes = np.where(passed, codes, found)
+    edges = replace(edges, inputs=edges.inputs | {"point_mm": (inside + outside) / 2}, codes=codes)
+    return edges.at(np.flatnonzero(sound))
 
 
-def _fit_first(
-    rays: Sequence[_Rays], pupils: Sequence[PupilCircles], exponents: Exponents, rims: Sequence[int]
-) -> Array:
-    """Numbers [K, M + 1] of the rims' circles, the same in all states, fitted to a few rays of each."""
-    numbers = np.zeros((len(rims), len(exponents) + 1))
-    few = [r.first(_FIRST // len(rays)) for r in rays]
-    for k, code in enumerate(rims):
-        rows = [np.flatnonzero(r.passed | (r.codes == code)) for r in few]
-        features = [_features(r, p, exponents, chosen) for r, p, chosen in zip(few, pupils, rows, strict=True)]
-        inside = np.concatenate([r.passed[chosen] for r, chosen in zip(few, rows, strict=True)])
-        numbers[k] = _separated(np.concatenate(features, 1), inside, numbers[k])
+def _codes(lens: ShaderLens, pupil: PupilCircles, rays: _Rays, point: Array) -> NDArray[np.int32]:
+    """Status [N] of the rays through other points of the widest stop."""
+    film, z, nm = (rays.inputs[name] for name in ("film_mm", "film_z_mm", "wavelength_nm"))
+    through = replace(lens, graph=pupil.image.through_stop(lens.graph))
+    return through.status(film, point, nm[0], z[0], lens.stop_radius_mm)
+
+
+def _fit_rims(edges: Sequence[_Rays], pupils: Sequence[PupilCircles], exponents: Exponents, code: int) -> list[Array]:
+    """Numbers [M + 1] of a rim's circle in every state: least squares, which stay near those of all states together
+    where no ray tells otherwise."""
+    rows = [_features(r.at(np.flatnonzero(r.codes == code)), p, exponents) for r, p in zip(edges, pupils, strict=True)]
+    together = _least(np.concatenate(rows, 1), np.zeros(len(exponents)))
+    return [np.append(_least(row, together), 1.0) for row in rows]
+
+
+def _least(features: Array, near: Array) -> Array:
+    """Numbers [M] for which a margin, with the last number 1, is nearly 0 on all rays, rather above it than below, and
+    which lie near others."""
+    size = np.sqrt(np.square(features).mean(1)) if features.shape[1] else np.ones(len(features))
+    scaled, numbers, weight = features / size[:, None], near, np.ones(features.shape[1])
+    matrix, lacks = scaled[:-1], -features[-1] - near @ features[:-1]
+    calm = np.eye(len(matrix)) * (_CALM + _RIDGE * len(weight))
+    for _ in range(_ROUNDS):
+        numbers = near + np.linalg.solve((matrix * weight) @ matrix.T + calm, matrix @ (weight * lacks)) / size[:-1]
+        weight = np.where(numbers @ features[:-1] + features[-1] < 0, _HEAVIER, 1.0)
     return numbers
-
-
-def _fit_rims(rays: _Rays, pupil: PupilCircles, exponents: Exponents, rims: Sequence[int], first: Array) -> Array:
-    """Numbers of the rims' circles in a state, from those that all states share: fitted to all rays that lie near them
-    or on their wrong side."""
-    numbers, blame = first.copy(), _blame(rays, pupil, exponents, rims, first)
-    lit = np.bincount(rays.zone[rays.passed], minlength=_ALL)
-    for k in range(len(rims)):
-        rows = np.flatnonzero(rays.passed | (blame == k))
-        parts = [numbers[k] @ _features(rays, pupil, exponents, part) for part in np.array_split(rows, _PARTS)]
-        margin = np.concatenate(parts)
-        rows = rows[np.where(rays.passed[rows], margin, -margin) < _NEAR]
-        features = _features(rays, pupil, exponents, rows)
-        numbers[k] = _separated(features, rays.passed[rows], numbers[k], rays.zone[rows], lit)
-    return numbers
-
-
-def _blame(
-    rays: _Rays, pupil: PupilCircles, exponents: Exponents, rims: Sequence[int], numbers: Array
-) -> NDArray[np.intp]:
-    """[N] the circle that should stop a blocked ray: that of its rim, or else the nearest; -1 where none should."""
-    blame = np.full(rays.codes.size, -1)
-    for k, code in enumerate(rims):
-        blame[rays.codes == code] = k
-    size = rays.inputs["stop_radius_mm"][0]
-    others = ~rays.passed & (blame < 0) & (np.hypot(*rays.inputs["point_mm"]) < _WITHIN * size)
-    for part in np.array_split(np.flatnonzero(others), _PARTS) if rims else ():
-        blame[part] = (numbers @ _features(rays, pupil, exponents, part)).argmin(0)
-    return blame
 
 
 def _with_circles(pupil: PupilCircles, exponents: Exponents, numbers: Array) -> PupilCircles:
@@ -227,21 +222,21 @@ def _drawn(lens: ShaderLens, pupil: PupilCircles, seed: int) -> _Rays:
     through = replace(lens, graph=pupil.image.through_stop(lens.graph))
     codes = through.status(film, point, nm, z, share * lens.stop_radius_mm)
     inputs = {"film_mm": film, "point_mm": point, "film_z_mm": z[None]}
-    inputs["stop_radius_mm"] = share[None] * lens.stop_radius_mm
+    inputs["wavelength_nm"], inputs["stop_radius_mm"] = nm[None], share[None] * lens.stop_radius_mm
     aside = np.abs(np.arctan2(np.abs(film[1]), np.abs(film[0]))) / (np.pi / 2)
     shares = (radius / pupil.film_radius_mm) ** 2, aside, share * 0.7501  # the widest stop is a separate zone
     zones = [np.minimum(s * n, n - 1).astype(np.intp) for s, n in zip(shares, _ZONES, strict=True)]
     return _Rays(inputs, codes, np.ravel_multi_index(zones, _ZONES))
 
 
-def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float]:
+def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float, float]:
     """`PupilCircles.wide`: images err most where the film ends."""
     size = rays.inputs["stop_radius_mm"][0] / pupil.image.stop_mm
     beyond = np.hypot(*rays.inputs["point_mm"]) / pupil.image.stop_mm / size - 1
     growth = (np.square(rays.inputs["film_mm"]).sum(0) / pupil.image.film_mm**2 * size) ** 2
     needs = [(float(growth[zone].mean()), need) for zone, need in _needs(rays, -beyond, _ALLOWED[0] / (rims + 1))]
     inner = max(0.0, *(need for at, need in needs if at < _INNER))
-    return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER))
+    return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER)), 0.0
 
 
 def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[NDArray[np.intp], float]]:
@@ -257,62 +252,13 @@ def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[NDArray[np.in
     return needs
 
 
-def _separated(
-    features: Array,
-    inside: Truths,
-    first: Array,
-    zone: NDArray[np.intp] | None = None,
-    lit: NDArray[np.intp] | None = None,
-) -> Array:
-    """Numbers [M + 1] of a circle which separate rays inside from the others: logistic regression on features
-    [M + 1, N], from the numbers `first`; these stay where no ray tells otherwise.
-
-    Args:
-        zone, lit: of each ray, and how many pass in each zone. Rays of zones that lose many weigh more.
-    """
-    numbers, weight = first, np.full(_ALL, _WEIGHTS[1])
-    calm = _CALM * np.square(features).mean(1)
-    for _ in range(_ROUNDS):
-        chance = 1 / (1 + np.exp(-np.clip(numbers @ features, -40, 40)))
-        force = np.where(inside, _WEIGHTS[1] if zone is None else weight[zone], 1.0)
-        matrix = (features * (force * np.maximum(chance * (1 - chance), _LEAST))) @ features.T
-        matrix += np.diag(_RIDGE * np.diag(matrix) + calm)
-        step = -np.linalg.solve(matrix, features @ (force * (chance - inside)) + calm * (numbers - first))
-        numbers = _stepped(numbers, step, first, features, inside, force, calm)
-        if zone is None or lit is None:
-            continue
-        lost = np.bincount(zone[inside & (numbers @ features < 0)], minlength=_ALL) / np.maximum(lit, _FEW / 3)
-        change = ((lost + _GOAL / 5) / (_GOAL * 1.2)).clip(1 / _HEAVIER, _HEAVIER)
-        weight = (weight * change).clip(_WEIGHTS[0], _WEIGHTS[2])
-    return numbers
-
-
-def _stepped(
-    numbers: Array, step: Array, first: Array, features: Array, inside: Truths, force: Array, calm: Array
-) -> Array:
-    """Numbers after a step of Newton's rule, or a part of it that makes the fit better."""
-
-    def error(numbers: Array) -> float:
-        margin = np.where(inside, 1.0, -1.0) * (numbers @ features)
-        return float(force @ np.logaddexp(0, -margin) + calm @ (numbers - first) ** 2 / 2)
-
-    step, before = step * min(1.0, _STRIDE / float(np.abs(step @ features).max())), error(numbers)
-    for _ in range(_HALVINGS):
-        after = numbers + step
-        after[-1] = max(after[-1], _FLATTEST * float(np.abs(after[:-1]).max()))
-        if error(after) < before:
-            return after
-        step = step / 2
-    return numbers
-
-
-def _features(rays: _Rays, pupil: PupilCircles, exponents: Exponents, rows: NDArray[np.intp]) -> Array:
-    """[M + 1, N] what a circle's margin is linear in, for some of the rays."""
+def _features(rays: _Rays, pupil: PupilCircles, exponents: Exponents) -> Array:
+    """[M + 1, N] what a circle's margin is linear in."""
     inputs, image = rays.inputs, pupil.image
-    point = inputs["point_mm"][:, rows] / image.stop_mm
-    position = (inputs["film_z_mm"][:, rows] - image.film_z_mm[0]) / image.film_z_mm[1]
-    variables = np.concatenate([inputs["film_mm"][:, rows] / image.film_mm, position, point])
-    features = np.ones((len(exponents) + 1, rows.size))
+    point = inputs["point_mm"] / image.stop_mm
+    position = (inputs["film_z_mm"] - image.film_z_mm[0]) / image.film_z_mm[1]
+    variables = np.concatenate([inputs["film_mm"] / image.film_mm, position, point])
+    features = np.ones((len(exponents) + 1, point.shape[1]))
     for feature, powers in zip(features, exponents, strict=False):
         for value, power in zip(variables, powers, strict=True):
             if power:
@@ -333,10 +279,10 @@ def _missed(rays: _Rays, within: Array) -> Array:
     return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
 
 
-def light_lost(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
+def light_lost(lens: ShaderLens, pupil: PupilCircles) -> float:
     """The share of the rays that pass which no sample is, in the worst zone of film and stop, by new random rays."""
-    if isinstance(pupil, PupilDisc):
-        return disc_lost(pupil, lens)
+    if pupil.wide[2]:
+        return max(float(np.mean(rows > pupil.wide[2])) for rows in _beyond_discs(lens, pupil, 100))
     counts = np.zeros((2, _ALL))
     for seed in range(4):
         rays = _drawn(lens, pupil, 100 + seed)
@@ -355,74 +301,35 @@ def _beside(lens: ShaderLens, image: StopImage) -> float:
     return float((np.bincount(part, away) / np.maximum(np.bincount(part), _FEW)).max())
 
 
-def fit_discs(
-    lenses: Sequence[ShaderLens], report: Report, between: Sequence[tuple[Array, ShaderLens]] = ()
-) -> list[PupilDisc]:
-    """The disc of a lens in each of its states; arguments of `fit_pupil`."""
-    exponents = np.array([(i, j) for i in range(_DISC_POWERS[0] + 1) for j in range(_DISC_POWERS[1] + 1)])
-    unit, stop = max(x.film_radius_mm for x in lenses), max(x.stop_radius_mm for x in lenses)
-    discs = []
-    for lens in lenses:
-        disc = PupilDisc(lens.end_of_light_mm(), unit, stop, exponents, np.zeros((3, len(exponents))))
-        discs.append(replace(disc, numbers=_fitted_disc(lens, disc)))
-        report(len(discs) / (len(lenses) + 1))
-    states = [*zip(np.eye(len(discs)), lenses, strict=True), *between]
-    while max(disc_lost(discs[0].mixed(discs[1:], weights), lens) for weights, lens in states) > _DISC_LOST:
-        discs = [replace(d, numbers=d.numbers * [[1.0], [_DISC_STEP], [_DISC_STEP]]) for d in discs]
-    return discs
+def _wide_discs(lenses: Sequence[ShaderLens], between: Sequence[tuple[Array, ShaderLens]] = ()) -> list[PupilCircles]:
+    """One wide disc for each state; arguments of `fit_pupil`."""
+    images = fit_stop_images(lenses, folded=True)
+    assert images is not None  # a finer image had enough rays
+    nothing = np.zeros((0, 3), np.int64), np.zeros((0, 3, 0))
+    pupils = [
+        PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0, 1.0), *nothing)
+        for lens, image in zip(lenses, images, strict=True)
+    ]
+    states = [*zip(np.eye(len(pupils)), lenses, strict=True), *between]
+    rows = [r for weights, lens in states for r in _beyond_discs(lens, pupils[0].mixed(pupils[1:], weights), 6)]
+    more = max(float(np.quantile(r, 1 - _DISC_LOST)) for r in rows)
+    return [replace(p, wide=(1.0, 0.0, more)) for p in pupils]
 
 
-def _fitted_disc(lens: ShaderLens, disc: PupilDisc) -> Array:
-    """Numbers [3, M] by asymmetric least squares on the extents of what passes: those too small weigh more."""
-    rng, extents, at = np.random.default_rng(6), [], []
-    for radius in np.linspace(0, 0.9999 * disc.film_radius_mm, _DISC_RADII):
-        for share in _DISC_STOPS:
-            size = share * lens.stop_radius_mm
-            pupil, passed = _drawn_in_boxes(lens, np.full(_DISC_RAYS, radius), np.full(_DISC_RAYS, size), rng)
-            if passed.any():
-                (x, y), scaled = pupil[:, passed], (radius / disc.unit_mm, size / disc.stop_mm)
-                centre, wide, tall = (x.max() + x.min()) / 2, (x.max() - x.min()) / 2, np.abs(y).max()
-                corners = np.hypot((x - centre) / max(wide, 1e-9), y / max(tall, 1e-9)).max()
-                extents.append((centre, wide * corners, tall * corners))
-                at.append(np.prod(np.array(scaled) ** disc.exponents, axis=1))
-    rows, wanted = np.array(at), np.array(extents).T
-    numbers = list[Array]()
-    for k, values in enumerate(wanted):
-        # A centre may lie on either side: half widths are measured about the fitted one.
-        if k == 1:
-            values = values + np.abs(wanted[0] - rows @ numbers[0])
-        weight = np.ones(len(values))
-        for _ in range(20):
-            fit = np.linalg.lstsq(rows * weight[:, None], values * weight, rcond=_RCOND)[0]
-            weight = np.where((rows @ fit < values) & (k > 0), 10.0, 1.0)
-        numbers.append(fit)
-    return np.stack(numbers)
-
-
-def _drawn_in_boxes(
-    lens: ShaderLens, radius: Array, stop: Array, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Random pupil points [2, N] in the boxes of film points, in their frames, and whether rays pass there."""
-    count, pupil = radius.size, lens.drawn_in_boxes(radius, rng)
-    angle = 2 * np.pi * rng.random(count) * lens.anamorphic
-    turn = np.exp(1j * angle)
-    film, turned = radius * turn, (pupil[0] + 1j * pupil[1]) * turn
-    z, nm = (rng.uniform(*span, count) for span in (lens.film_z_mm, lens.wavelength_nm))
-    film_mm, pupil_mm = (np.stack([v.real, v.imag]) for v in (film, turned))
-    return pupil, np.asarray(lens.status(film_mm, pupil_mm, nm, z, stop) == st.PASSED)
-
-
-def disc_lost(disc: PupilDisc, lens: ShaderLens) -> float:
-    """The share of random rays that pass beyond the disc, in the worst zone of film and stop."""
-    rng = np.random.default_rng(7)
-    area, share = rng.random(_DISC_CHECKED), rng.choice(_DISC_STOPS, _DISC_CHECKED)
-    radius, stop = disc.film_radius_mm * np.sqrt(area), share * lens.stop_radius_mm
-    pupil, passed = _drawn_in_boxes(lens, radius, stop, rng)
-    g = Graph()
-    g.outputs["rows"] = g.concat(*disc._rows(g.input("radius"), g.input("stop")))
-    inputs = {"radius": radius[None] / disc.unit_mm, "stop": stop[None] / disc.stop_mm}
-    centre, wide, tall = evaluate(g, inputs)["rows"]
-    out = passed & (np.hypot((pupil[0] - centre) / wide, pupil[1] / tall) > 1)
-    zone = (8 * area).astype(np.intp) * 3 + np.digitize(share, (0.3, 0.6))
-    counts, missed = (np.bincount(zone[rows], minlength=24) for rows in (passed, out))
-    return float((missed / np.maximum(counts, _FEW)).max())
+def _beyond_discs(lens: ShaderLens, pupil: PupilCircles, seed: int) -> list[Array]:
+    """How far random rays that pass lie beyond the image of the smallest stop that they pass, in units of
+    `StopImage.stop_mm`; for each zone of the film and that stop with enough rays."""
+    beyond, zones = [], []
+    for k in range(_DRAWN):
+        rays = draw_rays(lens, None, seed + k)
+        inputs = {"film_mm": rays.film_mm, "point_mm": 0 * rays.point_mm}
+        inputs |= {"film_z_mm": rays.film_z_mm[None], "wavelength_nm": rays.wavelength_nm[None]}
+        middle, by_x, by_y = evaluate(pupil.image.graph, inputs).values()
+        way, area = rays.pupil_mm - middle, by_x[0] * by_y[1] - by_x[1] * by_y[0]
+        x, y = (way[0] * by_y[1] - way[1] * by_y[0]) / area, (by_x[0] * way[1] - by_x[1] * way[0]) / area
+        size = np.hypot(*rays.point_mm)
+        beyond.append((np.hypot(x, y) - size) / pupil.image.stop_mm)
+        part = np.square(rays.film_mm).sum(0) / lens.film_radius_mm**2 * 8
+        zones.append(part.astype(np.intp) * 3 + np.digitize(size / lens.stop_radius_mm, (0.3, 0.6)))
+    lacks, zone = np.concatenate(beyond), np.concatenate(zones)
+    return [lacks[zone == z] for z in np.flatnonzero(np.bincount(zone) >= _FEW)]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -69,14 +69,6 @@ class Focusing:
         return z if self.film_z_mm is None else z.clip(*self.film_z_mm)
 
 
-class FilmFunction(NamedTuple):
-    """The film's position as a graph and its program, and its largest error (mm) at places between those of the fit."""
-
-    program: Program
-    error_mm: float
-    graph: Graph
-
-
 def number_of(axes: Sequence[Axis], nodes: Sequence[float], rule: str = "") -> float | Program:
     """A number that follows the state as those of a model do: of one value at all nodes a constant, else a function.
 
@@ -97,8 +89,8 @@ def film_function(
     axes: Sequence[Axis] = (),
     between: Sequence[tuple[Sequence[float], Focusing]] = (),
     focus: Focus = "best",
-) -> FilmFunction:
-    """The film by the distance in m (inf allowed) and, of "best", the stop's radius in mm.
+) -> tuple[Program, float]:
+    """The film by the distance in m (inf allowed) and, of "best", the stop's radius in mm; its largest error in mm.
 
     The film never falls back as the object comes nearer, and stays beyond the nearest one and the ends of the stop.
 
@@ -121,15 +113,14 @@ def film_function(
     fit, check = grid(*(_roots(n) for n in samples)), grid(*(np.linspace(0, 1, n) for n in _CHECKS))
     placed = np.array([node.places(*fit) for node in nodes])
     checked = [(state, lens, lens.places(*check)) for state, lens in between or [((), nodes[0])]]
-    found: list[FilmFunction] = []
+    found: list[tuple[Program, float]] = []
     for degrees in choices:
-        graph = _fitted(nodes, axes, placed, fit, degrees)
-        program = lower(graph)
+        program = lower(_fitted(nodes, axes, placed, fit, degrees))
         error = max(_error(program, axes, *known, check) for known in checked)
-        found.append(FilmFunction(program, error, graph))
+        found.append((program, error))
         if error < enough:
             break
-    return min(found, key=lambda f: f.error_mm)
+    return min(found, key=lambda f: f[1])
 
 
 def followed_rows(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]:
@@ -340,7 +331,7 @@ def film_extras(
         made["film_z_paraxial_mm"] = ("paraxial", reach, "the paraxial image", [])
     functions, lines = {}, []
     for name, (focus, limits, what, stop) in made.items():
-        functions[name], error, _ = film_function(nodes, axes, between, focus)
+        functions[name], error = film_function(nodes, axes, between, focus)
         given = ", ".join([*state, *distance, *(stop if by_stop else [])])
         lines.append(
             f"{name}({given}): film plane of {what}, {', '.join(limits)}, beyond as at the end; within "

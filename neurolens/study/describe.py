@@ -31,7 +31,7 @@ from neurolens.lens.glass import glass_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.setting.check import Check, check_lens, doubts, film_edge_mm, verdict
+from neurolens.setting.check import Check, check_lens, doubts, verdict
 from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import camera_rays, image_radius_mm
 from neurolens.setting.states import set_lens
@@ -239,23 +239,6 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
         "doubts": doubts(checks or []),
         "checks": [asdict(c) for c in checks or []],
     }
-
-
-_NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
-
-
-def section(path: Path) -> layout.Layout:
-    """A lens in section with rays, focused at infinity, as `layout.sheet` draws it; an anamorphic one in y-z."""
-    lens = set_lens(read_quietly(path))
-    data, edge = first_order(lens), film_edge_mm(lens)
-    if edge is None:
-        edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
-    focal = f"{data.efl_mm:.4g}"
-    if lens.anamorphic:
-        focal = f"{data.efl_mm:.3g} / {first_order(lens, meridian='x').efl_mm:.3g}"
-    field = "" if lens.half_field_deg is None else f", {lens.half_field_deg:.3g}°"
-    subtitle = f"{focal} mm f/{data.f_number:.2g}{field}, rims {lens.rims}"
-    return replace(layout.layout_profile(Scene(lens, math.inf, "y"), edge), title=path.stem, subtitle=subtitle)
 
 
 FOCUS, FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field's edge

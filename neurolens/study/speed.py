@@ -27,9 +27,8 @@ from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.records import ExactRecord, Timing, break_even_rays
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.cameras.model import OnnxLens, load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.graph.c import Signature, in_double, write_blocks, write_c, write_double
 from neurolens.graph.compiler import FLAGS, compile_c, has_compiler
 from neurolens.graph.program import Program
@@ -217,7 +216,8 @@ def exact_candidate(lens: Lens, domain: Domain) -> Candidate:
 
     def run(*columns: Any) -> Traced:
         *points, wavelength = columns
-        return trace(lens, camera_rays(*points, domain.pupil_z_mm), wavelength, transmittance=True)
+        fx, fy, fz, px, py = points
+        return trace(lens, camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength, transmittance=True)
 
     return Candidate(EXACT[0], lambda rays: partial(run, *eager_arguments(rays)), EAGER_BATCHES)
 

@@ -93,7 +93,7 @@ class Guess:
     ab: Array
 
     @staticmethod
-    def fitted(a: Array, b: Array, w: Array, z: Array, wanted: Array, mirror: bool) -> Guess:
+    def fitted(a: Array, b: Array, w: Array, z: Array, wanted: Array, *, mirror: bool) -> Guess:
         """The guess of vectors `wanted` [K, 2, N] from a and b [2, N], by least squares over all terms."""
         rows, forms = [*a, *b], MIRROR if mirror else ROUND
         products = [sum(rows[i] * rows[j] for i, j in form) for form in forms]
@@ -256,11 +256,11 @@ def inverse_of(model: LensModel) -> InverseModel:
     z = np.zeros_like(w) if z is None else z
     chief, scale = (np.array(v)[:, None] for v in (e.chiefs, e.pupil_scales_mm))
     at_pupil = (rays[2:4] - chief * rays[:2]) / scale
-    stop = (rays[:2] / e.film_scale_mm, out["stop"], w, z, at_pupil[None])
-    scene = (out["position"], out["direction"], w, np.zeros_like(w), np.stack([u, p]))
-    return InverseModel(
-        model, Guess.fitted(*(v[..., sheet] for v in stop), mirror=e.mirror), Guess.fitted(*scene, mirror=e.mirror)
-    )
+    at_sheet = (v[..., sheet] for v in (rays[:2] / e.film_scale_mm, out["stop"], w, z, at_pupil[None]))
+    stop = Guess.fitted(*at_sheet, mirror=e.mirror)
+    wanted = np.stack([u, p])
+    scene = Guess.fitted(out["position"], out["direction"], w, np.zeros_like(w), wanted, mirror=e.mirror)
+    return InverseModel(model, stop, scene)
 
 
 def _inputs(model: LensModel, rays: Array, film_z: Array) -> dict[str, Array]:

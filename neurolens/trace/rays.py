@@ -1,7 +1,7 @@
 """The exact tracer, in either direction: the reference for surrogates.
 
 Rays are separate tensors of shape [N]; float64 for truth, float32 for speed. A ray that cannot go on carries a
-status and stays finite.
+status and stays finite. Ghosts (`follow`) meet the same surfaces with the same tests, but may be reflected.
 """
 
 from __future__ import annotations
@@ -376,3 +376,88 @@ def sound_wavelength(
         return wavelength_nm, None
     sound = (wavelength_nm > 0) & (wavelength_nm < math.inf)
     return torch.where(sound, wavelength_nm, glass.LINE_D_NM).to(dtype), sound if lens.dispersive else None
+
+
+# ---- ghosts: light that any sequence of surfaces refracts or reflects ----
+
+Action = Literal["T", "R"]
+Steps = Sequence[tuple[int, Action]]
+
+
+class GhostTrace(NamedTuple):
+    """The result of following a sequence.
+
+    Attributes:
+        rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
+        status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
+        power: [N], the share of unpolarised light that the surfaces send on and the glass does not absorb.
+        points: x, y, z of the meeting points of every step, lens frame, mm.
+    """
+
+    rays: Rays
+    status: Tensor
+    power: Tensor
+    points: tuple[tuple[Tensor, Tensor, Tensor], ...]
+
+
+def turning(count: int, reflections: Sequence[int]) -> list[tuple[int, Action]]:
+    """The steps of light from the front to the film of `count` surfaces, reflected at some of them in this order."""
+    steps: list[tuple[int, Action]] = []
+    at, sense = 0, 1
+    for k in reflections:
+        steps += [*((between, "T") for between in range(at, k, sense)), (k, "R")]
+        at, sense = k - sense, -sense
+    return [*steps, *((k, "T") for k in range(at, count))]
+
+
+def follow(
+    lens: Lens,
+    rays: Rays,
+    steps: Steps,
+    wavelength_nm: Tensor | float | None = None,
+    *,
+    towards: Towards = "film",
+    polarised: bool = False,
+) -> GhostTrace:
+    """Follow light along a sequence of surfaces.
+
+    Args:
+        lens: the prescription; every rim and the stop are tested at every crossing.
+        rays: points and unit directions [N], lens frame, mm; float32 or float64.
+        steps: surfaces in the order in which they are met, "T" refracted or "R" reflected.
+        wavelength_nm: number or [N]; None takes `Lens.reference_nm`.
+        towards: "film" for light that enters at the front, "scene" for light that enters at the rear.
+        polarised: whether to follow the polarisation that each surface gives to the light, or to average it there.
+
+    Raises:
+        InputError: as `trace` for rays and wavelengths; no steps, a surface that does not exist or is not the next one
+            in the direction of travel.
+    """
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    check_rays(rays, wavelength_nm)
+    _check(len(lens.surfaces), steps, towards)
+    tracing = Tracing(lens, rays, wavelength_nm, 1 if towards == "film" else -1, steps[0][0], guard=True)
+    passage = Passage(tracing.o, lens, tracing.wavelength_nm, polarised)
+    points = []
+    for k, action in steps:
+        sense, reflected = tracing.sense, action == "R"
+        r, (met, bent, _), mediums = tracing.cross(k, reflected)
+        points.append((met.x, met.y, met.z + tracing.vertex))
+        passage.pass_surface(k, r, met, bent.q, mediums, sense, reflected)
+    power = tracing.tests.only(passage.arrived(rays.x), 0.0)
+    return GhostTrace(tracing.leave(), tracing.tests.status(), power, tuple(points))
+
+
+def _check(count: int, steps: Steps, towards: Towards) -> None:
+    """Surfaces must follow one another as light meets them."""
+    if not steps:
+        raise InputError("sequence", "steps", "(none)", "at least one surface")
+    if towards not in ("scene", "film"):
+        raise InputError("sequence", "towards", towards, '"scene" or "film"')
+    at, sense = (-1, 1) if towards == "film" else (count, -1)
+    for n, (k, action) in enumerate(steps):
+        if action not in ("T", "R"):
+            raise InputError("sequence", f"step {n}", action, '"T" or "R"')
+        if k != at + sense or not 0 <= k < count:
+            raise InputError("sequence", f"step {n}", k, f"surface {at + sense}, of 0 to {count - 1}")
+        at, sense = k, -sense if action == "R" else sense

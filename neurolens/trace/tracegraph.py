@@ -15,10 +15,9 @@ from neurolens.graph.ir import Graph, Value
 from neurolens.lens.glass import absorption_of, cauchy, glass_of, index_at, index_of
 from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Graphs, is_number, times
-from neurolens.trace.coatings import times_film
 from neurolens.trace.shapes import figure_of
 from neurolens.trace.surfaces import Hit, Medium, Rays, Test, cross, media, radius2
-from neurolens.trace.transmission import Passage, Shares
+from neurolens.trace.transmission import Passage, Shares, times_film
 
 TRANSMITTANCE = (
     "Transmittance: of unpolarised light, with the polarisation that surfaces give to it, coatings and absorption."

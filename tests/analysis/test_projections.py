@@ -10,10 +10,11 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
+from neurolens import handover as files
 from neurolens.analysis.projections import NAMES, Projection, fit, inverse_polynomial, residual
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import Field, field_of
-from neurolens.cli import projection as command
+from neurolens.cli import stmap as command
 from neurolens.lens.shot import Shot
 from tests.command_line import failure, run_json
 
@@ -65,7 +66,7 @@ def test_opencv_projects_to_the_same_pixels(kind: str, tmp_path: Path) -> None:
     found = example(kind)
     direction = rays(min(found.widest_rad, 1.5))
     path = tmp_path / "camera.yaml"
-    path.write_text(command._file_storage(found, 0.25))
+    path.write_text(files._file_storage(found, 0.25))
     stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix, numbers = (stored.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
     assert (stored.getNode("image_width").real(), stored.getNode("avg_reprojection_error").real()) == (1920, 0.25)
@@ -99,9 +100,9 @@ def test_closed_forms_of_ideal_cameras() -> None:
         ("pinhole", "opencv", 50.0, {"k1": 0.0, "k2": 0.0}),
     ):
         field = field_of_camera(spec)
-        points = command.shown(field, SIZE, FILM)
+        points = files._shown(field, SIZE, FILM)
         found = fit(kind, *points, SIZE, (focal / pixel, focal / pixel))
-        left = residual(found, *command.shown(field, SIZE, FILM, (40, 30)))
+        left = residual(found, *files._shown(field, SIZE, FILM, (40, 30)))
         assert left.worst_px < 2e-3 and left.sound
         least = 0.01 if kind == "f-theta" else 2e-4  # pixels, or a share
         assert {k: found.named[k] for k in expected} == pytest.approx(expected, abs=least, rel=1e-4)
@@ -121,7 +122,7 @@ def test_a_projection_that_turns_back_says_so() -> None:
 
 
 def test_f_theta_goes_both_ways() -> None:
-    found = fit("f-theta", *command.shown(field_of_camera("fisheye-stereographic"), SIZE, FILM), SIZE, (746.7, 746.7))
+    found = fit("f-theta", *files._shown(field_of_camera("fisheye-stereographic"), SIZE, FILM), SIZE, (746.7, 746.7))
     angle = np.linspace(0, found.widest_rad, 50)
     radius = sum(a * angle ** (k + 1) for k, a in enumerate(found.coefficients))
     back = sum(b * radius ** (k + 1) for k, b in enumerate(inverse_polynomial(found)))

@@ -22,7 +22,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main as command_line
-from neurolens.cli.blender_lenses import form_of
+from neurolens.cli.blender import form_of
 from neurolens.lens.shot import Shot
 
 _SIDE = 512  # rays of a point: this squared

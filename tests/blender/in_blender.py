@@ -65,7 +65,7 @@ def rendered(scene: Any, folder: Path, frame: int = 1, eye: str = "") -> Any:
 @contextmanager
 def installed_pack(folder: Path, lenses: list[Any]) -> Iterator[Path]:
     """A zip of the extension with these lenses, installed as from disk and enabled."""
-    from neurolens.blender.pack import write_pack
+    from neurolens.blender import write_pack
 
     out = folder / "neurolens.zip"
     write_pack(out, lenses)

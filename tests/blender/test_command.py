@@ -15,10 +15,8 @@ import pytest
 pytest.importorskip("onnxruntime", reason="neurolens is not installed in Blender's environment")
 
 from neurolens.base.errors import InputError  # noqa: E402
-from neurolens.cli import (
-    blender_lenses,  # noqa: E402
-    main,  # noqa: E402
-)
+from neurolens.cli import blender as command  # noqa: E402
+from neurolens.cli import main  # noqa: E402
 from neurolens.lens.paraxial import first_order  # noqa: E402
 from neurolens.shaders.blender_shader import Shader  # noqa: E402
 
@@ -45,15 +43,15 @@ def once(make: Callable[..., Any]) -> Callable[..., Any]:
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of three models and their lens file, and shaders that cost nothing."""
     for name in ("field_table", "thumbnail"):
-        monkeypatch.setattr(blender_lenses, name, once(getattr(blender_lenses, name)))
+        monkeypatch.setattr(command, name, once(getattr(command, name)))
 
     def written(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Shader:
         if file.stem == "huge":
             raise InputError(file, "operations", 20000, "up to 12000")
         return Shader("camera", f"shader of {file.name}, {zoom}", 1, (), {}, 21.6, 1.8, 0.7)
 
-    monkeypatch.setattr(blender_lenses, "shader_of", written)
-    monkeypatch.setattr(blender_lenses, "Processes", ThreadPoolExecutor)  # which know the stand-in
+    monkeypatch.setattr(command, "shader_of", written)
+    monkeypatch.setattr(command, "Processes", ThreadPoolExecutor)  # which know the stand-in
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # what stands in must not stay
     for folder in ("models", "lenses"):
         (tmp_path / folder).mkdir()
@@ -102,12 +100,12 @@ def test_lenses_that_cannot_be_shaders_are_left_out_and_said(place: Path, capsys
     for form in ("lenses/huge.toml",):
         shutil.copy(place / "lenses" / f"{LENS}.toml", place / form)
     given = ["build", "-o", str(place / "n.zip"), "--models", str(place / "models")]
-    shader_of = blender_lenses.shader_of
+    shader_of = command.shader_of
 
     def only_files(file: Path, **options: object) -> Shader:
         return shader_of(place / "x.onnx" if file.suffix == ".onnx" else file, **options)
 
-    blender_lenses.shader_of = only_files  # undone with the fixture's
+    command.shader_of = only_files  # undone with the fixture's
     assert main(["blender", *given, "--lens", "huge", "--json"]) == 0
     told, said = capsys.readouterr()
     assert json.loads(told)["lenses"] == {"huge": ["ols-36"]} and HUGE in said
@@ -129,7 +127,7 @@ def test_bad_input_is_one_line(
     (place / "a.txt").write_text("x")
     (place / "a.zip").write_text("no zip")
     with monkeypatch.context() as early:
-        early.setattr(blender_lenses, "form_of", lambda *given, **options: pytest.fail("no shader is to be made"))
+        early.setattr(command, "form_of", lambda *given, **options: pytest.fail("no shader is to be made"))
         for to, expected in (("a.zip", "a zip of `neurolens blender build`"), ("a.txt", "or a folder")):
             assert expected in failed(capsys, "add", models / f"{LENS}.ols-36.onnx", "--to", place / to)
     assert "format" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
@@ -139,9 +137,9 @@ def test_bad_input_is_one_line(
 def test_a_squeezed_picture_is_said_of_its_lens(place: Path) -> None:
     name = "cooke_anamorphic_42"  # focal lengths of 42.47 and 21.47 mm
     for file in (f"models/{name}.mlp-16x2.onnx", f"lenses/{name}.toml"):
-        [note] = blender_lenses.form_of(Path(file)).notes
+        [note] = command.form_of(Path(file)).notes
         assert "squeezed 1.98 times across" in note and "Aspect Y of 1.98" in note
-    assert blender_lenses.form_of(place / "models" / f"{LENS}.ols-36.onnx").notes == []
+    assert command.form_of(place / "models" / f"{LENS}.ols-36.onnx").notes == []
 
 
 def test_models_of_one_state_have_the_section_of_that_state_and_ranges_their_name() -> None:
@@ -151,8 +149,8 @@ def test_models_of_one_state_have_the_section_of_that_state_and_ranges_their_nam
         ("nikon_zoom_70_200-range.states-64", 71.5),
     ):
         file = Path(f"models/{model}.onnx")
-        lens = blender_lenses.stated_lens(file, Path("lenses"))
+        lens = command.stated_lens(file, Path("lenses"))
         assert lens is not None and first_order(lens).efl_mm == pytest.approx(efl, rel=1e-3)
-        packed = blender_lenses.packed_of([file], [])
+        packed = command.packed_of([file], [])
         assert packed.name.endswith(", any zoom") == ("range" in model)
-    assert blender_lenses.stated_lens(file, Path("models")) is None
+    assert command.stated_lens(file, Path("models")) is None

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from in_blender import MODULE, bpy, first_scene, installed_pack, rendered, surroundings
 
-from neurolens.blender.pack import Form, PackedLens, add_to_folder, user_folders
+from neurolens.blender import Form, PackedLens, add_lens, user_folders
 
 # A pinhole that shows its settings as a colour.
 SHADER = """
@@ -415,7 +415,7 @@ def panel(scene: Any) -> list[str]:
 def test_lenses_of_the_user_folder_join_the_menu(scene: Any) -> None:
     [folder] = user_folders()
     try:
-        add_to_folder(folder, packed("mine"))
+        add_lens(folder, packed("mine"))
         bpy.ops.neurolens.reload()
         assert bpy.ops.neurolens.apply(lens="mine", kind="exact") == {"FINISHED"}
         (folder / "lenses.json").write_text(json.dumps({"schema": 99, "lenses": []}))

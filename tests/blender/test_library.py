@@ -14,11 +14,10 @@ from typing import Any
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.blender.pack import (
+from neurolens.blender import (
     Form,
     PackedLens,
-    add_to_folder,
-    add_to_zip,
+    add_lens,
     extension_library,
     user_folders,
     write_pack,
@@ -47,7 +46,7 @@ def test_zip_is_read_as_it_was_written_and_takes_more(tmp_path: Path) -> None:
     first = out.read_bytes()
     write_pack(out, [lens(), lens("wide", ("network",), 20.0)])
     assert out.read_bytes() == first
-    add_to_zip(out, lens("gauss", ("exact",)))
+    add_lens(out, lens("gauss", ("exact",)))
     with zipfile.ZipFile(out) as packed:
         packed.extractall(folder)
     found, wrong = library.read_library([folder])
@@ -63,9 +62,9 @@ def test_zip_is_read_as_it_was_written_and_takes_more(tmp_path: Path) -> None:
 
 def test_user_folder_adds_to_the_lenses_that_ship(tmp_path: Path) -> None:
     shipped, own = tmp_path / "shipped", tmp_path / "own"
-    add_to_folder(shipped, lens())
-    add_to_folder(own, lens("gauss", ("exact",)))
-    add_to_folder(own, lens("mine"))
+    add_lens(shipped, lens())
+    add_lens(own, lens("gauss", ("exact",)))
+    add_lens(own, lens("mine"))
     found, wrong = library.read_library([shipped, own, tmp_path / "none"])
     assert not wrong and found["gauss"].variants.keys() == {"polynomial", "exact"} and "mine" in found
 
@@ -79,12 +78,12 @@ def test_facts_that_are_none_are_named_and_left(facts: str, tmp_path: Path) -> N
     found, wrong = library.read_library([tmp_path])
     assert not found and len(wrong) == 1 and str(tmp_path) in wrong[0]
     with pytest.raises(InputError):
-        add_to_folder(tmp_path, lens())
+        add_lens(tmp_path, lens())
     assert (tmp_path / "lenses.json").read_text() == facts
 
 
 def test_files_outside_the_folder_are_not_read(tmp_path: Path) -> None:
-    add_to_folder(tmp_path, lens())
+    add_lens(tmp_path, lens())
     data = json.loads((tmp_path / "lenses.json").read_text())
     data["lenses"][0]["variants"][0]["file"] = "../secret.osl"
     (tmp_path / "lenses.json").write_text(json.dumps(data))
@@ -127,7 +126,7 @@ def test_no_extension_takes_no_lens(content: bytes | dict[str, str], tmp_path: P
                 packed.writestr(name, text)
     before = path.read_bytes()
     with pytest.raises(InputError, match="neurolens blender build"):
-        add_to_zip(path, lens())
+        add_lens(path, lens())
     assert path.read_bytes() == before
 
 
@@ -148,17 +147,17 @@ def test_zips_that_are_encrypted_packed_otherwise_damaged_or_lie_take_no_lens(at
         data[listed + 24 : listed + 28] = (4_000_000_000).to_bytes(4, "little")
     path.write_bytes(data)
     with pytest.raises(InputError, match="neurolens blender build"):
-        add_to_zip(path, lens())
+        add_lens(path, lens())
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs")
 def test_fifos_are_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "f.zip")
     with pytest.raises(InputError, match="not a regular file"):
-        add_to_zip(tmp_path / "f.zip", lens())
+        add_lens(tmp_path / "f.zip", lens())
     os.mkfifo(tmp_path / "lenses.json")
     with pytest.raises(InputError, match="not a regular file"):
-        add_to_folder(tmp_path, lens())
+        add_lens(tmp_path, lens())
 
 
 @pytest.mark.parametrize("method", ["../../../escaped/evil", "/etc/evil", "a" * 300, "..\\evil", "x\0y", "\udc80"])
@@ -166,7 +165,7 @@ def test_no_text_of_a_card_leads_out_of_the_folder(method: str, tmp_path: Path) 
     """The card's fit.method was a part of the shader's path: it wrote outside, or no file could have its name."""
     hostile = PackedLens("gauss", "Gauss", 50.0, 1.8, "", None, [Form("polynomial", method, "x", 1.0, 21.6, 1.8, 0.7)])
     folder, out = tmp_path / "a" / "b" / "c", tmp_path / "n.zip"
-    add_to_folder(folder, hostile)
+    add_lens(folder, hostile)
     write_pack(out, [hostile])
     found, wrong = library.read_library([folder])
     assert not wrong and found["gauss"].variants["polynomial"].path.read_text() == "x"
@@ -244,14 +243,14 @@ def test_menus_are_sorted_by_each_order() -> None:
 
 def test_maker_character_and_bokeh_go_into_the_zip(tmp_path: Path) -> None:
     told = dataclasses.replace(lens(), maker="Laikin", character={"swirl": 0.4, "flare": None}, bokeh=b"discs")
-    add_to_folder(tmp_path, told)
+    add_lens(tmp_path, told)
     found = library.read_library([tmp_path])[0]["gauss"]
     assert (found.maker, found.character, found.bokeh.read_bytes()) == ("Laikin", {"swirl": 0.4}, b"discs")
-    add_to_folder(tmp_path, lens("gauss", ("exact",)))  # another form keeps what it does not bring
+    add_lens(tmp_path, lens("gauss", ("exact",)))  # another form keeps what it does not bring
     assert library.read_library([tmp_path])[0]["gauss"].bokeh == found.bokeh
 
 
 def test_characters_are_those_of_the_table() -> None:
-    from neurolens.cli.lens_list import CHARACTER  # no module of Blender's environment needs more than this file
+    from neurolens.cli.lens import CHARACTER  # no module of Blender's environment needs more than this file
 
     assert {figure for figure, _ in CHARACTER.values()} == library.CHARACTER.keys()

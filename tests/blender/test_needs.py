@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-import sys
 import zipfile
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
-from neurolens.blender import pack
+from neurolens import blender as pack
 
-
-def _extension() -> tuple[ModuleType, ModuleType]:
-    """Modules of the extension; its package itself starts with Blender."""
-    package = ModuleType("neurolens_extension")
-    package.__path__ = [str(pack.EXTENSION)]
-    sys.modules[package.__name__] = package
-    return tuple(importlib.import_module(f"neurolens_extension.{name}") for name in ("library", "needs"))  # type: ignore[return-value]
-
-
-library, needs = _extension()
+library = pack.extension_library()
 FIELD = library.Field((0.0, 10.0, 21.0), 1.0, ((0.0, 40.0, 200.0),) * 2, ((20.0,) * 3,) * 2, ((1.0, 0.9, 0.5),) * 2)
 
 
@@ -48,8 +36,8 @@ def test_confusion_is_that_of_the_thin_lens() -> None:
         if not math.isinf(depth):
             assert 1 / (1e3 * depth - there) + 1 / there == pytest.approx(1 / 50)
         expected = 50 / 2 * abs(there - film) / there
-        assert needs.confusion_mm(50.0, 2.0, focus, depth) == pytest.approx(expected)
-    assert needs.confusion_mm(50.0, 2.0, 2.0, 2.0) == 0
+        assert library.confusion_mm(50.0, 2.0, focus, depth) == pytest.approx(expected)
+    assert library.confusion_mm(50.0, 2.0, 2.0, 2.0) == 0
 
 
 @pytest.mark.parametrize(
@@ -62,22 +50,22 @@ def test_confusion_is_that_of_the_thin_lens() -> None:
     ],
 )
 def test_the_cheapest_that_holds_is_advised(tolerance: float, depths: list[float], use: str) -> None:
-    told = needs.needs(lens(), setting(), depths, 2.0, tolerance)
+    told = library.needs(lens(), setting(), depths, 2.0, tolerance)
     assert told.use == use and len(told.why) == 2 and all(line.endswith(".") for line in told.why)
     assert "20 px" in told.why[1]  # of distortion at the corner, of 200 um
 
 
 def test_what_keeps_no_tolerance_names_the_best() -> None:
-    told = needs.needs(lens(polynomial=3.0, network=2.0), setting(), [2.0], 2.0, 0.01)
+    told = library.needs(lens(polynomial=3.0, network=2.0), setting(), [2.0], 2.0, 0.01)
     assert told.use == "" and "the best is network with 0.2 px" in told.why[0]
-    assert "none takes" in needs.needs(lens(), setting(sensor_mm=(90.0, 60.0)), [], 2.0, 0.01).why[0]
-    assert "not known" in needs.needs(lens(field=None), setting(), [], 2.0, 1e6).why[1]
+    assert "none takes" in library.needs(lens(), setting(sensor_mm=(90.0, 60.0)), [], 2.0, 0.01).why[0]
+    assert "not known" in library.needs(lens(field=None), setting(), [], 2.0, 1e6).why[1]
 
 
 def test_field_is_that_of_the_lens_and_goes_through_the_zip(tmp_path: Path) -> None:
     """A stopped and scaled form of the same lens has the field scaled; the facts are read as they were written."""
     pytest.importorskip("torch")
-    from neurolens.cli.blender_lenses import field_table
+    from neurolens.cli.blender import field_table
     from neurolens.readers.lensfile import read_lens
     from neurolens.setting.states import set_lens
 

@@ -12,7 +12,7 @@ from film_light import FilmLight, film_light
 
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.vignetting import Vignetted
+from neurolens.cameras.reduced import Vignetted
 from neurolens.lens.shot import Shot
 
 ROOT = Path(__file__).parents[2]

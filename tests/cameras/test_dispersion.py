@@ -11,9 +11,9 @@ from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.dispersion import ReducedDispersion, film_shift
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
+from neurolens.cameras.reduced import ReducedDispersion, film_shift
 from neurolens.cameras.sampling import stratified
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.shot import Shot

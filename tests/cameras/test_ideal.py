@@ -14,10 +14,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras import build
 from neurolens.cameras.build import make_camera
+from neurolens.cameras.cameragraph import concentric_disk
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.ideal import ThickLens, ThinLens
-from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
-from neurolens.cameras.sampling import concentric_disk
+from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, ThinLens
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order, system_of

@@ -19,7 +19,7 @@ from onnx import ModelProto
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.cameras.model import ModelScene, OnnxCamera, OnnxLens, best_focus_z_mm, load_model
-from neurolens.cameras.pupil_search import PupilTable, pass_test, tightened
+from neurolens.cameras.pupil_outline import PupilTable, pass_test, tightened
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot

@@ -17,8 +17,9 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, pruned
-from neurolens.graph.osl import write_osl
+from neurolens.graph.loworder import low_tests
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import write_osl
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.shot import Shot
@@ -26,9 +27,9 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders import blender_shader as shaders
-from neurolens.shaders import lowtests, osl, pupil_fit, stop_image
-from neurolens.shaders.blender_shader import _smallest, exact_lens
-from neurolens.shaders.pupil import Blades, PupilCircles, PupilDisc
+from neurolens.shaders import osl, pupil_fit, shader_lens
+from neurolens.shaders.blender_shader import exact_lens
+from neurolens.shaders.pupil import Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
 from neurolens.surrogates import fit
@@ -41,7 +42,7 @@ FAR = 1e9
 
 @cache
 def lens() -> osl.OslLens:
-    return osl.model_lens(load_model(MODEL), _smallest(load_model(MODEL)), lambda share: None)
+    return osl.model_lens(load_model(MODEL), lambda share: None)
 
 
 def written() -> osl.OslCamera:
@@ -132,7 +133,7 @@ def test_fewer_terms_tell_which_rays_pass_and_move_none() -> None:
 def test_an_exact_lens_keeps_its_tests() -> None:
     lens = read_lens(GAUSS)
     traced = exact_graph(lens, pupil_plane_z_mm(lens), (400.0, 700.0))
-    assert lowtests.low_tests([traced], [osl._samples(written().lens, written().pupil)]) is None
+    assert low_tests([traced], [osl._samples(written().lens, written().pupil)]) is None
 
 
 def zoom(name: str, axis: Axis) -> tuple[list[ShaderLens], list[tuple[np.ndarray, ShaderLens]]]:
@@ -146,8 +147,7 @@ def zoom(name: str, axis: Axis) -> tuple[list[ShaderLens], list[tuple[np.ndarray
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quick fit of the pupil, where it is not the pupil that is tested."""
     monkeypatch.setattr(pupil_fit, "_RAYS", 3000)
-    monkeypatch.setattr(pupil_fit, "_FIRST", 15_000)
-    monkeypatch.setattr(stop_image, "_RAYS", 4000)
+    monkeypatch.setattr(shader_lens, "_RAYS", 4000)
 
 
 @pytest.mark.slow
@@ -214,11 +214,11 @@ def test_range_of_a_zoom_whose_groups_focus_is_refused_in_one_line(tmp_path, cap
 
 
 @cache
-def fitted(name: str) -> tuple[ShaderLens, PupilCircles | PupilDisc]:
+def fitted(name: str) -> tuple[ShaderLens, PupilCircles]:
     if name == MODEL.stem:
         return written().lens, written().pupil
     model = load_model(ROOT / "models" / f"{name}.onnx")
-    shown = osl.shader_lens(model, _smallest(model))
+    shown = osl.shader_lens(model)
     return shown, fit_pupil([shown], lambda share: None)[0]
 
 
@@ -239,7 +239,7 @@ BICONVEX = "thorlabs_lb1471_biconvex_50.ols-64"  # far off its axis two parts of
     "name, least",
     [
         ("muller_fisheye_100.ols-64", 0.95),
-        pytest.param(BICONVEX, 0.4, marks=pytest.mark.slow),
+        pytest.param(BICONVEX, 0.27, marks=pytest.mark.slow),
         *whole(("cooke_anamorphic_42.ols-64", 0.92)),
     ],
 )
@@ -247,7 +247,7 @@ def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float) -
     """Against samples all over a box on the pupil plane: light of film points on all sides, stop open and closed."""
     lens, pupil = fitted(name)
     rng, count, reach = np.random.default_rng(12), 100_000, reach_of(lens)
-    assert isinstance(pupil, PupilDisc) == (name == BICONVEX)
+    assert (pupil.wide[2] > 0) == (name == BICONVEX)
     assert min(passing_share(lens, pupil).values()) >= least
     for share, turn, field in ((1.0, 0.5, 0.6), (1.0, 1.2, 0.6), (0.5, 0.3, 0.6), (0.5, 0.9, 0.9)):
         stop = share * lens.stop_radius_mm
@@ -289,7 +289,7 @@ def test_pupils_lose_no_light_in_any_zone_of_the_film(name: str) -> None:
 
 
 def missed_by_zone(
-    lens: ShaderLens, pupil: PupilCircles | PupilDisc, reach: float, share: float = 1.0
+    lens: ShaderLens, pupil: PupilCircles, reach: float, share: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of random rays through a box, those that pass and those of them that no sample is: of five parts of the film's
     radius and of four of its half turn."""
@@ -301,28 +301,14 @@ def missed_by_zone(
         lens.film_z_mm, lens.wavelength_nm))  # fmt: skip
     passed = lens.status(film, point, nm, z, stop) == 0
     film, point = film[:, passed], point[:, passed]
-    if not (isinstance(pupil, PupilCircles) and pupil.image.anamorphic):
+    if not pupil.image.anamorphic:
         turn = np.exp(-1j * np.arctan2(film[1], film[0])) * (point[0] + 1j * point[1])
         film, point = np.stack([np.hypot(*film), 0 * film[0]]), np.stack([turn.real, turn.imag])
     inputs = {"film_mm": film, "pupil_mm": point, "stop_radius_mm": np.array([[stop]])}
     inputs |= {"film_z_mm": z[None, passed], "wavelength_nm": nm[None, passed]}
-    missed = beyond_disc(pupil, inputs) if isinstance(pupil, PupilDisc) else beyond_circles(pupil, inputs)
+    missed = beyond_circles(pupil, inputs)
     zone = (radius * 5).astype(int) * 4 + (angle * 4 / np.pi).astype(int) % 4
     return np.bincount(zone[passed], minlength=20), np.bincount(zone[passed], missed, 20)
-
-
-def beyond_disc(disc: PupilDisc, rays: dict[str, np.ndarray]) -> np.ndarray:
-    """[N] whether rays through points of the pupil lie beyond an ellipse: the samples of a square's middle and edges
-    show where it is."""
-    rows = {name: rays[name] for name in ("film_mm", "film_z_mm", "wavelength_nm", "stop_radius_mm")}
-    middle, side, top = (
-        evaluate(disc.graph, rows | {"square": np.repeat(np.array(at)[:, None], rays["film_mm"].shape[1], 1)})[
-            "pupil_mm"
-        ]
-        for at in ((0.5, 0.5), (1.0, 0.5), (0.5, 1.0))
-    )
-    half = np.stack([side[0] - middle[0], top[1] - middle[1]])
-    return np.hypot(*((rays["pupil_mm"] - middle) / half)) > 1.0001
 
 
 def beyond_circles(circles: PupilCircles, rays: dict[str, np.ndarray]) -> np.ndarray:
@@ -346,7 +332,7 @@ def beyond_circles(circles: PupilCircles, rays: dict[str, np.ndarray]) -> np.nda
 @pytest.mark.usefixtures("few_rays")
 def test_light_is_that_of_the_camera_where_rims_leave_half_a_pupil() -> None:
     file = ROOT / "models" / "ogawa_zoom_70_200-135mm.ols-60.onnx"
-    made = osl.model_lens(load_model(file), None, lambda share: None)
+    made = osl.model_lens(load_model(file), lambda share: None)
     assert min(made.passing().values()) > 0.97
     again, rng = osl.osl_graph(made.nodes[0]), np.random.default_rng(11)
     camera = OnnxCamera(load_model(file), Shot(FILM, math.inf))

@@ -13,8 +13,7 @@ from shipped import whole
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera
-from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import Passes, PupilTable, outline_of
+from neurolens.cameras.pupil_outline import Passes, PupilOutline, PupilTable, outline_of
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot

@@ -19,8 +19,7 @@ from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cli import export_lens, main
-from neurolens.cli.export_lens import lens_program, pupil_planes_mm
+from neurolens.cli import main
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot
@@ -30,6 +29,8 @@ from neurolens.setting import focusing
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.setting.pupils import camera_rays
 from neurolens.setting.states import set_lens
+from neurolens.shaders import lens_source
+from neurolens.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
 from neurolens.study.speed import CompiledSource
 from neurolens.surrogates.fit import gap_axis, zoom_axis
@@ -122,8 +123,8 @@ def test_the_film_of_a_model_is_where_its_camera_has_it() -> None:
 def test_the_exact_lens_as_a_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As C, of rays all over its domain: those of the tracer."""
     header, shader = tmp_path / "a.h", tmp_path / "a.glsl"
-    film, placed = export_lens._film, list[Any]()  # the best focus of all distances and stops is sought once
-    monkeypatch.setattr(export_lens, "_film", lambda *given: (placed or placed.append(film(*given)) or placed)[0])
+    film, placed = lens_source._film, list[Any]()  # the best focus of all distances and stops is sought once
+    monkeypatch.setattr(lens_source, "_film", lambda *given: (placed or placed.append(film(*given)) or placed)[0])
     assert main(["export", str(LENS), "--to", "c", "-o", str(header)]) == 0
     assert main(["export", str(LENS), "--to", "c-double", "-o", str(tmp_path / "d.h")]) == 0
     assert not re.search(r"\bfloat\b|\df\b|sqrtf|fmaf", (tmp_path / "d.h").read_text().split("*/", 1)[1])

@@ -43,20 +43,31 @@ def test_there_and_back_through_ideal_cameras(kind: str) -> None:
     assert (back.weight[ok] > 0).all()
 
 
+def in_square(point: np.ndarray) -> np.ndarray:
+    """The point of the unit square that goes to a point x + i y of the unit disc (Shirley and Chiu 1997)."""
+    size, turn = np.abs(point), np.angle(point)
+    quarter = np.round(turn / (np.pi / 2))
+    across = size * (turn - quarter * np.pi / 2) * 4 / np.pi
+    found = (size + 1j * across) * 1j**quarter
+    return np.stack([found.real, found.imag]) / 2 + 0.5
+
+
 @pytest.mark.parametrize("kind", ["exact", "exact64", "model"])
 def test_there_and_back_through_lenses(kind: str, model: OnnxCamera) -> None:
     """Aimed at the point of the front surface where the ray left, light comes back to the film point. No ray leaves
-    outside the box that the scene point's light is aimed at."""
+    outside the disc that the scene point's light is aimed at."""
     lens = model if kind == "model" else camera(kind)
     film, square, wavelength = film_rays(lens, 4000)
     rays = lens.sample(film, square, wavelength)
     points = points_on(rays)
-    lens.to_film(points[:, :1], square[:, :1], wavelength[:1])  # finds the boxes
-    front = lens._inverse[1] if kind == "model" else lens._front
     up = np.array([[0.0], [0.0], [lens.film.film_z_mm]])
-    low, high, half, cos, sin = front.box(1e3 * points + up)
-    x, y = 1e3 * rays.origin_m[:2].astype(float)  # on the front surface
-    aimed = np.stack([(x * cos + y * sin - low) / (high - low), ((y * cos - x * sin) / half + 1) / 2])
+    middle, edge = (
+        lens._front_discs.aim(1e3 * points + up, np.full((2, 4000), [[v], [0.5]], np.float32)) for v in (0.5, 1)
+    )
+    way = edge[0] - middle[0] + 1j * (edge[1] - middle[1])
+    aimed = in_square(
+        (1e3 * (rays.origin_m[0] + 1j * rays.origin_m[1].astype(float)) - middle[0] - 1j * middle[1]) / way
+    )
     passed = rays.status == st.PASSED
     assert aimed[:, passed].min() >= 0 and aimed[:, passed].max() <= 1
     # Rays that graze a rim on the way out may be stopped by it on the way back.

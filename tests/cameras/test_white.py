@@ -16,10 +16,9 @@ from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.ideal import ThickLens, ThinLens
+from neurolens.cameras.ideal import PROJECTIONS, Pinhole, ThickLens, ThinLens
 from neurolens.cameras.onnxlens import load_model
-from neurolens.cameras.pinhole import PROJECTIONS, Pinhole
-from neurolens.cameras.vignetting import Vignetted
+from neurolens.cameras.reduced import Vignetted
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.shot import Shot
 from neurolens.setting.states import set_lens

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -18,10 +19,9 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.defocus.gather import gather, spread_over
-from neurolens.defocus.highlights import spread_highlights, take_highlights
 from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.plate import Layer, PlatePinhole
-from neurolens.defocus.read import DepthSettings, read_plate
+from neurolens.defocus.picture import spread_highlights, take_highlights
+from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_channels, read_exr, write_channels
@@ -38,25 +38,25 @@ def thin(f_number: float = 1.4, focus_m: float = FOCUS_M) -> ThinLens:
     return ThinLens(50.0, f_number, focus_m, FILM)
 
 
-def pinhole_of(camera: Camera, size: tuple[int, int] = SIZE) -> PlatePinhole:
+def plate_of(camera: Camera, *layers: tuple[np.ndarray, np.ndarray], size: tuple[int, int] = SIZE) -> Plate:
     frame = frame_of(camera)
     per_mm = size[0] / camera.film_mm[0]
     reach = frame.reach_mm[0] * per_mm, frame.reach_mm[1] * per_mm
-    return PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[0])
+    pinhole = PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[0])
+    return Plate([Layer(rgb.astype(np.float32), np.asarray(w, np.float32)) for rgb, w in layers], pinhole, size)
 
 
 def blurred(
     camera: Camera, rgb: np.ndarray, w: np.ndarray, highlights: bool = False, samples: int = 128, threads: int = 1
 ) -> np.ndarray:
-    size = (w.shape[1], w.shape[0])
-    pinhole, layers = pinhole_of(camera, size), [Layer(rgb.astype(np.float32), np.asarray(w, np.float32))]
-    spread, taken = spread_over(camera, pinhole, size), None
+    plate = plate_of(camera, (rgb, w), size=(w.shape[1], w.shape[0]))
+    spread, taken = spread_over(camera, plate), None
     if highlights:
-        taken = take_highlights(layers[0], pinhole, spread, size)
+        taken = take_highlights(plate, 0, spread)
         assert len(taken.radius_px)
-    found = gather(layers, pinhole, camera, size, spread, samples, threads).rgb
+    found = gather(plate, camera, spread, samples, threads).rgb
     if taken is not None:
-        spread_highlights(found, taken, layers, pinhole, camera)
+        spread_highlights(found, taken, plate, camera)
     return found
 
 
@@ -151,17 +151,13 @@ def test_a_sharp_screen_hides_the_blur_behind_it() -> None:
 def test_what_lies_behind_an_edge_comes_from_the_layer_behind() -> None:
     """A near screen before a wall that is red where the screen hides it: only the layer behind knows."""
     camera = thin()
-    pinhole, w_far = pinhole_of(camera), in_focus(camera)
+    w_far = in_focus(camera)
     rgb, w = flat(1.0, w_far)
     rgb[:, :192], w[:, :192] = 0.0, 2.0
     hidden, far = flat(1.0, w_far)
     hidden[:, :192] = (1.0, 0.0, 0.0)
-    layers = [Layer(rgb.astype(np.float32), w.astype(np.float32))]
-    spread = spread_over(camera, pinhole, SIZE)
-    alone = gather(layers, pinhole, camera, SIZE, spread, 128)
-    both = gather(
-        [*layers, Layer(hidden.astype(np.float32), far.astype(np.float32))], pinhole, camera, SIZE, spread, 128
-    )
+    one, two = plate_of(camera, (rgb, w)), plate_of(camera, (rgb, w), (hidden, far))
+    alone, both = (gather(plate, camera, spread_over(camera, plate), 128) for plate in (one, two))
     assert alone.filled > 0.001 and both.filled < alone.filled / 20
     left = 192 - int(disc_px(camera, 2.0) / 2)
     assert alone.rgb[108, left, 1] > 0.15 and both.rgb[108, left, 1] < 0.02 < 0.15 < both.rgb[108, left, 0]
@@ -171,15 +167,8 @@ def test_planes_that_recede_have_no_edges() -> None:
     camera = thin()
     rgb, w = flat(1.0, 0.0)
     w[:] = np.linspace(0.05, 1.0, SIZE[1])[:, None]
-    pinhole = pinhole_of(camera)
-    found = gather(
-        [Layer(rgb.astype(np.float32), w.astype(np.float32))],
-        pinhole,
-        camera,
-        SIZE,
-        spread_over(camera, pinhole, SIZE),
-        64,
-    )
+    plate = plate_of(camera, (rgb, w))
+    found = gather(plate, camera, spread_over(camera, plate), 64)
     assert found.filled < 1e-4
 
 
@@ -208,8 +197,8 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     exact: Camera, place: tuple[float, float], w: float
 ) -> None:
     """Against rays from the point through the front of the lens, traced the other way."""
-    pinhole = pinhole_of(exact)
-    kernel = kernel_at(exact, pinhole, SIZE, place, w, place)
+    plate = plate_of(exact)
+    kernel, pinhole = kernel_at(exact, plate, place, w, place), plate.pinhole
     assert kernel is not None
     rgb, depth = flat(0.0, w)
     row, column = int(place[1]), int(place[0])
@@ -246,7 +235,7 @@ def test_the_middle_of_a_disc_on_the_axis_is_smooth() -> None:
     camera = make_camera("fused:leica_summilux_m_35mm_f1_4_asph_v1", Shot((36.0, 24.0), focus_m=0.7, f_number=1.4))
     for off in (0.0, 1.0):
         place = size[0] / 2 + off, size[1] / 2
-        kernel = kernel_at(camera, pinhole_of(camera, size), size, place, 0.0, place)
+        kernel = kernel_at(camera, plate_of(camera, size=size), place, 0.0, place)
         assert kernel is not None
         column, row = (int(m) - c for m, c in zip(place, kernel.corner_px, strict=True))
         part = kernel.light[row - 10 : row + 10, column - 10 : column + 10, 1].astype(np.float64)
@@ -332,13 +321,12 @@ def test_depth_may_be_in_another_part(tmp_path: Path) -> None:
 
 def test_lights_that_two_layers_show_are_spread_once() -> None:
     """A layer behind is a whole picture without the things in front: it shows the lights beside them, too."""
-    camera, size = thin(), SIZE
+    camera = thin()
     rgb, w = flat(0.0, 0.0)
     rgb[108, 194] = 1e4
-    pinhole, spread = pinhole_of(camera), spread_over(camera, pinhole_of(camera), size)
-    layers = [Layer(rgb.astype(np.float32), w.astype(np.float32)) for _ in range(2)]
-    lights = [len(take_highlights(layer, pinhole, spread, size, layers[:k]).light) for k, layer in enumerate(layers)]
-    assert lights == [1, 0] and layers[1].texel[108, 194, 0] < 1e4
+    plate = plate_of(camera, (rgb, w), (rgb, w))
+    lights = [len(take_highlights(plate, k, spread_over(camera, plate)).light) for k in (0, 1)]
+    assert lights == [1, 0] and plate.layers[1].texel[108, 194, 0] < 1e4
 
 
 def test_samples_of_a_deep_file_are_layers(tmp_path: Path) -> None:
@@ -372,24 +360,24 @@ def test_overscan_is_beyond_the_film(tmp_path: Path) -> None:
     plate = read_plate(tmp_path / "wide.exr", FILM, frame_of(thin()), DepthSettings())
     assert plate.size == SIZE and plate.layers[0].size == (SIZE[0] + 20, SIZE[1] + 20)
     camera = thin()
-    found = gather(plate.layers, plate.pinhole, camera, SIZE, spread_over(camera, plate.pinhole, SIZE), 16)
+    found = gather(plate, camera, spread_over(camera, plate), 16)
     assert found.rgb[2:-2, 2:-2].max() < 1e-3 and found.beyond == 0
 
 
 def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
     """A light in the border, just off the film: its disc reaches the picture, as the closed form says."""
     camera, border = thin(), 20
-    pinhole = pinhole_of(camera)
+    pinhole = plate_of(camera).pinhole
     pinhole = PlatePinhole(
         pinhole.reach_px, (pinhole.centre_px[0] + border, pinhole.centre_px[1] + border), pinhole.before_film_mm
     )
     rgb, w = flat(0.0, 2.0, (SIZE[0] + 2 * border, SIZE[1] + 2 * border))
     rgb[108 + border, border - 5] = 1e4  # 4.5 pixels from the edge
     rgb_before = rgb.copy()
-    layers, spread = [Layer(rgb.astype(np.float32), w.astype(np.float32))], spread_over(camera, pinhole, SIZE)
-    taken = take_highlights(layers[0], pinhole, spread, SIZE)
+    plate = replace(plate_of(camera, (rgb, w)), pinhole=pinhole)
+    taken = take_highlights(plate, 0, spread_over(camera, plate))
     picture = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
-    spread_highlights(picture, taken, layers, pinhole, camera)
+    spread_highlights(picture, taken, plate, camera)
     # The same light within a film that is as much larger.
     wide = ThinLens(50.0, 1.4, FOCUS_M, (FILM[0] * w.shape[1] / SIZE[0], FILM[1] * w.shape[0] / SIZE[1]))
     whole = blurred(wide, rgb_before, w, highlights=True)[border:-border, border:-border]
@@ -441,15 +429,15 @@ def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
 
 def test_a_kernel_has_the_area_of_rays_traced_from_the_point(exact: Camera) -> None:
     """Pixels above half of the mean, against a histogram of camera rays that see a small patch there."""
-    pinhole, place, w = pinhole_of(exact), (330.5, 150.5), 2.5
-    kernel = kernel_at(exact, pinhole, SIZE, place, w, place)
+    plate, place, w = plate_of(exact), (330.5, 150.5), 2.5
+    kernel = kernel_at(exact, plate, place, w, place)
     assert kernel is not None
     height, width = kernel.light.shape[:2]
     random, count = np.random.default_rng(5), 1_500_000
     px = np.array(kernel.corner_px)[:, None] + np.array([[width], [height]]) * random.random((2, count))
     film = np.stack([-(px[0] / SIZE[0] - 0.5) * FILM[0], (px[1] / SIZE[1] - 0.5) * FILM[1]]).astype(np.float32)
     rays = exact.sample(film, random.random((2, count)).astype(np.float32), np.full(count, 549.0, np.float32))
-    lines = pinhole.lines(rays.origin_m, rays.direction)
+    lines = plate.pinhole.lines(rays.origin_m, rays.direction)
     seen = np.hypot(lines[0] + w * lines[2] - place[0], lines[1] + w * lines[3] - place[1]) < 1.5
     weight = rays.weight * (seen & (rays.status == 0))
     cells = [(px[k] - kernel.corner_px[k]).astype(int) for k in (0, 1)]
@@ -471,7 +459,7 @@ def test_a_plate_of_our_own_says_its_pinhole_and_its_film(tmp_path: Path, scene:
     assert plates[0].pinhole.before_film_mm == 50.0
     # Depth counts from the film, 50 mm behind the hole; the ball's front is 1.9 m from it, 0.4 m off the axis.
     assert 1 / plates[0].layers[0].texel[..., 3].max() == pytest.approx(2.0 - 0.1 - 0.05, abs=0.02)
-    one, two = (gather(p.layers, p.pinhole, camera, p.size, spread_over(camera, p.pinhole, p.size), 64) for p in plates)
+    one, two = (gather(p, camera, spread_over(camera, p), 64) for p in plates)
     assert two.beyond == 0 and one.beyond > 0
     np.testing.assert_allclose(one.rgb[4:-4, 4:-4].mean(axis=(0, 1)), two.rgb[4:-4, 4:-4].mean(axis=(0, 1)), rtol=0.01)
     # The weight of the hole, cos^4, is taken out: what is left is the radiance of the white surroundings.
@@ -492,10 +480,10 @@ def test_highlights_before_and_behind_the_focus_have_their_own_kernels() -> None
 def test_a_light_too_wide_for_a_kernel_stays_among_the_others() -> None:
     camera = thin(0.7)
     size = (96, 54)
-    pinhole = pinhole_of(camera, size)
-    layer = Layer(*(v.astype(np.float32) for v in flat(0.0, 400.0, size)))
+    plate = plate_of(camera, flat(0.0, 400.0, size), size=size)
+    layer = plate.layers[0]
     layer.texel[20, 40, :3] = 1e4
-    assert not len(take_highlights(layer, pinhole, spread_over(camera, pinhole, size), size).radius_px)
+    assert not len(take_highlights(plate, 0, spread_over(camera, plate)).radius_px)
     assert layer.texel[20, 40, 0] == 1e4
 
 
@@ -511,8 +499,8 @@ def test_alpha_says_where_a_layer_has_nothing(tmp_path: Path) -> None:
     assert front[5, 9] == pytest.approx([0.4, 0.4, 0.4, 1.0]) and front[5, 300, 3] < 0
     camera = thin()
     alone, both = (
-        gather(layers, plate.pinhole, camera, SIZE, spread_over(camera, plate.pinhole, SIZE), 64).rgb[108, :, 1]
-        for layers in (plate.layers[:1], plate.layers)
+        gather(some, camera, spread_over(camera, some), 64).rgb[108, :, 1]
+        for some in (replace(plate, layers=plate.layers[:1]), plate)
     )
     assert alone[300] == 0 and both[300] == pytest.approx(0.97, abs=0.04)
     assert alone[192] == pytest.approx(alone[60] / 2, rel=0.2)  # the edge fades into nothing

@@ -13,9 +13,7 @@ import torch
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.defocus.atlas import pinhole_of
-from neurolens.defocus.kernels import Kernel, kernel_at
-from neurolens.defocus.rings import Grooves, aspheres, moves, responses
+from neurolens.defocus.kernels import Grooves, Kernel, aspheres, kernel_at, moves, own_plate, responses
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
@@ -114,9 +112,9 @@ def test_a_groove_on_a_thin_lens_turns_light_like_a_prism(plano: Path) -> None:
 def test_a_disc_has_the_rings_of_a_zone_plate_and_its_energy(plano: Path) -> None:
     """Light of the pupil's radius r arrives at m r + f (n - 1) h'(r)."""
     camera, size = make_camera(f"fused:{plano}", Shot((4.0, 3.0), math.inf)), (1600, 1200)
-    pinhole, grooves, near = pinhole_of(camera, size), Grooves(15.0, 0.5), 5.0
+    plate, grooves, near = own_plate(camera, size), Grooves(15.0, 0.5), 5.0
     place = size[0] / 2, size[1] / 2
-    plain, ringed = (kernel_at(camera, pinhole, size, place, near, place, grooves=g) for g in (None, grooves))
+    plain, ringed = (kernel_at(camera, plate, place, near, place, grooves=g) for g in (None, grooves))
     assert plain is not None and ringed is not None
     np.testing.assert_allclose(ringed.energy, plain.energy, rtol=0.003)
     radius = FOCAL / 8 / 2 * np.sqrt((np.arange(200_000) + 0.5) / 200_000)

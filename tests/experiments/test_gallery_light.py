@@ -20,9 +20,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot, StopShape
 from neurolens.readers.lensfile import read_lens

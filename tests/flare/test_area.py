@@ -7,20 +7,21 @@ import numpy as np
 import pytest
 from shipped import whole
 
-from neurolens.flare.areas import draw_edges, edges_of
-from neurolens.flare.canvas import Raster
+from neurolens.flare.canvas import Raster, draw_edges, edges_of
 from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
 from neurolens.flare.grids import REACH, grids_of
+from neurolens.flare.layers import FlareJob
 from neurolens.flare.lights import Light, light_rays, rays_across
-from neurolens.flare.picture import ghost_picture
-from neurolens.flare.steps import LOST
+from neurolens.flare.steps import LOST, entering
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.lens.apertures import Aperture
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB
+from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
 from tests.flare.test_ghosts import lens_of
+from tests.ghost_pictures import ghost_picture
 
 
 def drawn(found: np.ndarray, columns: int, share: float, size: tuple[int, int] = (12, 10)) -> np.ndarray:
@@ -157,7 +158,7 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
             continue
         grid = grids[pair]
         rows, area = rays_across(lens, light, grid.places)
-        found = tracer.follow(tracer.start(rows), 550.0, only=[pair], reach=REACH)
+        found = tracer.follow(entering(rows), 550.0, only=[pair], reach=REACH)
         edges = edges_of(found.rows[0], grid.columns, (96, 64), 96 / size)
         picture = np.zeros((64, 96, 3), np.float32)
         draw_edges(picture, range(64), edges, np.array([len(edges)]), np.full((1, 3), area * grid.cell))
@@ -168,10 +169,10 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
 
 def test_any_number_of_threads_and_layers_is_one_picture() -> None:
     lens, light = lens_of("cooke_triplet_50"), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
-    tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 48, 32)
-    one = ghost_picture(tracer, light, raster, wavelengths=4, threads=1)
-    assert np.array_equal(ghost_picture(tracer, light, raster, wavelengths=4, threads=3), one)
-    several = ghost_picture(tracer, light, raster, wavelengths=4, layers=[k % 3 for k in range(15)])
+    job = FlareJob(lens, light, Raster((36.0, 24.0), 48, 32), FlareSettings(bins=1), threads=1)
+    one = ghost_picture(job)
+    assert np.array_equal(ghost_picture(replace(job, threads=3)), one)
+    several = ghost_picture(job, [k % 3 for k in range(15)])
     np.testing.assert_allclose(several.sum(0), one[0], rtol=1e-4, atol=1e-7)
 
 
@@ -205,11 +206,11 @@ def test_a_ghost_that_a_rim_cuts_by_colour_has_no_bands() -> None:
     """
     lens = lens_of("tajima_retrofocus_24", f_number=8.0).with_aperture(Aperture(blades=6))
     tracer = GhostTracer(lens, [pair for pair in GhostTracer(lens).pairs if pair.name == "g07-06"])
-    raster, light = Raster((36.0, 24.0), 180, 120), Light(13.7, 10.0)
-    picture = ghost_picture(tracer, [light], raster, wavelengths=60)[0]
+    job = FlareJob(lens, [Light(13.7, 10.0)], Raster((36.0, 24.0), 180, 120), ghosts=tracer)
+    picture = ghost_picture(job)[0]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neurolens.flare.picture.FEWEST", 60)
-        fine = ghost_picture(tracer, [light], raster, wavelengths=60)[0]
+        patch.setattr("neurolens.flare.layers.FEWEST", 60)
+        fine = ghost_picture(job)[0]
     assert np.abs(picture - fine).max() < 0.05 * fine.max()
     assert np.abs(np.diff(picture[5], axis=0)).max() < 1.5 * np.abs(np.diff(fine[5], axis=0)).max()
 
@@ -226,11 +227,11 @@ def test_a_picture_of_all_ghosts_has_no_bands(name: str, coating: str) -> None:
     """
     lens = lens_of(name, f_number=8.0).with_aperture(Aperture(blades=6))
     lens = coated(lens, coating)
-    tracer, raster, light = GhostTracer(lens), Raster((36.0, 24.0), 180, 120), Light(13.7, 10.0)
-    picture = ghost_picture(tracer, [light], raster, wavelengths=16)[0]
+    job = FlareJob(lens, [Light(13.7, 10.0)], Raster((36.0, 24.0), 180, 120), FlareSettings(bins=4))
+    picture = ghost_picture(job)[0]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neurolens.flare.picture.FEWEST", 16)
-        fine = ghost_picture(tracer, [light], raster, wavelengths=16)[0]
+        patch.setattr("neurolens.flare.layers.FEWEST", 16)
+        fine = ghost_picture(job)[0]
     assert np.quantile(np.abs(picture - fine).max(-1) / fine.max(-1).clip(1e-30), 0.95) < 0.1
     assert np.abs(picture.sum((0, 1)) / fine.sum((0, 1)) - 1).max() < 0.1  # each colour's light
 
@@ -241,5 +242,6 @@ def test_a_caustic_takes_no_light_from_beside_it() -> None:
     lens = set_lens(lens, focus_m=40.0, f_number=2.8, focus_mode="best")
     tracer = GhostTracer(lens, [pair for pair in ghost_pairs(lens) if pair.name == "g11-06"])
     light = Light(13.7266, 10.0068, (2.57, 1.6, 0.67))
-    luminance = ghost_picture(tracer, [light], Raster((36.0, 24.0), 640, 427))[0] @ SRGB.to_xyz[1]
+    job = FlareJob(lens, [light], Raster((36.0, 24.0), 640, 427), ghosts=tracer)
+    luminance = ghost_picture(job)[0] @ SRGB.to_xyz[1]
     assert luminance.min() > -1e-6 * luminance.max()

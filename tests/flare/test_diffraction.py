@@ -18,10 +18,12 @@ from neurolens.analysis.fields import Scene
 from neurolens.base.errors import InputError
 from neurolens.flare import diffraction as d
 from neurolens.flare import exit_pupil as p
-from neurolens.flare.canvas import Raster, axis_irradiance
+from neurolens.flare.canvas import Raster
+from neurolens.flare.layers import FlareJob, axis_irradiance
 from neurolens.flare.lights import Light, light_rays
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
+from neurolens.render.settings import FlareSettings
 from neurolens.trace.rays import Rays, trace
 from tests.flare.test_ghosts import lens_of, plate
 
@@ -281,7 +283,7 @@ def test_picture_is_in_units_of_a_white_card() -> None:
     """The layer's sum is the light of the star over the card's; nothing is negative at one wavelength's grey."""
     lens, raster = double_gauss(22.0, Aperture(blades=6)), Raster((12.0, 8.0), 96, 64)
     light, more = (Light(3.0, 1.0, (rgb,) * 3) for rgb in (0.5, 1.5))  # their layers add up
-    picture = d.starburst_picture(lens, [light, more], raster, wavelength_nm=(NM, NM), wavelengths=1)
+    picture = d.starburst_picture(FlareJob(lens, [light, more], raster, FlareSettings(bins=1), (NM, NM)))
     assert picture.shape == (64, 96, 3) and picture.min() >= 0
     pupil = p.exit_pupil(lens, light, NM)
     assert pupil is not None
@@ -321,7 +323,9 @@ def corner_mask() -> Aperture:
 )
 def test_extremes(lens: Callable[[], Lens], light: Light, lit: bool) -> None:
     made_lens = lens()
-    film = d.starburst_picture(made_lens, [light], Raster((36, 24), 96, 64), wavelength_nm=(380, 780), wavelengths=2)
+    film = d.starburst_picture(
+        FlareJob(made_lens, [light], Raster((36, 24), 96, 64), FlareSettings(bins=2), (380.0, 780.0))
+    )
     assert np.isfinite(film).all() and bool(film.any()) == lit
     for nm in (380.0, 780.0) if lit else ():
         pupil = p.exit_pupil(made_lens, light, nm)
@@ -329,7 +333,7 @@ def test_extremes(lens: Callable[[], Lens], light: Light, lit: bool) -> None:
 
 
 def test_refusals_and_nothing_to_do() -> None:
-    assert not d.starburst_picture(plate(), [], Raster((36, 24), 9, 6)).any()
+    assert not d.starburst_picture(FlareJob(plate(), [], Raster((36, 24), 9, 6))).any()
     with pytest.raises(InputError, match="focused"):
         p.exit_pupil(replace(plate(), film_z_mm=None), AXIS, NM)
     pupil, lines = made(8.0)

@@ -13,16 +13,17 @@ from shipped import whole
 from neurolens.flare.canvas import Raster, Smear
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs, ghost_table
-from neurolens.flare.lights import CELLS, Light, light_towards, sides_across, with_disc
-from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import ghost_picture, photon_picture
-from neurolens.flare.sources import SceneLights
+from neurolens.flare.layers import FlareJob, photon_picture
+from neurolens.flare.lights import CELLS, Light, SceneLights, light_towards, sides_across, with_disc
+from neurolens.flare.steps import entering
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
+from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
 from tests.flare.test_ghosts import LENSES, lens_of
+from tests.ghost_pictures import ghost_picture
 
 CASE = Path(__file__).parents[3] / "shared/data/cases/render/area_light_flare.toml"
 
@@ -79,7 +80,8 @@ def test_ghosts_of_a_disc_are_the_integral_over_it() -> None:
     tracer, raster = brightest(lens, light, 14), Raster((36.0, 24.0), 120, 80)
 
     def light_of(lights: list[Light]) -> np.ndarray:
-        return ghost_picture(tracer, lights, raster, wavelengths=1, threads=1)[0].sum(-1)
+        job = FlareJob(lens, lights, raster, FlareSettings(bins=1), ghosts=tracer, finer=1)
+        return ghost_picture(job)[0].sum(-1)
 
     right = light_of(points_of(light, 2 * math.tan(math.radians(1.5)) * sides_across(light.towards), 7, True))
     disc, point = light_of([with_disc(light, 3.0)]), light_of([light])
@@ -108,7 +110,7 @@ def ghost_by_chance(lens: Lens, light: Light, pair: Pair, raster: Raster, count:
         far = np.linalg.norm(way, axis=0)
         rays = np.concatenate([place, 0 * place[:1], way / far])
         rays[:3] -= 60 * rays[3:]
-        x, y, power, worst = tracer.follow_each(tracer.start(rays), [550.0], pair)[0].astype(np.float64)
+        x, y, power, worst = tracer.follow_each(entering(rays), [550.0], pair)[0].astype(np.float64)
         lit = worst <= 1
         if part < 0:
             low, high = place[:, lit].min(1) - 0.2, place[:, lit].max(1) + 0.2
@@ -124,7 +126,7 @@ def test_streaks_of_the_sun_are_as_wide_as_its_disc() -> None:
     lens, raster = hexagonal("tajima_retrofocus_24"), Raster((9.0, 6.0), 240, 160)
     light = Light(0.0, 0.0)
     point, sun = (
-        starburst_picture(lens, [of], raster, wavelengths=3, threads=1).sum(-1).astype(np.float64)
+        starburst_picture(FlareJob(lens, [of], raster, FlareSettings(bins=3))).sum(-1).astype(np.float64)
         for of in (light, with_disc(light, 0.533))
     )
     widths = []
@@ -149,17 +151,15 @@ def test_stars_hold_no_negative_light() -> None:
     """Fringes of a point's star are of nearly one wavelength, beyond the gamut of sRGB, as a violet light is."""
     lens, raster = hexagonal("tajima_retrofocus_24"), Raster((4.5, 3.0), 60, 40)
     lights = [Light(2.0, 1.0, (0.1, 0.0, 1.0)), with_disc(Light(-2.0, 1.0), 0.533)]
-    star = starburst_picture(lens, lights, raster, wavelengths=5, threads=1)
+    star = starburst_picture(FlareJob(lens, lights, raster, FlareSettings(bins=5)))
     assert star.min() >= 0 and (star.sum(-1) > 0).all()
 
 
 def test_photons_of_a_disc_come_from_all_of_it() -> None:
     """The image of a disc of 4 degrees by photons: a disc of even light, its radius 2 degrees."""
     lens, raster = lens_of("laikin_double_gauss_50"), Raster((12.0, 8.0), 96, 64)
-    picture = photon_picture(
-        PhotonTracer(lens), [with_disc(Light(0.0, 0.0), 4.0)], raster, part="image", wavelengths=4, photons=1 << 16,
-        kernel_px=0, threads=1,
-    ).sum(-1)  # fmt: skip
+    job = FlareJob(lens, [with_disc(Light(0.0, 0.0), 4.0)], raster, FlareSettings(bins=4, kernel_px=0))
+    picture = photon_picture(job, "image", 1 << 16).sum(-1)
     y, x = np.mgrid[:64, :96]
     r = np.hypot(x - 47.5, y - 31.5) / 8  # mm
     edge = 50 * math.tan(math.radians(2))
@@ -179,7 +179,8 @@ def test_ghosts_that_rims_cut_have_fine_patches(name: str) -> None:
     (light,) = SceneLights(scene).seen(scene, lens.film_z_mm)
     (pair,), raster = [pair for pair in ghost_pairs(lens) if pair.name == name], Raster((36.0, 20.25), 160, 90)
     right = uniform_filter(ghost_by_chance(lens, light, pair, raster, 1 << 21), 11)
-    picture = ghost_picture(GhostTracer(lens, [pair]), [light], raster, wavelengths=1, threads=1)[0].sum(-1)
+    job = FlareJob(lens, [light], raster, FlareSettings(bins=1), ghosts=GhostTracer(lens, [pair]), finer=1)
+    picture = ghost_picture(job)[0].sum(-1)
     found, inside = uniform_filter(picture.astype(np.float64), 11), right > 0.3 * right.max()
     off = found[inside] / right[inside] * right[inside].sum() / found[inside].sum() - 1
     assert np.quantile(np.abs(off), 0.95) < 0.05

@@ -10,8 +10,17 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
-from neurolens.flare.lights import SUN, Light, light_rays, patches, read_lights, with_disc
-from neurolens.flare.sources import SceneLights, chosen, highlights, keep, keep_named
+from neurolens.flare.lights import (
+    SUN,
+    Light,
+    SceneLights,
+    highlights,
+    keep,
+    light_rays,
+    patches,
+    read_lights,
+    with_disc,
+)
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables, seen_from
@@ -182,27 +191,19 @@ def test_the_sun_and_large_lights() -> None:
 
 
 def test_lights_of_frames_neither_come_nor_go() -> None:
-    """Twelve lamps that a camera passes: each frame by itself has others; of all together the same, most energy first,
-    and a near panel is one of them."""
+    """Thirteen lights that a camera passes, five of which are kept: other ones in other frames, yet none by a step."""
     lamps = [{"position_m": [-3.0 + 0.5 * k, 2.0, -1.0], "intensity": [1.0 + 0.1 * k] * 3} for k in range(12)]
     quad = {"corner_m": [0.5, 1.5, -4.0], "edge_u_m": [1.0, 0.0, 0.0], "edge_v_m": [0.0, 1.0, 0.0]}
     lights, made = scene(points=lamps, quads=[{**quad, "emission": [9.0, 9.0, 9.0]}])
-    places = [seen_from(made, "scene", (x, 2.0, 3.0), (x, 2.0, -3.0)) for x in np.linspace(-3.0, 3.0, 25)]
-    frames = [lights.named(place, 100.0) for place in places]
-    assert all(len(frame) == 13 for frame in frames)
-    alone = [set(keep(list(f.values()), 5).lights) for f in frames]
-    assert len({frozenset(n for n, light in f.items() if light in of) for f, of in zip(frames, alone, strict=True)}) > 3
-    names = chosen(frames, 5)
-    whole = {name: sum(sum(f[name].rgb) for f in frames) for name in frames[0]}
-    ordered = sorted(whole, key=lambda name: -whole[name])
-    panel = next(name for name in whole if frames[0][name].shape is not None)
-    assert names == set(ordered[:5]) and panel in names
-    for frame in frames:
-        found = keep_named(frame, names)
-        assert found.of == 13 and set(found.lights) == {frame[name] for name in names}
-        left = sum(sum(frame[name].rgb) for name in ordered[5:]) / sum(sum(light.rgb) for light in frame.values())
-        assert found.dropped == pytest.approx(left)
-    assert chosen([], 3) == frozenset() and keep_named({}, names).lights == []
+    last, cast, steps = np.zeros(13), set[tuple[int, ...]](), 0.0
+    for x in np.linspace(-3.0, 3.0, 601):
+        every = lights.seen(seen_from(made, "scene", (x, 2.0, 3.0), (x, 2.0, -3.0)), 100.0)
+        kept = {(k.azimuth_deg, k.distance_m): sum(k.rgb) for k in keep(every, 5, fade=True).lights}
+        assert len(every) == 13 and len(kept) <= 5
+        now = np.array([kept.get((k.azimuth_deg, k.distance_m), 0.0) for k in every])
+        steps, last = max(steps, float(np.abs(now - last).max()) if last.any() else 0.0), now
+        cast.add(tuple(np.flatnonzero(now)))
+    assert len(cast) > 3 and steps < 0.1 * last.max()
 
 
 def test_lights_fade_before_they_are_left_out() -> None:

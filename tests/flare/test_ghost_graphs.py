@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.flare.ghostgraph import entrances, ghost_graphs
-from neurolens.flare.ghosts import GhostTracer, coated
+from neurolens.flare.ghosts import GhostTracer, coated, entrances, ghost_graphs
 from neurolens.flare.lights import Light, light_rays
+from neurolens.flare.steps import entering
 from neurolens.graph.interpret import evaluate
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
@@ -46,7 +46,7 @@ def test_graphs_are_the_traced_ghosts(name: str) -> None:
             given["stop_radius_mm"] = np.array([[closed.stop_radius_mm]])
             mine = evaluate(graph, given)["arriving"]
             rays = np.stack([*place, 0 * place[0], *d, np.sqrt(1 - (d**2).sum(0))])
-            exact = tracer.follow(tracer.start(rays), nm, only=[ghost.pair], reach=np.inf).rows[0].astype(np.float64)
+            exact = tracer.follow(entering(rays), nm, only=[ghost.pair], reach=np.inf).rows[0].astype(np.float64)
             lit = (exact[3] < 0.999) & (mine[3] < 0.999)
             assert lit.sum() > 100 and not ((exact[3] < 0.999) & (mine[3] > 1.001)).any()
             np.testing.assert_allclose(mine[:2, lit], exact[:2, lit], atol=0.03)

@@ -11,17 +11,18 @@ from film_light import film_light
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.flare.canvas import Raster, axis_irradiance
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_layout, ghost_pairs
+from neurolens.flare.layers import FlareJob, axis_irradiance
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import ghost_picture
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.readers.lensfile import read_lens
+from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
-from neurolens.trace.rays import Rays, trace
-from neurolens.trace.sequence import follow, turning
+from neurolens.trace.rays import Rays, follow, trace, turning
+from tests.ghost_pictures import ghost_picture
 
 LENSES = Path(__file__).parents[2] / "lenses"
 
@@ -146,7 +147,7 @@ def test_a_picture_holds_the_light_that_falls_on_it() -> None:
     """A film that holds every ghost of a plate: the picture's sum is the rays' power, in every layer."""
     lens = plate()
     tracer, raster, light = GhostTracer(lens), Raster((60.0, 40.0), 120, 80), Light(5.0, 0.0, (2.0, 2.0, 2.0))
-    picture = ghost_picture(tracer, [light], raster, wavelengths=3, layers=[1], threads=1)
+    picture = ghost_picture(FlareJob(lens, [light], raster, FlareSettings(bins=3), ghosts=tracer, finer=1), [1])
     assert picture.shape == (2, 80, 120, 3) and not picture[0].any()
     rays, area = light_rays(lens, light, 0, 4096)
     flux = 2 * area * tracer.trace(rays, 550.0).power[0].mean()

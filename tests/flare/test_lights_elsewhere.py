@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_line import failure, run_json
 
-from neurolens.blender.pack import extension_library
+from neurolens.blender import extension_library
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, ghost_table
 from neurolens.flare.layers import FlareJob, flare_layers

@@ -8,18 +8,17 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
-from neurolens.flare.canvas import Raster, axis_irradiance
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, ghost_pairs
+from neurolens.flare.layers import FlareJob, _smoothed, axis_irradiance, photon_picture
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
-from neurolens.flare.picture import _smoothed, photon_picture
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB
-from neurolens.render.settings import Scatter
+from neurolens.render.settings import FlareSettings, Scatter
 from neurolens.setting.states import set_lens
-from neurolens.trace.rays import Rays
-from neurolens.trace.sequence import follow, turning
+from neurolens.trace.rays import Rays, follow, turning
 from tests.flare.test_ghosts import LENSES, lens_of
 
 COUNT = 1 << 17
@@ -183,14 +182,14 @@ def test_direct_highlights_have_the_light_that_passes() -> None:
     """Out of focus, on a film that holds it: what comes without reflections, over the exposure; in no other part."""
     lens, light = lens_of("laikin_double_gauss_50"), Light(6.0, 0.0, distance_m=1.0)
     raster = Raster((36.0, 24.0), 36, 24)
-    tracer = PhotonTracer(lens)
-    picture = photon_picture(tracer, [light], raster, part="image", photons=1 << 15, wavelengths=1, threads=1)
+    job = FlareJob(lens, [light], raster, FlareSettings(bins=1))
+    picture = photon_picture(job, "image", 1 << 15)
     rays, area = light_rays(lens, light, 0, 1 << 15)
     direct = float(GhostTracer(lens, []).trace(rays, 550.0, direct=True).power.mean())
     expected = area * direct / axis_irradiance(lens, 550.0)
     noise = 4 / math.sqrt(direct * (1 << 15))
     assert picture[..., 1].sum() == pytest.approx(expected, rel=noise)
-    flare = photon_picture(tracer, [light], raster, photons=1 << 15, wavelengths=1, threads=1)
+    flare = photon_picture(job, "flare", 1 << 15)
     assert flare.max() < 0.1 * picture.max()
 
 

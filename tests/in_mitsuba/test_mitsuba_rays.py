@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import NeurolensError, NeurolensWarning
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
-from neurolens.mitsuba import library, load_scene
-from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples
+from neurolens.cameras.contract import RAYS_A_CALL as BATCH
+from neurolens.cameras.ideal import Pinhole, ThinLens
+from neurolens.mitsuba import load_scene
+from neurolens.mitsuba import sensor as library
+from neurolens.mitsuba.sensor import ChannelWavelengths, FilmRays, wavelength_samples
 from neurolens.render.colour import SpectralRange
 from neurolens.render.film import PixelGrid
 

@@ -16,8 +16,7 @@ from PIL import Image
 from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.cli import main
 from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
 from neurolens.render.pictures import read_exr

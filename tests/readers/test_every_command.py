@@ -90,7 +90,7 @@ def test_every_command_gives_a_foreign_file_to_its_reader(
     monkeypatch.setattr(any_format, "FORMATS", tuple(replace(f, read=stop) for f in any_format.FORMATS))
     (tmp_path / "out").mkdir(exist_ok=command == "blender")
     if command == "blender":
-        monkeypatch.setattr("neurolens.blender.pack.check_takes", lambda to: None)
+        monkeypatch.setattr("neurolens.blender.check_takes", lambda to: None)
     assert main([*words(command, files["zmx"], tmp_path, scene)]) == 2
     assert "by the reader of Zemax" in capsys.readouterr().err
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.render.colour import SpectralRange
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import Sampler

@@ -13,8 +13,7 @@ from render_helpers import FILM, SIZE, WHITE, diffuse, files_of_at_most, lit_sce
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.render import pictures
 from neurolens.render.pictures import read_exr, read_layers, write_exr, write_png
 from neurolens.render.renderer import Watch, render

@@ -10,7 +10,7 @@ from command_line import failure, run_json
 from render_helpers import FILM, WHITE, diffuse, scene
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.render.colour import (
     ACESCG,
     BRADFORD,

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from render_helpers import FLOOR, MATERIALS, WHITE, assert_aimed, on_floor, radiance, world
 
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.render.colour import SpectralRange
 from neurolens.render.film import PixelGrid
 from neurolens.render.integrator import trace

@@ -13,8 +13,7 @@ from shipped import whole
 
 from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.render.renderer import Watch, render
 
 LETTER_F = ["#####", "#....", "####.", "#....", "#....", "#...."]
@@ -112,9 +111,9 @@ class Raising(Pinhole):
     ("error", "said"),
     [
         (ModelError("a.onnx: cannot run it"), "a.onnx: cannot run it"),
-        *whole((MemoryError("2 TB"), "a render worker ran out of memory (2 TB)")),
-        *whole((ValueError("x" * 10_000), "a render worker failed: ValueError: xxx")),
-        (RuntimeError("no rays today"), "a render worker failed: RuntimeError: no rays today (test_renderer.py:"),
+        *whole((MemoryError("2 TB"), "a worker ran out of memory (2 TB)")),
+        *whole((ValueError("x" * 10_000), "a fault of neurolens: ValueError: xxx")),
+        (RuntimeError("no rays today"), "a fault of neurolens: RuntimeError: no rays today (test_renderer.py:"),
     ],
 )
 def test_what_a_worker_raises_is_one_line(error: Exception, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +141,7 @@ def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
     monkeypatch.setattr("neurolens.render.film.BATCH", 64)
     part, camera = tmp_path / "a.exr.part", Killed(50.0, FILM)
     options = SIZE | {"samples": 40, "threads": 2}
-    with pytest.raises(NeurolensError, match=r"killed \(signal 9: did the memory run out\?\).* kept in .*a\.exr\.part"):
+    with pytest.raises(NeurolensError, match=r"killed by signal 9: did the memory run out\?.* kept in .*a\.exr\.part"):
         render(scene(environment=WHITE), camera, watch=Watch(checkpoint=part), **options)
     with np.load(part, allow_pickle=False) as kept:
         assert kept["done"].min() >= 1 and kept["done"].max() == 2

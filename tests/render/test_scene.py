@@ -10,8 +10,7 @@ from PIL import Image
 from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.lens.apertures import Aperture
 from neurolens.render import images
 from neurolens.render.mesh import encloses

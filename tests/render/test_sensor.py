@@ -16,7 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cli import main
-from neurolens.frames.frame import Frame, prepare, write_pictures
+from neurolens.frames import Frame, prepare, write_pictures
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_channels, read_metadata

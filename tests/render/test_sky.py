@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from render_helpers import FLOOR, MATERIALS, assert_aimed, radiance, scene, world
 
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.render.colour import SRGB, SpectralRange, table
-from neurolens.render.environment import (
+from neurolens.render.job import expected_light
+from neurolens.render.lights import (
     SunLight,
     daylight_table,
     daylight_weights,
@@ -17,7 +18,6 @@ from neurolens.render.environment import (
     sun_spectrum,
     zenith,
 )
-from neurolens.render.job import expected_light
 from neurolens.render.renderer import render
 from neurolens.render.scenetables import Sky
 from neurolens.render.settings import FilmSettings

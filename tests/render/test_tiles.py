@@ -16,7 +16,7 @@ from shipped import whole
 
 from neurolens.cli import main
 from neurolens.render.pictures import METADATA_KEY, read_channels
-from neurolens.render.tiles import rows_of, tile_path
+from neurolens.render.renderer import rows_of, tile_path
 
 FARM = Path(__file__).parents[2] / "experiments" / "farm"
 Render = Callable[..., Path]

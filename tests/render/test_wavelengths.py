@@ -13,7 +13,7 @@ from shipped import whole
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.lens.shot import Shot
 from neurolens.render.colour import SpectralRange, table
 from neurolens.render.film import PixelGrid
@@ -32,7 +32,7 @@ def test_the_density_is_that_of_the_bins(light: tuple[np.ndarray, np.ndarray]) -
     spectral = SpectralRange(400, 700, light=light)
     assert spectral.edges_nm[[0, -1]] == pytest.approx([400, 700], abs=0) and np.all(np.diff(spectral.edges_nm) > 0)
     sample = ((np.arange(256 * 64) + 0.5) / (256 * 64)).astype(np.float32)
-    nm, bins = spectral.wavelengths_nm(sample), spectral.bin_of(sample)
+    nm, bins = spectral.wavelengths_nm(sample)[0], spectral.bin_of(sample)
     assert np.all(np.diff(nm) > 0) and np.all(np.bincount(bins) == 64)
     assert np.all((nm >= spectral.edges_nm[bins] - 1e-3) & (nm <= spectral.edges_nm[bins + 1] + 1e-3))
     # Divided by the density, the mean of 1 is the length of the range.

@@ -16,7 +16,8 @@ from shipped import whole
 from neurolens.analysis.fields import Scene
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
-from neurolens.cli import lens_list, main
+from neurolens.cli import lens as lens_list
+from neurolens.cli import main
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.any_format import lens_files, read_any
 from neurolens.study import describe as char
@@ -161,7 +162,7 @@ def test_a_changed_file_is_not_the_index_s(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(
-    "sort", ["speed", *whole(*(key for key in (*lens_list.SORTS, *lens_list.CHARACTER) if key != "speed"))]
+    "sort", ["speed", *whole(*(key for key in (*lens_list._SORTS, *lens_list.CHARACTER) if key != "speed"))]
 )
 def test_the_library_is_sorted_by_each_key(sort: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["lens", "list", "--sort", sort, "--json"]) == 0
@@ -169,9 +170,9 @@ def test_the_library_is_sorted_by_each_key(sort: str, capsys: pytest.CaptureFixt
     if sort in lens_list.CHARACTER:
         found = [row["character"][lens_list.CHARACTER[sort][0]] for row in rows]
     else:
-        found = [row[lens_list.SORTS[sort]] or None for row in rows]
+        found = [row[lens_list._SORTS[sort]] or None for row in rows]
     known = [v.casefold() if isinstance(v, str) else v for v in found if v is not None]
-    rising = sort in lens_list.SORTS or sort == "cats-eye"
+    rising = sort in lens_list._SORTS or sort == "cats-eye"
     assert known == sorted(known, reverse=not rising) and len(known) > 30
     assert found[len(known) :] == [None] * (len(rows) - len(known))
 

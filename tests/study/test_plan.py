@@ -17,7 +17,7 @@ from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import spectrum_of
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.cli import main
 from neurolens.lens.apertures import Aperture

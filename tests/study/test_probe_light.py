@@ -13,7 +13,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.flare.canvas import Raster
 from neurolens.flare.layers import FlareJob, flare_layers
-from neurolens.flare.sources import SceneLights
+from neurolens.flare.lights import SceneLights
 from neurolens.lens.shot import Shot
 from neurolens.plan.footprints import Footprints, blur_mm, distance_mm, left_to
 from neurolens.plan.plan import plan

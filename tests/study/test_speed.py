@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.speed import Call, Candidate, Race, Unavailable, camera_candidate, exact_candidate, race

@@ -24,7 +24,6 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.cli import main
-from neurolens.cli.export_lens import lens_program, pupil_planes_mm
 from neurolens.graph.program import _FOLDED, Program
 from neurolens.graph.shading import LANGUAGES
 from neurolens.lens.paraxial import film_z_mm
@@ -32,6 +31,7 @@ from neurolens.lens.prescription import VISIBLE_NM
 from neurolens.readers.any_format import read_any
 from neurolens.setting.pupils import image_radius_mm, pupil_bounds
 from neurolens.setting.states import set_lens
+from neurolens.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.shaders.source import camera_program
 from neurolens.surrogates.axes import mixture_of
 from neurolens.surrogates.source import WRITERS, Fix, fixed_models, fused_program

@@ -13,8 +13,7 @@ from polarised_fields import Step, pass_surface, power, powers, transmittance, u
 from torch import Tensor
 
 from neurolens.trace import transmission
-from neurolens.trace.coatings import Layers
-from neurolens.trace.transmission import Light, coated_shares, crossed, fresnel, turned
+from neurolens.trace.transmission import Layers, Light, coated_shares, crossed, fresnel, turned
 
 ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared" / "data" / "oracle"

@@ -22,15 +22,17 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.layers import FlareJob
 from neurolens.flare.lights import Light
-from neurolens.flare.picture import ghost_picture
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
+from neurolens.render.settings import FlareSettings
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import model_extras
 from neurolens.surrogates.source import export_source
+from tests.ghost_pictures import ghost_picture
 
 ROOT = Path(__file__).parents[2]
 LENS = "petzval_portrait_100"
@@ -287,7 +289,9 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: 
     rgb = (opened.number("neurolens.set.irradiance"),) * 3
     light = Light(np.degrees(np.arctan2(x, -z)), np.degrees(np.arcsin(y)), rgb)
     raster = Raster(tuple(opened.number("neurolens.engine.sides.a.values.film_mm")), WIDE, HIGH)
-    wanted = ghost_picture(tracer, [light], raster, wavelength_nm=(NM - 1, NM + 1), wavelengths=1, cell_px=4)[0, ..., 1]
+    settings = FlareSettings(bins=1, cell_px=4)
+    job = FlareJob(tracer.lens, [light], raster, settings, (NM - 1, NM + 1), ghosts=tracer, finer=1)
+    wanted = ghost_picture(job)[0, ..., 1]
     assert picture.sum() == pytest.approx(wanted.sum(), rel=0.02)
     coarse = [p.reshape(27, 5, 48, 5).mean((1, 3)) for p in (picture, wanted)]
     assert np.abs(coarse[0] - coarse[1]).sum() < 0.1 * coarse[1].sum()

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 import torch
 
+import neurolens.view as pages
 from neurolens.base.errors import InputError
 from neurolens.base.html import text_of
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.graph.osl import urgent
+from neurolens.graph.shading import urgent
 from neurolens.lens.prescription import VISIBLE_NM, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
@@ -28,8 +29,6 @@ from neurolens.setting.states import set_lens
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 from neurolens.trace.tracegraph import exact_graph
-from neurolens.view import page as pages
-from neurolens.view import shaders
 
 ROOT = Path(__file__).parents[2]
 LENS = "thorlabs_lb1471_biconvex_50"
@@ -196,7 +195,7 @@ def test_a_page_that_grows_too_large_leaves_files_out(tmp_path: Path) -> None:
 
 
 def tiny_lens() -> pages.ViewLens:
-    signature = shaders.Signature("tiny", ("film_x_mm",), (), ("x_mm",))
+    signature = pages.Signature("tiny", ("film_x_mm",), (), ("x_mm",))
     card = {"film_radius_mm": 20.0}
     noise = "".join(chr(33 + n) for n in np.random.default_rng(0).integers(0, 80, 3000)).replace("\\", "x")
     form = pages.Form("exact", "traced", "const float TINY_EFL_MM = 50.0f;\n", signature, card, {"c": noise.encode()})
@@ -219,7 +218,7 @@ def test_a_thin_lens_sends_rays_to_the_conjugate_point() -> None:
     focal, distance = 50.0, 52.0
     call = {"film_z_mm": 80.0, "stop_radius_mm": 9.0, "distance_mm": distance, "per_depth": 1 / focal - 1 / distance}
     given = {"film_mm": film, "pupil_mm": pupil} | {k: np.array([[v]]) for k, v in call.items()}
-    found = evaluate(shaders._thin_lens(), given)
+    found = evaluate(pages._thin_lens(), given)
     x, y, z, dx, dy, dz = found["scene_ray"]
     away = 1 / (1 / focal - 1 / distance)  # in front of the lens, at z = 28
     at = np.stack([x, y]) + np.stack([dx, dy]) * ((28.0 - away) - z) / dz
@@ -276,5 +275,5 @@ def test_a_paraboloid_has_a_path() -> None:
         Surface(30.0, 5.0, 16.0, 1.5, 60.0, conic=-1.0, asphere=((4, 1e-7),), stop=True), Surface(-200.0, 55.0, 16.0)
     )  # fmt: skip
     lens = set_lens(Lens("paraboloid", "", rows, 4.0, half_field_deg=5.0))
-    text, outputs = shaders.path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM)
+    text, outputs = pages.path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM)
     assert "lens_path" in text and len(outputs) > 4

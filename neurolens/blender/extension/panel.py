@@ -11,8 +11,7 @@ import bpy.utils.previews
 
 from . import camera as on_camera
 from . import library as facts
-from .library import KINDS, LensError, LensFacts, error_px, notes, outside, read_library, refusals, refused, too_large
-from .needs import needs
+from .library import LensError, LensFacts
 
 _FIRST = ("f_number", "focus_m", "zoom_mm")  # of the settings, before the others
 _LABELS = {  # where Blender would show the name alone
@@ -43,7 +42,7 @@ class Library:
             folders.append(Path(bpy.utils.extension_path_user(__package__, create=False)))
         except ValueError:
             pass  # not run as an extension
-        self.lenses, self.wrong = read_library(folders)
+        self.lenses, self.wrong = facts.read_library(folders)
         self.pictures = bpy.utils.previews.new()
         icons = {name: self._icon(name, lens.picture) for name, lens in self.lenses.items()}
         self.bokeh = {name: self._icon(f"bokeh of {name}", lens.bokeh) for name, lens in self.lenses.items()}
@@ -175,7 +174,7 @@ class NEUROLENS_OT_apply(_Operator):
     bl_label = "Put the Lens On"
     __annotations__ = {
         "lens": bpy.props.StringProperty(name="Lens", description="Its id; empty: the one chosen in the panel"),
-        "kind": bpy.props.StringProperty(name="Form", description=f"{', '.join(KINDS)}; empty: the panel's"),
+        "kind": bpy.props.StringProperty(name="Form", description=f"{', '.join(facts.KINDS)}; empty: the panel's"),
         "fit_sensor": bpy.props.BoolProperty(name="Fit Sensor", description="Make the sensor as large as the picture"),
     }
 
@@ -213,7 +212,7 @@ class NEUROLENS_OT_needs(_Operator):
         lens, setting = lens_of(props), on_camera.setting_of(context.scene, found)
         opened = setting.f_number or (found.data.dof.aperture_fstop if found.data.dof.use_dof else lens.f_number)
         depths = on_camera.depths_in_view(context, found, setting, lens.efl_mm)
-        told = needs(lens, setting, depths, opened, props.tolerance_px)
+        told = facts.needs(lens, setting, depths, opened, props.tolerance_px)
         props.advice = "\n".join(told.why)
         self.report({"INFO"}, told.why[0])
 
@@ -244,7 +243,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, camera = self.layout, context.camera
         layout.use_property_split = True
-        if (why := refused(bpy.app.version, bpy.app.build_options.cycles_osl)) is not None:
+        if (why := facts.refused(bpy.app.version, bpy.app.build_options.cycles_osl)) is not None:
             layout.label(text=why, icon="ERROR")
             return
         for line in LIBRARY.wrong:
@@ -278,14 +277,14 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
     def _draw_scene(self, context: Any, found: Any, lens: LensFacts, kind: str) -> None:
         layout, camera = self.layout, found.data
         variant, setting = lens.variants[kind], on_camera.setting_of(context.scene, found)
-        wrong, message = refusals(variant, setting), camera.neurolens.message
-        black = outside(variant, setting)
+        wrong, message = facts.refusals(variant, setting), camera.neurolens.message
+        black = facts.outside(variant, setting)
         if message and message != "; ".join(wrong):
             _wrapped(layout, message, "ERROR")
         applied = on_camera.applied(camera)
         if not applied:
             layout.operator("neurolens.apply", icon="CAMERA_DATA")
-        if too_large(variant, setting):
+        if facts.too_large(variant, setting):
             layout.operator("neurolens.apply", text="Fit Sensor and Put On").fit_sensor = True
         if applied:
             layout.operator("neurolens.take_back", icon="LOOP_BACK")
@@ -296,11 +295,11 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         layout.operator("neurolens.needs", icon="QUESTION")
         for line in camera.neurolens.advice.splitlines():
             _wrapped(layout, line, "INFO")
-        error = error_px(variant, setting)
+        error = facts.error_px(variant, setting)
         layout.label(text="Every surface is traced" if error is None else f"Error: {error:.2g} pixels (RMS)")
         for line in (*wrong, *black):
             _wrapped(layout, line, "ERROR")
-        for line in notes(variant, setting):
+        for line in facts.notes(variant, setting):
             _wrapped(layout, line, "INFO")
 
     def _draw_settings(self, camera: Any) -> None:
@@ -327,7 +326,7 @@ def warn_of_black(scene: Any, _graph: Any = None) -> None:
     lens = LIBRARY.lenses.get(lens_id)
     if lens is not None and kind in lens.variants:
         asked = lens.variants[kind], on_camera.setting_of(scene, found)
-        for line in (*refusals(*asked), *outside(*asked)):
+        for line in (*facts.refusals(*asked), *facts.outside(*asked)):
             print(f"neurolens: camera {found.name!r}, frame {scene.frame_current}: {line}", file=sys.stderr)
 
 

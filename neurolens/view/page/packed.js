@@ -144,7 +144,7 @@ function written(text) {
   }).join("\n");
 }
 
-/** Steps by urgent() of graph/osl.py: first those from which the longest chain of others leads on. */
+/** Steps by urgent() of graph/shading.py: first those from which the longest chain of others leads on. */
 function urgent(steps) {
   const lines = steps.split("\n").slice(0, -1), numbers = lines.map((line) => line.match(/\bt\d+\b/g)), ahead = new Map(), of = (n) => ahead.get(n) ?? 0;
   for (const [own, ...given] of [...numbers].reverse()) for (const n of given) ahead.set(n, Math.max(of(n), of(own) + 1));

@@ -1,56 +1,48 @@
-"""The parts of `neurolens export` that need torch: exact lenses, models with fixed inputs, ONNX, and inverse maps.
-
-The exact lens of a file is source code for one zoom position, or for all of them as an argument.
-"""
+"""The exact lens of a file as source code, for one zoom position, or for all of them as an argument."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from neurolens import __version__
 from neurolens.base import status as st
 from neurolens.base.bounds import RANGE
-from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
-from neurolens.cameras.model import load_model
 from neurolens.graph.c import Extras
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import VISIBLE_NM, Lens
 from neurolens.readers.any_format import read_any
-from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm, focus_states
+from neurolens.setting.focusing import best_focus_of_stops_mm, focus_states
 from neurolens.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import Array, Focusing, film_extras, followed, state_ranges
-from neurolens.study.measure import FRESH, fresh_rays, measure_on
 from neurolens.surrogates.axes import Axis, mixture_of, weights
-from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import gap_axis, zoom_axis
-from neurolens.surrogates.inverse import inverse_of
-from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source import DOUBLE, Fix, Written, checked_name, fixed_models, lines_of, write_program
+from neurolens.surrogates.source import DOUBLE, Written, checked_name, lines_of, write_program
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths
 _DISTANCES = 12  # about as many are placed for each lens
 _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
-# Rays for the errors of an ONNX file with fixed inputs.
-_HELD_OUT, _VIGNETTING = 20_000, 100_000
 
 
 def write_lens(
-    file: Path, out: Path, to: str, *, name: str | None = None, zoom: str | None = None, quiet: bool = False
-) -> Written:  # fmt: skip
+    file: Path,
+    out: Path,
+    to: str,
+    *,
+    name: str | None = None,
+    zoom: str | None = None,
+    progress: Progress | None = None,
+) -> Written:
     """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
 
     Args:
@@ -78,7 +70,7 @@ def write_lens(
     program = lens_program(nodes, axes, planes, double=to == DOUBLE)
     constants, functions = followed(axes, numbers(nodes, planes))
     constants |= {**state_ranges(axes), "wavelength_min_nm": VISIBLE_NM[0], "wavelength_max_nm": VISIBLE_NM[1]}
-    placed, said = _film(lens, nodes, axes, Progress(quiet=quiet))
+    placed, said = _film(lens, nodes, axes, progress or Progress(quiet=True))
     plane = f"z = {planes[0]:.6g} mm" if "pupil_z_mm" in constants else "z = NAME_pupil_z_mm(zoom_mm)"
     extras = Extras(constants, {**functions, **placed})
     return write_program(program, out, to, name, lines_of([*_head(lens, plane), *lines, *said]), extras)
@@ -113,10 +105,17 @@ def _film(
     nearest_m = [(_NEAR_EFL * abs(float(d.efl_mm)) + apart) / 1000 for d in data]
     with progress.stage("best focus of distances and stops") as report:
         done = count(1)
-        focused = [
-            focusing_of(at, near, lambda: report(min(1.0, next(done) / (_DISTANCES * len(lenses)))))
-            for at, near in zip(lenses, nearest_m, strict=True)
-        ]
+
+        def focusing(at: Lens, near_m: float) -> Focusing:
+            """How a lens is focused by its film, to so near."""
+
+            def best(focus_m: float, stops_mm: Array) -> Array:
+                report(min(1.0, next(done) / (_DISTANCES * len(lenses))))
+                return best_focus_of_stops_mm(at, focus_m, stops_mm.tolist(), VISIBLE_NM)
+
+            return Focusing(near_m, float(at.stop_radius_mm), lambda focus_m: film_z_mm(at, focus_m), best)
+
+        focused = [focusing(at, near) for at, near in zip(lenses, nearest_m, strict=True)]
         checked = [((v,), f) for v, f in zip(between, focused[len(nodes) :], strict=True)]
         return film_extras(focused[: len(nodes)], axes, checked)
 
@@ -156,51 +155,3 @@ def numbers(nodes: Sequence[Lens], planes_mm: Sequence[float]) -> list[tuple[str
         ("pupil_radius_mm", discs, "square"),
         ("stop_radius_max_mm", [float(n.stop_radius_mm) for n in nodes], ""),
     ]
-
-
-def focusing_of(lens: Lens, nearest_m: float, tick: Callable[[], None]) -> Focusing:
-    """How a lens is focused by its film, to so near; `tick` is called at each distance."""
-
-    def best(focus_m: float, stops_mm: Array) -> Array:
-        tick()
-        return best_focus_of_stops_mm(lens, focus_m, stops_mm.tolist(), VISIBLE_NM)
-
-    return Focusing(nearest_m, float(lens.stop_radius_mm), lambda focus_m: film_z_mm(lens, focus_m), best)
-
-
-def fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[Fix, tuple[LensModel, ...]]:
-    """What the numbers of --fix fix, by name, and the models that know it."""
-    film_z = fixed.get("film_z", [None])[0]
-    stop = fixed.get("stop", [None])[0]
-    if "f_number" in fixed:
-        stop = set_lens(model.lens, f_number=fixed["f_number"][0]).stop_radius_mm
-    if "focus" in fixed:
-        focus_m, lens = fixed["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
-        Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)
-        near, far = model.domain.film_z_mm
-        film_z = min(max(best_focus_z_mm(lens, focus_m), near), far)
-    fix = Fix(tuple(fixed.get("wavelengths", ())), film_z, stop)
-    return fix, fixed_models(model, fix)
-
-
-def write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
-    """Write a model as ONNX, with the errors of its card, or with new ones where something was fixed (None)."""
-    if len(models) > 1:
-        wavelengths = [m.domain.wavelength_nm[0] for m in models]
-        raise InputError("neurolens export", "--fix wavelengths", wavelengths, "one wavelength for an ONNX file")
-    model = models[0]
-    if card is not None:
-        export_onnx(model, out, card["errors"], derivatives=derivatives)
-        return
-    seed = int(model.settings.get("rays_seed") or 0) + FRESH
-    held_out = make_pairs(model.lens, model.domain, PairSettings(1, _HELD_OUT, 1, seed)).held_out
-    with atomic_path(out) as measured:  # a file without its errors never has the final name
-        export_onnx(model, measured, {})
-        rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
-        errors = measure_on(rays, load_model(measured))
-        export_onnx(model, measured, errors, derivatives=derivatives)
-
-
-def write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
-    """Write both inverse maps beside the model's file; returns their files and the share of rays that each finds."""
-    return {"inverse": export_inverse(inverse_of(model), out, load_model(out).card["errors"])}

@@ -1,0 +1,426 @@
+"""A lens as files of the programs that follow a render: USD, OpenTrackIO, lensfun, OpenCV, nerfstudio and NVIDIA.
+
+All files of a shot are of one pinhole, frame by frame, which the templates of all texts read. Its place is the entrance
+pupil, its focal length the paraxial size of the picture (of a lens with cylinders: of the y meridian, and widths are
+stretched by the squeeze). Breathing is a focal length that changes with the focus. Its f-number is this focal length
+over the entrance pupil's diameter, which gives discs of the lens's size.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from neurolens import __version__
+from neurolens.analysis import projections
+from neurolens.base.files import atomic_write_text
+from neurolens.base.html import html
+from neurolens.base.records import plain
+from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.field import Array, Complex, Field, spectrum_of, traced_light
+from neurolens.render.stmap import Plates, blocks
+
+FAR_M = 1e6  # stands for infinity where a program takes no other number
+LENSFUN_TYPES = {"equidistant": "fisheye"}  # other names are ours
+MOST_ENTRIES = 9  # of an animation that lensfun's profile has
+_SMALLER, _SMALLEST = (
+    (2, 4),
+    23.0,
+)  # stops from the shot's aperture to others in it, and its end; the widest is one, too
+_ROUNDS = 30  # of Lawson's weights
+MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"  # of OpenTrackIO
+_GOOD_PX = 0.1  # a polynomial that leaves more gives way to a ratio of two
+_LEAST = 1e-5  # singular value over the largest: below it coefficients grow until they cancel, and the ratio has poles
+SIDE = 2049  # of NVIDIA's exit picture
+_NEAR = 1.0  # pictures beyond the edge, so that what is read between pixels is right up to it
+_TRIED = 3  # each of so many is tried
+_FITTED, _HELD_OUT = (61, 41), (50, 34)  # points over the film
+AtStop = Callable[[float | None], Camera]
+Report = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """One frame.
+
+    Attributes:
+        number: of the frame; name: of it in file names, ".0001", "" for a still.
+        focal_mm: see the module. squeeze: focal length of the y over that of the x meridian.
+        pupil_mm: from the film to the entrance pupil; focus_m: to what is in focus, at most `FAR_M`.
+        f_stop: see the module. t_stop: None where it is not known.
+    """
+
+    number: int
+    name: str
+    focal_mm: float
+    squeeze: float
+    pupil_mm: float
+    focus_m: float
+    f_stop: float
+    t_stop: float | None
+
+    @classmethod
+    def of(cls, number: str, field: Field, settings: Mapping[str, Any], focus_m: float) -> Pinhole:
+        """The pinhole of a camera's frame; `number` as file names have it."""
+        state, (x, y) = settings["lens_state"], field.frame.reach_mm
+        size = y / (state["effective_focal_length_mm"] or y)
+        return cls(
+            int(number or 1), f".{number}" if number else "", y, float(f"{y / x:.6g}"), field.frame.pupil_mm[1],
+            min(focus_m, FAR_M), size * state["f_number"], state["t_stop"],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Handed:
+    """A shot.
+
+    Attributes:
+        attributes: of the first camera, see `render.pictures.standard_attributes`; texts are a stranger's.
+        rate: frames a second, numerator and denominator. colours: names of those that have maps of their own.
+    """
+
+    attributes: Mapping[str, Any]
+    version: str
+    rate: tuple[int, int]
+    frames: tuple[Pinhole, ...]
+    plates: Plates
+    colours: tuple[str, ...]
+
+    @property
+    def lens(self) -> str:
+        """The lens's name, not empty."""
+        return str(self.attributes.get("lensModel") or self.attributes["cameraModel"])
+
+    @property
+    def pixel_aspect(self) -> float:
+        """The width of a pixel over its height in what it shows."""
+        return float(f"{self.frames[0].squeeze * self.plates.pixel_mm[0] / self.plates.pixel_mm[1]:.6g}")
+
+    def film_mm(self, size: tuple[int, int], squeezed: bool = False) -> tuple[float, float]:
+        """The film of a picture of so many pixels, of the pinhole's focal length in both directions or as it is."""
+        stretch = 1.0 if squeezed else self.frames[0].squeeze
+        return size[0] * self.plates.pixel_mm[0] * stretch, size[1] * self.plates.pixel_mm[1]
+
+
+def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
+    """Coefficients of r^2, r^4, r^6 of light over that on the axis, by least squares, and the worst that they leave."""
+    lit = light > 0
+    powers = np.stack([radius[lit] ** k for k in (2, 4, 6)], 1)
+    scale = powers.max(0)
+    found = np.linalg.lstsq(powers / scale, light[lit] - 1, rcond=None)[0] / scale
+    return tuple(found.tolist()), float(np.abs(powers @ found + 1 - light[lit]).max())
+
+
+def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
+    """Points from the axis, without it, to the film's corner, or where the light ends, mm."""
+    return np.linspace(0, min(field.end_mm, math.hypot(*film_mm) / 2), count)[1:].astype(np.complex128)
+
+
+def lit_points(field: Field, film_mm: tuple[float, float], count: tuple[int, int] = _FITTED) -> Complex:
+    """Points spread over a film that light reaches, mm."""
+    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, n) * side for n, side in zip(count, film_mm, strict=True)))
+    points = np.asarray(x + 1j * y, np.complex128).reshape(-1)
+    return points[field.lit(points)]
+
+
+# The two lookup pictures of NVIDIA's schema OmniLensDistortionLutAPI, by which a USD camera has a lens's projection.
+#
+# `enter`, of the picture's size: the direction that a pixel sees, as R, G and B; x right, y up, -z forward; where no
+# light arrives 0, 0, 1, which is behind the camera. `exit`, a square: where the picture shows a direction, as R and G
+# from 0 to 1 from its upper left corner; -1 where it shows none. Directions are folded onto the square as onto an
+# octahedron, with forward in its middle; x grows to the right, and y, which is up, from the first row to the last. The
+# side is odd: so the folds run through centres of pixels, where pictures that are read between pixels are exact.
+# NVIDIA's renderer traces rays by the first; the second serves what it projects, such as motion vectors.
+
+
+def enter_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
+    """The channels of the picture of directions."""
+    planes = {name: np.empty(plates.picture[::-1], np.float32) for name in "RGB"}
+    for rows, point in blocks(plates.picture, plates.pixel_mm, report):
+        point = np.broadcast_to(point, (point.shape[0], plates.picture[0]))
+        way = field.directions(point.reshape(-1)) * np.array([1.0, 1.0, -1.0])[:, None]
+        way = np.where(field.lit(point.reshape(-1)) & np.isfinite(way).all(0), way, [[0.0], [0.0], [1.0]])
+        for plane, values in zip(planes.values(), way, strict=True):
+            plane[rows] = values.reshape(point.shape)
+    return planes
+
+
+def exit_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
+    """The channels of the picture of places."""
+    planes = {name: np.zeros((SIDE, SIDE), np.float32) for name in "RGB"}
+    across = np.asarray((np.arange(SIDE) + 0.5) * (2 / SIDE) - 1, np.float64)
+    for row, down in enumerate(across):
+        place = place_of(field, plates, folded(across, np.full(SIDE, down)))
+        planes["R"][row], planes["G"][row] = place
+        report((row + 1) / SIDE)
+    return planes
+
+
+def folded(u: Array, v: Array) -> Array:
+    """Directions [3, N], not of unit length, at points of the square from -1 to 1."""
+    z = 1 - np.abs(u) - np.abs(v)
+    out = z < 0
+    x = np.where(out, (1 - np.abs(v)) * np.where(u < 0, -1, 1), u)
+    y = np.where(out, (1 - np.abs(u)) * np.where(v < 0, -1, 1), v)
+    return np.stack([x, y, -z])
+
+
+def place_of(field: Field, plates: Plates, way: Array) -> Array:
+    """Where the picture shows directions [3, N] of a USD camera, 0 to 1 from the upper left; -1 where it does not."""
+    point = field.point(way * np.array([1.0, 1.0, -1.0])[:, None])
+    film = [n * p for n, p in zip(plates.picture, plates.pixel_mm, strict=True)]
+    place = np.stack([point.real / film[0] + 0.5, 0.5 - point.imag / film[1]])
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(place - 0.5) < 0.5 + _NEAR).all(0) & (np.abs(point) < 2 * field.end_mm)
+    return np.where(near, place, -1.0)
+
+
+def exit_residual_px(field: Field, plates: Plates, planes: Mapping[str, FloatArray]) -> float:
+    """The worst by which places that are read between four pixels of the exit picture are wrong, over the picture."""
+    middle = np.arange(1, SIDE)[::_TRIED] * (2 / SIDE) - 1
+    exact = place_of(field, plates, folded(*(c.reshape(-1) for c in np.meshgrid(middle, middle))))
+    four = [p[:-1, :-1] + p[1:, :-1] + p[:-1, 1:] + p[1:, 1:] for p in (planes["R"], planes["G"])]
+    read = np.stack([f[::_TRIED, ::_TRIED].reshape(-1) / 4 for f in four])
+    inside = (np.abs(exact - 0.5) < 0.5).all(0)
+    return float(np.hypot(*((read - exact)[:, inside] * np.array(plates.picture)[:, None])).max(initial=0))
+
+
+# OpenTrackIO 1.0.1: the numbers of OpenLensIO's lens model (SMPTE RiS-OSVP), in mm on the film.
+#
+# Undistorted places are e (1 + k1 r^2 + k3 r^4 + k5 r^6) / (1 + k2 r^2 + k4 r^4 + k6 r^6) of places e of the lens's
+# picture (the list "radial" of "Brown-Conrady D-U"; "U-D" is the other way), for a pinhole in the entrance pupil. Light
+# is 1 - (a1 r^2 + a2 r^4 + a3 r^6). A template has the rest of a sample. It leaves out where the camera stands, which
+# its tracker knows; a focus at infinity; lateral colour; distortion of lenses with cylinders or of more than a plane
+# holds.
+
+
+def opentrackio_sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | None, float]:
+    """The sample of one frame as JSON, and the worst that its formulae leave: pixels, share of light."""
+    plane = field.field_deg <= projections.WIDEST_DEG and pinhole.squeeze == 1
+    distortion, left_px = _distortions(field, shot) if plane else ([], None)
+    points = lit_points(field, shot.film_mm(shot.plates.picture, squeezed=True))
+    light, share = falloff(field.relative_light(points), np.abs(points))
+    squeeze = Fraction(pinhole.squeeze).limit_denominator(1000)
+    values = {
+        "shot": shot,
+        "pinhole": pinhole,
+        "distortion": distortion,
+        "overscan": max(1.0, *shot.plates.overscan),
+        "light": [-k for k in light],
+        "focus_m": pinhole.focus_m if pinhole.focus_m < FAR_M else None,
+        "squeeze": (squeeze.numerator, squeeze.denominator),
+        "ids": [uuid.uuid5(uuid.NAMESPACE_URL, f"neurolens {n} {shot}").urn for n in ("source", pinhole)],
+    }
+    return html("handover.opentrackio.json.jinja", **values), left_px, share
+
+
+def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float]]], float]:
+    """Names of both directions with their coefficients, and the worst that they leave in pixels; of a round lens."""
+    points = film_points(field, shot.film_mm(shot.plates.picture), 257)
+    way = field.directions(points)
+    both, found, worst = (points.real, field.frame.reach_mm[0] * way[0] / way[2]), [], 0.0
+    for model, (start, goal) in zip(MODELS, (both, both[::-1]), strict=True):
+        powers = np.stack([(start / start[-1]) ** n for n in (2, 4, 6)])
+        ratio, fits = goal / start, []
+        for terms in (powers, np.concatenate([powers, -ratio * powers])):
+            k = np.zeros(6)
+            k[: len(terms)] = np.linalg.lstsq((start * terms).T, goal - start, rcond=_LEAST)[0]
+            missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) - ratio) * start
+            by_mm = k.reshape(2, 3) / start[-1] ** np.array([2, 4, 6])
+            fits.append((float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
+            if fits[-1][0] < _GOOD_PX:
+                break
+        left, radial = min(fits, key=lambda fit: fit[0])
+        found.append((model, radial.T.reshape(-1).tolist()))
+        worst = max(worst, left)
+    return found, worst
+
+
+# A lensfun profile: distortion as poly5, lateral colour as poly3, light as pa, by focal length and aperture.
+#
+# lensfun's formulae (lensfun.github.io/manual/latest/group__Lens.html), with r = 1 at half the short side of a film of
+# the profile's aspect ratio and the picture's diagonal, counted between the centres of the outer pixels: the lens's
+# picture shows at r (1 + k1 r^2 + k2 r^4) what the corrected one shows at r, and red at v r + c r^2 + b r^3 what the
+# mean colour shows at r; light is 1 + k1 r^2 + k2 r^4 + k3 r^6, r = 1 in the corner. The size of the corrected picture
+# is fitted, too, for a fifth to a thirtieth of the distance that is left: it is that of a pinhole of another focal
+# length. lensfun's ptlens has one coefficient more, but version 0.3.4 computes it in fours of pixels, three of them
+# wrong by up to 0.14 pixels. Of 20 mm lenses by Canon and Nikon (f/2.8) poly5 leaves 0.67 and 0.56 pixels of 3840,
+# ptlens would leave 0.45, and a term r^7 more, as in ACM, which 0.3.4 has not, 0.43 and 0.28.
+#
+# Focal lengths are those of the pinhole, so that they tell a focus pull, too, for lensfun knows no breathing.
+
+
+class LensfunEntry(NamedTuple):
+    """The profile of a lens at one focal length.
+
+    Attributes:
+        focal_mm, distance_m: of the pinhole, of the plane in place. corrected_mm: of lensfun's corrected picture.
+        distortion: k1, k2. red, blue: v, c, b. light: f-number, k1, k2, k3 by aperture.
+        distortion_px, colour_px, light_share: the worst that the formulae leave.
+    """
+
+    focal_mm: float
+    distance_m: float
+    corrected_mm: float
+    distortion: tuple[float, float]
+    red: tuple[float, ...]
+    blue: tuple[float, ...]
+    light: tuple[tuple[float, ...], ...]
+    distortion_px: float
+    colour_px: float
+    light_share: float
+
+
+def lensfun_entry(
+    field: Field, camera: Camera, plane_m: float, shot: Handed, red_blue_nm: tuple[float, float], at_stop: AtStop
+) -> LensfunEntry:
+    """The entry of one state of a round lens; `at_stop` makes its camera at another f-number, None for the widest."""
+    picture, pixel = shot.plates.picture, shot.plates.pixel_mm[0]
+    film_mm = shot.film_mm(picture)
+    corner = math.hypot(picture[0] - 1, picture[1] - 1) / 2 * pixel
+    unit = corner / math.hypot(1, max(film_mm) / min(film_mm))
+    points = film_points(field, film_mm, 257)
+    (size, a, b), left = _minimax(field.ideal(points).real / unit, points.real / unit, (1, 3, 5))
+    colours = []
+    for nm in red_blue_nm:
+        light = traced_light(camera, points, spectrum_of(camera, only_nm=nm), field.frame, field.target, plane_m)
+        # Where the mean colour shows what this one shows.
+        colours.append(_minimax(field.picture(light.place).real / unit, points.real / unit, (1, 2, 3)))
+    lights, share = _lights(field, camera, plane_m, points[3::4], corner, at_stop)
+    focal, px = field.frame.reach_mm[0], unit / pixel
+    return LensfunEntry(
+        focal, min(plane_m, FAR_M), focal * size, (a / size**3, b / size**5), colours[0][0], colours[1][0], lights,
+        left * px, max(missed for _, missed in colours) * px, share,
+    )  # fmt: skip
+
+
+def _minimax(x: Array, y: Array, powers: Sequence[int]) -> tuple[tuple[float, ...], float]:
+    """Coefficients of a polynomial with the least worst distance from y, by Lawson's weights, and that distance."""
+    rows, weight = np.stack([x**p for p in powers], 1), np.ones(x.size)
+    best, least = tuple[float, ...](), math.inf
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weight)
+        found = np.linalg.lstsq(rows * root[:, None], y * root, rcond=None)[0]
+        left = np.abs(rows @ found - y)
+        if left.max() < least:
+            best, least = tuple(found.tolist()), float(left.max())
+        weight = weight * left + 1e-12
+        weight = weight / weight.sum()
+    return best, least
+
+
+def _lights(
+    field: Field, camera: Camera, plane_m: float, points: Complex, corner: float, at_stop: AtStop
+) -> tuple[tuple[tuple[float, ...], ...], float]:
+    """The light by aperture, the shot's own among them, and the worst share that the formula leaves."""
+    own = float(camera.settings["lens_state"]["f_number"])
+    further = [f for k in _SMALLER if (f := float(f"{own * 2 ** (k / 2):.3g}")) < _SMALLEST]
+    rows, worst, points = {}, 0.0, np.append(0j, points)
+    for made in (at_stop(None), *map(at_stop, further), camera):
+        light = traced_light(made, points, field.spectrum, field.frame, field.target, plane_m).light
+        k, left = falloff(light[1:] / light[0], points.real[1:] / corner)
+        f_number = float(made.settings["lens_state"]["f_number"])
+        rows[f"{f_number:.3g}"] = (f_number, *k)
+        worst = max(worst, left)
+    return tuple(sorted(rows.values())), worst
+
+
+# Projections of OpenCV, nerfstudio and NVIDIA.
+
+
+def fitted_projection(
+    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
+) -> tuple[projections.Projection, projections.Residual, dict[str, Any]]:
+    """A projection fitted to a field, what it leaves, and both as data; raises InputError as `fit`."""
+    step = [side / count for side, count in zip(film_mm, size, strict=True)]
+    focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
+    if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
+        focal = focal[0], focal[0]
+    fitted = projections.fit(kind, *_shown(field, size, film_mm), size, focal, source)
+    left = projections.residual(fitted, *_shown(field, size, film_mm, _HELD_OUT))
+    rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
+    data: dict[str, Any] = {
+        "camera": source,
+        "model": fitted.kind,
+        "size": list(fitted.size),
+        "focal_px": list(fitted.focal_px),
+        "centre_px": list(fitted.centre_px),
+        "coefficients": fitted.named,
+        "rms_px": left.rms_px,
+        "worst_px": left.worst_px,
+        "worst_at_deg": left.worst_at_deg,
+        "field_deg": left.field_deg,
+        "turns_back_at_deg": None if left.sound else left.fold_deg,
+        "by_field": rows,
+        "before_film_mm": list(field.frame.pupil_mm),
+    }
+    return fitted, left, data
+
+
+def _shown(
+    field: Field, size: tuple[int, int], film_mm: tuple[float, float], points: tuple[int, int] = _FITTED
+) -> tuple[Any, Any]:
+    """Unit directions [N, 3] and pixels [N, 2], in OpenCV's frame, of points spread over the lit picture."""
+    point = lit_points(field, film_mm, points)
+    pixel = np.stack([(point.real / film_mm[0] + 0.5) * size[0], (0.5 - point.imag / film_mm[1]) * size[1]], 1)
+    return field.directions(point).T * [1, -1, 1], pixel - 0.5
+
+
+def write_projection(out: Path, fitted: projections.Projection, data: dict[str, Any]) -> list[str]:
+    """Write the files of a projection; their names."""
+    files = {}
+    if fitted.kind in ("opencv", "opencv-rational", "kannala-brandt"):
+        files[out.with_name(f"{out.name}.yaml")] = _file_storage(fitted, data["rms_px"])
+    block = _block(fitted) | {"neurolens": {"version": __version__, **data}}
+    files[out.with_name(f"{out.name}.json")] = json.dumps(plain(block), indent=1, allow_nan=False) + "\n"
+    for path, text in files.items():
+        atomic_write_text(path, text)
+    return [str(path) for path in files]
+
+
+def _file_storage(fitted: projections.Projection, rms_px: float) -> str:
+    """YAML as OpenCV's FileStorage reads it, with the names of its own calibration sample."""
+
+    def matrix(name: str, rows: list[list[float]]) -> str:
+        values = ", ".join(repr(float(v)) for row in rows for v in row)
+        shape = f"   rows: {len(rows)}\n   cols: {len(rows[0])}\n   dt: d\n"
+        return f"{name}: !!opencv-matrix\n{shape}   data: [ {values} ]\n"
+
+    (fx, fy), (cx, cy) = fitted.focal_px, fitted.centre_px
+    return (
+        f"%YAML:1.0\n---\nimage_width: {fitted.size[0]}\nimage_height: {fitted.size[1]}\n"
+        f'distortion_model: "{fitted.kind}"\nfisheye_model: {int(fitted.kind == "kannala-brandt")}\n'
+        + matrix("camera_matrix", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        + matrix("distortion_coefficients", [[v] for v in fitted.coefficients])
+        + f"avg_reprojection_error: {rms_px!r}\n"
+    )
+
+
+def _block(fitted: projections.Projection) -> dict[str, Any]:
+    """The camera as nerfstudio, or NVIDIA's f-theta, or OpenCV has it."""
+    size = {"w": fitted.size[0], "h": fitted.size[1]}
+    if fitted.kind in ("opencv", "kannala-brandt"):
+        cx, cy = (c + 0.5 for c in fitted.centre_px)
+        name = "OPENCV" if fitted.kind == "opencv" else "OPENCV_FISHEYE"
+        focal = {"fl_x": fitted.focal_px[0], "fl_y": fitted.focal_px[1], "cx": cx, "cy": cy}
+        return {"camera_model": name, **size, **focal, **fitted.named, "frames": []}
+    if fitted.kind == "f-theta":
+        return {
+            "resolution": list(fitted.size),
+            "shutter_type": "GLOBAL",
+            "principal_point": list(fitted.centre_px),
+            "reference_poly": "ANGLE_TO_PIXELDIST",
+            "angle_to_pixeldist_poly": [0.0, *fitted.coefficients],
+            "pixeldist_to_angle_poly": [0.0, *projections.inverse_polynomial(fitted)],
+            "max_angle": fitted.widest_rad,
+            "linear_cde": [fitted.focal_px[0], 0.0, 0.0],
+        }
+    return {"camera_model": fitted.kind, **size, "focal_px": list(fitted.focal_px), **fitted.named}
