@@ -167,7 +167,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
 
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     """Name and title of each drawing, and the function that draws it to a path."""
-    from neurolens.analysis.breathing import draw_breathing
+    from neurolens.analysis.field_curves import draw_breathing
     from neurolens.analysis.fields import Scene
     from neurolens.analysis.layout import state_text
     from neurolens.analysis.spots import spots

@@ -26,12 +26,11 @@ from experiments.exact_race import exact_candidates
 from experiments.lab import Row
 from experiments.promises import read_index
 from neurolens import __version__
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Progress
 from neurolens.base.records import versions
-from neurolens.base.settings import read_config
+from neurolens.base.settings import RANGE, read_config
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import lens_files

@@ -26,10 +26,9 @@ from experiments.lab import Row
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import at_focal_length, light_curves
 from neurolens.photographs.profiles import Profile, database
-from neurolens.photographs.rims import fit_rims
-from neurolens.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, verify
+from neurolens.photographs.rims import at_focal_length, fit_rims
+from neurolens.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, light_curves, verify
 from neurolens.readers.any_format import read_any
 from neurolens.setting.rims import RimRule, derive_rims
 

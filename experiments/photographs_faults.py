@@ -25,10 +25,10 @@ from experiments import lab
 from experiments.lab import Row
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import at_focal_length
 from neurolens.photographs.faults import alarm, changed, check, glasses, swapped, transposed
 from neurolens.photographs.figures import Measures, measure
 from neurolens.photographs.profiles import Profile
+from neurolens.photographs.rims import at_focal_length
 from neurolens.photographs.verify import found_for
 from neurolens.readers.any_format import read_any
 

@@ -4,9 +4,11 @@ An adapter takes a `Task`, a lens and a batch of its rays, and returns two funct
 the rays; the second turns what the first returned into `Found`. An adapter makes what it can beforehand, off the clock,
 and raises `Unavailable` where it cannot run, with the reason. The programs are no dependencies of this project:
 
-    pip install --target DIR optiland==0.6.3 rayoptics==0.9.8     # and PYTHONPATH=DIR
-    pip install --target DIR --ignore-requires-python deeplens-core==2.5.6
-    export PBRT_V3=...                                            # a checkout of github.com/mmp/pbrt-v3
+    export PYTHONPATH=DIR PBRT_V3=...                             # a checkout of github.com/mmp/pbrt-v3
+    pip install --target DIR --no-deps optiland==0.6.3 vtk numba llvmlite pandas seaborn tabulate
+    pip install --target DIR --no-deps rayoptics==0.9.8 opticalglass anytree deprecation json-tricks parsimonious
+    pip install --target DIR --no-deps regex transforms3d openpyxl et_xmlfile xlrd
+    pip install --target DIR --no-deps --ignore-requires-python deeplens-core==2.5.6 einops tqdm
 """
 
 from __future__ import annotations

@@ -46,6 +46,7 @@ from experiments.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Prepared,
 from experiments.tracer_race import has_avx512
 from neurolens.analysis.plots import drawing, plain_log_ticks
 from neurolens.cameras.model import load_model
+from neurolens.cameras.onnxlens import BATCH
 from neurolens.graph.compiler import FLAGS, find_compiler, has_compiler
 from neurolens.graph.ir import pruned
 from neurolens.graph.program import SCENE_RAY
@@ -67,7 +68,7 @@ CASES = {  # lens: its models
     "canon_aspheric_50": ("ols-64", "mlp-16x2"),
     "thorlabs_lb1471_biconvex_50": ("ols-64", "mlp-16x2"),
 }
-C_BATCHES, TORCH_BATCHES = (2000, 4000, 10000, 20000), (10000, 20000, 50000)
+C_BATCHES, ONNX_BATCHES, TORCH_BATCHES = (2000, 4000, 10000, 20000), (8192, BATCH), (10000, 20000, 50000)
 TITLE, COMMAND = "# An open benchmark of lens rays", "`python -m experiments rays`"
 FAMILIES = {"exact, ours": "tab:blue", "model, ours": "tab:green", "others": "tab:red"}
 PACKAGES = ("optiland", "rayoptics", "deeplens-core")
@@ -207,7 +208,7 @@ def ours(name: str, task: Task, compiled: bool) -> list[Entry]:
         file = lab.MODELS / f"{name}.{kind}.onnx"
         source = cache(lambda file=file: CompiledSource(fused_program([read_model(file).at()])))
         found.append(Entry(model, f"{kind}, C", "float32", as_c(source), C_BATCHES))
-        found.append(Entry(model, f"{kind}, onnxruntime", "float32", in_onnxruntime(file), C_BATCHES))
+        found.append(Entry(model, f"{kind}, onnxruntime", "float32", in_onnxruntime(file), ONNX_BATCHES))
     return found
 
 

@@ -23,7 +23,7 @@ from neurolens.cameras.cameragraph import whole_camera
 from neurolens.cameras.lenscamera import LensCamera as _Camera
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.interpret import evaluate
-from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import LINE_D_NM
 from neurolens.lens.shot import Shot
 
 _SHARE, _LEAST = 0.03, 3e-3  # steps of derivatives by settings: a share of the setting, and 1/m of focus at least

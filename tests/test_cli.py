@@ -349,7 +349,7 @@ def test_what_is_said_after_a_terminal_was_closed_goes_nowhere() -> None:
     ours, theirs = os.openpty()
     code = (
         "import fcntl, signal, sys, termios, time\n"
-        "from neurolens.base.signals import handled\n"
+        "from neurolens.base.tasks import handled\n"
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"  # nohup's children ignore it
         "asked = []\n"
         "with handled(asked.append):\n"

@@ -23,7 +23,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular
 from neurolens.base.settings import apply_overrides
 from neurolens.base.tomlfile import read_toml
-from neurolens.lens import catalogue
+from neurolens.lens import glass as catalogue
 from neurolens.readers.any_format import read_any
 from neurolens.readers.json_lens import image_and_field, read_json_lens
 from neurolens.render import images, pictures

@@ -22,7 +22,7 @@ from neurolens.base.records import plain
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
 from neurolens.lens.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.pupils import image_radius_mm, on_plane
 from neurolens.trace.aiming import Axis, aim_at_stop, between, bracket, without_rims
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
@@ -239,12 +239,6 @@ class Scene:
         """Raise InputError for a pinhole, which has no focus."""
         if is_pinhole(self.lens):
             raise InputError(self.lens.path, "surfaces", "(a pinhole)", "a lens with power")
-
-
-def on_plane(rays: Rays, z_mm: float) -> Rays:
-    """Rays moved along themselves to the plane at z."""
-    t = (z_mm - rays.z) / rays.dz
-    return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=torch.full_like(rays.z, z_mm))
 
 
 @lru_cache(maxsize=16)

@@ -273,14 +273,7 @@ def diffraction_mtf(frequency_per_mm: Array, wavelength_nm: float, f_number: flo
 
 
 def _contrast(x_mm: Tensor, weight: Tensor, frequency: Array) -> Array:
-    rows, before, step, turn = [], 0.0, math.nan, weight
-    phases = weight.to(torch.complex128)
-    for f in frequency.tolist():
-        if not abs(f - before - step) < 1e-9:  # evenly spaced frequencies share the turn of the phases between them
-            step = f - before
-            turn = torch.polar(torch.ones_like(x_mm), x_mm * (2 * np.pi * step))
-        phases, before = phases * turn, f
-        rows.append(phases.sum(1).abs())
+    rows = [torch.polar(weight, 2 * np.pi * f * x_mm).sum(1).abs() for f in frequency.tolist()]
     return np.asarray(torch.stack(rows, 1).numpy())
 
 

@@ -7,7 +7,6 @@ folder that it writes; what it writes beside `out` comes back, too.
 
 from __future__ import annotations
 
-import ctypes
 import io
 import logging
 import math
@@ -20,19 +19,18 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, one_line
 from neurolens.base.files import TemporaryFolder, atomic_path, cache_folder, place_inside
-from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure
+from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure, keep_memory
 
 R = TypeVar("R")
 _MOST = 4096  # tasks in flight: each has a thread here that waits for it
 _ASK_EVERY_S = 1.0  # how many workers there are
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 _TIMEOUT, _POLL_S = "10s", 5.0
 _ANSWERED_S = 5.0  # until a worker's answer has gone
 _LOST = "the Dask scheduler is lost: what is done is kept, the same command goes on"
@@ -148,8 +146,7 @@ def _answer(work: Callable[..., Any], version: str, limit_s: float, args: Any, n
     """Run a task on a worker; errors travel as text."""
     if version != __version__:
         return Failed(f"a worker has neurolens {__version__}, not {version}")
-    if "MALLOC_TRIM_THRESHOLD_" in os.environ:
-        _keep_memory()
+    keep_memory()
     try:
         with _ALONE:
             return work(*args, **named) if math.isinf(limit_s) else _in_time(work, limit_s, args, named)
@@ -167,19 +164,6 @@ def _in_time(work: Callable[..., Any], limit_s: float, args: Any, named: Any) ->
         return Failed(f"took longer than {limit_s:g} s")
     finally:
         pool.shutdown(wait=False)
-
-
-@cache
-def _keep_memory() -> None:
-    """Let the C library (glibc) keep freed memory, once a worker, up to the sizes that it comes to by itself.
-
-    Dask's nannies have it given back at once (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth: getting the
-    pages of every larger array anew takes two fifths of a fit's time.
-    """
-    with suppress(AttributeError, OSError):  # another C library
-        library = ctypes.CDLL(None)
-        library.mallopt(_M_MMAP_THRESHOLD, 32 << 20)
-        library.mallopt(_M_TRIM_THRESHOLD, 64 << 20)
 
 
 def _distributed() -> Any:

@@ -35,11 +35,16 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from neurolens.base.bounds import within
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
 
 T = TypeVar("T")
+# Bounds that every input keeps: beyond them searches take minutes or find no light.
+F_NUMBER = 0.1, 10_000.0
+FOCAL_MM = 1e-3, 1e6
+FILM_MM = 1e-3, 1e4  # a side
+WAVELENGTH_NM = 100.0, 20_000.0  # from lithography to thermal cameras
+RANGE = "range"  # a zoom position that stands for all of them
 _UNIT = re.compile(r"(.+?)_(per_mm|px|mm|um|nm|m|deg|s)")
 _PLACEHOLDERS = {int: "N", float: "X", str: "NAME", Path: "FILE"}
 _NAMES = {
@@ -50,6 +55,16 @@ _NAMES = {
     Path: "a path",
     NoneType: '"none"',
 }
+
+
+def within(bounds: tuple[float, float], value: float) -> bool:
+    """True for a value between two bounds, False for NaN."""
+    return bounds[0] <= value <= bounds[1]
+
+
+def said(bounds: tuple[float, float]) -> str:
+    """The bounds in words: "from 0.1 to 10000"."""
+    return f"from {bounds[0]:g} to {bounds[1]:g}"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Executors that run tasks: in this process, in one for each task, in forked ones, or on a cluster (`base.cluster`).
+"""Executors that run tasks, in this process, in one for each, in forked ones, or on a cluster; and signals.
 
 They have the interface of `concurrent.futures`: `submit` returns a `Future`, and `wait` and `as_completed` of the
 standard library take it. `run_each` hands out the answers of any number of tasks while only a few of them wait in
@@ -13,6 +13,7 @@ Parts of a picture that are summed in a fixed order are `in_order`, by threads.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import multiprocessing
 import os
@@ -25,21 +26,25 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing.connection import wait
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from neurolens.base.errors import NeurolensError, one_line
-from neurolens.base.signals import end_at_once, held
 
 T = TypeVar("T")
 R = TypeVar("R")
 _LONGEST = 600  # characters of a reason
 _POLL_S, _POLL_PARENT_S, _PATIENCE_S = 0.05, 0.5, 5.0
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 # Another thread that starts a process asks all processes for their exit codes, which can be read only once.
 _STARTING = threading.Lock()
+# Signals that ask a command to end: Ctrl-C, SIGTERM, and SIGHUP, which a terminal sends when it closes.
+ASKING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+_AT_ONCE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -268,6 +273,19 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@cache
+def keep_memory() -> None:
+    """Let the C library (glibc) keep the memory of arrays, once a process, up to the sizes that it comes to by itself.
+
+    Else it gives that of every larger array back, and a trace spends half of its time on getting pages anew. Dask's
+    nannies ask for it (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth.
+    """
+    with suppress(AttributeError, OSError):  # another C library
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 32 << 20)
+        library.mallopt(_M_TRIM_THRESHOLD, 64 << 20)
+
+
 def _context(modules: list[str]) -> Any:
     """Processes are forked from a small server, which has imported the modules of the first task and has no threads."""
     kind = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
@@ -336,3 +354,95 @@ def _end_unread(pipe: int) -> None:
         waiting.register(pipe, 0)  # errors alone, such as a closed end
         waiting.poll()
         os._exit(1)
+
+
+@contextmanager
+def handled(by: Callable[[int], None]) -> Iterator[dict[int, Any]]:
+    """Call `by` with the number of a signal of `ASKING` inside the block; yields the handlers of before.
+
+    Signals that are ignored, as `nohup` has it, stay so. Only the main thread can handle signals: in others nothing
+    changes.
+    """
+
+    def handler(number: int, _: object) -> None:
+        if number != signal.SIGINT:
+            _leave_closed_terminal()
+        by(number)
+
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {n: signal.getsignal(n) for n in ASKING if signal.getsignal(n) not in (signal.SIG_IGN, None)}
+        for number in before:
+            signal.signal(number, handler)
+    try:
+        yield before
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+class Stopping:
+    """Inside the block, a signal of `ASKING` first requests a stop; a second one takes its usual effect.
+
+    `timeout` and others send a signal twice at once, to the process and to its group: that counts as one.
+    """
+
+    def __init__(self) -> None:
+        self._handled = handled(self._asked)
+        self._before: dict[int, Any] = {}
+        self.number: int | None = None  # of the signal
+        self._at = 0.0
+
+    def __enter__(self) -> Stopping:
+        self._before = self._handled.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
+        self._handled.__exit__(None, None, None)
+        return kind is Unfinished
+
+    def __call__(self) -> bool:
+        """True once a stop was requested."""
+        return self.number is not None
+
+    def _asked(self, number: int) -> None:
+        if self.number is None:
+            self.number, self._at = number, time.monotonic()
+        elif time.monotonic() > self._at + _AT_ONCE_S:
+            signal.signal(number, self._before[number])
+            signal.raise_signal(number)
+
+
+class Unfinished(Exception):
+    """Leaves the block of a `Stopping`, and a stage of the progress without its final line."""
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Keep the signals of `ASKING` waiting inside the block, and for ever from processes and threads started there."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ASKING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_at_once() -> None:
+    """In a process started inside `held`: signals that were not ignored end it, those that wait now too."""
+    for number in ASKING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ASKING)
+
+
+def _leave_closed_terminal() -> None:
+    """Let what is still printed go nowhere: writing to a closed terminal is an error, in the midst of saving."""
+    for descriptor in (1, 2):
+        try:
+            os.write(descriptor, b"")
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)

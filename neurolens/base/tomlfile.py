@@ -51,7 +51,7 @@ def parse_toml(text: str, file: str | Path) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, file: str | Path) -> Any:
-    """The values of a text of strict JSON, of which every number is finite.
+    """The values of a text of strict JSON, of which every number is finite and no object has a key twice.
 
     Raises:
         ValueError, RecursionError: no JSON. InputError: refused by `check_tree`.
@@ -62,7 +62,15 @@ def parse_json(text: str | bytes, file: str | Path) -> Any:
             raise ValueError(f"{number[:40]} is no finite number")
         return value
 
-    data = json.loads(text, parse_float=finite, parse_constant=finite)
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict[str, Any]()
+        for key, value in pairs:
+            if key in found:
+                raise ValueError(f"the key {key[:40]!r} is given twice")
+            found[key] = value
+        return found
+
+    data = json.loads(text, parse_float=finite, parse_constant=finite, object_pairs_hook=once)
     check_tree(data, file)
     return data
 

@@ -36,9 +36,8 @@ from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives
-from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import LINE_D_NM, index_of
-from neurolens.lens.paraxial import chief_reach_mm, first_order
+from neurolens.lens.paraxial import PupilBounds, chief_reach_mm, first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.setting.focusing import at_infinity

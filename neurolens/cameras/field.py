@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import PROJECTIONS
-from neurolens.lens import film_plane
+from neurolens.lens import paraxial
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -74,7 +74,7 @@ def spectrum_of(camera: Any, light_nm: tuple[float, float] = LIGHT_NM, only_nm: 
         return np.array([float(only_nm)]), np.ones(1)
     if not camera.dispersive and getattr(camera, "achromatic", False):
         return np.array([550.0]), np.ones(1)
-    return film_plane.colours((max(low, light_nm[0]), min(high, light_nm[1])))
+    return paraxial.colours((max(low, light_nm[0]), min(high, light_nm[1])))
 
 
 def frame_of(camera: Any) -> Frame:
@@ -90,7 +90,7 @@ def frame_of(camera: Any) -> Frame:
 
         data, film = first_order(lens, meridian="x"), float(camera.settings["film_z_mm"])
         focal, pupil = (data.front_focal_z_mm, data.rear_focal_z_mm), data.entrance_pupil_z_mm
-        x = film_plane.reach_mm(data.efl_mm, data.front_efl_mm, focal, pupil, film), film - pupil
+        x = paraxial.reach_mm(data.efl_mm, data.front_efl_mm, focal, pupil, film), film - pupil
     else:
         (reach, _), (pupil, _) = _measured(camera)
         x = reach, pupil

@@ -49,7 +49,7 @@ from neurolens.cameras.sampling import (
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.lens.apertures import Aperture
-from neurolens.lens.film_plane import film_z_mm
+from neurolens.lens.paraxial import film_z_of_planes_mm
 from neurolens.lens.shot import check_film
 
 _QUADRATURE = 256  # points a side
@@ -102,7 +102,7 @@ class ThickLens:
         self.front_z_mm, self.pupil_z_mm = front, front
         if entrance_pupil_z_mm is not None:
             self.pupil_z_mm = _finite("entrance_pupil_z_mm", entrance_pupil_z_mm)
-        self.film_z_mm = film_z_mm(f, front, rear, self.focus_m) if film_at_mm is None else float(film_at_mm)
+        self.film_z_mm = film_z_of_planes_mm(f, front, rear, self.focus_m) if film_at_mm is None else float(film_at_mm)
         self.image_distance_mm = positive("film_at_mm behind H'", self.film_z_mm - rear)
         self.radius_mm = f / (2 * self.f_number)
         # Newton's distances from the focal points: x of the entrance pupil, x' = s' - f of the film. The exit pupil is
@@ -273,7 +273,7 @@ class ThinLens(ThickLens):
     ) -> None:
         film_at_mm = None
         if film_offset_mm:
-            focused = film_z_mm(
+            focused = film_z_of_planes_mm(
                 positive("focal_length_mm", focal_length_mm), 0.0, 0.0, positive("focus_m", focus_m, infinite=True)
             )
             film_at_mm = positive("film_offset_mm, film distance", focused + film_offset_mm)

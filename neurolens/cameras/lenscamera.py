@@ -46,8 +46,7 @@ from neurolens.graph.loworder import with_film_derivatives, with_low_order_deriv
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
-from neurolens.lens.film_plane import LINE_D_NM
-from neurolens.lens.prescription import Surface
+from neurolens.lens.prescription import LINE_D_NM, Surface
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.trace.shapes import sag_and_derivatives
 

@@ -33,7 +33,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FilmPoints, FloatArray, SpectralRays
 from neurolens.cameras.field import Complex, end_of_light, on_rings, turns
 from neurolens.cameras.sampling import common_light, is_light, stratified
-from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import LINE_D_NM
 from neurolens.lens.shot import Dispersion, Vignetting
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from typing import Any
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable, reason
-from neurolens.base.signals import handled
+from neurolens.base.tasks import handled
 from neurolens.cli.arguments import Help, Parser, more_glasses
 
 # Packages of the extra that a base install lacks.

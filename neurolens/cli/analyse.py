@@ -11,9 +11,8 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError, warned
-from neurolens.base.settings import between, setting
+from neurolens.base.settings import WAVELENGTH_NM, between, said, setting
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:

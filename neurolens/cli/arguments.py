@@ -15,12 +15,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
-from neurolens.base.bounds import WAVELENGTH_NM
 from neurolens.base.errors import InputError, one_line, printable, warn
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, program
-from neurolens.base.settings import add_options, between, from_options, group, setting, setting_of, spelling
+from neurolens.base.settings import (
+    WAVELENGTH_NM,
+    add_options,
+    between,
+    from_options,
+    group,
+    setting,
+    setting_of,
+    spelling,
+)
 from neurolens.lens.shot import FocusMode, Shot, StopShape, film_size
 
 if TYPE_CHECKING:

@@ -23,12 +23,11 @@ from typing import Any
 import numpy as np
 
 import neurolens
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError, warn
 from neurolens.base.files import check_writable, fingerprint_of, kept_in_cache, safe_name, sha256_of
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model, lens_id_of, maker_of
-from neurolens.base.settings import setting
+from neurolens.base.settings import RANGE, setting
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender import Form, PackedLens, add_lens, check_takes, user_folders, write_pack
 from neurolens.cameras.build import ideal_as, make_camera

@@ -161,7 +161,7 @@ examples:
 
     def run(self) -> int:
         """Print the requested glasses."""
-        from neurolens.lens import catalogue
+        from neurolens.lens import glass as catalogue
 
         glasses: list[catalogue.Glass] = []
         for name in self.name:

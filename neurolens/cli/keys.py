@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
-from neurolens.base.settings import group, setting
+from neurolens.base.settings import F_NUMBER, FOCAL_MM, group, said, setting, within
 from neurolens.base.tomlfile import reject_unknown
 from neurolens.cli.arguments import floats
 from neurolens.render.scenetables import FARTHEST_M

@@ -132,7 +132,7 @@ examples:
 
             lens_layout(layout_profile(lens, domain), self.layout)
         if self.breathing is not None:
-            from neurolens.analysis.breathing import draw_breathing
+            from neurolens.analysis.field_curves import draw_breathing
 
             figures = draw_breathing(lens, self.breathing)
             data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in figures.items()}
@@ -227,7 +227,7 @@ def _lens_text(data: dict[str, Any]) -> str:
 
 
 def _first_order(data: dict[str, Any]) -> str:
-    from neurolens.lens.film_plane import LINE_D_NM
+    from neurolens.lens.prescription import LINE_D_NM
 
     def mm(*keys: str) -> str:
         return ", ".join(f"{cli.number(data[key], 6)} mm" for key in keys)

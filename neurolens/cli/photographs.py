@@ -12,9 +12,8 @@ from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
-    from neurolens.photographs.compare import Comparison
     from neurolens.photographs.rims import FittedRims
-    from neurolens.photographs.verify import Verified
+    from neurolens.photographs.verify import Comparison, Verified
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +86,7 @@ def _text(found: Verified, name: str, last: list[str]) -> str:
 
 
 def _row(c: Comparison) -> list[str]:
-    from neurolens.photographs.compare import near_f8
+    from neurolens.photographs.rims import near_f8
 
     cells = [f"{c.focal_mm:g}", cli.number(c.distortion_percent and c.distortion_percent.rms, 2)]
     light = c.light_stops

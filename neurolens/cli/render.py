@@ -21,7 +21,7 @@ from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
 from neurolens.base.records import plain, program
 from neurolens.base.settings import changed, group, positive, setting, setting_of
-from neurolens.base.signals import Stopping, Unfinished
+from neurolens.base.tasks import Stopping, Unfinished
 from neurolens.cameras.contract import FloatArray
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered

@@ -11,13 +11,12 @@ from typing import Any
 
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.base.settings import setting, setting_of
+from neurolens.base.settings import RANGE, setting, setting_of
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import arguments as cli
 from neurolens.cli.blender import Build, forms_of, key_of, kind_of, library, squeeze_of

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.base.kept import Kept
+from neurolens.base.files import Kept
 from neurolens.base.progress import Progress, Report
 from neurolens.base.tasks import in_order
 from neurolens.flare import canvas

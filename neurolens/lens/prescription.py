@@ -13,9 +13,9 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import lens_id_of
 from neurolens.lens.apertures import Aperture
-from neurolens.lens.film_plane import LINE_D_NM
 
 VISIBLE_NM = (400.0, 700.0)
+LINE_D_NM = 587.5618  # helium, yellow: where first-order data stand
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Surface:
         across: of a cylinder bent along the other axis, too: that radius (mm), and None where the curve is turned about
             a line parallel to it at this radius (a toroid), or the conic constant of a biconic, which has no asphere.
         focal_mm: of an ideal thin lens in air, a plane that refracts nothing: slopes change by -x / f and -y / f.
-        glass: name in the glass catalogue (`neurolens.lens.catalogue`); its dispersion rules over n_d and V_d.
+        glass: name in the glass catalogue (`neurolens.lens.glass`); its dispersion rules over n_d and V_d.
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
         coating: the thin films on the surface, None where bare.

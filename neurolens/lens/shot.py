@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from neurolens.base.bounds import F_NUMBER, FILM_MM, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
-from neurolens.base.settings import between, check_bounds, setting
+from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, between, check_bounds, said, setting, within
 
 FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]

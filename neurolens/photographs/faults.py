@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from neurolens.analysis.fields import Result
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import at_focal_length
 from neurolens.photographs.figures import Found, Measures, measure
 from neurolens.photographs.profiles import Profile
+from neurolens.photographs.rims import at_focal_length
 
 Array = NDArray[np.float64]
 

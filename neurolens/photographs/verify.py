@@ -1,10 +1,14 @@
-"""The verdict of photographs on a lens file: which profile, what differs, and in words what that means."""
+"""The verdict of photographs on a lens file: which profile, what differs over image height, and what that means.
+
+What a profile leaves free is taken out: the scale of the picture (the central one, too: fits to photographs are loose
+there), and the light on the axis. The distance of the photographs is not stated either: rays come from infinity.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -17,9 +21,9 @@ from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import Comparison, Curve, compare, near_f8
-from neurolens.photographs.figures import heights_of
-from neurolens.photographs.profiles import Match, Profile, matches, name_of, profile_named
+from neurolens.photographs.figures import between, chief_angles, heights_of, ideal_heights, shapes
+from neurolens.photographs.profiles import Light, Match, Profile, Radial, matches, name_of, profile_named
+from neurolens.photographs.rims import Array, at_focal_length, near_f8, open_light, stop_for
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import at_infinity
 
@@ -28,7 +32,99 @@ from neurolens.setting.states import at_infinity
 SOUND_PERCENT, DOUBTFUL_PERCENT = 0.1, 0.3
 SOUND_STOPS = 0.15
 _OTHER_FOCAL = 0.06  # relative difference of focal length from which a profile is of another lens
+# Broad bands of a camera: those at which rays agree best with lensfun's lateral colour.
+_BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
 FREE = "free in a profile, and taken out: the scale, the light on the axis; unknown: the distance of the photographs"
+
+
+@dataclass(frozen=True)
+class Curve(Result):
+    """One measured and one computed figure over image height; what the profile leaves free is taken out.
+
+    Attributes:
+        height_mm, measured, computed: [H], NaN beyond what either knows.
+    """
+
+    height_mm: Array
+    measured: Array
+    computed: Array
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the difference; NaN where there is none."""
+        off = self.measured - self.computed
+        off = off[np.isfinite(off)]
+        return float(np.sqrt(np.mean(off**2))) if len(off) else math.nan
+
+
+@dataclass(frozen=True)
+class Comparison(Result):
+    """A lens, in one focal length, against one profile.
+
+    Attributes:
+        focal_mm: of the profile.
+        distortion_percent: of the image height, mean removed. size: of the picture, for which it agrees best.
+        red_um, blue_um: beside green.
+        light_stops: by f-number, beside the axis.
+    """
+
+    focal_mm: float
+    distortion_percent: Curve | None
+    red_um: Curve | None
+    blue_um: Curve | None
+    light_stops: dict[float, Curve]
+    size: float = 1.0
+
+
+def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curve, float]:
+    """The shape of the distortion, measured and computed, and the size of the picture for which both agree best."""
+    height = heights_of(profile, lens)
+    angle, (real,) = chief_angles(lens, float(height.max()), [lens.reference_nm])
+    theirs, ours, size = shapes(height, profile.stretch(radial, height), real, real / ideal_heights(profile, angle))
+    return Curve(height, theirs, ours), size
+
+
+def colour_curves(lens: Lens, profile: Profile, radials: Mapping[str, Radial | None]) -> dict[str, Curve | None]:
+    """How much farther from the axis red and blue lie than green, in um, over broad bands as a camera's."""
+    height = heights_of(profile, lens)
+    _, real = chief_angles(lens, float(height.max()), [nm for band in _BANDS_NM.values() for nm in band])
+    red, green, blue = (np.mean(part, axis=0) for part in np.split(np.array(real), len(_BANDS_NM)))
+    found: dict[str, Curve | None] = {}
+    for band, ours in (("red", red - green), ("blue", blue - green)):
+        radial = radials[band]
+        found[band] = radial and Curve(height, profile.shift_um(radial, height), between(height, green, 1000 * ours))
+    return found
+
+
+def light_curves(lens: Lens, profile: Profile, lights: Sequence[Light]) -> dict[float, Curve]:
+    """The light over image height by f-number, in stops beside the axis."""
+    height, stop = heights_of(profile, lens), lens.stop_index
+    rims = np.array(lens.semi_diameters_mm)
+    opened = open_light(lens, np.concatenate([[0.0], height]), rims)
+    past_rims = np.min([opened.inside(k, radius) for k, radius in enumerate(rims) if k != stop], axis=0)
+    curves = {}
+    for row in lights:
+        inside = np.minimum(past_rims, opened.inside(stop, stop_for(lens, row.f_number)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sums = (inside * opened.light).sum(axis=(1, 2))
+            ours = np.log2(sums[1:] / sums[0])
+        ours[~np.isfinite(ours)] = math.nan
+        curves[row.f_number] = Curve(height, profile.stops(row, height), ours)
+    return curves
+
+
+def compare(lens: Lens, profile: Profile, focal_mm: float) -> Comparison:
+    """Compare a lens with a profile at one of the profile's focal lengths."""
+    placed = at_focal_length(lens, focal_mm)
+
+    def row(rows: Sequence[Radial]) -> Radial | None:
+        return next((r for r in rows if r.focal_mm == focal_mm), None)
+
+    radial, red, blue = row(profile.distortion), row(profile.red), row(profile.blue)
+    distortion, size = (None, 1.0) if radial is None else distortion_curve(placed, profile, radial)
+    colours = colour_curves(placed, profile, {"red": red, "blue": blue}) if red or blue else {}
+    light = light_curves(placed, profile, lights) if (lights := profile.light_at(focal_mm)) else {}
+    return Comparison(focal_mm, distortion, colours.get("red"), colours.get("blue"), light, size)
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from neurolens.flare.canvas import Raster
 from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.lights import Light, SceneLights, highlights, keep
 from neurolens.graph.compiler import has_compiler
-from neurolens.lens.film_plane import PupilBounds, colours
-from neurolens.lens.paraxial import first_order
+from neurolens.lens.paraxial import PupilBounds, colours, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Dispersion, Shot
 from neurolens.plan import footprints as prints

@@ -11,13 +11,18 @@ from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml
 from neurolens.lens.prescription import Lens
 from neurolens.readers.codev import looks_like_seq, read_seq
-from neurolens.readers.json_lens import looks_like_json, read_json_lens
-from neurolens.readers.keyed import is_blender, read_blender
+from neurolens.readers.json_lens import is_blender, looks_like_json, read_blender, read_json_lens
 from neurolens.readers.lensfile import read_lens
-from neurolens.readers.opticalbench import looks_like_opticalbench, read_opticalbench
 from neurolens.readers.oslo import looks_like_len, read_len
 from neurolens.readers.source import ReadOptions, read_text
-from neurolens.readers.tables import looks_like_flaresim, looks_like_table, read_flaresim, read_table
+from neurolens.readers.tables import (
+    looks_like_flaresim,
+    looks_like_opticalbench,
+    looks_like_table,
+    read_flaresim,
+    read_opticalbench,
+    read_table,
+)
 from neurolens.readers.zemax import looks_like_zmx, read_zmx
 
 OURS = "neurolens"

@@ -1,11 +1,24 @@
-"""Stop, f-number, film and rims of a lens where its file leaves them open, contradicts itself, or cannot mean them."""
+"""What a file says otherwise than a lens does, or leaves open: Forbes's aspheres, stop, f-number, film and rims.
+
+Forbes's aspheres become even powers of the height, as lenses have them (G. W. Forbes, Opt. Express 15, 5218, 2007).
+With u the height over a normalisation radius and x = u^2,
+    Qcon: sag = conic + u^4 sum a_m Qcon_m(x), Jacobi's P_m^(0,4)(2 x - 1): exactly even powers;
+    Qbfs: sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x), whose slopes along the normal are
+    orthonormal (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic, Thorlabs's ASL5040-UV is sharp).
+    The cosine is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens
+    model's powers do not reach that are refused.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from decimal import Context, Decimal, localcontext
 from typing import TYPE_CHECKING
+
+from numpy.polynomial import Polynomial
+from numpy.polynomial.polynomial import polyval
 
 from neurolens.base.errors import InputError
 from neurolens.lens import paraxial
@@ -22,6 +35,13 @@ UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
 _SLIGHTLY = 0.1  # of a rim's diameter
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
+
+CLOSE_MM, WORST_MM = 1e-11, 1e-9  # of sag, in the unit of the heights: what is aimed at, and what steep conics get
+MAX_TERMS = MAX_POWER // 2 - 1  # of either kind, m from 0
+_DIGITS = 80
+_SAMPLES = 101
+_ROUNDING = 1e-9  # sag that cancels in float64, where powers alternate
+Terms = tuple[tuple[int, float], ...]
 
 
 def finish(
@@ -110,21 +130,12 @@ def check_rows(lens: Lens) -> None:
     if len(rows) > MAX_SURFACES:
         raise InputError(file, "surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
     index = f"a refractive index from 1 to {MAX_INDEX}"
-    mirror = " (an index of -1 describes a mirror, and the lens model has none)"
     for k, s in enumerate(rows):
-        terms = (s.conic, *(a for _, a in s.asphere))
-        figures = (
-            ("radius", s.radius_mm, abs(s.radius_mm) > 0, "a number other than 0, or a plane"),
-            ("thickness", s.thickness_mm, math.isfinite(s.thickness_mm), "a finite length"),
-            ("diameter", s.diameter_mm, math.isnan(s.diameter_mm) or 0 < s.diameter_mm < math.inf, "a length above 0"),
-            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, index + mirror * (s.n_d == -1)),
-            ("Abbe number", s.V_d, s.V_d is None or 0 < s.V_d < math.inf, "a number above 0"),
-            ("asphere", (s.conic, s.asphere), all(map(math.isfinite, terms)), "finite coefficients"),
-            *(("asphere, power", p, 2 <= p <= MAX_POWER, f"a power from 2 to {MAX_POWER}") for p, _ in s.asphere),
-        )
-        for name, value, sound, expected in figures:
-            if not sound:
-                raise InputError(file, f"surface {k}, {name}", value, expected)
+        if not 1 <= s.n_d <= MAX_INDEX:
+            mirror = " (an index of -1 describes a mirror, and the lens model has none)" if s.n_d == -1 else ""
+            raise InputError(file, f"surface {k}, index", s.n_d, index + mirror)
+        for power in (p for p, _ in s.asphere if not 2 <= p <= MAX_POWER):
+            raise InputError(file, f"surface {k}, asphere, power", power, f"a power from 2 to {MAX_POWER}")
     if not 1 <= lens.object_medium.n_d <= MAX_INDEX:
         raise InputError(file, "object, index", lens.object_medium.n_d, index)
     check_figures(rows, file)
@@ -155,17 +166,13 @@ def with_stop(draft: Draft, wanted: str | None) -> Draft:
         rows = tuple(row.surface for row in draft.rows)
         lens = Lens("", "", rows, math.nan, path=draft.file, object_medium=Medium(**draft.object_medium))
         check_rows(lens)
-        heights = system_of(lens).march(1.0, 0.0).y
-        k = min(range(len(rows)), key=lambda k: _share(rows[k].semi_diameter_mm, heights[k]))
+        heights = system_of(lens).march(1.0, 0.0).y  # of a beam 2 mm wide
+        shares = [s.semi_diameter_mm / abs(y) if y else math.nan for s, y in zip(rows, heights, strict=True)]
+        k = min(range(len(rows)), key=lambda k: math.inf if math.isnan(shares[k]) else shares[k])
         assume(draft.file, f"no stop is marked: surface {names[k]}, whose rim limits the beam of the axis, is taken")
     # Its rim stays, where the f-number or pupil of the file would have a wider one.
     marked = (replace(row, surface=replace(row.surface, stop=i == k)) for i, row in enumerate(draft.rows))
     return replace(draft, rows=tuple(replace(row, aperture=row.aperture or row.surface.stop) for row in marked))
-
-
-def _share(rim: float, height: float) -> float:
-    """Return a rim over the height of the marginal ray of a beam 2 mm wide; infinite where there is no rim."""
-    return math.inf if math.isnan(rim) or height == 0 else rim / abs(height)
 
 
 def stop_aperture(draft: Draft) -> float | None:
@@ -232,3 +239,84 @@ def narrowed(lens: Lens, draft: Draft) -> Lens:
         say = assume if any(s.semi_diameter_mm > end_mm(s) * (1 + 1e-6) for s in lens.surfaces) else warn
         say(lens.path, f"rims narrowed to where spheres end or neighbours touch: {', '.join(changed)}")
     return found
+
+
+def qcon_terms(a: Sequence[float], radius: float, rim: float) -> Terms:
+    """Return the powers of the height of a Qcon departure with their coefficients.
+
+    Args:
+        a: a_0, a_1, ... radius: normalisation radius. rim: height up to which the surface is used.
+
+    Raises:
+        ValueError: float64 cannot hold the coefficients.
+    """
+    in_x = [Decimal(0)] * (len(a) + 2)
+    with localcontext(Context(prec=_DIGITS)):
+        for m, value in enumerate(a):
+            for k in range(m + 1):
+                in_x[k + 2] += (-1) ** (m + k) * math.comb(m, k) * math.comb(m + k + 4, m) * Decimal(value)
+        return _powers(in_x, radius, rim)
+
+
+def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, conic: float = 0.0) -> Terms:
+    """Return the terms of a Qbfs departure from a conic; see `qcon_terms`. ValueError where the conic is too steep."""
+    with localcontext(Context(prec=_DIGITS)):
+        s2, k = (Decimal(curvature) * Decimal(radius)) ** 2, Decimal(conic)
+        reach = (Decimal(rim) / Decimal(radius)) ** 2
+        if (1 + k) * s2 * reach >= 1:
+            raise ValueError("a rim inside the conic")
+
+        def inverse_cosine(x: Decimal) -> Decimal:
+            return ((1 - k * s2 * x) / (1 - (1 + k) * s2 * x)).sqrt()
+
+        form = _polynomial(0, 1, -1) * _qbfs_sum(a)
+        samples = [reach * k / (_SAMPLES - 1) for k in range(_SAMPLES)]
+        exact = [polyval(x, form.coef) * inverse_cosine(x) for x in samples]
+        for degree in range(MAX_POWER // 2 - max(len(a), 1)):
+            found = form * _interpolated(inverse_cosine, reach, degree)
+            off = max(abs(polyval(x, found.coef) - y) for x, y in zip(samples, exact, strict=True))
+            if off <= Decimal(CLOSE_MM):
+                break
+        if off > Decimal(WORST_MM):
+            raise ValueError(f"a conic that powers up to {MAX_POWER} follow to {WORST_MM:g}")
+        return _powers(found.coef.tolist(), radius, rim)
+
+
+def _qbfs_sum(a: Sequence[float]) -> Polynomial:
+    """Return sum a_m Qbfs_m(x), by the recurrence of Forbes, Opt. Express 18, 19700 (2010), appendix A."""
+    d = Decimal
+    p = [_polynomial(2), _polynomial(6, -8)]
+    q = [_polynomial(1), _polynomial(13, -16) / d(19).sqrt()]
+    f, g, h = [d(2), d(19).sqrt() / 2], [d(-1) / 2], list[Decimal]()
+    for m in range(2, len(a)):
+        h.append(-d(m * (m - 1)) / (2 * f[m - 2]))
+        g.append(-(1 + g[m - 2] * h[m - 2]) / f[m - 1])
+        f.append((m * (m + 1) + 3 - g[m - 1] ** 2 - h[m - 2] ** 2).sqrt())
+        p.append(_polynomial(2, -4) * p[m - 1] - p[m - 2])
+        q.append((p[m] - q[m - 1] * g[m - 1] - q[m - 2] * h[m - 2]) / f[m])
+    return sum((term * d(value) for value, term in zip(a, q, strict=False)), _polynomial(0))
+
+
+def _interpolated(function: Callable[[Decimal], Decimal], reach: Decimal, degree: int) -> Polynomial:
+    """Return the polynomial through a function of x in Chebyshev's points of [0, reach]."""
+    nodes = [reach / 2 * (1 - Decimal(math.cos(math.pi * (k + 0.5) / (degree + 1)))) for k in range(degree + 1)]
+    table = [function(x) for x in nodes]
+    for order in range(1, degree + 1):  # Newton's divided differences
+        for k in range(degree, order - 1, -1):
+            table[k] = (table[k] - table[k - 1]) / (nodes[k] - nodes[k - order])
+    found = _polynomial(table[-1])
+    for x, value in zip(nodes[-2::-1], table[-2::-1], strict=True):
+        found = _polynomial(-x, 1) * found + value
+    return found
+
+
+def _powers(in_x: Sequence[Decimal], radius: float, rim: float) -> Terms:
+    """Return the powers of the height of a polynomial in x; ValueError where its terms cancel beyond float64."""
+    terms = tuple((2 * k, float(c / Decimal(radius) ** (2 * k))) for k, c in enumerate(in_x) if c)
+    if sum(abs(a) * rim**p for p, a in terms) * 2.0**-52 > _ROUNDING:
+        raise ValueError("fewer terms: powers of the height cancel in float64")
+    return terms
+
+
+def _polynomial(*coefficients: Decimal | int) -> Polynomial:
+    return Polynomial([Decimal(c) for c in coefficients])

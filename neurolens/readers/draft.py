@@ -6,31 +6,34 @@ import math
 import re
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
+from neurolens.base.settings import WAVELENGTH_NM, within
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import (
+    MAX_TERMS,
     UNKNOWN,
     finish,
     first_order,
     narrowed,
+    qbfs_terms,
+    qcon_terms,
     smaller_stop,
     stop_aperture,
     with_likely_rims,
     with_rims,
     with_stop,
 )
-from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
 from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, ReadOptions, warn
 from neurolens.setting.rims import check_states
 
 INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
+MAX_STATES = 200
 
 
 @dataclass
@@ -45,6 +48,8 @@ class Block:
     semi_diameter: float = UNKNOWN
     medium: dict[str, Any] = field(default_factory=dict)
     stop: bool = False
+    aperture: bool = False  # as of `Row`
+    solved: bool = False  # whether the thickness follows from others, or from the paraxial image
 
     @property
     def radius(self) -> float:
@@ -79,9 +84,10 @@ class Block:
             raise self.start.error(name, found, str(error)) from None
         return self.rotational(terms)
 
-    def surface(self, shape: dict[str, Any]) -> Surface:
-        diameter = 2 * self.semi_diameter
-        return Surface(thickness_mm=self.thickness, diameter_mm=diameter, stop=self.stop, **shape, **self.medium)
+    def row(self, shape: dict[str, Any]) -> Row:
+        """The row of a surface whose fields of shape are given."""
+        figures = {"thickness_mm": self.thickness, "diameter_mm": 2 * self.semi_diameter, "stop": self.stop}
+        return Row(Surface(**figures, **shape, **self.medium), self.aperture, self.name)
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,64 @@ class State:
     stop_diameter: float | None = None
     object_distance: float = math.inf
     film_given: bool = True
+
+
+@dataclass
+class Positions:
+    """Zoom or focus positions while a text file is read, by place from 0; gaps and rims by surface and place.
+
+    Attributes:
+        count: 0 until the file states it.
+        pupil, f_number, rims: each sizes the stop; `rims` are semi-diameters, with their lines.
+    """
+
+    count: int = 0
+    titles: dict[int, str] = field(default_factory=dict)
+    gaps: dict[tuple[int, int], float] = field(default_factory=dict)
+    pupil: dict[int, float] = field(default_factory=dict)
+    f_number: dict[int, float] = field(default_factory=dict)
+    rims: dict[tuple[int, int], tuple[float, Line]] = field(default_factory=dict)
+
+    def begin(self, line: Line, keyword: str, count: int) -> None:
+        """Set how many positions there are."""
+        if not 1 <= count <= MAX_STATES:
+            raise line.error(keyword, count, f"1 to {MAX_STATES} positions")
+        self.count = count
+
+    def states(
+        self, blocks: Sequence[Block], noun: str, rim: str, solve: Callable[[list[float], int], bool]
+    ) -> tuple[State, ...]:
+        """The positions of a file as states.
+
+        Args:
+            blocks: object, surfaces and image. noun: what a position without a title is called. rim: the keyword of
+                semi-diameters. solve: carries out the solves of gaps at a place, and tells whether its film is given.
+
+        Raises:
+            InputError: a semi-diameter that changes anywhere but at the stop.
+        """
+        if self.count < 2:
+            return ()
+        for (surface, _), (_, line) in self.rims.items():
+            if not blocks[surface].stop:
+                raise line.error(rim, f"(surface {surface})", "the stop: other rims cannot change")
+        openings = {place: 2 * semi for (_, place), (semi, _) in self.rims.items()}
+        changing = {k for k, _ in self.gaps} | {k for k, block in enumerate(blocks) if block.solved}
+        states = []
+        for place in range(self.count):
+            gaps = [self.gaps.get((k, place), block.thickness) for k, block in enumerate(blocks)]
+            film_given = solve(gaps, place)
+            state = State(
+                name=self.titles.get(place) or f"{noun} {place + 1}",
+                thickness={k - 1: gaps[k] for k in sorted(changing) if 0 < k < len(blocks) - 1},
+                pupil=self.pupil.get(place),
+                f_number=self.f_number.get(place),
+                stop_diameter=openings.get(place),
+                object_distance=math.inf if gaps[0] >= INFINITE else gaps[0],
+                film_given=film_given,
+            )
+            states.append(state)
+        return tuple(states)
 
 
 @dataclass

@@ -11,15 +11,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.lens import catalogue, glass
-from neurolens.lens.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
-from neurolens.lens.glass import by_figures
+from neurolens.lens import glass as catalogue
+from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass, by_figures
 from neurolens.readers.source import Line, assume, read_lines, warn
 
 _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
@@ -178,16 +177,10 @@ def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
 @contextmanager
 def more_glasses(files: Iterable[str | Path]) -> Iterator[None]:
     """Add the glasses of these catalogues within a block, before those of the same names that ship."""
-    read, before = [read_agf(file) for file in files], catalogue.added()
-    try:
-        for found, refused in reversed(read):
-            catalogue.add(found, refused)
-        glass.forget()
+    with ExitStack() as stack:
+        for found, refused in reversed([read_agf(file) for file in files]):
+            stack.enter_context(catalogue.added(found, refused))
         yield
-    finally:
-        if read:
-            catalogue.restore(before)
-            glass.forget()
 
 
 class _Refused(Exception):

@@ -13,11 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.bounds import WAVELENGTH_NM, said, within
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
+from neurolens.base.settings import WAVELENGTH_NM, said, within
 from neurolens.base.tomlfile import format_value, read_toml
-from neurolens.lens import catalogue, designs
+from neurolens.lens import designs
+from neurolens.lens import glass as catalogue
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.glass import by_figures, check_against_table, index_at
 from neurolens.lens.prescription import Coating, Configuration, Lens, Medium, Surface

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.lens.prescription import Lens, Surface
+from neurolens.lens.prescription import Lens
 from neurolens.readers import draft
 from neurolens.readers.assemble import UNKNOWN
 from neurolens.readers.draft import INFINITE, Draft, Row, lens_of, primary_first
@@ -41,9 +41,7 @@ class Block(draft.Block):
     """One surface with what OSLO says of it."""
 
     values: dict[str, float] = field(default_factory=dict)
-    checked: bool = False
     glass: Line | None = None
-    solved: bool = False
 
 
 @dataclass
@@ -106,26 +104,26 @@ def _read(file: File, line: Line) -> None:
         numbers = [n for n in rest if re.fullmatch("[-+.0-9eE]+", n)]
         if not numbers or any(line.numbers(word, numbers)):
             raise line.error(word, " ".join(rest) or "(here)", REFUSED[word])
-    elif not _system(file, line, word, rest):
-        _surface(file, line, word, rest)
+    else:
+        _keyword(file, file.blocks[-1], line, word, rest)
 
 
-def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
+def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -> None:
+    """Carry out a keyword of the system, or of the last surface that was begun."""
     match word:
-        case "EBR" | "ANG":
-            value = line.numbers(word, rest[:1])[0]
-            if value < 0 or (word == "EBR" and value == 0):
-                raise line.error(word, value, "a number above 0")
-            if word == "EBR":
-                file.pupil = 2 * value
-            else:
-                file.half_field_deg = value if 1e-3 < value < 90 else None
+        case "EBR":
+            file.pupil = 2 * line.positive(word, rest)
+        case "ANG":
+            angle = line.first(word, rest)
+            if angle < 0:
+                raise line.error(word, angle, "a number above 0")
+            file.half_field_deg = angle if 1e-3 < angle < 90 else None
         case "FNO":
             file.f_number = line.positive(word, rest)
         case "WV":
             file.waves_um = line.numbers(word, rest)
         case "UNI":
-            mm = line.numbers(word, rest[:1])[0]
+            mm = line.first(word, rest)
             file.unit = next((name for name, value in UNITS_MM.items() if value == mm), None)
             if file.unit is None:
                 raise line.error(word, mm, "1 (mm), 10 (cm), 25.4 (inch) or 1000 (m)")
@@ -133,32 +131,24 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             file.blocks.append(Block(line, str(len(file.blocks))))
         case "END":
             file.ended = True
-            if rest and line.numbers(word, rest[:1])[0] != len(file.blocks) - 1:
+            if rest and line.first(word, rest) != len(file.blocks) - 1:
                 raise line.error(word, rest[0], f"{len(file.blocks) - 1}, the number of the image surface")
-        case _:
-            return False
-    return True
-
-
-def _surface(file: File, line: Line, word: str, rest: list[str]) -> None:
-    block = file.blocks[-1]
-    match word:
         case "AIR":
             block.medium = {}
         case "GLA":
             block.medium, block.glass = _glass(line, rest), line
         case "AP":
-            block.checked = rest[:1] == ["CHK"]
-            semi = line.numbers(word, rest[1:2] if block.checked else rest[:1])[0]
+            block.aperture = rest[:1] == ["CHK"]
+            semi = line.first(word, rest[block.aperture :])
             block.semi_diameter = semi if semi > 0 else UNKNOWN
         case "AST":
             block.stop = True
         case "PY":
-            if line.numbers(word, rest[:1])[0] != 0:
+            if line.first(word, rest) != 0:
                 raise line.error(word, rest[0], "0: the film in the paraxial image")
             block.solved = True
         case _ if word in ("RD", "CV", "TH", "CC", *TERMS):
-            block.values[word] = line.numbers(word, rest[:1])[0]
+            block.values[word] = line.first(word, rest)
         case _:
             file.skipped[word] += 1
 
@@ -168,8 +158,7 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
     if not rest:
         raise line.error("GLA", "(nothing)", "the name of a glass, or an index")
     if re.fullmatch(r"[0-9.]+", rest[0]):
-        indices = line.numbers("GLA", rest)
-        return {"n_d": indices[0]}
+        return {"n_d": line.numbers("GLA", rest)[0]}
     if rest[0].upper() in ("REFL", "RFL", "REFLECT"):
         raise line.error("GLA", rest[0], "a glass: the lens model has no mirrors")
     return named_glass(rest[0], line.file, f"line {line.number}, GLA")
@@ -188,17 +177,17 @@ def _complete(file: File) -> None:
         if block.solved and block is not last:
             raise block.start.error("PY", f"(on surface {k})", "the last surface")
     distance = first.values.get("TH", 0.0)
-    file.rows = tuple(Row(_surface_of(block), block.checked, block.name) for block in middle)
+    file.rows = tuple(map(_row, middle))
     file.object_medium, file.wavelengths_nm = first.medium, primary_first(waves_nm, waves_nm[0] if waves_nm else 0.0)
     file.object_distance = math.inf if distance >= INFINITE else distance
     file.film_given = not (last.solved and "TH" not in last.values)
 
 
-def _surface_of(block: Block) -> Surface:
+def _row(block: Block) -> Row:
     values = block.values
     block.curvature, block.thickness, block.conic = (values.get(key, 0.0) for key in ("CV", "TH", "CC"))
     radius = values.get("RD") or block.radius
     block.curvature = 1 / radius
     terms = sorted((TERMS[name], value) for name, value in values.items() if name in TERMS)
     # The radius as it is printed, not the inverse of its inverse.
-    return block.surface(block.rotational(terms) | {"radius_mm": radius})
+    return block.row(block.rotational(terms) | {"radius_mm": radius})

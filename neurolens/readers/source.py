@@ -81,9 +81,13 @@ class Line:
             )
         return value
 
+    def first(self, keyword: str, words: Sequence[str]) -> float:
+        """Return the first word as a finite number."""
+        return self.numbers(keyword, words[:1])[0]
+
     def positive(self, keyword: str, words: Sequence[str]) -> float:
         """Return the first word as a number above 0."""
-        value = self.numbers(keyword, words[:1])[0]
+        value = self.first(keyword, words)
         if value <= 0:
             raise self.error(keyword, value, "a number above 0")
         return value
@@ -187,8 +191,8 @@ class Table:
         return tables
 
     def text(self, key: str, *, required: bool = True) -> str:
-        """Return a text; an empty one where a text that is not required is absent."""
-        if key not in self.data and not required:
+        """Return a text; an empty one where a text that is not required is absent or null."""
+        if self.data.get(key) is None and not required:
             return ""
         value = self.data.get(key, "(missing)")
         if key not in self.data or not isinstance(value, str) or (required and not value.strip()):

@@ -1,7 +1,7 @@
 """The film: the film points of pixels, the sums of every pixel, which grow by tiles and passes, and its checkpoint.
 
-A checkpoint (see `base.kept`) holds the sums and the identity of the render: everything that the picture depends on, as
-JSON that two renders can compare.
+A checkpoint (see `base.files`) holds the sums and the identity of the render: everything that the picture depends on,
+as JSON that two renders can compare.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import fingerprint_of
-from neurolens.base.kept import CHUNK_BYTES, read_arrays, write_arrays
+from neurolens.base.files import CHUNK_BYTES, fingerprint_of, read_arrays, write_arrays
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.render.settings import FilmSettings
 

@@ -12,9 +12,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from neurolens.base.bounds import F_NUMBER, FILM_MM, said, within
 from neurolens.base.errors import InputError
-from neurolens.base.settings import from_dict
+from neurolens.base.settings import F_NUMBER, FILM_MM, from_dict, said, within
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
 from neurolens.lens.apertures import Aperture

@@ -18,8 +18,8 @@ from inspect import get_annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from neurolens.base.bounds import said, within
 from neurolens.base.errors import InputError
+from neurolens.base.settings import said, within
 
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]

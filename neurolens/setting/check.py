@@ -19,7 +19,7 @@ from neurolens.lens.paraxial import FirstOrder, first_order
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.setting.focusing import axial_rays, best_focus_z_mm
 from neurolens.setting.pupil_nodes import FilmLight
-from neurolens.setting.pupils import pupil_plane_z_mm
+from neurolens.setting.pupils import on_plane, pupil_plane_z_mm
 from neurolens.setting.rims import end_mm
 from neurolens.setting.states import in_state
 from neurolens.trace.aiming import aim_at_stop
@@ -243,8 +243,8 @@ def axial_blur_mm(lens: Lens) -> float:
     if not len(r.x):
         return math.inf
     z = best_focus_z_mm(lens, math.inf, (lens.reference_nm, lens.reference_nm))
-    x, y = (c + (z - r.z) * d / r.dz for c, d in ((r.x, r.dx), (r.y, r.dy)))
-    return math.sqrt(float((x * x + y * y).mean()))
+    spot = on_plane(r, z)
+    return math.sqrt(float((spot.x**2 + spot.y**2).mean()))
 
 
 def film_edge_mm(lens: Lens) -> float | None:
@@ -258,11 +258,9 @@ def film_edge_mm(lens: Lens) -> float | None:
     with torch.no_grad():
         out = trace(lens, bundle.rays, towards="film")
     if int(out.status[0]) == st.PASSED and bool(bundle.reached[0, 0]):
-        r = out.rays
-        return abs(float(r.x + (first_order(lens).rear_focal_z_mm - r.z) * r.dx / r.dz))
-    if lens.half_field_deg < 60:
-        return abs(first_order(lens).front_efl_mm) * math.tan(math.radians(lens.half_field_deg))
-    return None
+        return abs(float(on_plane(out.rays, first_order(lens).rear_focal_z_mm).x))
+    wide = lens.half_field_deg >= 60
+    return None if wide else abs(first_order(lens).front_efl_mm) * math.tan(math.radians(lens.half_field_deg))
 
 
 def corner_illumination(lens: Lens, radius_mm: float) -> float:

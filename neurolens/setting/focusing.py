@@ -8,8 +8,8 @@ solved for so that the paraxial image of the object lies on the film, which is f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.lens import film_plane, paraxial
+from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
@@ -82,26 +82,11 @@ def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
     return gaps
 
 
-@dataclass(frozen=True)
-class FocusPath:
-    """The moves of the gaps while focusing: `steps[j]` holds the change of each gap at state j, 0 at infinity.
+def focus_path(lens: Lens) -> dict[int, list[float]]:
+    """How each gap changes while a lens focuses: its changes at infinity, 0, and at the focus states, by surface.
 
-    `film` is the surface whose thickness is the distance to the film.
-    """
-
-    steps: tuple[Mapping[int, float], ...]
-    film: int
-
-    def moved(self, s: float) -> dict[int, float]:
-        """Return the change of each gap at the parameter s, from 0 (infinity) to the number of states beyond."""
-        j = min(int(s), len(self.steps) - 2)
-        share = s - j
-        low, high = self.steps[j], self.steps[j + 1]
-        return {k: low[k] * (1 - share) + high[k] * share for k in low}
-
-
-def focus_path(lens: Lens) -> FocusPath:
-    """Return the path of a lens at infinity focus, at a state of its zoom or between (then interpolated in log EFL).
+    The lens is at infinity focus, at a state of its zoom or between (the changes are then interpolated in log EFL). The
+    last gap is the distance to the film.
 
     Raises:
         InputError: a file without focus states.
@@ -125,10 +110,7 @@ def focus_path(lens: Lens) -> FocusPath:
     place = math.log(paraxial.first_order(lens).efl_mm)
     place = min(max(place, rows[0][0]), rows[-1][0])
     flat = monotone([r[0] for r in rows], [r[1] for r in rows], place)
-    steps = [dict.fromkeys(moved, 0.0)]
-    for j in range(stages):
-        steps.append(dict(zip(moved, flat[j * len(moved) :], strict=False)))
-    return FocusPath(tuple(steps), film)
+    return {k: [0.0, *flat[n :: len(moved)]] for n, k in enumerate(moved)}
 
 
 def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = None) -> Lens:
@@ -148,8 +130,8 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
 
     lens = at_infinity(lens)
     path, place = _mover(lens)
+    furthest = len(path[len(lens.surfaces) - 1]) - 1
     wanted = 0.0 if focus_m is None else 1 / (1000 * focus_m)
-    furthest = len(path.steps) - 1
     nearest = _vergence(place(furthest))
     if not nearest > 0:
         raise InputError(lens.path, "focus_mode", "internal", "focus states that focus nearer than infinity")
@@ -159,7 +141,7 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
     wanted, s = min(wanted, nearest), 0.0
     if wanted > max(_vergence(place(0.0)), 0.0):
         s = brentq(lambda s: _vergence(place(s)) - wanted, 0.0, furthest, xtol=1e-14)
-    return replace(place(s), infinity_mm=tuple((k, lens.surfaces[k].thickness_mm) for k in path.steps[0]))
+    return replace(place(s), infinity_mm=tuple((k, lens.surfaces[k].thickness_mm) for k in path))
 
 
 def _rounded_up(value: float) -> float:
@@ -171,17 +153,20 @@ def _rounded_up(value: float) -> float:
 def nearest_focus_m(lens: Lens) -> float:
     """Return the nearest distance from object to film that internal focusing reaches."""
     path, place = _mover(at_infinity(lens))
-    return 1 / _vergence(place(len(path.steps) - 1)) / 1000
+    return 1 / _vergence(place(len(path[len(lens.surfaces) - 1]) - 1)) / 1000
 
 
-def _mover(lens: Lens) -> tuple[FocusPath, Callable[[float], Lens]]:
-    """Return the path of a lens at infinity focus, and the lens with its groups moved along it, film fixed."""
-    path, back_mm = focus_path(lens), paraxial.first_order(lens).back_focus_mm
+def _mover(lens: Lens) -> tuple[dict[int, list[float]], Callable[[float], Lens]]:
+    """Return the path of a lens at infinity focus, and the lens with its groups moved along it, film fixed.
+
+    The place on the path runs from 0 (infinity) to the number of states beyond.
+    """
+    path, back_mm, film = focus_path(lens), paraxial.first_order(lens).back_focus_mm, len(lens.surfaces) - 1
 
     def place(s: float) -> Lens:
-        added = path.moved(s)
-        moved = lens.with_gaps({k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != path.film})
-        return replace(moved, film_z_mm=moved.vertices_mm[path.film] + back_mm + added[path.film])
+        added = {k: float(np.interp(s, range(len(steps)), steps)) for k, steps in path.items()}
+        moved = lens.with_gaps({k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != film})
+        return replace(moved, film_z_mm=moved.vertices_mm[film] + back_mm + added[film])
 
     return path, place
 
@@ -206,7 +191,7 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
     """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light,
     by default `Lens.light_nm`.
 
-    Rays of the colours of `film_plane.colours` are spread evenly over the entrance pupil, and those that stop and rims
+    Rays of the colours of `paraxial.colours` are spread evenly over the entrance pupil, and those that stop and rims
     let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
     closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
     thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
@@ -229,7 +214,7 @@ def _least_spot_mm(
     """Film planes of least spot for an axial point, behind the stop as it is or behind round ones of some radii."""
     # Without dispersion all light is of one colour.
     one = (lens.reference_nm, lens.reference_nm)
-    wavelengths, weights = film_plane.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
+    wavelengths, weights = paraxial.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
     along, across, at_stop = _moments(lens, object_z_mm, wavelengths)
     share = torch.from_numpy(weights)[:, None, None].expand_as(along)[None]
     if stops_mm is not None:  # rays at the edge count in part
@@ -315,7 +300,7 @@ def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]
     image = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return image, image
-    colours = np.linspace(*wavelength_nm, film_plane.COLOURS if lens.dispersive else 1)
+    colours = np.linspace(*wavelength_nm, paraxial.COLOURS if lens.dispersive else 1)
     low = high = image
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
         # The rays within each ring are those that a smaller stop lets through.

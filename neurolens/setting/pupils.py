@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.lens.film_plane import PupilBounds
-from neurolens.lens.paraxial import first_order
+from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.rims import end_mm
 from neurolens.trace.rays import passing, trace
@@ -52,6 +51,12 @@ def camera_rays(
     scale = -torch.sign(z) / torch.sqrt(x * x + y * y + z * z)
     start_z = torch.as_tensor(film_z, dtype=film_x.dtype, device=film_x.device).expand_as(film_x)
     return Rays(film_x, film_y, start_z, x * scale, y * scale, (z * scale).expand_as(film_x))
+
+
+def on_plane(rays: Rays, z_mm: float) -> Rays:
+    """Rays moved along themselves to the plane at z."""
+    t = (z_mm - rays.z) / rays.dz
+    return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=torch.full_like(rays.z, z_mm))
 
 
 def passes_at_any_azimuth(

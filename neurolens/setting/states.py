@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
+from neurolens.base.settings import F_NUMBER, FOCAL_MM, said, within
 from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.lens.shot import FocusMode, Shot
@@ -31,7 +31,7 @@ from neurolens.setting.focusing import (
     with_cover_glass,
     zoom_state_of,
 )
-from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.pupils import image_radius_mm, on_plane
 from neurolens.setting.rims import check_clearance
 from neurolens.trace.aiming import aim_at_stop
 from neurolens.trace.rays import trace
@@ -199,8 +199,7 @@ def _factor_for_field(lens: Lens, field_deg: float) -> float:
     out = trace(lens, chief.rays, towards="film")
     reached = float(chief.field_rad[0, 0])
     assert lens.film_z_mm is not None
-    r = out.rays
-    height = abs(float(r.x + (lens.film_z_mm - r.z) * r.dx / r.dz))
+    height = abs(float(on_plane(out.rays, lens.film_z_mm).x))
     if not bool(chief.reached.all()) or int(out.status[0]) != 0 or not height > 0:
         widest = min(math.degrees(reached) * 2, lens.half_field_deg * 2 if lens.half_field_deg else 360.0)
         raise InputError(lens.path, "field_deg", field_deg, f"a field that this lens sees (about {widest:.3g} degrees)")

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
+from neurolens.base.settings import RANGE
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.lens.paraxial import film_z_mm, first_order

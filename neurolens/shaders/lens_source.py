@@ -12,8 +12,8 @@ import numpy as np
 
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.bounds import RANGE
 from neurolens.base.progress import Progress
+from neurolens.base.settings import RANGE
 from neurolens.graph.c import Extras
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower

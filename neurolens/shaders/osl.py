@@ -37,8 +37,7 @@ from neurolens.graph.loworder import low_orders, low_tests, with_film_derivative
 from neurolens.graph.program import Mixture, Program
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import Parameter, write_osl
-from neurolens.lens.film_plane import LINE_D_NM
-from neurolens.lens.prescription import VISIBLE_NM
+from neurolens.lens.prescription import LINE_D_NM, VISIBLE_NM
 from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share

@@ -22,7 +22,7 @@ from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.graph.loworder import pursue
-from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import LINE_D_NM
 from neurolens.shaders.source import Focusing
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import with_film_derivatives
 from neurolens.graph.program import STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
-from neurolens.lens.film_plane import film_z_of_card_mm
+from neurolens.lens.paraxial import film_z_of_card_mm
 from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_names
 
 Array = NDArray[np.float64]

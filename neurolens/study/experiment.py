@@ -11,11 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.base.lensname import lens_id_of
-from neurolens.base.settings import apply_overrides, from_dict, read_config, to_dict, to_toml
+from neurolens.base.settings import RANGE, apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.lens.glass import glass_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens

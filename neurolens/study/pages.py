@@ -20,11 +20,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, library
 from neurolens.base.html import html, local_url
 from neurolens.base.records import NOISY, Results, error_of, noisy, pareto_front, program, reaches, time_of
+from neurolens.base.settings import RANGE
 
 C = TypeVar("C")
 R = TypeVar("R", bound=Mapping[str, Any])

@@ -80,11 +80,12 @@ def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
     """The graph of a model."""
     g = Graph()
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
-    inside = within_domain(model, rays, film_z, form)
+    radius = g.input("stop_radius_mm", per_call=True) if parts.vignetting else None
+    inside = within_domain(model, rays, film_z, radius, form)
     field = light_field(g, model.encoding, rays, film_z)
     series = DirectionSeries.of(model, form)
     values = model.core.build(g, field, units_of(model, series, form))
-    g.outputs["status"] = add_outputs(model, values, inside, series, form, parts).whole()
+    g.outputs["status"] = add_outputs(model, values, inside, radius, series, form, parts).whole()
     return g
 
 
@@ -94,23 +95,30 @@ def units_of(model: LensModel, series: DirectionSeries, form: Form) -> Units:
 
 
 def add_outputs(
-    model: LensModel, values: CoreValues, inside: Value, series: DirectionSeries, form: Form, parts: Parts = ALL
+    model: LensModel,
+    values: CoreValues,
+    inside: Value,
+    radius: Value | None,
+    series: DirectionSeries,
+    form: Form,
+    parts: Parts = ALL,
 ) -> Value:
-    """Set a model's outputs but the status, which is returned, of what its core gives (in `units_of`)."""
+    """Set a model's outputs but the status, which is returned, of what its core gives (in `units_of`).
+
+    Args:
+        inside: whether a ray is within the domain. radius: of the stop; without one neither stop nor rims are tested.
+    """
     g = inside.graph
     g.outputs["scene_ray"] = scene_ray(model, values, series, form)
     if parts.transmittance:
         g.outputs["transmittance"] = values.transmittance
     if parts.stop:
         g.outputs["stop_xy_mm"] = values.vectors[STOP]
-    status: Value | float = float(st.PASSED)
-    if parts.vignetting:
-        radius = g.input("stop_radius_mm", per_call=True)
-        inside = inside & radius.between(0.0, model.domain.stop_radius_mm * DOMAIN_SLACK)
-        status = _first_failure(model, values, radius, form)
+    tests = _tests(model, values, radius, form) if radius is not None else []
     if series.sinc is not None and values.unit is None:
-        known = g.square(values.vectors[DIRECTION]) <= (series.kappa * series.angle) ** 2  # false for NaN
-        status = g.select(known, status, g.value(status).maximum(float(st.OUTSIDE_DOMAIN)))
+        longest = (series.kappa * series.angle) ** 2
+        tests.append((_scaled(form, g.square(values.vectors[DIRECTION]), g.constant(longest)), st.OUTSIDE_DOMAIN))
+    status = g.first_failure([pair for pair, _ in tests], [code for _, code in tests]) if tests else float(st.PASSED)
     return g.select(inside, status, float(st.OUTSIDE_DOMAIN))
 
 
@@ -143,31 +151,36 @@ def wavelength_row(e: Encoding, wavelength_nm: Value) -> Value:
     return (1000 / math.sqrt(e.w_half)) / wavelength_nm
 
 
-def within_domain(model: LensModel, rays: Value, film_z: Value, form: Form) -> Value:
-    """Whether film point, pupil point, wavelength and film position lie in the domain; false for NaN."""
+def within_domain(model: LensModel, rays: Value, film_z: Value, radius: Value | None, form: Form) -> Value:
+    """Whether film point, pupil point, wavelength, film position and stop lie in the domain; false for NaN.
+
+    What is the same for all rays of a call decides once: no film point is within a square radius of -1.
+    """
     g, d = rays.graph, model.domain
-    film, pupil = (
-        g.square(rays[k : k + 2]) <= (r * DOMAIN_SLACK) ** 2 for k, r in ((0, d.film_radius_mm), (2, d.pupil_radius_mm))
-    )
     near, far = d.film_z_mm
-    inside = film & pupil & film_z.between(near / DOMAIN_SLACK, far * DOMAIN_SLACK)
+    call = film_z.between(near / DOMAIN_SLACK, far * DOMAIN_SLACK)
+    if radius is not None:
+        call = call & radius.between(0.0, d.stop_radius_mm * DOMAIN_SLACK)
+    film, pupil = ((r * DOMAIN_SLACK) ** 2 for r in (d.film_radius_mm, d.pupil_radius_mm))
+    inside = (g.square(rays[0:2]) <= g.select(call, film, -1.0)) & (g.square(rays[2:4]) <= pupil)
     if form.wavelength or model.encoding.w_half:
         inside = inside & rays[4].between(*model.wavelength_limits_nm)
     return inside
 
 
-def _first_failure(model: LensModel, values: CoreValues, radius: Value, form: Form) -> Value:
-    """Status of stop and rims, as camera rays meet them: the last surface first, at one surface as in `base.status`."""
+def _tests(model: LensModel, values: CoreValues, radius: Value, form: Form) -> list[tuple[tuple[Value, Value], int]]:
+    """Tests of stop and rims, as camera rays meet them: the last surface first, at one surface as in `base.status`."""
     g = radius.graph
-    crossing, limit = g.square(values.vectors[STOP]), radius * radius
-    if form.gate_scale != 1:
-        crossing, limit = crossing * form.gate_scale, limit * form.gate_scale
-    tests = [((crossing, limit), st.blocked(model.lens.stop_index, st.RIM))]
+    crossing = _scaled(form, g.square(values.vectors[STOP]), radius * radius)
+    tests = [(crossing, st.blocked(model.lens.stop_index, st.RIM))]
     if values.gates is not None:
         rows = [values.gates[k] for k in range(values.gates.rows)]
         tests += [((row, g.constant(0.0)), gate.status) for row, gate in zip(rows, model.gates, strict=True)]
-    tests.sort(key=lambda test: (-(test[1] // 4), test[1]))
-    return g.first_failure([pair for pair, _ in tests], [code for _, code in tests])
+    return sorted(tests, key=lambda test: (-(test[1] // 4), test[1]))
+
+
+def _scaled(form: Form, value: Value, limit: Value) -> tuple[Value, Value]:
+    return (value, limit) if form.gate_scale == 1 else (value * form.gate_scale, limit * form.gate_scale)
 
 
 @dataclass(frozen=True)

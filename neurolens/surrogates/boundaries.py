@@ -35,8 +35,8 @@ STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold
 MOST_BOUNDARY_TERMS = 64
 # Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
 # those errors, or by hardly more than with all terms. At a quarter as many rays were clipped wrongly as with all;
-# networks clipped more, and keep all.
-NEEDED_SHARE, _NEARLY = 0.25, 1.1
+# networks clipped more, and keep all. Of the transmittance, which nothing is decided by, a larger share is enough.
+NEEDED_SHARE, _NEARLY, _THROUGH_SHARE = 0.25, 1.2, 0.6
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
@@ -106,7 +106,8 @@ def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
     found[stop] = solve(rows[stop], crossing.reshape(1, -1), weight.repeat(2))[0]
     rays = data.pairs.train
     seen, wanted = features(data.encoding(rays.inputs)), rays.transmittance[None]
-    through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), TRANSMITTANCE_ERROR**-2 / len(rays), len(seen))
+    scale = (NEEDED_SHARE / (_THROUGH_SHARE * TRANSMITTANCE_ERROR)) ** 2 / len(rays)
+    through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), scale, len(seen))
     return found, solve_scalars(data, features, [through.needed(), *gates])
 
 
@@ -207,6 +208,13 @@ class _BoundaryFit:
 
     def scores(self) -> np.ndarray:
         return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
+
+
+def needed_for(sweep: Sweep, error: float) -> list[int]:
+    """The fewest columns of A and B of a vector with this squared residual, or with hardly more than all leave."""
+    sweep.restart([])
+    terms = sweep.count // 2
+    return _BoundaryFit(sweep, terms, NEEDED_SHARE**2 / max(error, 1e-300), terms).needed()
 
 
 def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: float = 0.0) -> list[int]:

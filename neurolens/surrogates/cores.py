@@ -285,7 +285,7 @@ class InvariantPolynomial(_Symmetric):
 
     @cached_property
     def coefficients_per_vector(self) -> int:
-        return int((self.ab[:2] != 0).any(0).sum())
+        return int((self.ab[:2] != 0).sum((1, 2)).max())
 
 
 @stored_as("mirror")

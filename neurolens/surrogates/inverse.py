@@ -442,13 +442,14 @@ def scene_graph(model: LensModel, guess: Start, form: Form, steps: int = STEPS) 
     back = (film_z - e.pupil_plane_z_mm) * (1 / (e.film_plane_z_mm - e.pupil_plane_z_mm))
     rays = g.concat(pupil + (p - pupil) * back, pupil, wavelength)
 
-    inside, light = within_domain(model, rays, film_z, form), light_field(g, e, rays, film_z)
+    radius, light = g.input("stop_radius_mm", per_call=True), light_field(g, e, rays, film_z)
+    inside = within_domain(model, rays, film_z, radius, form)
     series = DirectionSeries.of(model, form)
     core, planes = _core_graph(model, light, units_of(model, series, form)), (2, 3, 0, 1)
     outputs = g.inline(with_derivatives(core, _SCENE, [("planes", k) for k in planes]), {"planes": light.planes})
     vectors = (outputs["position"], outputs["direction"], outputs["stop"])
     values = CoreValues(vectors, outputs["transmittance"], outputs.get("gates"), index=outputs.get("index"))
-    status = add_outputs(model, values, inside, series, form)
+    status = add_outputs(model, values, inside, radius, series, form)
     area = determinant([g.concat(*(outputs[derivative(n, f"planes_{k}")] for n in _SCENE)) for k in planes]).abs()
     # Of (p, u), scaled, per mm^2 and (kappa rad)^2.
     factor = e.film_scale_mm**2 * math.prod(e.pupil_scales_mm) * series.kappa**2

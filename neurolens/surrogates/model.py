@@ -18,8 +18,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import inverse_square_um
+from neurolens.lens.paraxial import PupilBounds
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
 from neurolens.surrogates.card import DOMAIN_SLACK, mix_domain

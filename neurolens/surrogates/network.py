@@ -23,7 +23,7 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.kept import Kept, read_arrays
+from neurolens.base.files import Kept, read_arrays
 from neurolens.surrogates.boundaries import (
     MOST_NETWORK_TERMS,
     boundary_terms,
@@ -62,7 +62,7 @@ _GAP = 1.15
 _RAYS_A_TERM = 4
 # Converged, when so many bursts in a row lower the loss by less than this share each.
 _LITTLE, _IDLE = 0.01, 3
-# A training's state is kept (`base.kept`) every few seconds; another schema starts anew.
+# A training's state is kept (`base.files`) every few seconds; another schema starts anew.
 _SCHEMA, EVERY_S = 2, 3.0
 
 

@@ -14,10 +14,9 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from neurolens.base import status as st
-from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError
-from neurolens.lens.film_plane import PupilBounds
-from neurolens.lens.paraxial import first_order
+from neurolens.base.settings import WAVELENGTH_NM, said
+from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.focusing import film_range_mm
 from neurolens.setting.pupils import camera_rays, image_radius_mm, pupil_bounds

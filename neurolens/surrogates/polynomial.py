@@ -1,7 +1,8 @@
 """Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement; and first order.
 
-One support serves position and direction, chosen by the film-equivalent error in the nearest focused plane and at
-infinity. The stop crossing, the transmittance and the gates are then fitted on the monomials that are computed anyway.
+One choice of monomials serves position and direction, by the film-equivalent error in the nearest focused plane and at
+infinity; by orthogonal least squares each then keeps the terms that it needs. The stop crossing, the transmittance and
+the gates are fitted on the monomials that are computed anyway.
 The thin and the thick lens that renderers use today have the same form: their rays follow the ideal (collinear) map of
 the prescription's focal length and principal planes; stop and rims are fitted as quadratic forms, which is what
 first-order rim crossings are. Lenses with cylinders, which have two planes of symmetry, are fitted axis by axis.
@@ -28,6 +29,7 @@ from neurolens.surrogates.boundaries import (
     features_of,
     fit_stop,
     invariant_core,
+    needed_for,
     solve_scalars,
     stop_crossing,
     transmittance_terms,
@@ -67,6 +69,7 @@ Shift = tuple[float, float]
 
 _CHOICE_RAYS = 10_000
 _SURPLUS = 1.5  # terms before elimination over terms kept
+_POSITION_SHARE = 2 / 3  # the position needs no less error than this share of the direction's, both weighed
 # Growth goes on while directions err by more than this, a round taking away at least a share of the squared residual.
 FINE_DEG, _MORE_ROUNDS, _LEAST_FALL, _PASSES = 0.002, 4, 0.03, 3
 # The search for planes: rays of a trial fit, degree of its candidates; multiples of u in p and of p in u (scaled, see
@@ -92,7 +95,6 @@ def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     if count <= settings.terms:
         raise InputError("fit", "train", count, f"more training rays than the {settings.terms} terms")
     train, dispersive = data.train, data.encoding.dispersive
-    invariants = train.field.invariants()
     outputs = weighed_apart(data.pairs.lens, data.pairs.domain, train.vectors, settings.position_weight)
     # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
     field, wanted = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field)), outputs[..., :_CHOICE_RAYS]
@@ -108,13 +110,22 @@ def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
         exponents, chosen = _grown_on(data, exponents, chosen, lambda e: _sweep(e, field, wanted), settings.terms)
     chosen = chosen or [0]  # rays on the axis alone choose nothing
     exponents, columns = kept(exponents, chosen)
-    own, features = len(exponents), monomials(invariants, exponents)
-    # The chosen columns only; position and direction share them.
-    coefficients = solve(vector_columns(features, train.field)[columns], train.vectors[:2].flatten(1))
+    own = len(exponents)
     exponents = np.concatenate([exponents, boundary_terms(data, exponents, first)])
     exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
     columns = [c if c < own else c - own + len(exponents) for c in columns]
-    return invariant_core(data, exponents, columns, coefficients, sparse=True)
+    rows = vector_columns(monomials(train.field.invariants(), exponents), train.field)
+    coefficients = rows.new_zeros((STOP, len(rows)))
+    least = 0.0
+    for row, vector in enumerate((DIRECTION, POSITION)):
+        mine = columns
+        if settings.method == "ols" and len(columns) == settings.terms:
+            sweep = _sweep(exponents, field, wanted[row : row + 1])
+            sweep.restart(columns)
+            error = max(sweep.residual, least)
+            mine, least = min(needed_for(sweep, error), columns, key=len), _POSITION_SHARE**2 * error
+        coefficients[vector, mine] = solve(rows[mine], train.vectors[vector].reshape(1, -1))[0]
+    return invariant_core(data, exponents, range(len(rows)), coefficients, sparse=True)
 
 
 def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -19,6 +19,7 @@ from torch.autograd import forward_ad
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import cache_folder
+from neurolens.base.tasks import keep_memory
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.arithmetic import is_number, times
@@ -113,7 +114,7 @@ def trace(
     wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     check_rays(rays, wavelength_nm)
     if not torch.compiler.is_compiling():
-        _keep_memory()
+        keep_memory()
     if towards not in ("scene", "film"):
         raise InputError("trace", "towards", towards, '"scene" or "film"')
     if any(not 0 <= k < len(lens.surfaces) for k in record):
@@ -153,7 +154,7 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = 
     Arguments and errors are those of `trace`, with one wavelength.
     """
     check_rays(rays, wavelength_nm)
-    _keep_memory()
+    keep_memory()
     chunks = zip(*(c.split(CHUNK) for c in rays), strict=True)
     with torch.no_grad():
         return torch.cat([_passing_chunk(lens, Rays(*chunk), wavelength_nm, towards) for chunk in chunks])
@@ -189,16 +190,6 @@ def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache_folder("torch"))
     torch.compiler.assume_constant_result(start_of)
     return torch.compile(run, dynamic=False, fullgraph=fullgraph)
-
-
-@cache
-def _keep_memory() -> None:
-    """Make glibc keep the memory of chunks between operators, once a process: half the time of a trace otherwise.
-
-    Freeing one block above 128 KiB raises the limit for return to the system to its size (mallopt(3),
-    M_MMAP_THRESHOLD).
-    """
-    torch.empty(30 << 20, dtype=torch.uint8)
 
 
 def _differentiated(value: Any) -> bool:

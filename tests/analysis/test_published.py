@@ -18,9 +18,8 @@ from neurolens.analysis.bundles import bundle, hexapolar
 from neurolens.analysis.field_curves import RECTILINEAR, Seidel, curvature, distortion, illumination, seidel
 from neurolens.analysis.fields import Array, Scene, on_plane
 from neurolens.lens.designs import design
-from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.paraxial import FirstOrder, first_order, image_z_mm
-from neurolens.lens.prescription import Lens, Surface
+from neurolens.lens.prescription import LINE_D_NM, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.trace.aiming import without_rims

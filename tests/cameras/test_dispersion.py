@@ -15,7 +15,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import Pinhole
 from neurolens.cameras.reduced import ReducedDispersion, film_shift
 from neurolens.cameras.sampling import stratified
-from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import LINE_D_NM
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 

@@ -14,11 +14,10 @@ from neurolens.analysis import field_curves
 from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import compare
 from neurolens.photographs.faults import Checked, alarm, changed, check, swapped, transposed
 from neurolens.photographs.figures import SHARES, Tables, chief_rays, measure
 from neurolens.photographs.profiles import Profile
-from neurolens.photographs.verify import found_for
+from neurolens.photographs.verify import compare, found_for
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 

@@ -13,9 +13,8 @@ from neurolens.base.errors import InputError
 from neurolens.cli import main
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import open_light, with_rims
 from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile
-from neurolens.photographs.rims import FittedRims, Ring, fit_rims, with_fitted_rims, with_ring
+from neurolens.photographs.rims import FittedRims, Ring, fit_rims, open_light, with_fitted_rims, with_rims, with_ring
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.rims import check_states
 from neurolens.setting.states import set_lens

@@ -8,7 +8,7 @@ import pytest
 from command_line import failure, run_json
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.lens import catalogue
+from neurolens.lens import glass as catalogue
 from neurolens.lens.glass import index_at, index_of
 from neurolens.readers.glasses import more_glasses, read_agf
 from neurolens.readers.lensfile import read_lens

@@ -11,7 +11,7 @@ from test_tables_oslo import OSLO
 from test_zemax import BODY, DUMMY, HEAD, TAIL, read, swapped
 
 from neurolens.base.errors import InputError
-from neurolens.lens import catalogue
+from neurolens.lens import glass as catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any

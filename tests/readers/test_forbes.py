@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from neurolens.readers.forbes import CLOSE_MM, MAX_TERMS, _qbfs_sum, qbfs_terms, qcon_terms
+from neurolens.readers.assemble import CLOSE_MM, MAX_TERMS, _qbfs_sum, qbfs_terms, qcon_terms
 
 mpmath = pytest.importorskip("mpmath")
 mp = mpmath.mp.clone()

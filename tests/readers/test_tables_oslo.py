@@ -7,7 +7,7 @@ from lens_formats import swapped
 from shipped import singlet_mm
 
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
-from neurolens.lens import catalogue
+from neurolens.lens import glass as catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.oslo import read_len

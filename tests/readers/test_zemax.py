@@ -11,7 +11,7 @@ from lens_formats import swapped as swapped_in
 from shipped import singlet_mm
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.lens import catalogue
+from neurolens.lens import glass as catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.source import ReadOptions

@@ -12,8 +12,7 @@ from shipped import whole
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.lens.film_plane import PupilBounds
-from neurolens.lens.paraxial import first_order
+from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import camera_rays, image_radius_mm

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
-from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import LINE_D_NM
-from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.lens.paraxial import PupilBounds, film_z_mm, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens

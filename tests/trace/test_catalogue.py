@@ -11,7 +11,7 @@ import torch
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cli import main
-from neurolens.lens import catalogue
+from neurolens.lens import glass as catalogue
 from neurolens.lens.glass import (
     LINE_C_NM,
     LINE_D_NM,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens.analysis.breathing import breathing
+from neurolens.analysis.field_curves import breathing
 from neurolens.cameras.exact import search_key
 from neurolens.graph.interpret import evaluate
 from neurolens.lens.glass import LINE_D_NM, index_of

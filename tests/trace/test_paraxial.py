@@ -10,7 +10,7 @@ import torch
 from shipped import SOME, tabled
 
 from neurolens.base.errors import InputError
-from neurolens.lens import film_plane
+from neurolens.lens import paraxial
 from neurolens.lens.paraxial import film_z_mm, first_order, stop_radius_mm
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.states import set_lens
@@ -180,5 +180,5 @@ def test_wavelength_shifts_the_focus() -> None:
 def test_wild_numbers_of_a_card_place_a_film_without_warnings(focal_mm: float) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        film = film_plane.film_z_mm(np.float64(focal_mm), 0.0, 0.0, np.float64(1e306))
+        film = paraxial.film_z_of_planes_mm(np.float64(focal_mm), 0.0, 0.0, np.float64(1e306))
     assert not math.isfinite(film) or film >= focal_mm

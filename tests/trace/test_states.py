@@ -8,7 +8,7 @@ import pytest
 import torch
 from shipped import NAMES, tabled, whole
 
-from neurolens.analysis.breathing import breathing, field_change
+from neurolens.analysis.field_curves import breathing, field_change
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import LINE_D_NM
 from neurolens.lens.paraxial import film_z_mm, first_order
