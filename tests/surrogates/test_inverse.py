@@ -203,6 +203,13 @@ def test_other_cores_have_inverses_too(kind: str) -> None:
         assert shares["converged"] >= 0.9999 and shares["other"] == 0
 
 
+def test_a_zoom_has_inverses_at_its_states() -> None:
+    zoom = load_model(lens_models.LENSES.with_name("models") / "nikon_zoom_80_200-range.states-64.onnx")
+    model = zoom.at(113.0).fitted
+    found = convergence(inverse_of(model), *passing_rays(model, 3000, seed=3))
+    assert min(shares["converged"] for shares in found.values()) >= 0.9999
+
+
 def test_a_published_core_without_direction_vectors_is_refused() -> None:
     with pytest.raises(InputError, match="direction vectors"):
         inverse_of(lens_models.model("hanika"))
