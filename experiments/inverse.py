@@ -12,7 +12,7 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.inverse import (
     STEPS,
     TOLERANCE,
+    Guess,
     InverseModel,
     convergence,
     front_index,
@@ -167,21 +168,18 @@ def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class _OnePoint:
-    """A start that is the same pupil point for all rays."""
-
-    u: tuple[float, float]
+class _OnePoint(Guess):
+    """A start that is the same pupil point for all rays: its numbers are that point."""
 
     def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
-        return [light.u * 0.0 + g.constant(np.array(self.u))]
+        return [light.u * 0.0 + g.constant(self.ab)]
 
 
 def _reachable(inverse: InverseModel, rays: Array, film_z: Array, stop: Array) -> NDArray[np.bool_]:
     """[N] whether a passing ray goes from each film point through each stop point, from many starts."""
     side, found = np.linspace(-0.9, 0.9, _STARTS), np.zeros(len(film_z), bool)
     for a, b in product(side, side) if len(film_z) else ():
-        one = replace(inverse, stop=_OnePoint((float(a), float(b))))
+        one = replace(inverse, stop=_OnePoint(np.zeros((0, 5), np.int64), np.array([a, b])))
         found |= one.through_stop(rays[:2], stop, rays[4], film_z, steps=15).status == st.PASSED
     return found
 

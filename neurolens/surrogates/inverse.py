@@ -15,7 +15,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,13 +70,6 @@ _FOLD = 0.1
 _OTHER = 0.02
 
 
-class Start(Protocol):
-    """A first guess: K vectors, 2 rows each, of a and b, the p and u of `light`; z None: it is 0."""
-
-    def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
-        """Append the guess to a graph."""
-
-
 @dataclass(frozen=True, eq=False)
 class Guess:
     """First guess of an inverse map: K vectors from two vectors a and b.
@@ -110,7 +103,7 @@ class Guess:
         return Guess(exponents, np.stack(ab, 2))
 
     def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
-        """See `Start`."""
+        """The vectors, 2 rows each, of a and b, the p and u of `light`; z None: it is 0."""
         wide, last = self.ab.shape[2], self.exponents.shape[1] - 1
         variables = [v for v in range(last) if v < last - 1 or light.dispersive]
         x = light.products(MIRROR if wide == 2 else ROUND)
@@ -166,8 +159,8 @@ class InverseModel:
     """
 
     model: LensModel
-    stop: Start
-    scene: Start
+    stop: Guess
+    scene: Guess
 
     def through_stop(
         self, film_xy_mm: ArrayLike, stop_xy_mm: ArrayLike, wavelength_nm: ArrayLike, film_z_mm: ArrayLike,
@@ -396,7 +389,7 @@ def _light(e: Encoding, vectors: list[Value], wavelength: Value) -> Field:
     return Field(g.concat(*vectors, wavelength_row(e, wavelength)), -e.w_middle / e.w_half)
 
 
-def stop_graph(model: LensModel, guess: Start, form: Form, steps: int = STEPS) -> Graph:
+def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -> Graph:
     """The map from stop points to camera rays.
 
     Inputs stop_rays (film x, y, stop x, y in mm, wavelength in nm), film_z_mm, stop_radius_mm. Outputs rays (film x, y,
@@ -420,7 +413,7 @@ def stop_graph(model: LensModel, guess: Start, form: Form, steps: int = STEPS) -
     return _finished(g, rays, out, area, status, size or g.square(off), form)
 
 
-def scene_graph(model: LensModel, guess: Start, form: Form, steps: int = STEPS) -> Graph:
+def scene_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -> Graph:
     """The map from scene rays to camera rays: as `stop_graph`, but for its input and what density is of.
 
     Input front_rays: x and y on the front surface (mm), direction vector of the model (angle vector in rad, or slope;
