@@ -47,7 +47,7 @@ NAMES = {
     "four-lenses": ("four_lenses", "the README's first picture: a night through a thin lens and three real ones"),
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
     "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),
-    "survive": ("survive", "commands killed at random moments, on full disks, two at once"),
+    "survive": ("survive", "commands killed at random moments end in the same result"),
     "photons": ("photons", "flare by photons, as in Keshmirian 2008"),
     "glare": ("glare", "contrast that veiling glare takes"),
     "starburst": ("starburst", "stars by diffraction: checks against closed forms, seconds"),

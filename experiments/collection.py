@@ -117,7 +117,7 @@ class RayOptics:
 
     def __init__(self, python: Path, folder: Path) -> None:
         self.python, self.folder = python, folder
-        self.kept = lab.kept_rows(KEPT, "experiments collection", lambda row: row["key"])
+        self.kept = {row["key"]: row for row in lab.kept_rows(KEPT, "experiments collection")}
 
     def ask(self, rows: Sequence[Row], mend: bool, report: Report) -> dict[str, Row]:
         """The answers for files that neurolens has read, by name.
@@ -254,7 +254,7 @@ def page(rows: list[Row]) -> str:
     parts += ["## Refused", lab.table("files|reason|why it is right|which", shown)]
     for title, key in (("Assumed", "assumed"), ("Told", "notes")):
         pairs = [(r, text) for r in read for text in r[key] if key == "assumed" or text not in r["assumed"]]
-        shown = [[len(found), text, stem(found[0])] for text, found in grouped(pairs)]
+        shown = [[len(some), text, stem(some[0])] for text, some in grouped(pairs)]
         parts += [f"## {title}", lab.table("files|what|the first", shown)]
     if any("cause" in r for r in read):
         parts += _agreement(read)

@@ -15,7 +15,6 @@ import itertools
 import math
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +24,8 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.cli import main
-from neurolens.defocus.gather import Gathered
 from neurolens.defocus.kernels import kernel_at, own_plate
-from neurolens.defocus.picture import defocus
+from neurolens.defocus.picture import Gathered, defocus
 from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_exr, write_png
@@ -43,55 +41,6 @@ _FLOOR_SEED = 1000
 # A render of a point of light has this film, pixels per mm, focus and radius of the ball in pixels; its kernel has so
 # many pixels across each pixel of the render.
 _STRIP_MM, _PER_MM, _STRIP_FOCUS_M, _BALL_PX, _FINER = (4.5, 30.0), 10.0, 1.2, 1, 8
-
-
-@dataclass(frozen=True)
-class Row:
-    """One scene: FLIP against the path-traced lens, seconds of a core, and what `defocus` said."""
-
-    scene: str
-    flip: float
-    flip_without_highlights: float
-    flip_thin: float
-    cpu_s: float
-    render_cpu_s: float
-    highlights: int
-    filled: float
-    beyond: float
-
-
-@dataclass(frozen=True)
-class Point:
-    """A point's kernel beside its render: FLIP, relative differences of area ((sum)^2 / sum of squares) and light."""
-
-    field_mm: float
-    distance_m: float
-    flip: float
-    area: float
-    light: float
-    area_px: float
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Blurred plates beside path tracing through the lens, whose variance falls as 1 / samples.
-
-    Attributes:
-        plate: samples of a pixel. cpu_s: of plates and blur. noise: variance (`rel_mse`) by two seeds; error: mean
-            square distance from the mean of two path-traced pictures, without their noise. light: more than theirs.
-        traced_s, traced_noise: of a path-traced picture. faster, faster_to_error: how many times as long path tracing
-            takes to the same noise, and to the same error, what the plate cannot know included.
-    """
-
-    plate: int
-    cpu_s: float
-    noise: float
-    error: float
-    light: float
-    traced_s: float
-    traced_noise: float
-    faster: float
-    faster_to_error: float
 
 
 def rendered(scene: Path, camera: str, path: Path, samples: int, *more: str) -> tuple[Path, float]:
@@ -132,19 +81,25 @@ def blurred(scene: str, path: Path, highlights: bool, *behind: Path) -> tuple[Ga
     return defocus(plate, camera, highlights=highlights), time.process_time() - began
 
 
-def measure(scene: str, folder: Path) -> Row:
-    """Render what is missing of a scene, blur its plate, compare."""
+def measure(scene: str, folder: Path) -> lab.Row:
+    """Render what is missing of a scene, blur its plate, compare by FLIP with the path-traced lens."""
     plate, _ = picture_of(scene, "pinhole", folder)
     (exact, seconds), (thin, _) = (picture_of(scene, kind, folder) for kind in ("fused", "thin"))
     truth = read_exr(exact)[0]
     (found, cpu_s), (without, _) = (blurred(scene, plate, highlights) for highlights in (True, False))
     write_png(folder / f"{scene}.defocus.png", found.rgb)
     best, noisy, thin_flip = (flip(rgb, truth) for rgb in (found.rgb, without.rgb, read_exr(thin)[0]))
-    return Row(scene, best, noisy, thin_flip, cpu_s, seconds, found.highlights, found.filled, found.beyond)
+    row: lab.Row = {"scene": scene, "flip": best, "flip_without_highlights": noisy, "flip_thin": thin_flip}
+    row |= {"cpu_s": cpu_s, "render_cpu_s": seconds, "highlights": found.highlights}
+    return row | {"filled": found.filled, "beyond": found.beyond}
 
 
-def equal_noise(folder: Path, samples: int) -> Noise:
-    """Blurred plates of the lights, with overscan and the layer behind the figures, beside path-traced pictures."""
+def equal_noise(folder: Path, samples: int) -> lab.Row:
+    """Blurred plates of the lights, with overscan and the layer behind the figures, beside path-traced pictures.
+
+    Noise is variance (`rel_mse`) by two seeds; error the mean square distance from the mean of two path-traced
+    pictures, without their noise; `faster`, `faster_to_error`: how many times as long path tracing takes to the same.
+    """
     scene, behind = _scene("lights"), folder / "behind.toml"
     rows = scene.read_text(encoding="utf-8").splitlines()
     figures = [row for row in rows if "centre_m" in row and "material" in row]
@@ -167,14 +122,17 @@ def equal_noise(folder: Path, samples: int) -> Noise:
     ours, theirs = np.min(spent, axis=0).tolist()
     light = float(np.sum(found, dtype=np.float64) / np.sum(traced) - 1)
     faster = [theirs * traced_noise / v / ours for v in (noise, error)]
-    return Noise(samples, ours, noise, error, light, theirs, traced_noise, faster[0], faster[1])
+    row: lab.Row = {"plate": samples, "cpu_s": ours, "noise": noise, "error": error, "light": light}
+    row |= {"traced_s": theirs, "traced_noise": traced_noise}
+    return row | {"faster": faster[0], "faster_to_error": faster[1]}
 
 
-def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> Point:
+def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> lab.Row:
     """A small ball that shines, path-traced through the lens, beside the lens's kernel at its place.
 
     The film is a strip, as wide as the disc of blur: the same lens and the same field, and fewer pixels. The kernel is
-    spread over the ball's own picture.
+    spread over the ball's own picture. Returns FLIP, and relative differences of area ((sum)^2 / sum of squares) and
+    of light.
     """
     shot = Shot(_STRIP_MM, _STRIP_FOCUS_M, f_number=F_NUMBER, wavelength_nm=(400.0, 700.0))
     camera = make_camera(f"fused:{lab.LENSES / LENS}.toml", shot)
@@ -208,9 +166,8 @@ def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> Poi
     bright = 2 * float((meant**2).sum() / meant.sum())  # twice the mean over the disc
     areas = [float(rgb.sum()) ** 2 / float((rgb.astype(np.float64) ** 2).sum()) for rgb in (meant, traced)]
     light = float(meant.sum() / traced.sum(dtype=np.float64))
-    return Point(
-        field_mm, distance_m, flip(meant / bright, traced / bright), areas[0] / areas[1] - 1, light - 1, areas[1] / 3
-    )
+    row: lab.Row = {"field_mm": field_mm, "distance_m": distance_m, "flip": flip(meant / bright, traced / bright)}
+    return row | {"area": areas[0] / areas[1] - 1, "light": light - 1, "area_px": areas[1] / 3}
 
 
 def large_s(scene: str, folder: Path) -> tuple[float, int]:
@@ -306,21 +263,13 @@ def run(args: argparse.Namespace) -> None:
     for scene, report in lab.stages(lab.chosen(SCENES, str, args.only, "defocus"), str, args.quiet):
         rows.append(measure(scene, args.pictures))
         report(1.0)
-    first, worst = rows[0].scene, max(rows, key=lambda row: row.flip).scene
+    first, worst = rows[0]["scene"], max(rows, key=lambda row: row["flip"])["scene"]
     two = [read_exr(picture_of(worst, "fused", args.pictures, seed)[0])[0] for seed in (0, _FLOOR_SEED)]
     plate = picture_of(worst, "pinhole", args.pictures)[0]
     better = flip(blurred(worst, plate, True)[0].rgb, (two[0] + two[1]) / 2)
     large, count = large_s(first, args.pictures)
-    known = {
-        "lens": LENS,
-        "f_number": F_NUMBER,
-        "width": WIDTH,
-        "samples": SAMPLES["fused"],
-        "plate": SAMPLES["pinhole"],
-        "first": first,
-        "worst": worst,
-        "better": better,
-    }
+    known = {"lens": LENS, "f_number": F_NUMBER, "width": WIDTH, "first": first, "worst": worst, "better": better}
+    known |= {"samples": SAMPLES["fused"], "plate": SAMPLES["pinhole"]}
     known |= {"floor": flip(*two), "wide": _LARGE[0], "high": _LARGE[1], "large": large, "count": count}
     head = "# Blur of a lens for sharp pictures, beside path-traced ones", "`python -m experiments defocus`"
     text = lab.page(*head, _NOTES.format(**known), lab.machine_line(), lab.table(_COLUMNS, rows))

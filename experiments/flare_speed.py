@@ -20,7 +20,6 @@ import re
 import statistics
 import subprocess
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -48,57 +47,22 @@ OPTIONS = [
 ]
 
 
-@dataclass(frozen=True)
-class Row:
-    """Times are ns a ghost ray, minimum and median.
-
-    `arriving` is the share of ghost rays that reach the film's plane, `steps` the number of surfaces that a ghost
-    passes, `own_steps` of those that it does not share with other ghosts.
-    """
-
-    lens: str
-    surfaces: int
-    ghosts: int
-    arriving: float
-    steps: float
-    own_steps: float
-    compiled_min: float
-    compiled_median: float
-    torch_min: float
-    torch_median: float
-
-    @property
-    def gain(self) -> float:
-        return self.torch_min / self.compiled_min
-
-
-@dataclass(frozen=True)
-class Public:
-    """A tracer in the race with the public one: ns a ghost ray, minimum and median."""
-
-    tracer: str
-    ghosts: int
-    rays: int
-    arriving: float
-    ns_min: float
-    ns_median: float
-
-
 def run(args: argparse.Namespace) -> int:
     """Time the lenses, write the tables; 1 where the goal is missed."""
     lab.quiet_glasses()
     torch.set_num_threads(1)
     names = lab.chosen(LENSES, str, args.only, "lenses")
-    progress, rows = Progress(quiet=args.quiet), []
+    progress, rows = Progress(quiet=args.quiet), list[lab.Row]()
     for name in names:
         with progress.stage(name) as report:
             rows.append(_row(name, args.rounds, report))
-    main = [r.compiled_min for r in rows if r.lens == LENSES[0]]
+    main = [r["compiled_min"] for r in rows if r["lens"] == LENSES[0]]
     goal = lab.Goal(f"ns a ghost ray, {LENSES[0]}", GOAL_NS, main[0] if main else None)
     beside = [] if args.flaresim is None else _beside(args.flaresim, max(3, args.rounds // 3), progress)
     other = "flaresim was not given (--flaresim): not measured beside ours."
     if beside:
-        goal_now = lab.Goal(f"times as fast as {beside[0].tracer}", 10.0, beside[0].ns_min / beside[1].ns_min, True)
+        theirs, ours = beside
+        goal_now = lab.Goal(f"times as fast as {theirs['tracer']}", 10.0, theirs["ns_min"] / ours["ns_min"], True)
         other = lab.page(lab.table(_PUBLIC, beside), lab.goal_table("Goal", [goal_now]))
     text = lab.page("# Ghosts", __doc__ or "", lab.table(_COLUMNS, rows), lab.goal_table("Goal", [goal]), other)
     data = {"machine": lab.machine(), "rounds": args.rounds, "rows": rows, "beside": beside}
@@ -106,7 +70,9 @@ def run(args: argparse.Namespace) -> int:
     return int(bool(main) and main[0] > GOAL_NS)
 
 
-def _row(name: str, rounds: int, report: lab.Report) -> Row:
+def _row(name: str, rounds: int, report: lab.Report) -> lab.Row:
+    """Times in ns a ghost ray; `arriving`: the share of ghost rays that reach the film; `steps`: surfaces that a
+    ghost passes, `own_steps` of those that it does not share with other ghosts."""
     lens = lab.lens_of(name, focus_m=math.inf)
     tracer = GhostTracer(lens)
     rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, _RAYS)
@@ -120,14 +86,15 @@ def _row(name: str, rounds: int, report: lab.Report) -> Row:
         return len(some) * _RAYS
 
     times = lab.cpu_ns({"compiled": lambda: tracer.trace(rays, _NM).worst.size, "torch": by_path}, rounds, report)
-    steps = statistics.mean(map(len, paths))
-    own_steps = statistics.mean(len(lens.surfaces) - 1 - pair.first for pair in tracer.pairs)
-    arriving = float((tracer.trace(rays, _NM).worst <= 1).mean())
-    ends = [end(times[which]) for which in ("compiled", "torch") for end in (min, statistics.median)]
-    return Row(name, len(lens.surfaces), len(paths), arriving, steps, own_steps, *ends)
+    row: lab.Row = {"lens": name, "surfaces": len(lens.surfaces), "ghosts": len(paths)}
+    row |= {"arriving": float((tracer.trace(rays, _NM).worst <= 1).mean()), "steps": statistics.mean(map(len, paths))}
+    row["own_steps"] = statistics.mean(len(lens.surfaces) - 1 - pair.first for pair in tracer.pairs)
+    for how, ns in times.items():
+        row |= {f"{how}_min": min(ns), f"{how}_median": statistics.median(ns)}
+    return row | {"gain": row["torch_min"] / row["compiled_min"]}
 
 
-def _beside(binary: Path, rounds: int, progress: Progress) -> list[Public]:
+def _beside(binary: Path, rounds: int, progress: Progress) -> list[lab.Row]:
     """flaresim and our tracer on the first lens, in turn.
 
     Raises:
@@ -149,9 +116,11 @@ def _beside(binary: Path, rounds: int, progress: Progress) -> list[Public]:
     git = ["git", "-C", str(binary.resolve().parent), "log", "-1", "--format=%h of %cs"]
     version = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
     pairs = len(tracer.pairs)
+    both = (f"flaresim ({version})", int(count), hits / count, theirs), ("ours", pairs * _RAYS, arriving, ours)
     return [
-        Public(f"flaresim ({version})", pairs, int(count), hits / count, min(theirs), statistics.median(theirs)),
-        Public("ours", pairs, pairs * _RAYS, arriving, min(ours), statistics.median(ours)),
+        {"tracer": name, "ghosts": pairs, "rays": rays, "arriving": share, "ns_min": min(ns)}
+        | {"ns_median": statistics.median(ns)}
+        for name, rays, share, ns in both
     ]
 
 

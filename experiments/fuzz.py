@@ -5,8 +5,7 @@ list of lights or keys, what an earlier run has kept) or the words of a command 
 when the exit code is 0, or 2 with one line on stderr (warnings aside; 1 where a command judges, as `evaluate`), no
 temporary file stays, a refused command has written nothing, and processor time, waiting and memory stay within bounds.
 
-Cases run one after the other in a process that is forked for every two hundred of them; one that dies or hangs costs
-its own case. A case with a fault is run again in a process of its own, and the page tells whether it fails there, too.
+Every case runs in a process that is forked for it, on a copy of good files; one that dies or hangs costs itself alone.
 Case K of seed S is always the same: `--seed S --first K --cases 1 --keep DIR` shows a fault again. A run that is
 interrupted goes on, for finished batches are kept.
 """
@@ -20,19 +19,20 @@ import os
 import platform
 import re
 import resource
-import select
 import shutil
 import signal
+import stat
 import sys
 import tempfile
+import threading
+import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import chdir, redirect_stdout, suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from experiments import lab
 from experiments.fuzz_kinds import KINDS, SEEDS, build, chosen, make_seeds, plate, shorten
@@ -40,7 +40,7 @@ from experiments.lab import cpu_s, resident_kb
 from neurolens import __version__, cli
 from neurolens.base.files import atomic_write_text, write_json
 
-__all__ = ["KINDS", "SEEDS", "run_cases"]
+__all__ = ["KINDS", "SEEDS"]
 
 CPU_S, LONG_CPU_S, WALL_S, MEMORY = 20.0, 60.0, 300.0, 2 << 30
 _BATCH = 200
@@ -73,123 +73,93 @@ class Verdict:
 
     case: int
     kind: str
-    argv: tuple[str, ...]
+    argv: list[str]
     code: int
     said: str
-    faults: tuple[str, ...]
+    faults: list[str]
     cpu_s: float = 0.0
     memory: int = 0
 
 
-# ---- A batch: cases one after the other, in a process of its own. ----------------------------------------------------
+# ---- A case, in a process of its own. --------------------------------------------------------------------------------
 
 
-class Folder:
-    """A folder of good files that is made whole again after every case."""
-
-    def __init__(self, good: Path, place: Path) -> None:
-        shutil.copytree(good, place, copy_function=shutil.copy, ignore=lambda *_: ["fifo"])
-        os.mkfifo(place / "fifo")
-        self.place = place
-        self.good = {p: p.read_bytes() if p.is_file() else None for p in sorted(place.rglob("*"))}
-        self.clean = self.state()
-
-    def state(self) -> dict[Path, tuple[int, int, int]]:
-        """The paths in the folder, with numbers that change with their contents."""
-        found = {}
-        for path in self.place.rglob("*"):
-            about = path.lstat()
-            found[path] = about.st_ino, about.st_size, 0 if path.is_dir() else about.st_mtime_ns
-        return found
-
-    def restore(self) -> None:
-        """Write what has changed anew, and remove what is new."""
-        now = self.state()
-        for path in now:
-            if path not in self.good and path.parent in (self.place, *self.good):
-                _remove(path)
-        for path, data in self.good.items():
-            if now.get(path) == self.clean[path]:
-                continue
-            if data is not None:
-                _remove(path)
-                path.write_bytes(data)
-            elif path.name != "fifo":
-                if not path.is_dir() or path.is_symlink():
-                    _remove(path)
-                path.mkdir(exist_ok=True)
-            elif not path.is_fifo():
-                _remove(path)
-                os.mkfifo(path)
-        self.clean = self.state()
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+def run_case(good: Path, scratch: Path, case: int, seed: int, only: str, keep: Path | None = None) -> Verdict:
+    """Run a case on a copy of good files; where it has a fault, its files are kept in a folder."""
+    chance, kind = chosen(seed, case, only)
+    place, answer = scratch / "work", scratch / "answer.json"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    shutil.copytree(good, place, copy_function=shutil.copy, ignore=lambda *_: ["fifo"])
+    os.mkfifo(place / "fifo")
+    argv = KINDS[kind][1](chance, place)
+    process = os.fork()
+    if not process:
+        try:
+            _child(case, kind, argv, place, answer)
+        finally:
+            os._exit(0)
+    late = threading.Timer(WALL_S, os.killpg, (process, signal.SIGKILL))
+    late.start()
+    _, status, used = os.wait4(process, 0)
+    late.cancel()
+    with suppress(ProcessLookupError):
+        os.killpg(process, signal.SIGKILL)  # what it left behind
+    if answer.exists():
+        verdict = Verdict(**json.loads(answer.read_text()))
     else:
-        path.unlink(missing_ok=True)
+        code, said = os.waitstatus_to_exitcode(status), (scratch / "stderr").read_bytes()[-2000:]
+        why = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
+        cpu = used.ru_utime + used.ru_stime
+        verdict = Verdict(
+            case, kind, argv, code, said.decode(errors="backslashreplace"), [why], cpu, used.ru_maxrss << 10
+        )
+    if verdict.faults and keep is not None:
+        shutil.rmtree(keep, ignore_errors=True)
+        fifos = [path for path in place.rglob("*") if path.is_fifo()]
+        shutil.copytree(place, keep, symlinks=True, ignore=lambda f, names: [n for n in names if Path(f, n) in fifos])
+        write_json(keep / "verdict.json", asdict(verdict))
+    return verdict
 
 
-def _batch(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str, answers: int) -> None:
-    """Run cases in the new process, and write a line for each of them to a pipe."""
-    try:
-        os.setsid()
-        os.environ["NEUROLENS_TRACEBACK"] = "1"
-        for number, name in ((0, os.devnull), (1, os.devnull), (2, str(scratch / "stderr"))):
-            os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND), number)
-        sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", errors="backslashreplace")
-        resource.setrlimit(resource.RLIMIT_DATA, (2 * MEMORY + 1024 * resident_kb("VmData"),) * 2)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 28,) * 2)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        parser = build()
-        folder = Folder(good, scratch / "work")
-        for case in cases:
-            chance, kind = chosen(seed, case, only)
-            argv = KINDS[kind][1](chance, folder.place)
-            os.write(answers, f"{json.dumps([case, kind, argv])}\n".encode())
-            verdict = _case(case, kind, argv, folder, lambda: parser)
-            os.write(answers, f"{json.dumps(asdict(verdict))}\n".encode())
-            if verdict.faults and len(cases) == 1:
-                os._exit(0)  # the files stay for whoever asked
-            os.chdir(scratch)
-            folder.restore()
-    except BaseException:
-        import traceback
-
-        os.write(answers, f"{json.dumps({'broken': traceback.format_exc()})}\n".encode())
-    finally:
-        os._exit(0)
-
-
-def _case(case: int, kind: str, argv: list[str], folder: Folder, parser: Callable[[], Any]) -> Verdict:
-    """Run one command and judge how it ends."""
-    before = folder.state()
-    os.chdir(folder.place)
-    os.ftruncate(2, 0)
+def _child(case: int, kind: str, argv: list[str], place: Path, answer: Path) -> None:
+    """Run the command of a case within bounds, judge how it ends, and write the verdict."""
+    os.setsid()
+    os.environ["NEUROLENS_TRACEBACK"] = "1"
+    for number, name in ((0, os.devnull), (1, os.devnull), (2, str(answer.with_name("stderr")))):
+        os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND), number)
+    sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", errors="backslashreplace")
+    resource.setrlimit(resource.RLIMIT_DATA, (2 * MEMORY + 1024 * resident_kb("VmData"),) * 2)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 28,) * 2)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    before, spent = _state(place), cpu_s()
+    os.chdir(place)
     Path("/proc/self/clear_refs").write_text("5")  # the largest memory counts from here
-    spent, children = cpu_s(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
     signal.setitimer(signal.ITIMER_PROF, CPU_S if kind != "long runs" else LONG_CPU_S)
     try:
-        code = cli.main(argv, parser)
+        code = cli.main(argv, build)
     except SystemExit as stopped:
         code = stopped.code if isinstance(stopped.code, int) else 1
     except BaseException:
-        import traceback
-
         traceback.print_exc()
         code = 70
     signal.setitimer(signal.ITIMER_PROF, 0)
     with suppress(OSError, ValueError):
         sys.stdout.flush()
         sys.stderr.flush()
-    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    memory = max(resident_kb("VmHWM"), largest if largest > children else 0) << 10
-    after = folder.state()
-    new = [path for path in after if after[path] != before.get(path)]
-    said = (folder.place.parent / "stderr").read_bytes().decode(errors="backslashreplace")
-    faults = tuple(_faults(argv, code, said, [p.name for p in new], memory))
-    return Verdict(case, kind, tuple(argv), code, said[-2000:], faults, cpu_s() - spent, memory)
+    memory = max(resident_kb("VmHWM"), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss) << 10
+    after = _state(place)
+    new = [path.name for path in after if after[path] != before.get(path)]
+    said = answer.with_name("stderr").read_bytes().decode(errors="backslashreplace")
+    faults = list(_faults(argv, code, said, new, memory))
+    verdict = Verdict(case, kind, argv, code, said[-2000:], faults, cpu_s() - spent, memory)
+    answer.write_text(json.dumps(asdict(verdict)))
+
+
+def _state(place: Path) -> dict[Path, tuple[int, int, int]]:
+    """The paths in a folder, with numbers that change with their contents."""
+    about = {path: path.lstat() for path in place.rglob("*")}
+    return {p: (a.st_ino, a.st_size, 0 if stat.S_ISDIR(a.st_mode) else a.st_mtime_ns) for p, a in about.items()}
 
 
 def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memory: int) -> Iterator[str]:
@@ -213,74 +183,6 @@ def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memor
         yield f"{len(said)} characters on stderr"
     if memory > MEMORY or re.search(r"\bmemory\b", said):
         yield f"memory: {memory >> 20} MB"
-
-
-# ---- Batches. --------------------------------------------------------------------------------------------------------
-
-
-def _answers(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str) -> Iterator[Verdict]:
-    """Verdicts of cases in a process of their own; the last may be that of one that died or took too long."""
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir()
-    there, here = os.pipe()
-    process = os.fork()
-    if not process:
-        os.close(there)
-        _batch(good, scratch, cases, seed, only, here)
-    os.close(here)
-    begun: list[Any] | None = None
-    why = ""
-    with os.fdopen(there, "rb") as pipe:
-        while True:
-            if not select.select([pipe], [], [], WALL_S)[0]:
-                why = f"no end within {WALL_S:g} s"
-                break
-            line = pipe.readline()
-            if not line:
-                break
-            answer = json.loads(line)
-            if isinstance(answer, list):
-                begun = answer
-            elif "broken" in answer:
-                raise RuntimeError(answer["broken"])
-            else:
-                begun = None
-                yield Verdict(**{**answer, "argv": tuple(answer["argv"]), "faults": tuple(answer["faults"])})
-    with suppress(ProcessLookupError):
-        os.killpg(process, signal.SIGKILL)
-    _, status, used = os.wait4(process, 0)
-    if begun is not None:
-        number = os.waitstatus_to_exitcode(status)
-        why = why or (f"killed by {signal.Signals(-number).name}" if number < 0 else f"ended with {number}")
-        said = (scratch / "stderr").read_bytes()[-2000:].decode(errors="backslashreplace")
-        yield Verdict(begun[0], begun[1], tuple(begun[2]), number, said, (why,), 0.0, used.ru_maxrss << 10)
-
-
-def run_cases(
-    good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str = "", keep: Path | None = None
-) -> list[Verdict]:
-    """Verdicts of cases. One with a fault is run again by itself, and its files are kept in a folder."""
-    found: list[Verdict] = []
-    while len(found) < len(cases):
-        got = list(_answers(good, scratch / "batch", cases[len(found) :], seed, only))
-        if not got:
-            raise RuntimeError(f"no answer from case {cases[len(found)]} on")
-        found += got
-    for k, verdict in enumerate(found):
-        if verdict.faults:
-            (alone,) = _answers(good, scratch / "alone", [verdict.case], seed, only)
-            also = (*verdict.faults, "not when it is run by itself") if not alone.faults else verdict.faults
-            found[k] = Verdict(**{**asdict(verdict), "faults": also})
-            if keep is not None:
-                _keep(scratch / "alone" / "work", keep / f"{seed}-{verdict.case}", found[k])
-    return found
-
-
-def _keep(work: Path, place: Path, verdict: Verdict) -> None:
-    (work / "fifo").unlink(missing_ok=True)
-    shutil.rmtree(place, ignore_errors=True)
-    shutil.copytree(work, place, symlinks=True, ignore=lambda f, names: [n for n in names if (Path(f) / n).is_fifo()])
-    write_json(place / "verdict.json", asdict(verdict))
 
 
 def _single(folder: Path, argv: list[str]) -> tuple[int, str]:
@@ -318,6 +220,7 @@ def run(args: argparse.Namespace) -> int:
     verdicts = list[Verdict]()
     for module in _LOADED:  # once, not in every process
         import_module(module)
+    import_module("torch").set_num_threads(1)  # a fork has none of the threads that a library counts on
     shorten()
     with tempfile.TemporaryDirectory(prefix="neurolens-fuzz-", dir=_disk()) as scratch:
         good = Path(scratch) / "good"
@@ -327,7 +230,8 @@ def run(args: argparse.Namespace) -> int:
             cases = range(first, min(first + _BATCH, wanted.stop))
             kept = folder / f"{args.seed}-{first}-{len(cases)}{args.only and '-'}{args.only}.json"
             if args.restart or not kept.exists():
-                made = run_cases(good, Path(scratch), cases, args.seed, args.only, args.keep)
+                places = {case: args.keep and args.keep / f"{args.seed}-{case}" for case in cases}
+                made = [run_case(good, Path(scratch) / "case", k, args.seed, args.only, to) for k, to in places.items()]
                 write_json(kept, [asdict(v) for v in made])
             verdicts += [Verdict(**row) for row in json.loads(kept.read_text())]
             bad = [v for v in verdicts if v.faults]

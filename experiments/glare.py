@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,37 +42,21 @@ _AT_ONCE = 1 << 16
 OPTIONS = [lab.count("photons", 4_000_000, "of each case (default: 4 million)"), lab.out()]
 
 
-@dataclass(frozen=True)
-class Contrast:
-    """Veiling glare is I0 / Imax; kept is K''/K'."""
-
-    coating: str
-    condition: str
-    surround: str
-    veil: float
-    error: float
-
-    @property
-    def kept(self) -> float:
-        return 1 / (1 + 2 * self.veil)
-
-
 def run(args: argparse.Namespace) -> int:
     """Measure, and write the table."""
     progress, lens = Progress(quiet=args.quiet), lab.lens_of(LENS, focus_m=math.inf)
-    contrasts: list[Contrast] = []
+    contrasts: list[lab.Row] = []
     for name in COATINGS:
         with progress.stage(f"contrast, {name}"):
             contrasts += contrast_of(lens if name == "bare" else coated(lens, name), name, args.photons)
     text = lab.page("# Glare", __doc__ or "", f"{args.photons:,} photons a case.", lab.table(_CONTRAST, contrasts))
-    data = {"machine": lab.machine(), "photons": args.photons}
-    data["contrast"] = [vars(row) | {"kept": row.kept} for row in contrasts]
+    data = {"machine": lab.machine(), "photons": args.photons, "contrast": contrasts}
     print(lab.write_results(args.out, "glare", text, data))
     return 0
 
 
-def contrast_of(lens: Lens, coating: str, count: int) -> Iterator[Contrast]:
-    """The veil of every condition and surround."""
+def contrast_of(lens: Lens, coating: str, count: int) -> Iterator[lab.Row]:
+    """The veil I0 / Imax of every condition and surround, and the contrast K''/K' that it leaves."""
     efl, bright = float(first_order(lens).efl_mm), [axis_irradiance(lens, nm) for nm in _COLOURS]
     black = math.atan(_PATCH_MM / efl)
     frame = math.atan(math.hypot(*HALF_MM) / efl)
@@ -94,7 +77,8 @@ def contrast_of(lens: Lens, coating: str, count: int) -> Iterator[Contrast]:
                     total += flux * float(weight.sum())
                     square += flux**2 * float((weight.astype(np.float64) ** 2).sum())
             per = 1 / (count * math.pi * _WITHIN_MM**2 * lost)
-            yield Contrast(coating, condition, surround, total * per, math.sqrt(square) * per)
+            veil, about = total * per, {"coating": coating, "condition": condition, "surround": surround}
+            yield about | {"veil": veil, "error": math.sqrt(square) * per, "kept": 1 / (1 + 2 * veil)}
 
 
 def _flare(tracer: PhotonTracer, rays: Floats, nm: float, seed: int) -> Iterator[Floats]:

@@ -17,7 +17,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,27 +97,6 @@ void main() {{
 }
 _NOWHERE = "o = float[9](fx, fy, px, py, nm, film_z, stop, fx, fy); code = 0"
 _PLACES = {**dict(zip(RAY, ("fx", "fy", "px", "py"), strict=True)), WAVELENGTH: "nm", FILM_Z: "film_z"}
-
-
-@dataclass
-class Row:
-    """One form of a lens.
-
-    Attributes:
-        operations: float operations of a ray (a fused multiply-add is one). roots: square roots and divisions of them.
-        rms_um: film-equivalent error against float64. wrong: share of rays passed or blocked otherwise than there.
-        ns: nanoseconds a ray by work, (least, median). gain: the exact lens's least time over this one's.
-    """
-
-    lens: str
-    refractions: int
-    form: str
-    operations: int = 0
-    roots: int = 0
-    rms_um: float | None = None
-    wrong: float | None = None
-    ns: dict[str, tuple[float, float]] = field(default_factory=dict)
-    gain: dict[str, float] = field(default_factory=dict)
 
 
 class Subject(NamedTuple):
@@ -214,20 +193,20 @@ class ShaderRace:
         return known.rms_um, float((passed != truly).double().mean())
 
 
-def rows_of(subject: Subject, raced: ShaderRace, found: dict[str, Any]) -> list[Row]:
-    """The table of a lens, the work around it first."""
-    rows = []
+def rows_of(subject: Subject, raced: ShaderRace, found: dict[str, Any]) -> list[lab.Row]:
+    """The table of a lens, the work around it first: `wrong` is the share of rays passed or blocked otherwise than in
+    float64, `ns` least and median by work, `gain` the exact lens's least time over this one's."""
+    rows, each = [], 1e9 / raced.count
     for form, program in {NOTHING: None, **subject.programs}.items():
-        row = Row(subject.name, subject.model.lens.refractions, form)
+        row: lab.Row = {"lens": subject.name, "refractions": subject.model.lens.refractions, "form": form}
         if program is not None:
-            kinds = program.count()
-            row.operations, row.roots = sum(kinds.values()), kinds.get("div", 0) + kinds.get("sqrt", 0)
-            row.rms_um, row.wrong = raced.errors(subject, form)
-        for work in WORKS:
-            seconds, exact = (found["seconds"][f"{subject.name} {f} {work}"] for f in (form, EXACT))
-            each = 1e9 / raced.count
-            row.ns[work] = (each * min(seconds), each * statistics.median(seconds))
-            row.gain[work] = min(exact) / min(seconds)
+            row |= lab.operations_of(program)
+            row["rms_um"], row["wrong"] = raced.errors(subject, form)
+        seconds = {work: found["seconds"][f"{subject.name} {form} {work}"] for work in WORKS}
+        row["ns"] = {work: (each * min(some), each * statistics.median(some)) for work, some in seconds.items()}
+        if form != NOTHING:
+            exact = {work: min(found["seconds"][f"{subject.name} {EXACT} {work}"]) for work in WORKS}
+            row["gain"] = {work: exact[work] / min(some) for work, some in seconds.items()}
         rows.append(row)
     return rows
 
@@ -240,17 +219,14 @@ ray read, 40 written; "in place": none read, 4 for {each} rays written. "No lens
 every figure. RMS um and wrong (passed or blocked wrongly, of the rays sent): {checked} rays that came back, against the
 lens traced in float64.{load}"""
 _COLUMNS = lab.columns(
-    ("lens", "lens"),
-    ("refractions", "refractions"),
-    ("form", "form"),
-    ("operations (roots)", lambda r: f"{r.operations} ({r.roots})" if r.operations else None),
-    ("RMS um", "rms_um", ".2g"),
-    ("wrong %", "wrong", ".2g", 100),
-    ("stored: ns a ray", lambda r: lab.best_median(*r.ns["stored"], form=".3g")),
-    ("exact over it", lambda r: None if r.form == NOTHING else f"{r.gain['stored']:.2f}"),
-    ("in place: ns a ray", lambda r: lab.best_median(*r.ns["in place"], form=".3g")),
-    ("exact over it", lambda r: None if r.form == NOTHING else f"{r.gain['in place']:.2f}"),
-)
+    ("lens", "lens"), ("refractions", "refractions"), ("form", "form"),
+    ("operations (roots)", lambda r: f"{r['operations']} ({r['roots']})" if r.get("operations") else None),
+    ("RMS um", "rms_um", ".2g"), ("wrong %", "wrong", ".2g", 100),
+    *(column for work in WORKS for column in (
+        (f"{work}: ns a ray", lambda r, work=work: lab.best_median(*r["ns"][work], form=".3g")),
+        ("exact over it", f"gain.{work}", ".2f"),
+    )),
+)  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> None:

@@ -12,8 +12,6 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +23,16 @@ from experiments.lab import Report, Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Graph
 from neurolens.graph.newton import solve, with_jacobian
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
-from neurolens.surrogates.cores import Array, Field
+from neurolens.surrogates.cores import Array
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.inverse import (
     STEPS,
     TOLERANCE,
-    Guess,
     InverseModel,
     convergence,
     front_index,
@@ -44,7 +41,7 @@ from neurolens.surrogates.inverse import (
     stop_system,
 )
 from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs, sample_domain
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
 from neurolens.surrogates.terms import pinned_threads
 from neurolens.trace.surfaces import front_rays
 
@@ -58,11 +55,11 @@ _STARTS = 7
 Given = dict[str, NDArray[np.float64]]
 
 
-def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) -> Row:
+def measure_lens(file: Path, rays: int, terms: int = 64) -> Row:
     """One record: lens, focus_m, and the shares of rays that each iteration finds.
 
     Args:
-        rays: that pass the lens (a tenth otherwise than by three steps). uniform: stop points.
+        rays: that pass the lens (a tenth otherwise than by three steps).
 
     Raises:
         InputError: a lens that cannot be fitted.
@@ -86,7 +83,6 @@ def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) 
             "ours": {t: convergence(inverse, *(c.astype(t) for c in every)) for t in ("float64", "float32")},
             "two_steps": convergence(inverse, *few, steps=2),
             "published": _published(inverse, *few),
-            "uniform": _uniform(inverse, uniform),
             "rays": rays,
         }
 
@@ -140,50 +136,6 @@ def _plain(system: Graph, given: Given) -> dict[str, Any]:
     return found
 
 
-def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
-    """Outcome for stop points uniform over the stop and film points uniform over the film.
-
-    Returns shares: passed, blocked, outside (the ray leaves the domain), unsolved; `missed`: unsolved although a ray
-    that passes is found from one of a grid of starts; and of the solved ones what the published iteration misses, by
-    number of steps.
-    """
-    domain = inverse.model.domain
-    sample = sample_domain(domain, count, seed=31)
-    rays, film_z = sample.rows.numpy(), sample.film_z.numpy()
-    stop = rays[2:4] * 0.9999 * domain.stop_radius_mm / domain.pupil_radius_mm
-    status = inverse.through_stop(rays[:2], stop, rays[4], film_z).status
-    unsolved = status == st.NO_SOLUTION
-    part = rays[:, ~unsolved], film_z[~unsolved], stop[:, ~unsolved]
-    plain = _plain(stop_system(inverse.model), _stop_inputs(inverse.model, *part))
-    some = np.flatnonzero(unsolved)[:500]
-    lost = _reachable(inverse, rays[:, some], film_z[some], stop[:, some])
-    return {
-        "passed": float((status == st.PASSED).mean()),
-        "blocked": float((status >= 4).mean()),
-        "outside": float((status == st.OUTSIDE_DOMAIN).mean()),
-        "unsolved": float(unsolved.mean()),
-        "missed": float(lost.mean() * unsolved.mean()) if len(some) else 0.0,
-        "published_missed": plain["missed"],
-        "published_away": plain["away"],
-    }
-
-
-class _OnePoint(Guess):
-    """A start that is the same pupil point for all rays: its numbers are that point."""
-
-    def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
-        return [light.u * 0.0 + g.constant(self.ab)]
-
-
-def _reachable(inverse: InverseModel, rays: Array, film_z: Array, stop: Array) -> NDArray[np.bool_]:
-    """[N] whether a passing ray goes from each film point through each stop point, from many starts."""
-    side, found = np.linspace(-0.9, 0.9, _STARTS), np.zeros(len(film_z), bool)
-    for a, b in product(side, side) if len(film_z) else ():
-        one = replace(inverse, stop=_OnePoint(np.zeros((0, 5), np.int64), np.array([a, b])))
-        found |= one.through_stop(rays[:2], stop, rays[4], film_z, steps=15).status == st.PASSED
-    return found
-
-
 _INTRODUCTION = """\
 # Inverse maps
 
@@ -194,10 +146,6 @@ share of them, in percent, that an iteration does not find ({tolerance:g} of the
 and in radians). Published: Newton from the first-order map, undamped, 3 / 5 / 10 / 20 steps; "away": residual above 1
 after 20. Ours: direct fit, then {steps} limited steps (two for comparison). "other": another ray through the same point
 (the map is folded in the lens itself, and one ray of two is found). Both on the same model (64 coefficients)."""
-_UNIFORM = """\
-Shares in percent for film points uniform over the film. "no ray": no ray of the model's domain goes through the point,
-or none was found; "missed": of those, where one of 49 other starts leads to a ray that passes. Published: of the points
-that have a ray, those that it does not find."""
 
 
 def _share(title: str, path: str, rest: bool = False) -> lab.Column:
@@ -210,20 +158,14 @@ def _share(title: str, path: str, rest: bool = False) -> lab.Column:
     return lab.Column(title, cell)
 
 
-def _published_columns(missed: str, away: str) -> list[lab.Column]:
-    """The shares that the published iteration misses, by steps, and that ran away after the most."""
-    first, *more = PUBLISHED_STEPS
-    heads = {first: f"published: {first}"} | {n: str(n) for n in more}
-    return [*(_share(head, f"{missed}.{n}") for n, head in heads.items()), _share("away", f"{away}.{more[-1]}")]
-
-
 _MAPS = {"stop": "Film point and stop point to ray", "scene": "Scene ray to film"}
 
 
 def _map_columns(which: str) -> list[lab.Column]:
     return [
         *lab.columns(("lens", "lens"), ("rays", "rays")),
-        *_published_columns(f"published.{which}.missed", f"published.{which}.away"),
+        *(_share(f"published: {n}", f"published.{which}.missed.{n}") for n in PUBLISHED_STEPS),
+        _share("away", f"published.{which}.away.{PUBLISHED_STEPS[-1]}"),
         _share("ours: 2", f"two_steps.{which}.converged", rest=True),
         _share("3", f"ours.float64.{which}.converged", rest=True),
         _share("3, float32", f"ours.float32.{which}.converged", rest=True),
@@ -232,21 +174,12 @@ def _map_columns(which: str) -> list[lab.Column]:
     ]
 
 
-_OUTCOMES = ("passed", "blocked", "outside", "unsolved", "missed")
-_UNIFORM_COLUMNS = [
-    lab.Column("lens", "lens"),
-    *(_share("no ray" if k == "unsolved" else k, f"uniform.{k}") for k in _OUTCOMES),
-    *_published_columns("uniform.published_missed", "uniform.published_away"),
-]
-
-
 def page(records: Sequence[Row]) -> str:
     """The tables in Markdown."""
     done = [r for r in records if "ours" in r]
     parts = [_INTRODUCTION.format(steps=STEPS, tolerance=TOLERANCE)]
     for which, title in _MAPS.items():
         parts += [f"## {title}", lab.table(_map_columns(which), done)]
-    parts += ["## Stop points uniform over the stop", _UNIFORM, lab.table(_UNIFORM_COLUMNS, done)]
     refused = [f"- {r['lens']}: {r['refused']}" for r in records if "refused" in r]
     return lab.page(*parts, *(["Not measured:", "\n".join(refused)] if refused else []))
 

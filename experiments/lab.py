@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -259,11 +260,13 @@ def resume(
     args: argparse.Namespace,
     name: str,
     items: Mapping[Any, T],
-    measure: Callable[[T, Report], Row],
+    measure: Callable[[T, Report], Row | list[Row]],
     key: Callable[[Row], Hashable],
     page: Callable[[list[Row]], str],
     *,
-    listed: str = "",
+    listed: str = "rows",
+    facts: Row | None = None,
+    about: Callable[[list[Row]], Row] = lambda rows: {},
     again: bool = False,
     maker: str = "",
     seconds: float = 20.0,
@@ -272,23 +275,47 @@ def resume(
     """Measure the items that NAME.json lacks, write page and rows after each, and print the page.
 
     Args:
-        items: what to measure, by the key of its row. again: measure all of them.
-        listed: the key of the list of rows in the file, where it is no bare list.
+        items: what to measure, by the key of its rows; `measure` returns one or several. again: measure all of them.
+        listed: the key of the list of rows in the file; "" where the file is a bare list.
+        facts: stand in the file, by default the machine; given here, rows of other facts are not kept. about: more for
+            the file.
         maker: the command, if it is not `experiments NAME`. seconds: expected for an item.
         order: of the keys of the rows; they are sorted without it.
     """
-    rows = kept_rows(args.out / f"{name}.json", maker or f"experiments {name}", key, listed)
+    file, rows = args.out / f"{name}.json", dict[Any, list[Row]]()
+    for row in kept_rows(file, maker or f"experiments {name}", listed, facts or {}):
+        rows.setdefault(key(row), []).append(row)
 
     def ordered() -> list[Row]:
-        return [rows[k] for k in (order or sorted(rows)) if k in rows]
+        return [row for k in (order or sorted(rows)) for row in rows.get(k, ())]
 
     missing = [k for k in items if again or k not in rows]
     for k, report in stages(missing, lambda k: k if isinstance(k, str) else " ".join(k), args.quiet, seconds):
-        rows[k] = measure(items[k], report)
-        args.out.mkdir(parents=True, exist_ok=True)
+        made = measure(items[k], report)
+        rows[k] = made if isinstance(made, list) else [made]
         done = ordered()
-        write_results(args.out, name, page(done), {"machine": machine(), listed: done} if listed else done)
+        data = (facts or {"machine": machine()}) | about(done) | {listed: done} if listed else done
+        write_results(args.out, name, page(done), data)
     print(page(ordered()))
+
+
+def kept_rows(path: Path, maker: str, listed: str = "", facts: Mapping[str, Any] = MappingProxyType({})) -> list[Row]:
+    """The rows of an earlier run; none where there is no such file, or one that states other facts.
+
+    Args:
+        maker: the command that writes the file. listed: the key of the list in the file, where it is no bare list.
+
+    Raises:
+        InputError: the file holds something else.
+    """
+    if not path.is_file():
+        return []
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        same = all(data.get(key) == value for key, value in plain(dict(facts)).items())
+        return [dict(row) for row in (data[listed] if listed else data)] if same else []
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(path, "file", f"({type(error).__name__})", f"rows of {maker}") from error
 
 
 def write_small(file: Path, forms: Iterable[tuple[Any, dict[str, Any]]], most_bytes: int) -> None:
@@ -341,33 +368,6 @@ def denoised(rgb: Any) -> Any:
     return pyoidn.denoise(np.ascontiguousarray(rgb, dtype=np.float32), hdr=True)
 
 
-def kept_rows(path: Path, maker: str, key: Callable[[Row], Hashable], listed: str = "") -> dict[Any, Row]:
-    """The rows of an earlier run by their key; none where there is no such file.
-
-    Args:
-        maker: the command that writes the file. listed: the key of the list in the file, where it is no bare list.
-
-    Raises:
-        InputError: the file holds something else.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        return {key(row): dict(row) for row in (data[listed] if listed else data)}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "file", f"({type(error).__name__})", f"rows of {maker}") from error
-
-
-def earlier_rows(path: Path, same: Row) -> list[Row]:
-    """The rows of an earlier run if these values of its file, such as its machine, are the same; else none."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        return list(data["rows"]) if {key: data[key] for key in same} == same else []
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
-
-
 # ---- The machine. ----------------------------------------------------------------------------------------------------
 
 
@@ -416,6 +416,41 @@ def cpu_ns(calls: Mapping[str, Callable[[], int]], rounds: int, report: Report |
         if report:
             report(k / rounds)
     return times
+
+
+def race_rows(
+    rows: Mapping[str, Row], field: Sequence[Any], domain: Any, rounds: int, over: Callable[[str], Row], report: Report
+) -> list[Row]:
+    """Race candidates (`neurolens.study.speed`) named as the rows are, and give each row its times and its ratios.
+
+    Args:
+        over: for the name of a row, the candidates that its least time is compared with, by the words of the row for
+            them: `speedup` then holds how many times as fast it is.
+    """
+    from neurolens.study.speed import race
+
+    timed = race(field, domain, rounds=rounds, report=report)
+    for name, row in rows.items():
+        timing, ratios = timed.timing(name), {k: timed.speedup(name, base) for k, base in over(name).items()}
+        row |= {"ns": timing and dict(timing), "reason": timed.unavailable.get(name), "load": timed.load}
+        row["speedup"] = {k: ratio["min"] for k, ratio in ratios.items() if ratio}
+    return list(rows.values())
+
+
+def operations_of(program: Any) -> Row:
+    """Floating-point operations of a ray by a program (a fused multiply-add is one), and its roots and divisions."""
+    kinds = program.count()
+    return {"operations": sum(kinds.values()), "roots": kinds.get("div", 0) + kinds.get("sqrt", 0)}
+
+
+def times_of(row: Row) -> str:
+    """Least and median nanoseconds of a row of a race, or why there are none."""
+    return best_median(row["ns"]["min"], row["ns"]["median"]) if row["ns"] else f"not run: {row['reason']}"
+
+
+def load_line(rows: Iterable[Row]) -> str:
+    """The machine, and its load while the rows were measured."""
+    return f"{machine_line()} Load average up to {max((row['load'] or 0.0 for row in rows), default=0.0):.1f}."
 
 
 class Unmeasured(NeurolensError):

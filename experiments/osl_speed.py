@@ -101,27 +101,6 @@ OPTIONS = [
 
 
 @dataclass(frozen=True)
-class Row:
-    """A camera in a scene.
-
-    Attributes:
-        operations, error_um: of a ray, and the RMS error; None for cameras that are not ours.
-        begin_ms: what a picture takes before its first ray. ns_min, ns_median: ns of CPU a ray.
-        over, over_median: the least over the least of the scene's base, and the median of that ratio in the turns.
-    """
-
-    scene: str
-    camera: str
-    operations: int | None
-    error_um: float | None
-    begin_ms: float
-    ns_min: float
-    ns_median: float
-    over: float
-    over_median: float
-
-
-@dataclass(frozen=True)
 class Stage:
     """A scene: pixels, samples, rounds, its cameras, and the one that they are divided by."""
 
@@ -234,8 +213,11 @@ def in_blender(python: Path, plan: lab.Row, report: Report) -> lab.Row:
         return found
 
 
-def rows_of(scene: str, stage: Stage, times: Mapping[str, Any], operations: Mapping[str, int]) -> list[Row]:
+def rows_of(scene: str, stage: Stage, times: Mapping[str, Any], operations: Mapping[str, int]) -> list[lab.Row]:
     """The rows of a scene, from the seconds of full and of tiny pictures by camera.
+
+    `begin_ms` is what a picture takes before its first ray, `ns_min` and `ns_median` are ns of CPU a ray; `over` and
+    `over_median` are the least over the least of the scene's base, and the median of that ratio in the turns.
 
     Raises:
         Unmeasured: rays take no longer than beginning does.
@@ -245,13 +227,13 @@ def rows_of(scene: str, stage: Stage, times: Mapping[str, Any], operations: Mapp
     base = ns[stage.base]
     if min(map(min, ns.values())) <= 0:
         raise lab.Unmeasured("what Blender takes to begin hides the rays: the machine is too busy, or they are too few")
-    return [
-        Row(
-            scene, name, operations.get(name), _error_um(name), 1e3 * begin[name], min(own), statistics.median(own),
-            min(own) / min(base), statistics.median(a / b for a, b in zip(own, base, strict=True)),
-        )
-        for name, own in ns.items()
-    ]  # fmt: skip
+    rows: list[lab.Row] = []
+    for name, own in ns.items():
+        ratios = [a / b for a, b in zip(own, base, strict=True)]
+        row = {"scene": scene, "camera": name, "operations": operations.get(name), "error_um": _error_um(name)}
+        row |= {"begin_ms": 1e3 * begin[name], "ns_min": min(own), "ns_median": statistics.median(own)}
+        rows.append(row | {"over": min(own) / min(base), "over_median": statistics.median(ratios)})
+    return rows
 
 
 def _error_um(camera: str) -> float | None:
@@ -264,9 +246,9 @@ def _error_um(camera: str) -> float | None:
     return 0.0 if file.suffix == ".toml" else float(load_model(file).card["errors"]["rms_um"])
 
 
-def goals(rows: Sequence[Row]) -> list[lab.Goal]:
+def goals(rows: Sequence[lab.Row]) -> list[lab.Goal]:
     """The goals, by the least times."""
-    ns = {(r.scene, r.camera): r.ns_min for r in rows}
+    ns = {(r["scene"], r["camera"]): r["ns_min"] for r in rows}
 
     def ratio(text: str, wanted: float, over: tuple[str, str], under: tuple[str, str], least: bool = False) -> lab.Goal:
         return lab.Goal(text, wanted, ns[over] / ns[under] if over in ns and under in ns else None, least)
@@ -302,11 +284,11 @@ their paths are longer, and less is left to that chance. One colour is the camer
 """
 
 
-def _page(blender: str, stages: Mapping[str, Stage], rows: Sequence[Row], met: Sequence[lab.Goal]) -> str:
+def _page(blender: str, stages: Mapping[str, Stage], rows: Sequence[lab.Row], met: Sequence[lab.Goal]) -> str:
     parts = []
     for name, s in stages.items():
         told = f"{s.size[0]} x {s.size[1]} pixels, {s.samples} samples, {s.rounds} rounds; the base: {s.base}."
-        parts += [f"## {_HEADINGS[name]}", told, lab.table(_COLUMNS, [r for r in rows if r.scene == name], "–")]
+        parts += [f"## {_HEADINGS[name]}", told, lab.table(_COLUMNS, [r for r in rows if r["scene"] == name], "–")]
     head = f"Blender {blender}; {lab.machine_line()}"
     return lab.page("# Cameras in Cycles", __doc__ or "", head, *parts, _NOTE, lab.goal_table("Goal", met))
 

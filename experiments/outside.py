@@ -11,7 +11,6 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -55,28 +54,30 @@ def send(model: OnnxLens, count: int, seed: int = 1, report: Callable[[float], N
     """Send `count` random rays of every kind, batch by batch, film plane and stop random too."""
     rng, found = np.random.default_rng(seed), Outcome()
     while found.rays < count:
-        n = min(_BATCH, count - found.rays)
-        _one_batch(model, rng, n, found)
+        _one_batch(model, rng, min(_BATCH, count - found.rays), found)
         if report:
             report(found.rays / count)
     return found
 
 
 def _one_batch(model: OnnxLens, rng: np.random.Generator, n: int, found: Outcome) -> None:
-    state, place = _state(model, rng)
-    d = (model.at(*state) if place is _Place.INSIDE else model).card["domain"]
-    rays, film_z, stop = _rays(rng, n, d), _film_z(rng, d), _stop(rng, d)
+    state, within = _state(model, rng)
+    d = (model.at(*state) if within else model).card["domain"]
+    radius, (near, far) = d["stop_radius_mm"], d["film_z_mm"]
+    rays = _rays(rng, n, d)
+    film_z = _number(rng, near + (far - near) * rng.uniform(), (near * 0.99, far * 1.01, -far, d["pupil_z_mm"]))
+    stop = _number(rng, radius * rng.choice([0.1, 0.5, 1.0]), (-radius, 1.01 * radius))
     with np.errstate(all="ignore"):
-        out = model.rays(rays[:2], rays[2:4], rays[4], float(film_z), float(stop), state or None)
-        surely_out, surely_in = _sides(d, rays.astype(np.float64), float(film_z), float(stop), _wavelengths(model))
-        if place is not _Place.INSIDE:
-            surely_out, surely_in = np.full(n, place is _Place.OUTSIDE), np.zeros(n, bool)
+        out = model.rays(rays[:2], rays[2:4], rays[4], film_z, stop, state or None)
+        # One wavelength is a range, too: any where no glass disperses, though the domain then holds one.
+        wavelengths = d["wavelength_nm"] if model.card["lens"]["dispersive"] else ANY_WAVELENGTH_NM
+        surely_out, surely_in = _sides(d, rays.astype(np.float64), film_z, stop, *wavelengths)
+        if not within:
+            surely_out, surely_in = np.full(n, within is False), np.zeros(n, bool)
         passed = out.status == st.PASSED
         finite = np.isfinite(out.scene_ray).all(0) & np.isfinite(out.transmittance) & np.isfinite(out.stop_xy_mm).all(0)
         length = np.sqrt((out.scene_ray[3:].astype(np.float64) ** 2).sum(0))
-    found.rays += n
-    found.inside += int(surely_in.sum())
-    found.passed += int(passed.sum())
+    found.rays, found.inside, found.passed = found.rays + n, found.inside + surely_in.sum(), found.passed + passed.sum()
     for promise, bad in (
         (PASSES_OUTSIDE, surely_out & (out.status != st.OUTSIDE_DOMAIN)),
         (NOT_FINITE, passed & ~finite),
@@ -86,31 +87,26 @@ def _one_batch(model: OnnxLens, rng: np.random.Generator, n: int, found: Outcome
         found.broken[promise] += int(bad.sum())
 
 
-def _wavelengths(model: OnnxLens) -> tuple[float, float]:
-    """Shortest and longest that the model takes: any where no glass disperses, though its domain then holds one."""
-    low, high = model.card["domain"]["wavelength_nm"] if model.card["lens"]["dispersive"] else ANY_WAVELENGTH_NM
-    return float(low), float(high)
+def _state(model: OnnxLens, rng: np.random.Generator) -> tuple[tuple[float, ...], bool | None]:
+    """A state, six times in seven one of the model's, else any number; none for a model of one state.
 
-
-class _Place(Enum):
-    """Where a state lies: among the model's, beyond them, or so close to their ends that rounding decides."""
-
-    INSIDE, OUTSIDE, BETWEEN = range(3)
-
-
-def _state(model: OnnxLens, rng: np.random.Generator) -> tuple[tuple[float, ...], _Place]:
-    """A state, six times in seven one of the model's, else any number; none for a model of one state."""
-    values, places = [], []
+    Returns also whether the state is one of the model's; None so close to the ends that rounding decides.
+    """
+    values, within = [], list[bool | None]([True])
     for low, high in (axis.limits for axis in model.axes):
         v = low + (high - low) * rng.uniform()
         if rng.uniform() < 1 / 7:
             v = float(rng.choice(np.array([0.9 * low - 1e-3, 1.1 * high, *_SPECIAL], np.float32)))
         give = 1e-3 * (high - low)
-        beyond = not low - give <= v <= high + give  # NaN too
         values.append(v)
-        places.append(_Place.OUTSIDE if beyond else _Place.INSIDE if low <= v <= high else _Place.BETWEEN)
-    place = next((p for p in (_Place.OUTSIDE, _Place.BETWEEN) if p in places), _Place.INSIDE)
-    return tuple(values), place
+        within.append(True if low <= v <= high else None if low - give <= v <= high + give else False)  # NaN: False
+    return tuple(values), False if False in within else None if None in within else True
+
+
+def _number(rng: np.random.Generator, usual: float, others: tuple[float, ...]) -> float:
+    """A number of a call: seven times in ten the usual one, else another or a special one, as float32."""
+    strange = rng.choice(np.array([*others, *_SPECIAL], np.float32))
+    return float(np.float32(usual if rng.uniform() < 0.7 else strange))
 
 
 def _rays(rng: np.random.Generator, n: int, d: dict[str, Any]) -> Floats:
@@ -118,45 +114,25 @@ def _rays(rng: np.random.Generator, n: int, d: dict[str, Any]) -> Floats:
     bits = rng.integers(0, 2**32, (5, n), dtype=np.uint32).view(np.float32)
     low, high = d["wavelength_nm"]
 
-    def disc(radius: float, reach: NDArray[np.float64]) -> NDArray[np.float64]:
-        phi = rng.uniform(0, 2 * math.pi, n)
-        return np.stack([np.cos(phi), np.sin(phi)]) * radius * reach
-
     def ray(film: NDArray[np.float64], pupil: NDArray[np.float64], colour: NDArray[np.float64]) -> Floats:
-        points = np.concatenate([disc(d["film_radius_mm"], film), disc(d["pupil_radius_mm"], pupil)])
+        phi = rng.uniform(0, 2 * math.pi, (2, n))
+        reach = np.stack([d["film_radius_mm"] * film, d["pupil_radius_mm"] * pupil])
+        points = np.stack([reach * np.cos(phi), reach * np.sin(phi)], axis=1).reshape(4, n)
         return np.concatenate([points, (low + (high - low) * colour)[None]]).astype(np.float32)
 
     steps = [0.3, 0.999, 1.0, 1.0001, 1.001, 1.1, 3.0, 1e4]
     colours = [-2.0, -0.001, 0.0, 0.5, 1.0, 1.001, 30.0]
     close = ray(rng.choice(steps, n), rng.choice(steps, n), rng.choice(colours, n))
     inside = ray(np.sqrt(rng.uniform(0, 1, n)), np.sqrt(rng.uniform(0, 1, n)), rng.uniform(0, 1, n))
-    which = rng.integers(0, 3, n)
-    rays = np.where(which == 0, bits, np.where(which == 1, close, inside))
-    spoilt = rng.uniform(size=rays.shape) < 0.01
-    return np.asarray(np.where(spoilt, rng.choice(_SPECIAL, rays.shape), rays), np.float32)
-
-
-def _film_z(rng: np.random.Generator, d: dict[str, Any]) -> np.float32:
-    near, far = d["film_z_mm"]
-    if rng.uniform() < 0.7:
-        return np.float32(near + (far - near) * rng.uniform())
-    other = [near * 0.99, far * 1.01, -far, d["pupil_z_mm"], *_SPECIAL]
-    return np.float32(rng.choice(np.array(other, np.float32)))
-
-
-def _stop(rng: np.random.Generator, d: dict[str, Any]) -> np.float32:
-    radius = d["stop_radius_mm"]
-    if rng.uniform() < 0.7:
-        return np.float32(radius * rng.choice([0.1, 0.5, 1.0]))
-    return np.float32(rng.choice(np.array([-radius, 1.01 * radius, *_SPECIAL], np.float32)))
+    rays = np.choose(rng.integers(0, 3, n), [bits, close, inside])
+    return np.where(rng.uniform(size=rays.shape) < 0.01, rng.choice(_SPECIAL, rays.shape), rays).astype(np.float32)
 
 
 def _sides(
-    d: dict[str, Any], rays: NDArray[np.float64], film_z: float, stop: float, wavelengths_nm: tuple[float, float]
+    d: dict[str, Any], rays: NDArray[np.float64], film_z: float, stop: float, low: float, high: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Rays surely outside the domain, and surely inside: between lie those that rounding decides."""
     near, far = d["film_z_mm"]
-    low, high = wavelengths_nm
     sides = []
     for slack in (DOMAIN_SLACK * (1 + _ROUNDING), 1.0 - _ROUNDING):
         # abs: a bound of a negative z moves outwards too; compared so that NaN fails.
@@ -165,7 +141,7 @@ def _sides(
         give = abs(slack - 1) + _ROUNDING
         ok &= (near - give * abs(near) <= film_z) & (film_z <= far + give * abs(far))
         ok &= (stop >= 0) & (stop <= d["stop_radius_mm"] * slack)
-        ok &= (rays[4] >= low / (1 + give)) & (rays[4] <= high * (1 + give))  # one wavelength is a range, too
+        ok &= (rays[4] >= low / (1 + give)) & (rays[4] <= high * (1 + give))
         sides.append(ok)
     # An opening whose square leaves float32 stops every ray but that through its middle, by one status or another.
     return ~sides[0], sides[1] & (stop >= 1e-6 * d["stop_radius_mm"])

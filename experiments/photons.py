@@ -13,7 +13,6 @@ import argparse
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -44,36 +43,15 @@ OPTIONS = [
 ]
 
 
-@dataclass(frozen=True)
-class Row:
-    """Shares of the photons cast: `film` arrive on the film, `flare` of these after reflections, also by number."""
-
-    x_mm: int
-    y_mm: int
-    most: int
-    photons: int
-    seconds: float
-    processor_seconds: float
-    his: str
-    film: float
-    flare: float
-    two: float
-    four: float
-    more: float
-    stopped: float
-    left: float
-    cut: float
-
-
 def run(args: argparse.Namespace) -> int:
     """Trace the cases, write the tables; 1 where the goal is missed."""
     lens = lab.lens_of(LENS, zoom=ZOOM, focus_m=DISTANCE_MM / 1000, focus_mode="best")
-    tracer, rows, progress = PhotonTracer(lens), [], Progress(quiet=args.quiet)
+    tracer, rows, progress = PhotonTracer(lens), list[lab.Row](), Progress(quiet=args.quiet)
     cases = [(*case, args.photons) for case in CASES] + [(*at, 10, "12 to 15 h", 2 * args.photons) for at in TWICE]
     for x, y, most, his, count in cases:
         with progress.stage(f"{x}, {y}, {most} reflections"):
             rows.append(_row(tracer, x, y, most, his, count, args.threads))
-    slowest = max(r.seconds for r in rows if r.photons == args.photons)
+    slowest = max(r["seconds"] for r in rows if r["photons"] == args.photons)
     goal = lab.Goal(f"seconds for {args.photons:,} photons, {args.threads} threads", GOAL_S, slowest)
     text = lab.page("# Photons", __doc__ or "", lab.table(_COLUMNS, rows), lab.goal_table("Goal", [goal]))
     data = {"machine": lab.machine(), "photons": args.photons, "threads": args.threads, "rows": rows}
@@ -88,7 +66,8 @@ def light_at(x_mm: float, y_mm: float) -> Light:
     return Light(math.degrees(azimuth), math.degrees(elevation), distance_m=far / 1000)
 
 
-def _row(tracer: PhotonTracer, x: int, y: int, most: int, his: str, count: int, threads: int) -> Row:
+def _row(tracer: PhotonTracer, x: int, y: int, most: int, his: str, count: int, threads: int) -> lab.Row:
+    """Seconds, and shares of the photons cast: those on the film, of these after reflections, also by number."""
     light, half = light_at(x, y), np.array(FILM_MM)[:, None] / 2
 
     def part(first: int) -> np.ndarray:
@@ -104,10 +83,12 @@ def _row(tracer: PhotonTracer, x: int, y: int, most: int, his: str, count: int, 
     with ThreadPoolExecutor(threads) as pool:
         books = np.sum(list(pool.map(part, range(0, count, _AT_ONCE))), 0) / count
     seconds, worked = time.perf_counter() - began, time.process_time() - worked
-    by = books[:12]
-    return Row(
-        x, y, most, count, seconds, worked, his, by.sum(), by[1:].sum(), by[2], by[4], by[5:].sum(), *books[12:]
-    )  # fmt: skip
+    by, (stopped, left, cut) = books[:12], books[12:]
+    shares = {"film": by.sum(), "flare": by[1:].sum(), "two": by[2], "four": by[4], "more": by[5:].sum()}
+    shares |= {"stopped": stopped, "left": left, "cut": cut}
+    about = {"x_mm": x, "y_mm": y, "most": most, "photons": count, "his": his}
+    about |= {"seconds": seconds, "processor_seconds": worked}
+    return about | {name: float(share) for name, share in shares.items()}
 
 
 _COLUMNS = lab.columns(

@@ -23,7 +23,7 @@ from neurolens.base.progress import Report
 from neurolens.cameras.build import ideal_as, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.warped import Warped
+from neurolens.cameras.reduced import Warped
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot

@@ -97,18 +97,6 @@ def rear_rim(lens: Lens, film_radius_mm: float) -> RadialPupil:
     return _disc(float(lens.vertices_mm[rear]), film_radius_mm, lens.surfaces[rear].semi_diameter_mm)
 
 
-def global_exit_pupil(lens: Lens, film_radius_mm: float) -> RadialPupil:
-    """The paraxial exit pupil: the image of the stop as the film's centre sees it (Kolb et al. 1995).
-
-    Raises:
-        InputError: an image-telecentric lens, whose exit pupil is at infinity.
-    """
-    data = first_order(lens)
-    if not math.isfinite(data.exit_pupil_z_mm):
-        raise InputError(lens.path, "exit_pupil_z_mm", data.exit_pupil_z_mm, "a lens that is not image-telecentric")
-    return _disc(data.exit_pupil_z_mm, film_radius_mm, data.exit_pupil_diameter_mm / 2)
-
-
 def hull_disc(lens: Lens, film_radius_mm: float) -> RadialPupil:
     """The axial disc on the pupil plane that holds the passing rays of the whole film."""
     plane, (rows, points) = pupil_plane_z_mm(lens), _HULL
@@ -148,37 +136,28 @@ def wu_exit_pupil(lens: Lens, film_radius_mm: float) -> RadialPupil:
     return _disc(float(z[best]), film_radius_mm, float(hull[best]))
 
 
-def pixel_pupils(lens: Lens, film_radius_mm: float, shape: Literal["disc", "ellipse"]) -> RadialPupil:
-    """A pupil for every pixel from probe rays (Steinert et al. 2011): the disc, or the ellipse, about those that pass.
+def pixel_pupils(lens: Lens, film_radius_mm: float) -> RadialPupil:
+    """A pupil for every pixel from probe rays (Steinert et al. 2011): the disc about those that pass.
 
     By symmetry one film radius stands for all pixels at it. Probes that pass are few when the stop is closed: the
     disc about them is widened by half the distance between probes, and searched a second time inside it.
     """
     plane, (pixels, probes) = pupil_plane_z_mm(lens), _PIXELS
-    passes = passes_through(lens, plane)
-    rng = np.random.default_rng(0)
+    passes, rng = passes_through(lens, plane), np.random.default_rng(0)
     film = (np.arange(pixels) + 0.5) * film_radius_mm / pixels
-    centre, along = np.zeros(pixels), np.full(pixels, hull_disc(lens, film_radius_mm).along[0])
-    across = along.copy()
+    centre, radius = np.zeros(pixels), np.full(pixels, hull_disc(lens, film_radius_mm).along[0])
     for _ in range(2):
         r, angle = np.sqrt(rng.random((pixels, probes))), 2 * math.pi * rng.random((pixels, probes))
-        u = centre[:, None] + np.maximum(along, 0)[:, None] * r * np.cos(angle)
-        v = np.maximum(across, 0)[:, None] * r * np.sin(angle)
+        reach = np.maximum(radius, 0)[:, None] * r
+        u, v = centre[:, None] + reach * np.cos(angle), reach * np.sin(angle)
         passed = passes(np.repeat(film, probes), np.stack([u.ravel(), v.ravel()])).reshape(pixels, probes)
-        spacing = np.sqrt(math.pi * np.maximum(along, 0) * np.maximum(across, 0) / probes) / 2
-        low, high = np.where(passed, u, np.inf).min(1), np.where(passed, u, -np.inf).max(1)
+        spacing = np.maximum(radius, 0) * math.sqrt(math.pi / probes) / 2
         some = passed.any(1)
+        low, high = (f(np.where(passed, u, end), axis=1) for f, end in ((np.min, np.inf), (np.max, -np.inf)))
         centre = np.where(some, (np.where(some, low, 0) + np.where(some, high, 0)) / 2, 0)
-        if shape == "disc":
-            reach = np.where(passed, np.hypot(u - centre[:, None], v), 0).max(1) + spacing
-            along, across = np.where(some, reach, -1), np.where(some, reach, -1)
-        else:
-            # The ellipse of the box about the probes, scaled until it holds them.
-            a = np.where(some, high - low, 1) / 2 + 1e-9
-            b = np.where(passed, np.abs(v), 0).max(1) + 1e-9
-            scale = np.where(passed, np.hypot((u - centre[:, None]) / a[:, None], v / b[:, None]), 0).max(1)
-            along, across = np.where(some, a * scale + spacing, -1), np.where(some, b * scale + spacing, -1)
-    return RadialPupil(plane, film_radius_mm, centre, along, across, "ellipse")
+        farthest = np.where(passed, np.hypot(u - centre[:, None], v), 0).max(1)
+        radius = np.where(some, farthest + spacing, -1)
+    return RadialPupil(plane, film_radius_mm, centre, radius, radius, "ellipse")
 
 
 def radial_bounds(lens: Lens, film_radius_mm: float, shape: Literal["box", "ellipse"]) -> RadialPupil:

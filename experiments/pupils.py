@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,11 +23,10 @@ from experiments import lab
 from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.pupil_outline import PupilOutline, PupilTable
+from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.plan.costs import cycles_ns
-from neurolens.setting.pupils import pupil_bounds
 from neurolens.shaders.blender_shader import lens_of
 from neurolens.shaders.osl import osl_program
 from neurolens.shaders.pupil_fit import light_lost
@@ -69,9 +68,6 @@ CASES = (
     Case("laikin_double_gauss_50", 50.0, 1.8),
     Case("laikin_double_gauss_50", 50.0, 8.0),
 )
-# Steinert 2009, Table 5.3: percent of rays through the global pupil that pass, pixel (128, 96) of 512 x 384.
-TABLE_5_3 = {2.8: 64.31, 4.0: 35.8, 5.6: 18.1, 8.0: 9.0, 11.0: 5.1, 16.0: 3.0, 22.0: 1.7, 32.0: 0.8, 45.0: 0.4}
-
 FILM_MM = (36.0, 24.0)
 OURS = "outlines (ours)"
 SAMPLES = 2**17
@@ -146,48 +142,17 @@ def lost_light(camera: ExactCamera, film: Any, square: Any, wavelength: Any, wid
     return float((area * (passed & outside)).sum() / (area * passed).sum())
 
 
-@dataclass(frozen=True)
-class Pupil:
-    """A plane, and points on it."""
-
-    pupil_z_mm: float
-    sample: SampleFunction
-
-
 def _searched(make: Callable[..., Any], *args: Any) -> Callable[[Lens, PupilOutline], Any]:
     return lambda lens, outline: make(lens, outline.film_radius_mm, *args)
-
-
-def _boxes(lens: Lens, outline: PupilOutline) -> Pupil:
-    assert lens.film_z_mm is not None
-    bounds = pupil_bounds(lens, outline.film_radius_mm, (lens.film_z_mm, lens.film_z_mm), (400.0, 700.0))
-    low, high, half = PupilTable.of(vars(bounds)).rows
-    # Rows hold the boxes of their neighbours, so what passes between two rows lies in the mean of their boxes.
-    rows = np.stack([low, high - low, half])
-    lit = np.append((low <= high)[:-1] & (low <= high)[1:], False)
-
-    def sample(film: Any, square: Any, wavelength: Any) -> tuple[Any, Any]:
-        radius = np.hypot(*film)
-        place = np.minimum(radius / bounds.film_radius_mm, 1) * (low.size - 1)
-        start, width, across = (np.interp(place, np.arange(low.size), row) for row in rows)
-        cos, sin = (film + [[1e-30], [0]]) / (radius + 1e-30)
-        u, v = start + width * square[0], across * (2 * square[1] - 1)
-        points = np.stack([u * cos - v * sin, u * sin + v * cos]).astype(np.float32)
-        return points, (2 * width * across * lit[place.astype(int)]).astype(np.float32)
-
-    return Pupil(bounds.pupil_z_mm, sample)
 
 
 # How the pupil of a lens on the axis is made; `OURS` is the outline that the camera has found.
 METHODS: dict[str, Callable[[Lens, PupilOutline], Any]] = {
     "rear rim": _searched(known.rear_rim),
-    "exit pupil": _searched(known.global_exit_pupil),
     "Wu, two steps": _searched(known.wu_exit_pupil),
-    "pixel disc": _searched(known.pixel_pupils, "disc"),
-    "pixel ellipse": _searched(known.pixel_pupils, "ellipse"),
+    "pixel disc": _searched(known.pixel_pupils),
     "radial boxes": _searched(known.radial_bounds, "box"),
     "radial ellipses": _searched(known.radial_bounds, "ellipse"),
-    "interpolated boxes": _boxes,
     OURS: lambda lens, outline: outline,
 }
 
@@ -216,19 +181,6 @@ def _nanoseconds(sample: SampleFunction, film: Any, square: Any, wavelength: Any
     return 1e9 * least / film.shape[1]
 
 
-def pixel_rates(samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
-    """f-number, percent that passes from the pixel of Table 5.3 through the rear rim, and theirs; 36 x 27 mm film."""
-    radius = math.hypot(128, 96) * 36 / 512
-    r, angle = SobolEngine(2, scramble=True, seed=1).draw(samples).double().numpy().T
-    r, angle = np.sqrt(r), 2 * math.pi * angle
-    for f_number, theirs in TABLE_5_3.items():
-        lens = lab.lens_of("brendel_tessar_100", focal_length_mm=50.0, f_number=f_number)
-        rim = known.rear_rim(lens, radius)
-        points = rim.along[0] * np.stack([r * np.cos(angle), r * np.sin(angle)])
-        passed = known.passes_through(lens, rim.pupil_z_mm)(np.full(samples, radius), points)
-        yield f_number, 100 * float(passed.mean()), theirs
-
-
 _INTRO = """\
 # Share of rays that pass
 
@@ -248,10 +200,9 @@ What both lose besides is the step by which bounds are widened: 4.5% of the sear
 
 
 _METHODS = """\
-rear rim: its disc, Steinert's and Willi's global pupil. exit pupil: the paraxial one at this stop. Wu: one disc by a
-search in two steps. pixel disc, ellipse: about 128 probe rays per pixel (Steinert). radial boxes: pbrt's bounds, 50
-intervals of the film radius, 2000 samples each; radial ellipses: the ellipses inside them. interpolated boxes: those of
-this project before, between 33 film radii. outlines (ours): `neurolens.cameras.pupil_outline`.
+rear rim: its disc, Steinert's and Willi's global pupil. Wu: one disc by a search in two steps. pixel disc: about 128
+probe rays per pixel (Steinert). radial boxes: pbrt's bounds, 50 intervals of the film radius, 2000 samples each; radial
+ellipses: the ellipses inside them. outlines (ours): `neurolens.cameras.pupil_outline`.
 """
 
 
@@ -276,20 +227,12 @@ _RATES = lab.columns(
 _LIGHT = lab.columns(*_LENS, *((method, f"rates.{method}.light", ".1f", 100) for method in METHODS))
 
 
-def page(passages: Sequence[lab.Row], pixel: Sequence[Sequence[float]], samples: int) -> str:
-    """The whole page in Markdown; `pixel`: of `pixel_rates`."""
+def page(passages: Sequence[lab.Row], samples: int) -> str:
+    """The whole page in Markdown."""
     width, height = FILM_MM
     sources = dict.fromkeys(f"- {_name(p)}: {p['source']}." for p in passages if p["source"])
     parts = [_INTRO.format(width=width, height=height, samples=samples), lab.table(_RATES, passages), _METHODS]
     parts += ["## Light found, percent", lab.table(_LIGHT, passages), "Figures in brackets:", "\n".join(sources)]
-    if pixel:
-        head = ["f/", *(f"{n:g}" for n, _, _ in pixel)]
-        rows = [["ours", *(f"{a:.2f}" for _, a, _ in pixel)], ["theirs", *(f"{b:g}" for _, _, b in pixel)]]
-        parts += [
-            "## Closing the stop: Tessar 50 mm, one pixel, rear rim",
-            "Pixel (128, 96) of 512 x 384 on 36 x 27 mm, d line; Steinert 2009, Table 5.3, in the second row.",
-            lab.table(head, rows),
-        ]
     return lab.page(*parts)
 
 
@@ -308,9 +251,8 @@ def run(args: argparse.Namespace) -> None:
     lab.quiet_glasses()
     cases = lab.chosen(CASES, lambda case: case.lens, args.only, "pupils")
     done = [measure(case, args.rays) for case in lab.counted(cases, "pupils", args.quiet)]
-    pixel = [] if args.only else list(pixel_rates(args.rays))
-    data = {"film_mm": FILM_MM, "samples": args.rays, "cases": done, "tessar_pixel": pixel}
-    print(lab.write_results(args.out, "passage", page(done, pixel, args.rays), data))
+    data = {"film_mm": FILM_MM, "samples": args.rays, "cases": done}
+    print(lab.write_results(args.out, "passage", page(done, args.rays), data))
 
 
 SHADERS = lab.columns(

@@ -134,13 +134,18 @@ Prepared = tuple[Callable[[], Any], Callable[[Any], Found]]
 
 
 class Peer(NamedTuple):
-    """A tracer of others: its name, its precision, its adapter, batch sizes to choose from, most rays of a pass."""
+    """A tracer: its name, its precision, its adapter, batch sizes to choose from, most rays of a pass, whose it is."""
 
     name: str
     precision: str
     adapter: Callable[[Task], Prepared]
     batches: tuple[int, ...] = (4000, 10000, 20000)
     most: int = 20000
+    family: str = "others"
+
+    @property
+    def key(self) -> str:
+        return f"{self.name}, {self.precision}"
 
 
 def package(name: str) -> Any:

@@ -26,13 +26,12 @@ Writes rays.md, rays.json and rays.png. Other programs run where they are instal
 from __future__ import annotations
 
 import argparse
-import inspect
 import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -42,7 +41,7 @@ import numpy as np
 import torch
 
 from experiments import lab
-from experiments.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Prepared, Task, table_of
+from experiments.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Peer, Prepared, Task, table_of
 from experiments.tracer_race import has_avx512
 from neurolens.analysis.plots import drawing, plain_log_ticks
 from neurolens.cameras.model import load_model
@@ -72,35 +71,6 @@ C_BATCHES, ONNX_BATCHES, TORCH_BATCHES = (2000, 4000, 10000, 20000), (8192, BATC
 TITLE, COMMAND = "# An open benchmark of lens rays", "`python -m experiments rays`"
 FAMILIES = {"exact, ours": "tab:blue", "model, ours": "tab:green", "others": "tab:red"}
 PACKAGES = ("optiland", "rayoptics", "deeplens-core")
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A candidate: what `ray_peers.Peer` has, and its family."""
-
-    family: str
-    name: str
-    precision: str
-    adapter: Callable[[Task], Prepared]
-    batches: tuple[int, ...]
-    most: int = COUNT
-
-    @property
-    def key(self) -> str:
-        return f"{self.name}, {self.precision}"
-
-
-@dataclass
-class Row:
-    """A row: minimum, median, batch and rounds in `ns`, what rule 4 wants in `errors`; or why there are none."""
-
-    lens: str
-    family: str
-    name: str
-    precision: str
-    ns: dict[str, float] | None = None
-    errors: dict[str, float] | None = None
-    reason: str | None = None
 
 
 def task_of(name: str, count: int = COUNT) -> Task:
@@ -179,19 +149,12 @@ def in_onnxruntime(file: Path) -> Callable[[Task], Prepared]:
     return adapter
 
 
-def ours(name: str, task: Task, compiled: bool) -> list[Entry]:
+def ours(name: str, task: Task, compiled: bool) -> list[Peer]:
     """Our rows for a lens."""
     lens, domain = task.lens, task.domain
-    exact, model = "exact, ours", "model, ours"
-    found = [
-        Entry(exact, "torch", str(dtype).removeprefix("torch."), in_torch(whole_trace, dtype), TORCH_BATCHES)
-        for dtype in (torch.float64, torch.float32)
-    ]
-    if compiled:
-        run = (
-            too_long if any(s.asphere for s in lens.surfaces) else in_torch(compile_tracing(whole_trace), torch.float32)
-        )
-        found.append(Entry(exact, "torch, compiled", "float32", run, (20000,)))
+
+    def exact(name: str, precision: str, adapter: Any, batches: tuple[int, ...] = C_BATCHES) -> Peer:
+        return Peer(name, precision, adapter, batches, COUNT, "exact, ours")
 
     @cache
     def ray_alone() -> CompiledSource:
@@ -202,14 +165,25 @@ def ours(name: str, task: Task, compiled: bool) -> list[Entry]:
     def whole() -> CompiledSource:
         return CompiledSource(lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)))
 
-    found.append(Entry(exact, "C", "float32", as_c(ray_alone), C_BATCHES))
-    found.append(Entry(exact, "C, with dispersion and transmittance", "float32", as_c(whole), C_BATCHES))
+    rows = [
+        exact("torch", str(dtype).removeprefix("torch."), in_torch(whole_trace, dtype), TORCH_BATCHES)
+        for dtype in (torch.float64, torch.float32)
+    ]
+    if compiled:
+        slow = any(s.asphere for s in lens.surfaces)
+        run = too_long if slow else in_torch(compile_tracing(whole_trace), torch.float32)
+        rows.append(exact("torch, compiled", "float32", run, (20000,)))
+    rows += [exact("C", "float32", as_c(ray_alone))]
+    rows += [exact("C, with dispersion and transmittance", "float32", as_c(whole))]
     for kind in CASES[name]:
         file = lab.MODELS / f"{name}.{kind}.onnx"
         source = cache(lambda file=file: CompiledSource(fused_program([read_model(file).at()])))
-        found.append(Entry(model, f"{kind}, C", "float32", as_c(source), C_BATCHES))
-        found.append(Entry(model, f"{kind}, onnxruntime", "float32", in_onnxruntime(file), ONNX_BATCHES))
-    return found
+        for how, adapter, sizes in (
+            ("C", as_c(source), C_BATCHES),
+            ("onnxruntime", in_onnxruntime(file), ONNX_BATCHES),
+        ):
+            rows.append(Peer(f"{kind}, {how}", "float32", adapter, sizes, COUNT, "model, ours"))
+    return rows
 
 
 # ---- The race. -------------------------------------------------------------------------------------------------------
@@ -220,10 +194,9 @@ def errors(found: Found, exact: Found, focal_mm: float) -> dict[str, float]:
     passes = found.passes & np.isfinite(found.way).all(0)
     both = passes & exact.passes
     point, way, p0, d0 = (a[:, both].astype(np.float64) for a in (found.point, found.way, exact.point, exact.way))
-    angle = 2 * np.arcsin(np.minimum(np.linalg.norm(way - d0, axis=0) / 2, 1))
-    away = np.linalg.norm(np.cross(point - p0, d0, axis=0), axis=0)
+    angle = 1e6 * 2 * np.arcsin(np.minimum(np.linalg.norm(way - d0, axis=0) / 2, 1))
+    away = 1e3 * np.linalg.norm(np.cross(point - p0, d0, axis=0), axis=0)
     rms = {name: math.sqrt(float((v * v).mean())) for name, v in (("direction_urad", angle), ("position_um", away))}
-    rms = {"direction_urad": 1e6 * rms["direction_urad"], "position_um": 1e3 * rms["position_um"]}
     other = float((passes != exact.passes).mean())
     return {"film_um": 1e-3 * abs(focal_mm) * rms["direction_urad"], **rms, "other": other, "rays": len(passes)}
 
@@ -234,7 +207,7 @@ def reference(task: Task) -> Found:
     return read(call())
 
 
-def answer(entry: Entry, task: Task, batch: int) -> Found:
+def answer(entry: Peer, task: Task, batch: int) -> Found:
     """What an entry answers to the rays, batch by batch."""
     parts = []
     for first in range(0, min(entry.most, task.film.shape[1]), batch):
@@ -243,9 +216,9 @@ def answer(entry: Entry, task: Task, batch: int) -> Found:
     return Found(*(np.concatenate(each, -1) for each in zip(*parts, strict=True)))
 
 
-def best_pass(entry: Entry, task: Task) -> tuple[int, Callable[[], int]]:
+def best_pass(entry: Peer, task: Task) -> tuple[int, Callable[[], int]]:
     """The fastest batch, and a function that does the rays in such batches often enough and returns how many it did."""
-    found = []
+    tried = []
     for batch in entry.batches:
         calls = [entry.adapter(task.part(k, batch))[0] for k in range(0, entry.most, batch)]
 
@@ -256,169 +229,131 @@ def best_pass(entry: Entry, task: Task) -> tuple[int, Callable[[], int]]:
             return time.process_time() - began
 
         first = once()
-        took = once() if first > 1 else min(once() for _ in range(4))
-        found.append((took, batch, calls))
-    took, batch, calls = min(found, key=lambda each: each[0])
+        tried.append((once() if first > 1 else min(once() for _ in range(4)), batch, once))
+    took, batch, once = min(tried, key=lambda each: each[0])
     repeats = max(1, math.ceil(LEAST_S / max(took, 1e-6)))
 
     def run() -> int:
         for _ in range(repeats):
-            for call in calls:
-                call()
+            once()
         return repeats * entry.most
 
     return batch, run
 
 
-def measure(name: str, rounds: int, compiled: bool, report: lab.Report) -> list[Row]:
-    """Race everything through one lens."""
+def measure(name: str, rounds: int, compiled: bool, report: lab.Report) -> list[lab.Row]:
+    """Race everything through one lens: minimum, median, batch and rounds in `ns`, the figures of rule 4 in `errors`.
+
+    Rows of programs that cannot run have a `reason`.
+    """
     task = task_of(name)
     exact, focal = reference(task), first_order(task.lens).efl_mm
-    field = ours(name, task, compiled)
-    field += [Entry("others", p.name, p.precision, p.adapter, p.batches, p.most) for p in PEERS]
-    rows = {e.key: Row(name, e.family, e.name, e.precision) for e in field}
+    field = [*ours(name, task, compiled), *PEERS]
+    about: lab.Row = {"lens": name, "title": f"{task.lens.name}, {task.lens.refractions} refractions (`{name}`)"}
+    about["rays"] = (
+        f"Film disc {task.domain.film_radius_mm:.4g} mm at z = {task.film_z:.6f}, pupil disc "
+        f"{task.domain.pupil_radius_mm:.6f} mm at z = {task.pupil_z:.6f} (front vertex at 0, mm); "
+        f"{100 * float(exact.passes.mean()):.0f}% of the rays pass."
+    )
+    rows: dict[str, lab.Row] = {
+        e.key: about | {"family": e.family, "name": e.name, "precision": e.precision, "ns": None} for e in field
+    }
     runs: dict[str, Callable[[], int]] = {}
-    batch: dict[str, int] = {}
     with pinned_threads():
         torch._dynamo.reset()
         for k, entry in enumerate(field):
             try:
-                batch[entry.key], runs[entry.key] = best_pass(entry, task)
-                found = answer(entry, task, batch[entry.key])
-                first = Found(*(a[..., : len(found.passes)] for a in exact))
-                rows[entry.key].errors = errors(found, first, focal)
+                batch, runs[entry.key] = best_pass(entry, task)
+                answers = answer(entry, task, batch)
+                first = Found(*(a[..., : len(answers.passes)] for a in exact))
+                rows[entry.key] |= {"batch": batch, "errors": errors(answers, first, focal)}
             except Unavailable as reason:
-                rows[entry.key].reason = str(reason)
+                rows[entry.key]["reason"] = str(reason)
             report(0.6 * (k + 1) / len(field))
         times = lab.cpu_ns(runs, rounds, lambda done, left=None: report(0.6 + 0.4 * done, left))
     for key, ns in times.items():
-        rows[key].ns = {"min": min(ns), "median": float(np.median(ns)), "batch": batch[key], "rounds": len(ns)}
-    return [*rows.values(), *(Row(name, "others", n, "", reason=why) for n, why in ABSENT.items())]
+        rows[key]["ns"] = {"min": min(ns), "median": float(np.median(ns)), "rounds": len(ns)}
+    absent = [about | {"family": "others", "name": n, "ns": None, "reason": why} for n, why in ABSENT.items()]
+    return [row | {"load": os.getloadavg()[0]} for row in (*rows.values(), *absent)]
 
 
 # ---- Page and plot. --------------------------------------------------------------------------------------------------
 
-
-def _figure(key: str) -> Callable[[Row], str | None]:
-    return lambda r: None if r.errors is None else f"{r.errors[key]:.2g}"
-
-
 _COLUMNS = lab.columns(
-    ("program", "name"),
-    ("precision", "precision"),
-    (
-        "ns a ray",
-        lambda r: lab.best_median(r.ns["min"], r.ns["median"], form=".3g") if r.ns else f"not run: {r.reason}",
-    ),
-    ("batch", lambda r: r.ns and format(r.ns["batch"], ".0f")),
-    ("film um", _figure("film_um")),
-    ("direction urad", _figure("direction_urad")),
-    ("position um", _figure("position_um")),
-    ("other, %", lambda r: None if r.errors is None else f"{100 * r.errors['other']:.2g}"),
-)
-_NOTES = """\
-{line}
-Instruction set of C: {vectors}, by {compiler} {flags}; of torch: {torch}.
-{packages} {rounds} rounds, load average up to {load:.1f} on {cores} cores; times are of the processor, minimum (median
-in brackets). A pixel is 5 um."""
+    ("program", "name"), ("precision", "precision"), ("ns a ray", lab.times_of), ("batch", "batch"),
+    ("film um", "errors.film_um", ".2g"), ("direction urad", "errors.direction_urad", ".2g"),
+    ("position um", "errors.position_um", ".2g"), ("other, %", "errors.other", ".2g", 100),
+)  # fmt: skip
 _READING = """\
 Models, the exact lens in C "with dispersion and transmittance" and the tracer written by hand answer with the
 transmittance, too; the last takes the mean of both polarisations. Slow rows did the first 20,000 rays
 (Optiland, DeepLens) or 500 (ray-optics). The cards of the singlet's models call them poor. Whoever knows a faster way
-to call one of the others is asked to say so."""
+to call one of the others is asked to say so. A pixel is 5 um."""
 
 
-def versions() -> str:
-    """Versions of the packages of others that are here."""
-    found = []
+def facts(rounds: int) -> str:
+    """What rule 6 wants, and how C was compiled."""
+    compiler = Path(find_compiler()).name if has_compiler() else "no compiler"
+    others = []
     for name in PACKAGES:
-        try:
-            found.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return f"Others: {', '.join(found)}." if found else ""
+        with suppress(PackageNotFoundError):
+            others.append(f"{name} {version(name)}")
+    return (
+        f"Instruction set of C: {'AVX-512' if has_avx512() else 'AVX2'}, by {compiler} {' '.join(FLAGS)}; of torch: "
+        f"{torch.backends.cpu.get_cpu_capability()}. Others: {', '.join(others) or 'none'}. {rounds} rounds on "
+        f"{os.cpu_count()} cores; times are of the processor, minimum (median in brackets)."
+    )
 
 
-def page(rows: Sequence[Row], known: Mapping[str, Any]) -> str:
+def page(rows: Sequence[lab.Row], about: str) -> str:
     """The table of every lens, the plot, the rules."""
     parts = []
-    for name in dict.fromkeys(r.lens for r in rows):
-        parts += [f"## {known['lenses'][name]['title']}", known["lenses"][name]["rays"]]
-        mine = sorted((r for r in rows if r.lens == name), key=lambda r: (r.ns is None, r.ns["min"] if r.ns else 0))
-        parts.append(lab.table(_COLUMNS, mine))
-    rules = (inspect.getdoc(inspect.getmodule(page)) or "").partition("Rules. ")[2].partition("\n\nWrites")[0]
+    for name in dict.fromkeys(r["lens"] for r in rows):
+        mine = sorted((r for r in rows if r["lens"] == name), key=lambda r: r["ns"]["min"] if r["ns"] else math.inf)
+        parts += [f"## {mine[0]['title']}", mine[0]["rays"], lab.table(_COLUMNS, mine)]
+    rules = (__doc__ or "").partition("Rules. ")[2].partition("\n\nWrites")[0]
     plot = "![Error against time, a point a program](rays.png)"
-    return lab.page(TITLE, COMMAND, _NOTES.format(**known), plot, *parts, _READING, "## Rules", rules)
+    return lab.page(TITLE, COMMAND, f"{lab.load_line(rows)} {about}", plot, *parts, _READING, "## Rules", rules)
 
 
-def description(name: str) -> dict[str, str]:
-    """What a page says of a lens and its rays."""
-    task = task_of(name, 20000)
-    d, passing = task.domain, float(reference(task).passes.mean())
-    rays = (
-        f"Film disc {d.film_radius_mm:.4g} mm at z = {task.film_z:.6f}, pupil disc {d.pupil_radius_mm:.6f} mm at "
-        f"z = {task.pupil_z:.6f} (front vertex at 0, mm); {100 * passing:.0f}% of the rays pass."
-    )
-    return {"title": f"{task.lens.name}, {task.lens.refractions} refractions (`{name}`)", "rays": rays}
-
-
-def draw(rows: Sequence[Row], known: Mapping[str, Any], file: Path) -> None:
-    """Error on the film against time, a panel a lens."""
-    names = list(dict.fromkeys(r.lens for r in rows))
-    floor = 1e-11  # um; the trace that all are compared with has no error, and a logarithm none
-    with drawing(file, 5.6 * len(names), 6.4) as figure:
-        panels = figure.subplots(1, len(names), squeeze=False)[0]
-        for name, panel in zip(names, panels, strict=True):
-            timed = [(row.ns["min"], row) for row in rows if row.lens == name and row.ns]
-            for k, (x, row) in enumerate(sorted(timed, key=lambda pair: pair[0])):
-                assert row.errors
-                y, colour = max(row.errors["film_um"], floor), FAMILIES[row.family]
-                panel.plot(x, y, "s" if row.precision == "float64" else "o", color=colour, markersize=4)
-                panel.annotate(f"{k + 1}", (x, y), (2, 4 if k % 2 else -9), textcoords="offset points", color=colour)
-                place = 0.03, 0.02 + 0.028 * (len(timed) - 1 - k)
-                panel.text(*place, f"{k + 1}  {row.name}", transform=panel.transAxes, fontsize=7, color=colour)
-            panel.set(xscale="log", yscale="log", xlabel="ns a ray, one thread", title=known["lenses"][name]["title"])
+def draw(rows: Sequence[lab.Row], file: Path) -> None:
+    """Error on the film against time, a panel a lens, a number a program in the order of time."""
+    titles = {r["lens"]: r["title"] for r in rows}
+    with drawing(file, 5.6 * len(titles), 6.4) as figure:
+        for panel, name in zip(figure.subplots(1, len(titles), squeeze=False)[0], titles, strict=True):
+            timed = sorted((r for r in rows if r["lens"] == name and r["ns"]), key=lambda r: r["ns"]["min"])
+            for k, row in enumerate(timed, 1):
+                # The trace that all are compared with has no error, and a logarithm none.
+                x, y, colour = row["ns"]["min"], max(row["errors"]["film_um"], 1e-11), FAMILIES[row["family"]]
+                panel.plot(x, y, "s" if row["precision"] == "float64" else "o", color=colour, markersize=4)
+                panel.annotate(f"{k}", (x, y), (2, 4 if k % 2 else -9), textcoords="offset points", color=colour)
+                words = f"{k}  {row['name']}, {row['precision']}"
+                panel.text(0.03, 0.97 - 0.028 * k, words, transform=panel.transAxes, fontsize=7, color=colour)
+            panel.set(xscale="log", yscale="log", xlabel="ns a ray, one thread", title=titles[name])
             plain_log_ticks(panel.xaxis, panel.yaxis)
-            panel.title.set_fontsize(8)
-            panel.grid(alpha=0.3)
             panel.margins(0.2)
-        panels[0].set_ylabel("RMS error on the film, um (1e-11: the reference itself)")
-        for family, colour in FAMILIES.items():
-            panels[0].plot([], [], "o", color=colour, label=family)
-        panels[0].plot([], [], "s", color="grey", label="float64 (others float32)")
-        panels[0].legend(fontsize=7, loc="upper right")
+            panel.set_ylabel("RMS error on the film, um (1e-11: the reference itself)")
 
 
 OPTIONS = (
     lab.option("--quick", action="store_true", help="without the tracer that torch compiles"),
-    lab.ONLY,
-    lab.count("rounds", 12, "rounds (default 12)", least=10),
-    lab.out(),
-)
-
-
-def facts(rounds: int, load: float) -> dict[str, Any]:
-    """What rule 6 wants, and how C was compiled."""
-    compiler = Path(find_compiler()).name if has_compiler() else "no compiler"
-    known: dict[str, Any] = {
-        "machine": lab.machine(),
-        "line": lab.machine_line(),
-        "vectors": "AVX-512" if has_avx512() else "AVX2",
-    }
-    known |= {"compiler": compiler, "flags": " ".join(FLAGS), "packages": versions(), "rounds": rounds, "load": load}
-    return known | {"torch": torch.backends.cpu.get_cpu_capability(), "cores": os.cpu_count()}
+    lab.ONLY, lab.count("rounds", 12, "rounds (default 12)", least=10), lab.out(),
+)  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> None:
     """Race lens by lens, then write page and plot."""
     lab.quiet_glasses()
     warnings.simplefilter("ignore")
-    cases = lab.chosen(list(CASES), lambda c: c, args.only, "rays")
-    rows, load, text, known = list[Row](), 0.0, "", dict[str, Any]()
-    for name, report in lab.stages(cases, lambda c: c, args.quiet, 60.0):
-        rows += measure(name, args.rounds, not args.quick, report)
-        load = max(load, os.getloadavg()[0])
-        known = facts(args.rounds, load) | {"lenses": {n: description(n) for n in dict.fromkeys(r.lens for r in rows)}}
-        text = lab.write_results(args.out, "rays", page(rows, known), {**known, "rows": rows})
-    draw(rows, known, args.out / "rays.png")
-    print(text)
+    cases, about = lab.chosen(list(CASES), str, args.only, "rays"), facts(args.rounds)
+
+    def drawn(rows: Sequence[lab.Row]) -> str:
+        if args.out.is_dir():
+            draw(rows, args.out / "rays.png")
+        return page(rows, about)
+
+    lab.resume(
+        args, "rays", {name: name for name in cases},
+        lambda name, report: measure(name, args.rounds, not args.quick, report), lambda row: row["lens"], drawn,
+        facts={"machine": lab.machine(), "about": about}, again=True, seconds=60.0, order=list(CASES),
+    )  # fmt: skip

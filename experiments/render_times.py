@@ -9,11 +9,10 @@ compiler; what this machine cannot make is left out, and the page says so. The t
 from __future__ import annotations
 
 import argparse
-import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -26,7 +25,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import FUSED, make_camera
-from neurolens.cameras.contract import RAYS_A_CALL, Camera
+from neurolens.cameras.contract import Camera
 from neurolens.lens.shot import Shot
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
@@ -39,7 +38,7 @@ FUSED_MODELS = ("polynomial, C", "network, C")
 KINDS = (TORCH, EXACT_C, *GRAPHS, *FUSED_MODELS)
 _FILES = dict(zip((*GRAPHS, *FUSED_MODELS), ("ols-64", "mlp-16x2") * 2, strict=True))
 # Scenes of rising cost: one bounce off a wall; small lights, three; meshes, gloss, glass, six.
-CHEAP = "cheap"
+CHEAP, MOVES = "cheap", "with differentials"
 SCENES = {CHEAP: "grid", "middle": "lights", "dear": "room"}
 CHEAP_ROUNDS = 4  # times the rounds of the other scenes: there the camera counts most, and a render is short
 # Refractions, name, file of lenses/, focal length in mm.
@@ -56,17 +55,8 @@ LENSES = (
 _QUICK = (2, 14, 40)
 _FILM = (0.36, 0.2025)  # of the focal length
 _FOCUS_M, _F_NUMBER = 5.0, 4.0
-_ALONE_ROUNDS, _SLOW_S = 15, 0.1
-
-
-@dataclass(frozen=True)
-class Size:
-    """The amount of rendering: pixels, samples per pixel, rounds."""
-
-    width: int = 128
-    height: int = 72
-    samples: int = 16
-    rounds: int = 5
+_SIZE = (128, 72, 16, 5)  # pixels, samples of each, rounds
+_GREEN = np.full(1, 550, np.float32)
 
 
 @dataclass
@@ -75,9 +65,8 @@ class Subject:
 
     Attributes:
         refractions: of the lens, None for an ideal camera. kind: one of `KINDS`, or an ideal camera.
-        made_s: seconds to make it, compiling included.
-        ns, ns_moves: nanoseconds of a ray without and with differentials, the camera alone, best of the rounds.
-        moves_error: RMS error of differentials that are fitted.
+        seconds, camera_s: by scene, of every round: of a render, and of its camera alone; under `MOVES` of the cheap
+            scene with differentials.
     """
 
     lens: str
@@ -85,27 +74,19 @@ class Subject:
     kind: str
     camera: Camera | None = None
     reason: str = ""
-    made_s: float = 0.0
-    ns: float | None = None
-    ns_moves: float | None = None
-    moves_error: float | None = None
-
-    @property
-    def name(self) -> str:
-        return self.kind if self.lens == self.kind else f"{self.lens}, {self.kind}"
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    camera_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
 
-@dataclass
-class Timed:
-    """A camera in a scene: seconds of every round, in all and in the camera, and the share of rays that pass."""
+class _WithDifferentials:
+    """A camera that computes the differentials of all its rays, which the renderer does not use, to time them."""
 
-    subject: Subject
-    scene: str
-    differentials: bool
-    seconds: list[float] = field(default_factory=list)
-    camera_s: list[float] = field(default_factory=list)
-    passed: float = 0.0
-    paths: int = 0
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self.sample = camera.sample_differentials  # type: ignore[attr-defined]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
 
 
 def make_subjects(quick: bool, report: Report) -> list[Subject]:
@@ -121,107 +102,43 @@ def make_subjects(quick: bool, report: Report) -> list[Subject]:
             compiled = FUSED if kind in (EXACT_C, *FUSED_MODELS) else ""
             specs.append((Subject(lens, count, kind), f"{compiled}{file}", efl))
     for k, (subject, spec, efl) in enumerate(specs):
-        began = time.perf_counter()
+        film, f_number = (_FILM[0] * efl, _FILM[1] * efl), None if spec == "pinhole" else _F_NUMBER
         try:
-            subject.camera = make_camera(spec, shot(efl, spec))
-            _differentials(subject.camera, 1)
-            subject.moves_error = getattr(subject.camera, "differentials_error", None)
+            camera: Any = make_camera(spec, Shot(film, _FOCUS_M, f_number))
+            subject.camera = camera
+            if subject.kind in (EXACT_C, *FUSED_MODELS):  # fits its differentials here, not in every render
+                camera.sample_differentials(*(np.full((n, 1), v, np.float32) for n, v in ((2, 0), (2, 0.5))), _GREEN)
         except InputError as error:
             subject.reason = str(error).replace(f"{lab.ROOT}/", "")
-        subject.made_s = time.perf_counter() - began
         report((k + 1) / len(specs))
     return [subject for subject, _, _ in specs]
 
 
-def shot(efl: float, spec: str) -> Shot:
-    """The settings of every camera."""
-    f_number = None if spec == "pinhole" else _F_NUMBER
-    return Shot((_FILM[0] * efl, _FILM[1] * efl), _FOCUS_M, f_number)
-
-
-def _differentials(camera: Camera, count: int) -> Callable[[], object] | None:
-    """A call that samples rays with differentials, run once; None for a camera without them."""
-    call = partial(camera.sample_differentials, *_inputs(camera, count))  # type: ignore[attr-defined]
-    try:
-        call()
-    except InputError:
-        return None
-    return call
-
-
-def _inputs(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same random numbers for every camera: points over the film and the pupil's square, wavelengths."""
-    rng = np.random.default_rng(1)
-    film = (rng.random((2, count)) - 0.5) * np.array(camera.film_mm)[:, None]
-    low, high = camera.wavelength_nm or (400.0, 700.0)
-    wavelength = np.clip(rng.uniform(400, 700, count), low, high)
-    return film.astype(np.float32), rng.random((2, count), np.float32), wavelength.astype(np.float32)
-
-
-def time_alone(subjects: Sequence[Subject], report: Report) -> None:
-    """Time every camera by itself, with and without differentials, in turn."""
-    calls: list[tuple[Subject, str, int, Callable[[], object]]] = []
-    for s in subjects:
-        if s.camera is not None:
-            count = getattr(s.camera, "rays_a_call", RAYS_A_CALL)
-            calls.append((s, "ns", count, partial(s.camera.sample, *_inputs(s.camera, count))))
-            moves = _differentials(s.camera, count)
-            if moves is not None:
-                calls.append((s, "ns_moves", count, moves))
-    for k in range(_ALONE_ROUNDS):
-        for s, what, count, call in calls:
-            least: float | None = getattr(s, what)
-            if least is None or least * count <= _SLOW_S * 1e9:  # one slow call is measured well enough
-                began = time.perf_counter()
-                call()
-                ns = (time.perf_counter() - began) / count * 1e9
-                setattr(s, what, ns if least is None else min(least, ns))
-        report((k + 1) / _ALONE_ROUNDS)
-
-
-def time_renders(subjects: Sequence[Subject], scenes: dict[str, Scene], size: Size, report: Report) -> list[Timed]:
-    """Every camera in every scene; in the cheap one also with differentials, where they take no minute."""
-    rows = []
+def time_renders(subjects: Sequence[Subject], scenes: dict[str, Scene], size: dict[str, int], report: Report) -> None:
+    """Every camera in every scene in turn; in the cheap one compiled cameras also with differentials."""
+    runs: list[tuple[Subject, str, Any]] = []
     for cost in scenes:
         for s in subjects:
-            if s.camera is not None:
-                rows.append(Timed(s, cost, False))
-                if cost == CHEAP and s.ns_moves is not None and s.kind not in {TORCH, *GRAPHS}:
-                    rows.append(Timed(s, cost, True))  # right after, for their ratio
-    rounds = {cost: size.rounds * (CHEAP_ROUNDS if cost == CHEAP else 1) for cost in scenes}
-    for k in range(max(rounds.values())):
-        for i, row in enumerate(rows):
-            if k < rounds[row.scene]:
-                assert row.subject.camera is not None
-                stats = one_render(scenes[row.scene], row.subject.camera, size, row.differentials)
-                row.seconds.append(stats["seconds"])
-                row.camera_s.append(stats["camera_thread_seconds"])
-                row.passed, row.paths = stats["passed_fraction"], int(stats["paths"])
-            report((k + (i + 1) / len(rows)) / max(rounds.values()))
-    return rows
-
-
-def one_render(scene: Scene, camera: Camera, size: Size, differentials: bool = False) -> dict[str, float]:
-    """Statistics of one render."""
-    pixels: dict[str, Any] = {"width": size.width, "height": size.height, "samples": size.samples}
-    shown = _WithDifferentials(camera) if differentials else camera
-    return render(scene, shown, **pixels, seed=1, threads=1, film=FilmSettings(wavelengths="one")).stats
-
-
-class _WithDifferentials:
-    """A camera that computes the differentials of all its rays, which the renderer does not use, to time them."""
-
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
-        self.sample = camera.sample_differentials  # type: ignore[attr-defined]
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
+            runs += [(s, cost, s.camera)] if s.camera is not None else []
+            if cost == CHEAP and s.camera is not None and s.kind in (EXACT_C, *FUSED_MODELS):
+                runs.append((s, MOVES, _WithDifferentials(s.camera)))  # right after, for their ratio
+    pixels: dict[str, Any] = {key: size[key] for key in ("width", "height", "samples")}
+    rounds = {cost: size["rounds"] * (CHEAP_ROUNDS if cost in (CHEAP, MOVES) else 1) for _, cost, _ in runs}
+    for k in range(-1, max(rounds.values())):  # the first round fits what the cameras need, and does not count
+        for i, (s, cost, camera) in enumerate(runs):
+            if k < rounds[cost]:
+                shown, film = scenes.get(cost, scenes[CHEAP]), FilmSettings(wavelengths="one")
+                few = pixels if k >= 0 else pixels | {"samples": 1}
+                stats = render(shown, camera, **few, seed=1, threads=1, film=film).stats
+                if k >= 0:
+                    s.seconds[cost].append(stats["seconds"])
+                    s.camera_s[cost].append(stats["camera_thread_seconds"])
+            report((k + 1 + (i + 1) / len(runs)) / (max(rounds.values()) + 1))
 
 
 # ---- The page. -------------------------------------------------------------------------------------------------------
 
-ABOVE_THIN, MOVES, PER_REFRACTION = 0.05, 0.30, 0.10  # the goals, as shares
+ABOVE_THIN, MOST_MOVES, PER_REFRACTION = 0.05, 0.30, 0.10  # the goals, as shares
 _NOTES = """\
 Every camera sees the same 20 degrees at f/4, focused at 5 m, one wavelength per path, {width} x {height} pixels,
 {samples} samples, one thread, {rounds} rounds of all cameras in turn ({more} times as many in the cheap scene);
@@ -231,74 +148,43 @@ meshes, gloss, glass and six ({dear}.toml). "exact, torch" is the eager tracer, 
 and compiled, with the pupil, weights and status around it in one call, as the models "C" are (`--camera fused:FILE`);
 polynomials are `ols-64` of models/, networks `mlp-16x2`. Overhead is the time above the pinhole's, as a share of the
 pinhole's render, per refraction. Camera is the share of a render's time that its camera takes. Blocked rays cost no
-path: a lens that loses light renders faster for it. Differentials are computed and handed on; nothing uses them. Those
-of compiled cameras are polynomials of low order, whose RMS error stands beside them."""
+path: a lens that loses light renders faster for it. Differentials are computed and handed on; nothing uses them."""
+_LEGEND = """\
+Seconds (median); overhead over the pinhole per refraction; share of the camera. Ideal cameras stand in the
+first column."""
 
 
-@dataclass
-class Results:
-    """The results so far."""
-
-    size: Size
-    subjects: list[Subject] = field(default_factory=list)
-    rows: list[Timed] = field(default_factory=list)
-
-    def row(self, subject: Subject | str, scene: str, differentials: bool = False) -> Timed | None:
-        """The times of a camera (of an ideal one by its kind) in a scene, if there are any."""
-        for r in self.rows:
-            if subject in (r.subject, r.subject.kind) and (r.scene, r.differentials) == (scene, differentials):
-                return r if r.seconds else None
-        return None
-
-    def above_thin(self, subject: Subject, scene: str) -> float | None:
-        """Seconds in the camera above those of the thin lens, over the pinhole's render."""
-        if (row := self.row(subject, scene)) and (thin := self.row(THIN, scene)) and (hole := self.row(PINHOLE, scene)):
-            return (min(row.camera_s) - min(thin.camera_s)) / min(hole.seconds)
-        return None
-
-    def moves_share(self, subject: Subject) -> float | None:
-        """Median over the rounds of the camera's seconds with differentials over those without, less 1."""
-        if (row := self.row(subject, CHEAP)) and (more := self.row(subject, CHEAP, True)):
-            return median(with_ / without for with_, without in zip(more.camera_s, row.camera_s, strict=True)) - 1
-        return None
-
-    def overhead(self, subject: Subject, scene: str) -> float | None:
-        """Time above the pinhole's over the pinhole's, per refraction; of an ideal camera as a whole."""
-        if (row := self.row(subject, scene)) and (pinhole := self.row(PINHOLE, scene)):
-            return (min(row.seconds) / min(pinhole.seconds) - 1) / max(subject.refractions or 1, 1)
-        return None
-
-    def ns_in_render(self, subject: Subject, differentials: bool = False) -> float | None:
-        """Nanoseconds a ray in the cheap render."""
-        row = self.row(subject, CHEAP, differentials)
-        return None if row is None else min(row.camera_s) / row.paths * 1e9
+def overhead(subject: Subject, pinhole: Subject, scene: str) -> float:
+    """Time above the pinhole's over the pinhole's, per refraction; of an ideal camera as a whole."""
+    times = min(subject.seconds[scene]) / min(pinhole.seconds[scene])
+    return (times - 1) / max(subject.refractions or 1, 1)
 
 
-def goals(results: Results) -> list[lab.Goal]:
+def goals(subjects: Sequence[Subject]) -> list[lab.Goal]:
     """The goals of every kind of camera in every scene; the worst lens counts."""
+    thin, hole = (next(s for s in subjects if s.kind == kind) for kind in (THIN, PINHOLE))
 
-    def goal(kind: str, text: str, wanted: float, share: Callable[[Subject], float | None]) -> lab.Goal:
-        known = {s.lens: v for s in results.subjects if s.kind == kind and (v := share(s)) is not None}
+    def goal(kind: str, text: str, wanted: float, scene: str, share: Callable[[Subject], float]) -> lab.Goal:
+        known = {s.lens: share(s) for s in subjects if s.kind == kind and s.seconds[scene]}
         worst = max(known, key=lambda name: known[name], default="")
         return lab.Goal(f"{kind}: {text}", wanted, known.get(worst), worst=worst)
 
+    def above_thin(scene: str) -> Callable[[Subject], float]:
+        return lambda s: (min(s.camera_s[scene]) - min(thin.camera_s[scene])) / min(hole.seconds[scene])
+
+    def moves(s: Subject) -> float:
+        return median(a / b for a, b in zip(s.camera_s[MOVES], s.camera_s[CHEAP], strict=True)) - 1
+
     above, adds = "camera above the thin lens's, of the {} pinhole render", "what differentials add to the camera"
     made = [
-        goal(kind, above.format(scene), ABOVE_THIN, partial(results.above_thin, scene=scene))
+        goal(kind, above.format(scene), ABOVE_THIN, scene, above_thin(scene))
         for kind in (*FUSED_MODELS, *GRAPHS)
         for scene in SCENES
     ]
-    made += [goal(k, f"{adds}, in the cheap render", MOVES, results.moves_share) for k in (EXACT_C, *FUSED_MODELS)]
-    text, overhead = "overhead a refraction, of the cheap pinhole render", partial(results.overhead, scene=CHEAP)
-    return made + [goal(kind, text, PER_REFRACTION, overhead) for kind in (EXACT_C, TORCH)]
-
-
-def write(results: Results, out: Path) -> str:
-    """Write README.md; returns the page."""
-    out.mkdir(parents=True, exist_ok=True)
-    text = page(results)
-    atomic_write_text(out / "README.md", text)
-    return text
+    made += [goal(k, f"{adds}, in the cheap render", MOST_MOVES, MOVES, moves) for k in (EXACT_C, *FUSED_MODELS)]
+    text = "overhead a refraction, of the cheap pinhole render"
+    share = partial(overhead, pinhole=hole, scene=CHEAP)
+    return made + [goal(kind, text, PER_REFRACTION, CHEAP, share) for kind in (EXACT_C, TORCH)]
 
 
 def _percent(share: float | None) -> str | None:
@@ -309,62 +195,26 @@ _GOALS = lab.columns(
     ("goal", "text"), ("wanted", lambda g: f"at most {_percent(g.wanted)}"),
     ("measured, worst lens", lambda g: _percent(g.measured)), ("lens", "worst"), ("", "verdict"),
 )  # fmt: skip
-_LEGEND = """\
-Seconds (median); overhead over the pinhole per refraction; share of the camera. Ideal cameras stand in the
-first column."""
 
 
-def page(results: Results) -> str:
-    """All tables."""
-    timed = {r.scene for r in results.rows if r.seconds}
-    parts = [f"## Seconds, {s}\n\n{_LEGEND}\n\n{_scene_table(results, s)}" for s in SCENES if s in timed]
-    missing = [f"{s.name}: {s.reason}." for s in results.subjects if s.reason]
-    return lab.page(
-        "# Render time by camera",
-        "`python -m experiments render`",
-        _NOTES.format(**vars(results.size), **SCENES, more=CHEAP_ROUNDS),
-        lab.machine_line(", one of them used"),
-        "## Goals",
-        lab.table(_GOALS, goals(results), "–"),
-        *parts,
-        "## Cameras by themselves",
-        lab.table(_camera_columns(results), results.subjects, "–"),
-        *missing,
-    )
-
-
-def _scene_table(results: Results, scene: str) -> str:
+def scene_table(subjects: Sequence[Subject], scene: str) -> str:
     """One row per lens, one column per kind: seconds, overhead a refraction, share of the camera."""
+    hole = next(s for s in subjects if s.kind == PINHOLE)
 
-    def cell(kind: str, of: dict[str, Subject]) -> str | None:
-        row = results.row(of[kind], scene) if kind in of else None
-        if row is None:
+    def cell(s: Subject | None) -> str | None:
+        if s is None or not s.seconds[scene]:
             return None
-        over = "" if kind == PINHOLE else f"; {_percent(results.overhead(of[kind], scene))}"
-        share = _percent(min(row.camera_s) / min(row.seconds))
-        return f"{lab.best_median(min(row.seconds), median(row.seconds), form='.3f')}{over}; {share}"
+        over = "" if s is hole else f"; {_percent(overhead(s, hole, scene))}"
+        share = _percent(min(s.camera_s[scene]) / min(s.seconds[scene]))
+        times = lab.best_median(min(s.seconds[scene]), median(s.seconds[scene]), form=".3f")
+        return f"{times}{over}; {share}"
 
     rows = []
-    for lens, count in dict.fromkeys((s.lens, s.refractions) for s in results.subjects):
-        of = {s.kind: s for s in results.subjects if s.lens == lens}
+    for lens, count in dict.fromkeys((s.lens, s.refractions) for s in subjects):
+        of = {s.kind: s for s in subjects if s.lens == lens}
         shown = (lens, *KINDS[1:]) if lens in (PINHOLE, THIN, STOP) else KINDS
-        rows.append([lens, count, *(cell(kind, of) for kind in shown)])
+        rows.append([lens, count, *(cell(of.get(kind)) for kind in shown)])
     return lab.table(["lens", "refractions", *KINDS], rows, "–")
-
-
-def _camera_columns(results: Results) -> tuple[lab.Column, ...]:
-    return lab.columns(
-        ("camera", "name"),
-        ("refractions", "refractions"),
-        ("ns per ray, alone", "ns", ".3g"),
-        ("with differentials", "ns_moves", ".3g"),
-        ("ns per ray in the cheap render", results.ns_in_render, ".3g"),
-        ("with differentials", partial(results.ns_in_render, differentials=True), ".3g"),
-        ("differentials add", lambda s: _percent(results.moves_share(s))),
-        ("their error", lambda s: _percent(s.moves_error)),
-        ("rays that pass", lambda s: _percent(row.passed) if (row := results.row(s, CHEAP)) else None),
-        ("made in s", "made_s", ".2g"),
-    )
 
 
 OPTIONS = (
@@ -374,19 +224,24 @@ OPTIONS = (
 
 
 def run(args: argparse.Namespace) -> None:
-    """Make the cameras, time them alone and in renders; the tables are written after each step."""
+    """Make the cameras, time them in renders, write the page."""
     lab.quiet_glasses()
     torch.set_num_threads(1)
-    results = Results(Size(64, 36, 16, 1) if args.quick else Size())
-    chosen = list(SCENES.items())[: 1 if args.quick else 3]
-    scenes = {cost: load_scene(lab.SCENES / f"{name}.toml") for cost, name in chosen}
-    progress = Progress({"cameras": 25, "cameras alone": 5, "renders": 65}, quiet=args.quiet)
+    names = dict(list(SCENES.items())[: 1 if args.quick else 3])
+    scenes = {cost: load_scene(lab.SCENES / f"{name}.toml") for cost, name in names.items()}
+    size = dict(zip(("width", "height", "samples", "rounds"), (64, 36, 16, 1) if args.quick else _SIZE, strict=True))
+    progress = Progress({"cameras": 25, "renders": 65}, quiet=args.quiet)
     with progress.stage("cameras") as report:
-        results.subjects = make_subjects(args.quick, report)
-    with progress.stage("cameras alone") as report:
-        time_alone(results.subjects, report)
-    write(results, args.out)
+        subjects = make_subjects(args.quick, report)
     with progress.stage("renders") as report:
-        results.rows = time_renders(results.subjects, scenes, results.size, report)
-    write(results, args.out)
-    print(write(results, args.out))
+        time_renders(subjects, scenes, size, report)
+    text = lab.page(
+        "# Render time by camera", "`python -m experiments render`",
+        _NOTES.format(**size, **SCENES, more=CHEAP_ROUNDS), lab.machine_line(", one of them used"),
+        "## Goals", lab.table(_GOALS, goals(subjects), "–"),
+        *(f"## Seconds, {scene}\n\n{_LEGEND}\n\n{scene_table(subjects, scene)}" for scene in scenes),
+        *(f"{s.lens}, {s.kind}: {s.reason}." for s in subjects if s.reason),
+    )  # fmt: skip
+    args.out.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(args.out / "README.md", text)
+    print(text)

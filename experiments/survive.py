@@ -1,9 +1,9 @@
-"""Commands that are killed, or meet a full disk, a second run, a clock that went back, a place that cannot be written.
+"""Commands that are killed at random moments: the same command again ends in the same result.
 
-Each case runs a small command once, undisturbed, and then again and again, disturbed: killed by SIGKILL at random
-moments of its time and started again, until it is done. What it writes must be the same bytes (of pictures: pixels and
-previews; of results: all but times), no file under its final name may be half-written at any moment, and what does not
-work must be one line. Commands run in processes forked from this one, so that killing is not spent on imports.
+Each case runs a small command once, undisturbed, and then again and again, killed by SIGKILL at random moments of its
+time and started again, until it is done. What it writes must be the same bytes (of pictures: pixels and previews; of
+results: all but times), and no file under its final name may be half-written at any moment. Commands run in processes
+forked from this one, so that killing is not spent on imports.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import io
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import tempfile
@@ -38,7 +37,6 @@ OPTIONS = [
     lab.out(),
 ]
 _TILES = 3
-_FULL_BYTES = 4096  # of a file on the disk that is full
 _MOST_RUNS = 200
 
 
@@ -101,41 +99,33 @@ def run(args: argparse.Namespace) -> None:
     """Disturb every case, and write the table."""
     import torch  # noqa: F401  before forks: kills shall meet the work
 
-    chance = random.Random(args.seed)
-    rows = [
-        _case(case, max(1, round(case.share * args.kills)), chance, Path(place))
-        for case in CASES
-        if not args.only or case.name in args.only
-        for place in [tempfile.mkdtemp(prefix="survive-")]
-    ]
-    header = ["command", "kills", "starts until done, median", "same bytes", "half-written", "full disk"]
-    header += ["two runs at once", "clock back a year", "no place to write"]
-    table = "\n".join(lab.markdown_table(header, rows))
-    page = f"# Runs that are disturbed\n\n{' '.join((__doc__ or '').split())}\n\n{table}\n"
+    chance, rows = random.Random(args.seed), []
+    for case in CASES:
+        if not args.only or case.name in args.only:
+            with tempfile.TemporaryDirectory(prefix="survive-") as place:
+                rows.append(_case(case, max(1, round(case.share * args.kills)), chance, Path(place)))
+    header = ["command", "kills", "starts until done, median", "same bytes", "half-written"]
+    page = lab.page("# Runs that are killed", " ".join((__doc__ or "").split()), lab.table(header, rows))
     args.out.mkdir(parents=True, exist_ok=True)
     atomic_write_text(args.out / "survive.md", page)
     print(page)
 
 
-def _case(case: Case, kills: int, chance: random.Random, place: Path) -> tuple[str, ...]:
+def _case(case: Case, kills: int, chance: random.Random, place: Path) -> tuple[object, ...]:
     fresh = place / "fresh"
     fresh.mkdir()
     case.prepare(fresh)
     wanted, spent = _undisturbed(case, fresh, place / "whole")
-    same = broken = done = starts = 0
+    same = broken = done = 0
     counts = []
     while done < kills:
-        folder = _copy(fresh, place / "killed")
-        starts = 1
+        folder, starts = _copy(fresh, place / "killed"), 1
         while done < kills and starts < _MOST_RUNS and not _killed(folder, case.argv, chance.random() * spent):
             done, starts = done + 1, starts + 1
             broken += not _whole(folder)
-        same += _ended(folder, case, wanted)
+        same += _run(folder, case.argv) == (0, "") and _written(folder) == wanted
         counts.append(starts)
-    told = (_full(case, fresh, place, wanted), _two(case, fresh, place, wanted), _back(case, fresh, place, wanted))
-    shutil.rmtree(place)
-    middle, agree = sorted(counts)[len(counts) // 2], f"{same} of {len(counts)}"
-    return case.name, str(done), str(middle), agree, str(broken), *told, _nowhere(case)
+    return case.name, done, sorted(counts)[len(counts) // 2], f"{same} of {len(counts)}", broken
 
 
 def _undisturbed(case: Case, fresh: Path, folder: Path) -> tuple[dict[str, str], float]:
@@ -153,51 +143,7 @@ def _copy(fresh: Path, folder: Path) -> Path:
     return folder
 
 
-def _ended(folder: Path, case: Case, wanted: dict[str, str]) -> bool:
-    """Whether the same command, undisturbed, ends with the same result."""
-    return _run(folder, case.argv) == (0, "") and _written(folder) == wanted
-
-
-def _full(case: Case, fresh: Path, place: Path, wanted: dict[str, str]) -> str:
-    """A disk that takes files of a few thousand bytes only, and then has room."""
-    folder = _copy(fresh, place / "full")
-    code, said = _run(folder, case.argv, _FULL_BYTES)
-    lines = said.strip().count("\n") + 1 if said.strip() else 0
-    whole = _whole(folder)
-    end = _ended(folder, case, wanted)
-    return f"exit {code}, {lines} line{'s' * (lines != 1)}, {'same' if end and whole else 'OTHER'} after"
-
-
-def _two(case: Case, fresh: Path, place: Path, wanted: dict[str, str]) -> str:
-    folder = _copy(fresh, place / "two")
-    children = [_start(folder, case.argv) for _ in range(2)]
-    codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child, _ in children]
-    good = _written(folder) == wanted and _whole(folder)
-    return f"exit {codes[0]} and {codes[1]}, {'same' if good else 'OTHER'}"
-
-
-def _back(case: Case, fresh: Path, place: Path, wanted: dict[str, str]) -> str:
-    """Started, killed, and started again with all files a year in the future, as after a clock that was wrong."""
-    folder = _copy(fresh, place / "back")
-    _killed(folder, case.argv, 0.05)
-    later = time.time() + 365 * 86400
-    for file in folder.rglob("*"):
-        os.utime(file, (later, later))
-    return "same" if _ended(folder, case, wanted) else "OTHER"
-
-
-def _nowhere(case: Case) -> str:
-    """A folder where nobody can write, the superuser included."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        case.prepare(folder)
-        argv = [{"out.exr": "/proc/out.exr", "run": "/proc/run"}.get(word, word) for word in case.argv]
-        code, said = _run(folder, argv)
-    lines = len(said.strip().splitlines())
-    return f"exit {code}, {lines} line{'s' * (lines != 1)}"
-
-
-def _start(folder: Path, argv: Sequence[str], most_bytes: int | None = None) -> tuple[int, Path]:
+def _start(folder: Path, argv: Sequence[str]) -> tuple[int, Path]:
     """Begin a command in a process of its own; its number, and the file that will hold what it says on stderr."""
     said = folder.with_name(f"{folder.name}-{random.getrandbits(48):x}.txt")
     child = os.fork()
@@ -206,20 +152,16 @@ def _start(folder: Path, argv: Sequence[str], most_bytes: int | None = None) -> 
     code = 70
     try:
         os.chdir(folder)
-        if most_bytes is not None:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
         told = io.StringIO()
         with redirect_stdout(io.StringIO()), redirect_stderr(told):
             code = main(argv)
-        resource.setrlimit(resource.RLIMIT_FSIZE, resource.getrlimit(resource.RLIMIT_FSIZE))
-        said.write_text(told.getvalue()[:_FULL_BYTES])
+        said.write_text(told.getvalue())
     finally:
         os._exit(code)
 
 
-def _run(folder: Path, argv: Sequence[str], most_bytes: int | None = None) -> tuple[int, str]:
-    child, said = _start(folder, argv, most_bytes)
+def _run(folder: Path, argv: Sequence[str]) -> tuple[int, str]:
+    child, said = _start(folder, argv)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     text = said.read_text() if said.exists() else ""
     said.unlink(missing_ok=True)

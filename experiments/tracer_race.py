@@ -12,12 +12,12 @@ from __future__ import annotations
 import argparse
 import ctypes
 import math
-import os
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.scalars import lower
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, cauchy, index_of
 from neurolens.lens.prescription import Lens, Medium, Surface
-from neurolens.study.speed import FUSED_BATCHES, Call, Candidate, CompiledSource, Unavailable, program_candidate, race
+from neurolens.study.speed import FUSED_BATCHES, Call, Candidate, CompiledSource, Unavailable, program_candidate
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import FilmRays, domain_of, sample_domain
 from neurolens.trace.tracegraph import exact_graph
@@ -43,8 +43,8 @@ CASES = (
     Case("canon_ef_70_200mm_f2_8l_is_ii_usm.toml", None, math.inf),
     Case("panavision_anamorphic_zoom_21.toml", None, math.inf),
 )
-OURS = {"exact C": True, "exact C, mean of polarisations": False}
-DOUBLE = "exact C, double precision"
+EXACT, DOUBLE = "exact C", "exact C, double precision"
+OURS = {EXACT: True, "exact C, mean of polarisations": False}
 WAYS = {"Newton's steps": (), "the machine's roots": ("-DNOFAST",)}
 VECTORS = (1, 2, 3)
 _FLAGS = ("-std=c++17", "-O3", "-march=native")
@@ -145,24 +145,8 @@ class Hand:
         return call, [a[: len(rays)] for a in arrays[5:]]
 
 
-@dataclass(frozen=True)
-class Row:
-    """A candidate: its operations, times, how many rays have another status than ours, our time over its own."""
-
-    file: str
-    lens: str
-    refractions: int
-    name: str
-    operations: int | None
-    ns: dict[str, Any] | None
-    reason: str | None
-    other_statuses: int | None
-    ours_over_it: float | None
-    load: float | None
-
-
-def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
-    """Race ours and the hand-written tracer through one lens."""
+def measure(case: Case, rounds: int, report: lab.Report) -> list[lab.Row]:
+    """Race ours and the hand-written tracer through one lens; of each, how many rays have another status than ours."""
     lens = case.lens()
     lens = replace(lens, surfaces=tuple(by_figures(s) for s in lens.surfaces))
     domain = domain_of(lens, film_radius_mm=case.film_radius_mm, focus_m=(math.inf, case.near_m))
@@ -172,32 +156,26 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
     rays = replace(rays, film_z=rays.film_z * 0 + domain.film_z_mm[0])
     names = ("film_x_mm", "film_y_mm", "film_z_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
     columns: dict[str, Any] = dict(zip(names, map(np.asarray, rays.columns()), strict=False))
-    call = {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": domain.stop_radius_mm}
-    ours = CompiledSource(programs["exact C"]).rays(columns | call)["status"]
+    columns |= {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": domain.stop_radius_mm}
+    ours = CompiledSource(programs[EXACT]).rays(columns)["status"]
     field, other = [program_candidate(name, p, domain) for name, p in programs.items()], dict.fromkeys(programs, 0)
     programs[DOUBLE] = lower(exact_graph(lens, *wide, double=True))
     field.append(program_candidate(DOUBLE, programs[DOUBLE], domain, double=True))
-    other[DOUBLE] = int((CompiledSource(programs[DOUBLE], double=True).rays(columns | call)["status"] != ours).sum())
+    other[DOUBLE] = int((CompiledSource(programs[DOUBLE], double=True).rays(columns)["status"] != ours).sum())
     for way, options in WAYS.items():
         for vectors in VECTORS:
             name = f"by hand, {vectors} vector{'s' * (vectors > 1)}, {way}"
             made = cache(lambda vectors=vectors, options=options: Hand(lens, wide[0], (*options, f"-DW={vectors}")))
             field.append(hand_candidate(name, made, domain))
-            try:
+            with suppress(Unavailable):
                 run, out = made().prepared(rays, domain.stop_radius_mm)
-            except Unavailable:
-                continue
-            run()
-            other[name] = int((out[-1] != ours).sum())
-    timed = race(field, domain, rounds=rounds, report=report)
-    rows = []
-    for name in (c.name for c in field):
-        timing, ratio = timed.timing(name), timed.speedup(name, "exact C")
-        count = sum(programs[name].count().values()) if name in programs else None
-        ns, gain = None if timing is None else dict(timing), ratio["min"] if ratio else None
-        about = case.file, lens.name, lens.refractions, name, count
-        rows.append(Row(*about, ns, timed.unavailable.get(name), other.get(name), gain, timed.load))
-    return rows
+                run()
+                other[name] = int((out[-1] != ours).sum())
+    about = {"file": case.file, "lens": lens.name, "refractions": lens.refractions}
+    rows: dict[str, lab.Row] = {c.name: about | {"name": c.name, "other_statuses": other.get(c.name)} for c in field}
+    for name, program in programs.items():
+        rows[name] |= lab.operations_of(program)
+    return lab.race_rows(rows, field, domain, rounds, lambda name: {EXACT: EXACT}, report)
 
 
 def hand_candidate(name: str, made: Any, domain: Domain) -> Candidate:
@@ -206,40 +184,31 @@ def hand_candidate(name: str, made: Any, domain: Domain) -> Candidate:
 
 
 _COLUMNS = lab.columns(
-    ("lens", "lens"),
-    ("refractions", "refractions"),
-    ("tracer", "name"),
-    ("operations", "operations"),
-    ("ns per ray", lambda r: lab.best_median(r.ns["min"], r.ns["median"]) if r.ns else f"unavailable: {r.reason}"),
-    ("other statuses", "other_statuses"),
-    ("exact C takes, times this", "ours_over_it", ".2f"),
-)
+    ("lens", "lens"), ("refractions", "refractions"), ("tracer", "name"), ("operations", "operations"),
+    ("ns per ray", lab.times_of), ("other statuses", "other_statuses"),
+    ("exact C takes, times this", f"speedup.{EXACT}", ".2f"),
+)  # fmt: skip
 _NOTES = """\
 One thread, {wide}, float32, {rounds} rounds in turn in one process (best; median in brackets), each at its best batch.
 Rays uniform over film and pupil disc of the domain, blocked ones included; of {rays} of them those with another status
-than ours are counted (in double precision: of the same rays before they are rounded). Load average meanwhile up to
-{load:.1f} on {cores} cores. Ours by {compiler} {flags}."""
+than ours are counted (in double precision: of the same rays before they are rounded). Ours by {compiler} {flags}."""
 OPTIONS = (lab.ONLY, lab.ROUNDS, lab.out())
-
-
-def page(rows: Sequence[Row], known: dict[str, Any]) -> str:
-    """Return the whole page."""
-    load, compiler = max(row.load or 0.0 for row in rows), Path(find_compiler()).name
-    notes = _NOTES.format(**known, load=load, compiler=compiler, wide="AVX-512" if has_avx512() else "AVX2")
-    head = "# The exact lens as C beside a tracer written by hand", "`python -m experiments tracer`"
-    return lab.page(*head, notes, lab.machine_line(), lab.table(_COLUMNS, rows))
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure lens by lens; rows of other lenses from this machine are kept."""
     lab.quiet_glasses()
-    machine: dict[str, Any] = {"machine": lab.machine(), "flags": " ".join(FLAGS)}
-    known = machine | {"rounds": int(args.rounds or 20), "rays": max(FUSED_BATCHES), "cores": os.cpu_count()}
-    chosen, text = lab.chosen(CASES, lambda c: c.file, args.only, "tracer"), ""
-    kept = [Row(**row) for row in lab.earlier_rows(args.out / "tracer_race.json", machine)]
-    order = [case.file for case in CASES]
-    for case, report in lab.stages(chosen, lambda c: c.file, args.quiet):
-        kept = [row for row in kept if row.file != case.file] + measure(case, known["rounds"], report)
-        rows = sorted(kept, key=lambda row: order.index(row.file))
-        text = lab.write_results(args.out, "tracer_race", page(rows, known), {**known, "rows": rows})
-    print(text)
+    flags, counts = " ".join(FLAGS), {"rounds": int(args.rounds or 20), "rays": max(FUSED_BATCHES)}
+
+    def page(rows: Sequence[lab.Row]) -> str:
+        compiler, wide = Path(find_compiler()).name, "AVX-512" if has_avx512() else "AVX2"
+        notes = _NOTES.format(**counts, flags=flags, compiler=compiler, wide=wide)
+        head = "# The exact lens as C beside a tracer written by hand", "`python -m experiments tracer`"
+        return lab.page(*head, notes, lab.load_line(rows), lab.table(_COLUMNS, rows))
+
+    lab.resume(
+        args, "tracer_race", {c.file: c for c in lab.chosen(CASES, lambda c: c.file, args.only, "tracer")},
+        lambda case, report: measure(case, counts["rounds"], report), lambda row: row["file"], page,
+        facts={"machine": lab.machine(), "flags": flags}, about=lambda rows: counts, again=True,
+        order=[case.file for case in CASES],
+    )  # fmt: skip

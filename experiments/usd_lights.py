@@ -22,8 +22,7 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.blender import extension_library
 from neurolens.cli.keys import _frames as frames_of
-from neurolens.render.mesh import Mesh
-from neurolens.render.primitives import Rays
+from neurolens.render.primitives import Mesh, Rays
 
 OPTIONS = (
     lab.option("stage", type=Path, metavar="STAGE", help="USD file"),

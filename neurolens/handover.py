@@ -378,30 +378,14 @@ def write_projection(out: Path, fitted: projections.Projection, data: dict[str, 
     """Write the files of a projection; their names."""
     files = {}
     if fitted.kind in ("opencv", "opencv-rational", "kannala-brandt"):
-        files[out.with_name(f"{out.name}.yaml")] = _file_storage(fitted, data["rms_px"])
+        files[out.with_name(f"{out.name}.yaml")] = html(
+            "handover.opencv.yaml.jinja", lens=fitted, rms_px=data["rms_px"]
+        )
     block = _block(fitted) | {"neurolens": {"version": __version__, **data}}
     files[out.with_name(f"{out.name}.json")] = json.dumps(plain(block), indent=1, allow_nan=False) + "\n"
     for path, text in files.items():
         atomic_write_text(path, text)
     return [str(path) for path in files]
-
-
-def _file_storage(fitted: projections.Projection, rms_px: float) -> str:
-    """YAML as OpenCV's FileStorage reads it, with the names of its own calibration sample."""
-
-    def matrix(name: str, rows: list[list[float]]) -> str:
-        values = ", ".join(repr(float(v)) for row in rows for v in row)
-        shape = f"   rows: {len(rows)}\n   cols: {len(rows[0])}\n   dt: d\n"
-        return f"{name}: !!opencv-matrix\n{shape}   data: [ {values} ]\n"
-
-    (fx, fy), (cx, cy) = fitted.focal_px, fitted.centre_px
-    return (
-        f"%YAML:1.0\n---\nimage_width: {fitted.size[0]}\nimage_height: {fitted.size[1]}\n"
-        f'distortion_model: "{fitted.kind}"\nfisheye_model: {int(fitted.kind == "kannala-brandt")}\n'
-        + matrix("camera_matrix", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        + matrix("distortion_coefficients", [[v] for v in fitted.coefficients])
-        + f"avg_reprojection_error: {rms_px!r}\n"
-    )
 
 
 def _block(fitted: projections.Projection) -> dict[str, Any]:

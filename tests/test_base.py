@@ -100,7 +100,7 @@ def test_what_killed_runs_left_is_removed_after_a_day(tmp_path: Path, monkeypatc
     os.utime(fresh, (time.time() - 2 * 86400,) * 2)
     atomic_write_text(tmp_path / "a.txt", "a")
     assert fresh.exists()  # looked for once an hour: thousands of files in a folder cost each as much as one
-    monkeypatch.setattr("neurolens.base.files._CLEANED_S", 0.0)
+    monkeypatch.setattr("neurolens.base.files._cleaned", set())
     atomic_write_text(tmp_path / "a.txt", "a")
     assert not fresh.exists()
 
@@ -272,22 +272,6 @@ numbers = st.floats(allow_nan=False)
 def test_the_resolved_settings_read_back_bit_for_bit(settings: Experiment) -> None:
     assert from_dict(Experiment, tomllib.loads(to_toml(settings)), "memory") == settings
     assert from_dict(Experiment, to_dict(settings), "memory") == settings
-
-
-class Clock:
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> None:
-    clock, stream = Clock(), io.StringIO()
-    progress = Progress({"trace": 10, "fit": 60}, stream=stream, interval_s=5, clock=clock)
-    with progress.stage("trace") as report:
-        clock.now += 6
-        report(0.25)
-    assert stream.getvalue().splitlines()[0] == "trace:  25%, 6.0 s, 18 s left (in all 1 min 18 s left)"
 
 
 @pytest.mark.parametrize("fraction", [-1.0, 0.0, 1.0, 7.0])

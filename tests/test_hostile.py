@@ -28,7 +28,7 @@ from neurolens.readers.any_format import read_any
 from neurolens.readers.json_lens import image_and_field, read_json_lens
 from neurolens.render import images, pictures
 from neurolens.render.colour import illuminant, read_spectrum
-from neurolens.render.meshfile import read_file
+from neurolens.render.mesh import read_file
 
 ROOT = Path(__file__).parents[1]
 SECONDS = 10  # each takes less than one, and took from ten to more than a hundred

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neurolens.analysis.bundles import bundle, hexapolar, points
-from neurolens.analysis.fields import Array, Result, Scene, on_plane
+from neurolens.analysis.fields import Array, OverField, Result, Scene, on_plane
 from neurolens.analysis.plots import FIELD_COLOURS, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, LINE_G_NM
@@ -85,19 +85,16 @@ _CLOSE = 1e-3  # stop radii; differences are central, so that the error is of th
 
 
 @dataclass(frozen=True)
-class Curvature(Result):
+class Curvature(OverField):
     """Foci over F fields from the axis to the edge, one wavelength.
 
     Attributes:
-        field_deg, height_mm: [F] of the chief ray.
         tangential_mm, sagittal_mm: [F] along the axis from the film, positive away from the lens.
         petzval_mm: [F] the Petzval surface at these heights, drawn through the sagittal focus on the axis.
         petzval_radius_mm: its radius, positive when its centre lies towards +z; inf when flat; NaN with cylinders.
     """
 
     wavelength_nm: float
-    field_deg: Array
-    height_mm: Array
     tangential_mm: Array
     sagittal_mm: Array
     petzval_mm: Array
@@ -123,7 +120,7 @@ def curvature(
     height = rays.chief_height_mm.numpy()
     bend = petzval_curvature(scene.lens, wavelength_nm)
     petzval, radius = sagittal[0] + bend * height**2 / 2, math.inf if bend == 0 else 1 / bend
-    return Curvature(wavelength_nm, angles, height, tangential, sagittal, petzval, radius)
+    return Curvature(angles, height, wavelength_nm, tangential, sagittal, petzval, radius)
 
 
 def _crossing(place: Tensor, slope: Tensor) -> Array:
@@ -144,11 +141,10 @@ _SMALL_DEG = 1e-3  # the field whose image height gives the scale
 
 
 @dataclass(frozen=True)
-class Distortion(Result):
+class Distortion(OverField):
     """Distortion over F fields from the axis to the edge.
 
     Attributes:
-        field_deg, height_mm: [F] of the chief ray.
         scale_mm: image height per radian at the axis: the focal length for a distant object.
         error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
         best: the projection of least root mean square error over the whole field.
@@ -157,8 +153,6 @@ class Distortion(Result):
     """
 
     wavelength_nm: float
-    field_deg: Array
-    height_mm: Array
     scale_mm: float
     error_percent: dict[str, Array]
     best: str
@@ -184,7 +178,7 @@ def distortion(
     best = min(errors, key=lambda k: np.mean(errors[k] ** 2) if np.isfinite(errors[k]).all() else math.inf)
     reference = best if scene.wide else RECTILINEAR
     return Distortion(
-        wavelength_nm, angles, height[1:], float(height[0] / theta[0]), errors, best, reference,
+        angles, height[1:], wavelength_nm, float(height[0] / theta[0]), errors, best, reference,
         float(errors[reference][-1]), scene.edge.name if edge_deg is None else f"{edge_deg:g} degrees",
     )  # fmt: skip
 
@@ -200,11 +194,10 @@ _MARGIN = 0.08  # margin of the grid around the bundle, as film points beside th
 
 
 @dataclass(frozen=True)
-class Illumination(Result):
+class Illumination(OverField):
     """Light over F fields from the axis to the edge, one wavelength, glass without losses.
 
     Attributes:
-        field_deg, height_mm: [F] of the chief ray.
         relative: [F] film irradiance over that on the axis.
         unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
         passed: [F] share of the stop's light that no rim takes.
@@ -213,8 +206,6 @@ class Illumination(Result):
     """
 
     wavelength_nm: float
-    field_deg: Array
-    height_mm: Array
     relative: Array
     unvignetted: Array
     passed: Array
@@ -245,7 +236,7 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
     )
     cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
     relative, unvignetted, passed = (values for values, _ in shares(light).values())
-    return Illumination(nm, angles, height, relative, unvignetted, passed, cos4, spread)
+    return Illumination(angles, height, nm, relative, unvignetted, passed, cos4, spread)
 
 
 def _film_light(scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> FilmLight:

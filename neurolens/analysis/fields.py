@@ -40,6 +40,14 @@ class Result:
         return found
 
 
+@dataclass(frozen=True)
+class OverField(Result):
+    """Base of results over F fields, `field_deg` [F], whose chief rays meet the film at `height_mm` [F]."""
+
+    field_deg: Array
+    height_mm: Array
+
+
 DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
 
 # Half field from which a lens counts as a wide one: near objects then lie on a sphere, not on a plane.
@@ -129,7 +137,7 @@ class Scene:
     @property
     def image_radius_mm(self) -> float:
         """Radius of the lit film."""
-        return _image_radius_mm(self.lens)
+        return image_radius_mm(self.lens)[0]
 
     def image_axes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Tangential component, positive towards the image, and sagittal component of x and y on the film."""
@@ -239,11 +247,6 @@ class Scene:
         """Raise InputError for a pinhole, which has no focus."""
         if is_pinhole(self.lens):
             raise InputError(self.lens.path, "surfaces", "(a pinhole)", "a lens with power")
-
-
-@lru_cache(maxsize=16)
-def _image_radius_mm(lens: Lens) -> float:
-    return image_radius_mm(lens)[0]
 
 
 @lru_cache(maxsize=16)

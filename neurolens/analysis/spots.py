@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
-from neurolens.analysis.fields import Array, Result, Scene
+from neurolens.analysis.fields import Array, OverField, Result, Scene
 from neurolens.lens.paraxial import is_pinhole
 from neurolens.setting.pupil_nodes import LEVELS, converged
 
@@ -20,13 +20,12 @@ _SHIFTS = 21
 
 
 @dataclass(frozen=True)
-class Spots(Result):
+class Spots(OverField):
     """Spots of F fields, W wavelengths, P rays; shifts of the film are positive away from the lens.
 
     Attributes:
-        field_deg, height_mm: [F], of the chief ray of the first wavelength.
-        tangential_um, sagittal_um: [F, W, P] from that chief ray, NaN where blocked; rings over the stop, to draw.
-            The figures below are converged over what stop and rims leave open (`pupil_nodes`).
+        tangential_um, sagittal_um: [F, W, P] from the chief ray of the first wavelength, NaN where blocked; rings over
+            the stop, to draw. The figures below are converged over what stop and rims leave open (`pupil_nodes`).
         slope_tangential, slope_sagittal: [F, W, P], for spots at another focus.
         rms_um: [F] root mean square distance from the centroid, over all wavelengths, weighted by energy.
         geometric_um: [F] the largest distance from the centroid; NaN, as all sizes, where no ray passes.
@@ -38,9 +37,7 @@ class Spots(Result):
         spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
-    field_deg: Array
     wavelength_nm: Array
-    height_mm: Array
     tangential_um: Array
     sagittal_um: Array
     slope_tangential: Array
@@ -76,7 +73,7 @@ def spots(
     shifts = np.asarray(_span(best, n, waves[0]) if shift_mm is None else shift_mm, dtype=np.float64)
     slope_t, slope_s = rays.slopes
     return Spots(
-        np.array(rays.field_deg), np.array(waves), rays.chief_height_mm.numpy(),
+        np.array(rays.field_deg), rays.chief_height_mm.numpy(), np.array(waves),
         1000 * rays.tangential_mm.numpy(), 1000 * rays.sagittal_mm.numpy(), slope_t.numpy(), slope_s.numpy(),
         rms, geometric, by_wavelength, passed, n, airy,
         shifts, _rms_um(moments, shifts), best, best_rms, spread,
@@ -166,7 +163,7 @@ def _span(best: Array, f_number: float, wavelength_nm: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Fans(Result):
+class Fans(OverField):
     """Fans of F fields, W wavelengths and n pupil points.
 
     Attributes:
@@ -176,9 +173,7 @@ class Fans(Result):
             Both from the chief ray of the first wavelength; NaN where a rim blocks.
     """
 
-    field_deg: Array
     wavelength_nm: Array
-    height_mm: Array
     pupil: Array
     tangential_um: Array
     sagittal_um: Array
@@ -191,14 +186,14 @@ def fans(
     pattern = fan(n)
     rays = bundle(scene, field_deg, wavelength_nm, pattern)
     return Fans(
-        np.array(rays.field_deg), np.array(rays.wavelength_nm), rays.chief_height_mm.numpy(),
+        np.array(rays.field_deg), rays.chief_height_mm.numpy(), np.array(rays.wavelength_nm),
         pattern.tangential[:n].numpy(),
         1000 * rays.tangential_mm[..., :n].numpy(), 1000 * rays.sagittal_mm[..., n:].numpy(),
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Mtf(Result):
+class Mtf(OverField):
     """MTF of F fields at K frequencies.
 
     Attributes:
@@ -211,8 +206,6 @@ class Mtf(Result):
             (`pupil_nodes.converged`).
     """
 
-    field_deg: Array
-    height_mm: Array
     wavelength_nm: Array
     frequency_per_mm: Array
     tangential: Array

@@ -43,8 +43,7 @@ except ModuleNotFoundError:  # Windows
 _LARGEST_LIST, _CHECKSUM = 1 << 24, "checksum"
 _LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
 _ABANDONED_S = 24 * 3600.0  # nothing is written for a day
-_CLEANED_S = 3600.0  # folders of thousands of files are not searched at each one
-_cleaned: dict[Path, float] = {}
+_cleaned = set[Path]()  # folders of thousands of files are not searched at each one
 _FOLDER, _LOCK = "neurolens-", ".neurolens-lock"  # of temporary folders
 _DIGEST = 32  # bytes of SHA-256
 # Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
@@ -142,10 +141,10 @@ def _temporary(target: Path) -> Path:
 
 
 def _remove_abandoned(new: Path) -> None:
-    """Remove temporary files beside `new` that are much older, by the clock of that disk."""
-    if (looked := _cleaned.get(new.parent)) is not None and time.monotonic() - looked < _CLEANED_S:
+    """Remove temporary files beside `new` that are much older, by the clock of that disk, once a process."""
+    if new.parent in _cleaned:
         return
-    _cleaned[new.parent] = time.monotonic()
+    _cleaned.add(new.parent)
     with suppress(OSError):
         now = new.stat().st_mtime
         for entry in os.scandir(new.parent):
@@ -374,11 +373,8 @@ def read_rows(path: Path, what: str) -> list[Mapping[str, Any]]:
     data = read_bytes(path, _LARGEST_LIST, what)
     try:
         text = data.decode("utf-8-sig")
-        rows = (
-            json.loads(text)
-            if path.suffix.lower() == ".json"
-            else list(csv.DictReader(text.splitlines(), restkey="(one more)"))
-        )
+        table = csv.DictReader(text.splitlines(), restkey="(one more)")
+        rows = json.loads(text) if path.suffix.lower() == ".json" else list(table)
     except (ValueError, RecursionError, csv.Error) as error:
         raise InputError(path, "file", f"({error})", f"{what} as CSV or JSON") from None
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):

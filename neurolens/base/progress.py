@@ -81,15 +81,23 @@ class Progress:
         def report(fraction: float, seconds_left: float | None = None) -> None:
             share = min(max(float(fraction), 0.0), 1.0)
             elapsed = self._clock() - began
-            left = self._left(share, elapsed, expected) if seconds_left is None else seconds_left
-            self._show(self._line(name, share, elapsed, left))
+            left = seconds_left
+            if left is None and share > 0.02:  # from its pace, once it has one
+                left = elapsed * (1 / share - 1)
+            elif left is None and expected is not None:
+                left = max(expected * self._pace() - elapsed, 0.0)
+            to_go = "" if left is None else f", {duration(left)} left{self._total(left)}"
+            self._show(f"{name}: {100 * share:3.0f}%, {duration(elapsed)}{to_go}")
 
         if self._terminal():
             report(0.0)
         try:
             yield report
         except BaseException:
-            self._end_line()
+            if self._open_line and self._output is not None:
+                self._output.write("\n")
+                self._output.flush()
+                self._open_line = False
             raise
         taken = self._clock() - began
         if expected is not None:
@@ -101,21 +109,9 @@ class Progress:
         """Print a permanent line."""
         self._show(text, last=True)
 
-    def _left(self, share: float, elapsed: float, expected: float | None) -> float | None:
-        """Seconds left of a stage: from its pace once it has one, from the plan before."""
-        if share > 0.02:
-            return elapsed * (1 / share - 1)
-        return None if expected is None else max(expected * self._pace() - elapsed, 0.0)
-
     def _pace(self) -> float:
         """Measured over expected seconds of the finished stages; a few short stages predict long ones poorly."""
         return (self._taken_s + _TRUST_S) / (self._expected_s + _TRUST_S)
-
-    def _line(self, name: str, share: float, elapsed: float, left: float | None) -> str:
-        text = f"{name}: {100 * share:3.0f}%, {duration(elapsed)}"
-        if left is None:
-            return text
-        return text + f", {duration(left)} left{self._total(left)}"
 
     def _total(self, left: float) -> str:
         """The time left of the whole run, where more stages wait."""
@@ -123,15 +119,16 @@ class Progress:
             return ""
         return f" (in all {duration(left + self._pace() * sum(self._waiting.values()))} left)"
 
+    @property
     def _output(self) -> TextIO | None:
         return None if self._quiet else self._stream or sys.stderr
 
     def _terminal(self) -> bool:
-        stream = self._output()
+        stream = self._output
         return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
     def _show(self, text: str, last: bool = False) -> None:
-        stream = self._output()
+        stream = self._output
         if stream is None:
             return
         now, text = self._clock(), printable(text)
@@ -147,10 +144,3 @@ class Progress:
             return
         self._printed_at = now
         stream.flush()
-
-    def _end_line(self) -> None:
-        stream = self._output()
-        if self._open_line and stream is not None:
-            stream.write("\n")
-            stream.flush()
-            self._open_line = False

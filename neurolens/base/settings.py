@@ -145,9 +145,9 @@ def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -
     return convert
 
 
-def between(low: float, high: float, unit: str) -> Callable[[str], float]:
+def between(low: float, high: float, unit: str, kind: Callable[[str], Any] = float) -> Callable[[str], Any]:
     """Type of an argument that is a number from `low` to `high`."""
-    return _within(float, (low, high), unit)
+    return number(kind, lambda value: low <= value <= high, _expected(kind, (low, high), unit))
 
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
@@ -161,10 +161,6 @@ def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
     """Type of an argument that is a number above 0; "inf" only if `infinite`."""
     expected = f"{unit} above 0{', or inf' if infinite else ''}"
     return number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
-
-
-def _within(kind: Any, bounds: tuple[float, float], unit: str) -> Callable[[str], Any]:
-    return number(kind, lambda value: bounds[0] <= value <= bounds[1], _expected(kind, bounds, unit))
 
 
 def _expected(kind: Any, bounds: tuple[float, float], unit: str) -> str:
@@ -235,7 +231,7 @@ def _details(
         unit = _UNIT.fullmatch(f.name)
         details["metavar"] = option.metavar or (unit[2].upper() if unit else _PLACEHOLDERS[kind])
         bounds = None if option.kind else option.within
-        details["type"] = _within(kind, bounds, option.unit) if bounds else option.kind or kind
+        details["type"] = between(*bounds, option.unit, kind) if bounds else option.kind or kind
     if option.nargs is not None:
         details["nargs"] = option.nargs
     elif many:

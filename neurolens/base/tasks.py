@@ -261,6 +261,13 @@ def failure(error: Exception) -> Failed:
     return Failed(f"{said} ({os.path.basename(frame.filename)}:{frame.lineno})")
 
 
+def _outcome(work: Callable[..., Any], args: Any, named: Any) -> Any:
+    try:
+        return work(*args, **named)
+    except Exception as error:
+        return failure(error)
+
+
 def answer_of(outcome: Any) -> Any:
     """The answer that another process has sent, or NeurolensError with the reason of its failure."""
     if isinstance(outcome, Failed):
@@ -321,11 +328,7 @@ def _serve(pipe: Any, work: Callable[..., Any], number: int, jobs: int, parent: 
     with suppress(EOFError):
         while True:
             args, named = pipe.recv()
-            try:
-                outcome = work(*args, **named)
-            except Exception as error:
-                outcome = failure(error)
-            pipe.send(outcome)
+            pipe.send(_outcome(work, args, named))
 
 
 def _end_with(parent: int) -> None:
@@ -340,11 +343,7 @@ def _work(pipe: Any, work: Callable[..., Any], args: Any, named: Any) -> None:
     end_at_once()
     threading.Thread(target=_end_unread, args=(pipe.fileno(),), daemon=True).start()
     with suppress(BrokenPipeError):  # the process that asked was killed
-        try:
-            outcome = work(*args, **named)
-        except Exception as error:
-            outcome = failure(error)
-        pipe.send(outcome)
+        pipe.send(_outcome(work, args, named))
 
 
 def _end_unread(pipe: int) -> None:

@@ -24,9 +24,12 @@ from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import RAY
 
 Array = NDArray[np.float64]
+Degrees = tuple[int, int, int]
+Pair = tuple[float, float]
 
-# Degrees in film and pupil point of the terms without a wavelength, linear in the wavelengths, and quadratic.
-_DEGREES = (7, 3, 1)
+# Degrees in film and pupil point of the terms without a wavelength, linear in the wavelengths, and quadratic; the
+# higher ones serve where the lower do not keep film points within `_WORST_MM`.
+_DEGREES = ((5, 3, 1), (7, 3, 1))
 _LIGHT_DEGREE, _TINT = 4, 8  # of the ratio of light: in film and pupil point, and in the wavelength alone
 _STEPS, _CLOSE = 5, 1e-4  # of Newton's method; how well a shift must keep the scene ray, mm
 _FAR_MM = 50.0  # from the lens, where an error of a direction counts as an error of the position
@@ -75,23 +78,27 @@ def fit_shift(
     waves = (1000 / np.stack([rays[4], companion_nm])) ** 2
     middle, spread = 0.5 * float(waves.min() + waves.max()), 0.5 * float(np.ptp(waves))
     scale = np.repeat([np.abs(rays[:2]).max(), np.abs(rays[2:4]).max()], 2)
-    weights, tint, left = _terms(np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread]), values)
+    columns = np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread])
+    for degrees in _DEGREES:
+        weights, tint, left = _terms(columns, values, degrees)
+        if left <= _WORST_MM:
+            break
     if left > max(_WORST_MM, _WORST * float(np.sqrt(np.mean(np.sum(values[:2] ** 2, axis=0))))):
         return None
     x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
-    graphs = _shift_graphs(weights, tint, scale, (middle, spread), (x, y), film_mm)
+    graphs = _shift_graphs(degrees, weights, tint, scale, (middle, spread), (x, y), film_mm)
     on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
     surely, inside = float(np.quantile(margin, _SURELY)), margin[found.kept]
     lost = on_film & ~found.passed[found.kept] & (inside > surely)
     away = ((waves[1] - waves[0]) * np.where((rays[:2] * rays[2:4]).sum(axis=0) <= 0, -1, 1))[lost]
-    slopes = (_BEYOND * float(np.max(inside[lost] / way, initial=0, where=way > 0)) for way in (away, -away))
-    return Shift(*graphs, (x, y), (surely, *slopes))
+    near, far = (_BEYOND * float(np.max(inside[lost] / way, initial=0, where=way > 0)) for way in (away, -away))
+    return Shift(*graphs, (x, y), (surely, near, far))
 
 
-def _terms(columns: Array, values: Array) -> tuple[Array, Array, float]:
+def _terms(columns: Array, values: Array, degrees: Degrees) -> tuple[Array, Array, float]:
     """Fit the values [5, N] of `_Solved` by variables [6, N]: weights [5, M] of the monomials, coefficients of the
     light by wavelength, and the RMS error of the film point on the half of the rays that were not fitted."""
-    exponents, parity = _monomials()
+    exponents, parity = _monomials(degrees)
     products = np.stack([np.prod(columns.T**powers, axis=1) for powers in exponents]) * (columns[5] - columns[4])
     tints = np.stack([columns[5] ** k - columns[4] ** k for k in range(1, _TINT + 1)])
     train = np.arange(values.shape[1]) % 2 == 0
@@ -109,10 +116,10 @@ def _terms(columns: Array, values: Array) -> tuple[Array, Array, float]:
 
 
 def _shift_graphs(
-    weights: Array, tint: Array, scale: Array, waves: tuple[float, float], *limits_mm: tuple[float, float]
+    degrees: Degrees, weights: Array, tint: Array, scale: Array, waves: Pair, *limits_mm: Pair
 ) -> tuple[Graph, Graph]:
     """The graphs of `Shift`, for what `_terms` finds in variables so scaled, the reach and the film."""
-    exponents, of_hero, g = _monomials()[0], Graph(), Graph()
+    exponents, of_hero, g = _monomials(degrees)[0], Graph(), Graph()
 
     def variable(g: Graph, name: str) -> Value:
         inverse = 1000.0 / g.input(name)
@@ -123,7 +130,7 @@ def _shift_graphs(
     for name, rows in (("film_shift", slice(0, 2)), ("pupil_shift", slice(2, 4)), ("tint", slice(4, 5))):
         used = weights[rows].any(axis=0)
         each, place = np.unique(exponents[used][:, :5], axis=0, return_inverse=True)
-        powers = np.zeros((1 if name == "tint" else len(_DEGREES), len(weights[rows]), len(each)))
+        powers = np.zeros((1 if name == "tint" else len(degrees), len(weights[rows]), len(each)))
         powers[exponents[used][:, 5], :, place.ravel()] = weights[rows][:, used].T  # of the companion's variable
         of_hero.outputs[name] = of_hero.polynomial(each, powers.reshape(-1, len(each)), variables)
     hero, other = (variable(g, name) for name in ("wavelength_nm", "companion_nm"))
@@ -195,16 +202,16 @@ def shifted(g: Graph, shift: Shift) -> Value:
 
 
 @cache
-def _monomials() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _monomials(degrees: Degrees) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Exponents [M, 6] of film x, y, pupil x, y, hero and companion; and [M] 0 where odd in x alone, 1 where odd in y
     alone, as shifts are, 2 where odd in neither, as light is.
 
     Lenses with two planes of symmetry have no others, round or with cylinders.
     """
     found, parity = [], []
-    for *point, hero, other in product(*[range(_DEGREES[0] + 1)] * 4, *[range(len(_DEGREES))] * 2):
+    for *point, hero, other in product(*[range(degrees[0] + 1)] * 4, *[range(len(degrees))] * 2):
         order, x, y = hero + other, (point[0] + point[2]) % 2, (point[1] + point[3]) % 2
-        shifts = x + y == 1 and order < len(_DEGREES) and sum(point) <= _DEGREES[order]
+        shifts = x + y == 1 and order < len(degrees) and sum(point) <= degrees[order]
         if shifts or (not (x or y or order) and 0 < sum(point) <= _LIGHT_DEGREE):
             found.append((*point, hero, other))
             parity.append(y if shifts else 2)

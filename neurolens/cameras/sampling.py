@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,7 @@ from neurolens.trace.shapes import sag_mm
 from neurolens.trace.surfaces import meet_front
 
 _BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
-_ANGLES, _ROOM = (
-    24,
-    1.01,
-)  # intervals of angles of light at a lens's front; how far it may lie beyond the rays that tell
+_ANGLES, _LEVELS, _ROOM = 24, 5, 1.01  # see `FrontDiscs`; by which its discs are widened
 LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
 
@@ -31,11 +29,11 @@ class FrontDiscs:
     """Discs on a lens's front surface at which light from the scene is aimed, by its angle to the axis.
 
     Light of a direction that reaches the film crosses a part of the front surface that moves with that angle. What
-    comes from a near scene point has directions far apart: it is aimed at a disc that holds all light of the film.
+    comes from a scene point has directions as far apart as the front is wide as seen from there.
 
     Attributes:
-        width_rad: of the equal intervals of the angle, from 0. discs: [B, 2] of each interval with its neighbours,
-            centre along the azimuth of the direction and radius (mm).
+        width_rad: of the equal intervals of the angle, from 0. discs: [L, B, 2] of each interval with the 2^l next on
+            either side, centre along the azimuth of the direction and radius (mm).
         far_mm: radius of all light, about the axis. reach_mm: from the vertex to its farthest point on the surface.
     """
 
@@ -51,23 +49,28 @@ class FrontDiscs:
         side = np.hypot(leaving[3], leaving[4])
         angle, azimuth = np.arctan2(side, -leaving[5]), (leaving[3] + 1j * leaving[4]) / np.maximum(side, 1e-12)
         width, place, far = angle.max() / _ANGLES, (x + 1j * y) * azimuth.conj(), float(np.hypot(x, y).max())
-        row, discs = np.minimum(angle / width, _ANGLES - 1).astype(np.intp), np.full((_ANGLES, 2), [0.0, far])
-        for k in np.unique(row):
-            near = place[np.abs(row - k) <= 1]
-            discs[k, 0] = (near.real.min() + near.real.max()) / 2 if k else 0.0  # the axis has no azimuth
-            discs[k, 1] = np.abs(near - discs[k, 0]).max()
+        row = np.minimum(angle / width, _ANGLES - 1).astype(np.intp)
+        discs = np.full((_LEVELS, _ANGLES, 2), [0.0, far])
+        for level, k in product(range(_LEVELS), np.unique(row)):
+            near = place[np.abs(row - k) <= 2**level]
+            discs[level, k, 0] = (near.real.min() + near.real.max()) / 2 if k else 0.0  # the axis has no azimuth
+            discs[level, k, 1] = np.abs(near - discs[level, k, 0]).max()
         depth = 0.0 if shape is None else float(sag_mm(shape, far, 0.0, held=True))
         return FrontDiscs(float(width), discs * [1.0, _ROOM], _ROOM * far, _ROOM * math.hypot(far, depth))
 
     def aim(self, point_mm: NDArray[np.float64], square: FloatArray) -> tuple[NDArray[np.float64], ...]:
         """x, y (mm) and the area (mm^2) per unit of the square, [N] each, for scene points [3, N] (mm, lens frame)."""
+        point_mm = np.where(np.isfinite(point_mm).all(0), point_mm, 0.0)
         side, distance = np.hypot(point_mm[0], point_mm[1]), np.sqrt((point_mm**2).sum(0))
-        angle = np.nan_to_num(np.arctan2(side, -point_mm[2]))
+        angle = np.arctan2(side, -point_mm[2])
         # Directions from the surface differ from that of the vertex by no more than this, and their azimuths.
         apart = np.arcsin(np.minimum(self.reach_mm / np.maximum(distance, 1e-9), 1))
-        turn = np.minimum(np.sin(apart) / np.maximum(np.sin(angle), 1e-12), 2.0)
-        centre, radius = self.discs[np.minimum(angle / self.width_rad, _ANGLES - 1).astype(np.intp)].T
-        some = apart <= self.width_rad
+        turn = np.sin(apart) / np.maximum(np.sin(angle), 1e-12)
+        turn = np.where((turn < 1) & (apart < np.pi / 2), math.sqrt(2) * turn, 2.0)  # at least the chord of that angle
+        level = np.ceil(np.log2(np.maximum(apart / self.width_rad, 1))).astype(np.intp)
+        interval = np.minimum(angle / self.width_rad, _ANGLES - 1).astype(np.intp)
+        centre, radius = self.discs[np.minimum(level, _LEVELS - 1), interval].T
+        some = (level < _LEVELS) & (radius + np.abs(centre) * turn < self.far_mm)
         centre, radius = np.where(some, centre, 0.0), np.where(some, radius + np.abs(centre) * turn, self.far_mm)
         azimuth = np.where(side > 0, (point_mm[0] + 1j * point_mm[1]) / np.where(side > 0, side, 1), 1.0)
         u, v = concentric_disk(square).astype(np.float64)

@@ -186,11 +186,8 @@ examples:
         """Refuse options that exclude each other and files that cannot be written; raises InputError."""
         if self.frames.frames is not None and self.out is None:
             self.refuse("--frames", f"({len(self.frames.frames)})", "-o beside it")
-        reflections = self.settings.most_reflections
-        if not (self.settings.photons or self.settings.glare) and reflections not in (
-            FlareSettings.most_reflections,
-            2,
-        ):
+        by_chance, reflections = self.settings.photons or self.settings.glare, self.settings.most_reflections
+        if not by_chance and reflections not in (FlareSettings.most_reflections, 2):
             self.refuse("--reflections", reflections, "2, or --photons or --glare beside it, which take more")
         if self.out is not None:
             Files.of(self.out)

@@ -7,9 +7,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neurolens import __version__
+from neurolens import handover as standards
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
@@ -20,9 +21,6 @@ from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import Maker, StMap, TracedFrame
 from neurolens.render.pictures import read_channels, standard_attributes
 from neurolens.render.stmap import illumination_map
-
-if TYPE_CHECKING:
-    from neurolens.handover import Handed, LensfunEntry
 
 _KINDS = "opencv", "opencv-rational", "kannala-brandt", "f-theta"
 
@@ -57,15 +55,13 @@ examples:
 
     def run(self) -> int:
         """Trace the fields of all frames, write the maps, then what is fitted to them."""
-        from neurolens.handover import Handed, Pinhole  # fails here where scipy is missing, before the work
-
         progress = self.progress()
         frames, plates = self.traced(progress)
         self.out.mkdir(parents=True, exist_ok=True)
         data = self.data_of(frames, plates)
-        shot = Handed(
+        shot = standards.Handed(
             standard_attributes(frames[0].camera.settings), __version__, (self.fps.numerator, self.fps.denominator),
-            tuple(Pinhole.of(f.number, f.fields[""], f.camera.settings, f.focus_m) for f in frames), plates,
+            tuple(standards.Pinhole.of(f.number, f.fields[""], f.camera.settings, f.focus_m) for f in frames), plates,
             tuple(name for name in frames[0].fields if name),
         )  # fmt: skip
         writer = _Writer(self, frames, shot)
@@ -77,14 +73,18 @@ examples:
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
         """The maps of `stmap`, light as a grey picture with alpha, which all programs multiply by, and NVIDIA's."""
-        from neurolens.handover import enter_map, exit_map
 
         def light(*given: Any) -> dict[str, Any]:
             grey = illumination_map(*given)["Y"]
             return {**dict.fromkeys("RGB", grey), "A": 0 * grey + 1}
 
         maps = super().jobs(frame)[:-1]
-        return [*maps, ("illumination", "", light), ("enter", "", enter_map), ("exit", "", exit_map)]
+        return [
+            *maps,
+            ("illumination", "", light),
+            ("enter", "", standards.enter_map),
+            ("exit", "", standards.exit_map),
+        ]
 
 
 @dataclass(frozen=True)
@@ -98,15 +98,13 @@ class _Writer:
 
     command: Handover
     frames: list[TracedFrame]
-    shot: Handed
+    shot: standards.Handed
     left: dict[str, float] = field(default_factory=dict)
     fits: dict[str, dict[str, Any]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def files(self, data: dict[str, Any], progress: Progress) -> list[str]:
         """Write all; their names."""
-        from neurolens.handover import LENSFUN_TYPES, exit_residual_px
-
         names, command, shot = [], self.command, self.shot
         with progress.stage("fit projections, OpenTrackIO") as report:
             for k in range(len(self.frames)):
@@ -114,11 +112,11 @@ class _Writer:
                 report((k + 1) / len(self.frames))
         entries = self._entries(progress)
         exits, _ = read_channels(command.out / f"shot.exit{shot.frames[0].name}.exr", "RG")
-        self._worse("exit_px", exit_residual_px(self.frames[0].fields[""], shot.plates, exits))
+        self._worse("exit_px", standards.exit_residual_px(self.frames[0].fields[""], shot.plates, exits))
         self._worse("maps_px", max(row["there_and_back_px"] for row in data["frames"]))
         values = {"shot": shot, "about": f"{shot.lens} ({command.camera}), neurolens {__version__}", "entries": entries}
         values |= {"left": self.left, "fits": self.fits, "notes": self.notes, "projection": command.projection}
-        values |= {"parallax": data["frames"][0]["parallax"], "types": LENSFUN_TYPES}
+        values |= {"parallax": data["frames"][0]["parallax"], "types": standards.LENSFUN_TYPES}
         for name in ("shot.usda", "shot.nk", "shot.blender.py", "shot.lensfun.xml", "README.md"):
             if entries or name != "shot.lensfun.xml":
                 template = f"handover.{name.removeprefix('shot.')}.jinja"
@@ -128,22 +126,22 @@ class _Writer:
 
     def _of_frame(self, k: int) -> list[str]:
         """Write the sample of OpenTrackIO and the projections of a frame; their names."""
-        from neurolens.handover import fitted_projection, opentrackio_sample, write_projection
-
         command, pinhole, traced = self.command, self.shot.frames[k], self.frames[k].fields[""]
-        text, left_px, share = opentrackio_sample(traced, pinhole, self.shot)
+        text, left_px, share = standards.opentrackio_sample(traced, pinhole, self.shot)
         atomic_write_text(path := command.out / f"shot.opentrackio{pinhole.name}.json", text)
         self._worse("opentrackio_px", left_px)
         self._worse("light_share", share)
         names = [str(path)]
         for kind in _KINDS:
             try:
-                fitted, left, data = fitted_projection(kind, traced, command.picture, command.film, str(command.camera))
+                fitted, left, data = standards.fitted_projection(
+                    kind, traced, command.picture, command.film, str(command.camera)
+                )
             except InputError as error:
                 note = f"shot.{kind}: got {error.value}, expected {error.expected}"
                 self.notes.extend([note] if note not in self.notes else [])
                 continue
-            names += write_projection(command.out / f"shot.{kind}{pinhole.name}", fitted, data)
+            names += standards.write_projection(command.out / f"shot.{kind}{pinhole.name}", fitted, data)
             row = {"worst_px": left.worst_px, "rms_px": left.rms_px, "turns_back_at_deg": data["turns_back_at_deg"]}
             if left.worst_px >= self.fits.get(kind, row)["worst_px"]:
                 self.fits[kind] = row
@@ -153,17 +151,17 @@ class _Writer:
         if value is not None:
             self.left[name] = max(value, self.left.get(name, 0.0))
 
-    def _entries(self, progress: Progress) -> list[LensfunEntry]:
+    def _entries(self, progress: Progress) -> list[standards.LensfunEntry]:
         """The entries of lensfun's profile, by focal length; none of a lens with cylinders."""
-        from neurolens.handover import MOST_ENTRIES, lensfun_entry
-
         if self.shot.frames[0].squeeze != 1:
             self.notes.append("shot.lensfun.xml: lensfun knows no anamorphic lens")
             return []
         command, states, found = self.command, self.command.states(), list[Any]()
         by_focal = dict(sorted((float(f"{p.focal_mm:.5g}"), k) for k, p in enumerate(self.shot.frames)))
         rows = list(by_focal.values())
-        chosen = sorted({round(n * (len(rows) - 1) / (MOST_ENTRIES - 1)) for n in range(MOST_ENTRIES)})
+        chosen = sorted(
+            {round(n * (len(rows) - 1) / (standards.MOST_ENTRIES - 1)) for n in range(standards.MOST_ENTRIES)}
+        )
         red_blue = command.wavelengths[0], command.wavelengths[2]
         with progress.stage("fit lensfun's profile") as report:
             for n in chosen:
@@ -173,7 +171,7 @@ class _Writer:
                 def at_stop(f_number: float | None, state: Any = state) -> Camera:
                     return command.make(replace(state, f_number=f_number), progress)[0]
 
-                entry = lensfun_entry(frame.fields[""], frame.camera, plane_m, self.shot, red_blue, at_stop)
+                entry = standards.lensfun_entry(frame.fields[""], frame.camera, plane_m, self.shot, red_blue, at_stop)
                 found.append(entry)
                 self._worse("lensfun_px", entry.distortion_px)
                 self._worse("colour_px", entry.colour_px)

@@ -15,7 +15,7 @@ from neurolens.cli import arguments as cli
 from neurolens.frames import Files
 from neurolens.lens.shot import Dispersion, Shot
 from neurolens.mitsuba import load_scene, render
-from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, libraries
+from neurolens.mitsuba.sensor import FILM_WIDTH_MM, libraries
 from neurolens.render.pictures import standard_attributes, write_exr, write_png
 
 
@@ -53,7 +53,7 @@ examples:
         width, height = (int(v) for v in scene.sensors()[0].film().size())
         progress = self.progress()
         film = self.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width)
-        shot = self.state.shot(film, wavelength_nm=LIGHT_NM, dispersion=self.dispersion)
+        shot = self.state.shot(film, dispersion=self.dispersion)
         camera = cli.camera(self.camera, shot, progress)
         began = time.perf_counter()
         with progress.stage(f"render {self.scene}, {camera.name}") as report:

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
-from neurolens.defocus.gather import LIGHT_NM, RayTable, channel_wavelengths, turned
-from neurolens.defocus.plate import FloatArray, Plate, PlatePinhole
+from neurolens.defocus.plate import LIGHT_NM, FloatArray, Plate, PlatePinhole, RayTable, channel_wavelengths, turned
 from neurolens.flare.canvas import LOST, draw_edges, edges_of
 
 Array = NDArray[np.float64]

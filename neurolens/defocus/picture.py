@@ -1,4 +1,9 @@
-"""A plate as a lens would have photographed it: all of its pixels gathered, and its highlights spread as clean discs.
+"""A plate as a lens would have photographed it: its pixels gathered, and its highlights spread as clean discs.
+
+The picture gets the camera's blur, distortion, vignetting and colour fringes. The rays of a pixel lie between those of
+the four nodes around it. What a ray meets is found in the plate's depth (`gather.c`). A pixel takes the more samples,
+the wider the lens blurs there, and weighs them so that even light stays even: the mean of radiance by weight, times the
+mean weight of the whole pupil.
 
 Highlights are pixels that are far brighter than their surroundings. Few of a pixel's samples would find them, which is
 noise. Their light above that of the surroundings is taken out of the plate and spread by the lens's own kernels, one
@@ -8,22 +13,31 @@ out.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
+from neurolens.base.tasks import in_order
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
-from neurolens.defocus.gather import Gathered, compiled, gather, radius_px, spread_over
 from neurolens.defocus.kernels import LARGEST, kernel_at
-from neurolens.defocus.plate import FloatArray, Plate
+from neurolens.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable
+from neurolens.graph.compiler import c_source, load_compiled
+from neurolens.render.sampler import sobol
 
+_SET = 512  # points of the pupil
+_FEW = 128  # of them, to measure blur
+_LEAST, _A_PIXEL = 8, 1  # samples of a pixel, and more for each pixel of the blur's radius: FLIP hardly gains by others
+_CLEAR = 0.01  # of its inverse depth, by which what hides a point is nearer
 _SAID = 0.002  # share of the light that was made up, from which it is said
 _EDGE = 9  # points of each side of the film that are tried
 _WINDOW = 33  # pixels about which surroundings are meant
@@ -36,61 +50,145 @@ _SAME = 0.01  # of inverse depth, within which two layers show the same thing
 _CELLS, _COLOURS = 24, 2
 
 
-def defocus(
-    plate: Plate, camera: Camera, samples: int = 64, threads: int = 1, highlights: bool = True,
-    progress: Progress | None = None,
+@dataclass(frozen=True)
+class Gathered:
+    """The picture [H, W, 3] that a camera takes of a plate, and the shares of its light that the plate did not have:
+    `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs."""
+
+    rgb: FloatArray
+    filled: float
+    beyond: float
+    highlights: int = 0
+
+
+class _Table(ctypes.Structure):
+    _fields_ = [  # noqa: RUF012
+        *((name, ctypes.c_int) for name in ("across", "down", "samples", "channels", "stride")),
+        *((name, ctypes.c_float) for name in ("pitch_x", "pitch_y")),
+        *((name, ctypes.c_void_p) for name in ("rays", "jitter")),
+        ("above", ctypes.c_float),
+    ]
+
+
+@cache
+def compiled() -> ctypes.CDLL:
+    defined = {"NUMBERS": NUMBERS, "WEIGHT": NUMBERS - 1, "FINEST": FINEST.bit_length() - 1, "CLEAR": f"{_CLEAR}f"}
+    library = load_compiled(c_source("defocus/gather.c", **defined))
+    whole, pointer = ctypes.c_int, ctypes.c_void_p
+    library.splat.argtypes = [pointer, whole, pointer, whole, pointer, *[whole] * 2, pointer, *[whole] * 2, pointer]
+    library.splat.restype = None
+    library.gather.argtypes = [pointer, whole, _Table, whole, whole, whole, pointer, pointer]
+    library.gather.restype = None
+    return library
+
+
+def _points(count: int, numbers: int) -> FloatArray:
+    """Points [numbers, count] of the unit cube, evenly."""
+    return ((sobol(count, numbers) + 2.0**31 / count) / 2.0**32).astype(np.float32)
+
+
+def spread_over(camera: Camera, plate: Plate) -> NDArray[np.float64]:
+    """The variance of the places at which rays of each node [rows, columns, 3] see a point: of a, 2 covariances, of b;
+    summed over x and y, so that its root is the radius of an even disc over sqrt(2)."""
+    points, found = _points(_FEW, 3), []
+    table = RayTable(camera, plate, points[:2], points[2])
+    for j in range(table.cells[1] + 1):
+        rays = table.row(j)[..., :NUMBERS].astype(np.float64)
+        weight = rays[..., 4:] / np.maximum(rays[..., 4:].sum(axis=1, keepdims=True), 1e-30)
+        a, b = (part - (weight * part).sum(axis=1, keepdims=True) for part in (rays[..., :2], rays[..., 2:4]))
+        found.append(np.stack([(weight * term).sum(axis=(1, 2)) for term in (a * a, 2 * a * b, b * b)], axis=1))
+    return np.stack(found)
+
+
+def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float64]:
+    """Radii in pixels of the discs of things of inverse depth w."""
+    a, ab, b = np.moveaxis(spread, -1, 0)
+    return np.sqrt(np.maximum(2 * (a + (ab + b * w) * w), 0))
+
+
+def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[np.uint8]:
+    """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel."""
+    width, height = plate.size
+    places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
+    nodes = [
+        np.minimum((p / n * (k - 1)).round().astype(int), k - 1)
+        for p, n, k in zip(places, (height, width), spread.shape[:2], strict=True)
+    ]
+    here = spread[np.ix_(*nodes)]
+    widest = np.zeros(here.shape[:2])
+    for layer in plate.layers:
+        low, high = np.zeros(widest.shape), np.full(widest.shape, max(layer.nearest, 0.0))
+        for _ in range(2):
+            reach = np.maximum(radius_px(here, low), radius_px(here, high))
+            level = np.clip(np.ceil(np.log2(np.maximum(reach, 1) / FINEST)), 0, len(layer.bounds) - 1).astype(int)
+            for k in np.unique(level):
+                bounds = layer.bounds[k]
+                cell = FINEST << int(k)
+                rows, columns = (
+                    np.clip(((p + border) / cell).astype(int), 0, n - 1)
+                    for p, border, n in zip(places, plate.border_px[::-1], bounds.shape, strict=False)
+                )
+                least, most = _beside(bounds[..., 0], np.minimum), _beside(bounds[..., 1], np.maximum)
+                inside = level == k
+                low = np.where(inside, np.maximum(least[np.ix_(rows, columns)], 0), low)
+                high = np.where(inside, np.maximum(most[np.ix_(rows, columns)], 0), high)
+        widest = np.maximum(widest, np.maximum(radius_px(here, low), radius_px(here, high)))
+    wanted = np.ceil(np.log2(np.clip(_LEAST / 2 + _A_PIXEL * widest, _LEAST, samples))).astype(np.uint8)
+    return np.ascontiguousarray(wanted.repeat(FINEST, 0).repeat(FINEST, 1)[:height, :width])
+
+
+def _beside(values: FloatArray, by: np.ufunc) -> FloatArray:
+    """The least or largest value of each cell and its eight neighbours."""
+    padded = np.pad(values, 1, mode="edge")
+    rows = by(by(padded[:-2], padded[1:-1]), padded[2:])
+    return by(by(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+
+
+def gather(
+    plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = 64, threads: int = 1,
+    report: Callable[[float], None] = lambda _: None,
 ) -> Gathered:  # fmt: skip
-    """The picture that a camera takes of a plate.
+    """The picture that a camera takes of a plate by at most `samples` a pixel; `spread`: `spread_over` of both."""
+    width, height = plate.size
+    points = _points(_SET, 5)
+    jitter = np.ascontiguousarray(points[2:4].T)
+    table = RayTable(camera, plate, points[:2], points[4])
+    (across, down), structs, sizes = table.cells, plate.structs(), _sizes(plate, spread, samples)
+    rgb = np.empty((height, width, 3), np.float32)
+    lost = np.zeros(3)
+    edges = [round(j * height / down) for j in range(down + 1)]
 
-    Args:
-        samples: of a pixel, at most, 8 to 512; rounded up to a power of two.
-        highlights: spread pixels that are far brighter than their surroundings as discs, without noise.
+    def tasks() -> Iterator[tuple[int, FloatArray]]:
+        before = table.row(0)
+        for j in range(down):
+            after = table.row(j + 1)
+            yield j, np.stack([before, after])
+            before = after
 
-    Warns:
-        NeurolensWarning: light that the plate does not have.
+    def band(task: tuple[int, FloatArray]) -> NDArray[np.float64]:
+        j, rays = task
+        first, stop = edges[j], edges[j + 1]
+        sums = np.empty((stop - first, width, 8), np.float32)
+        struct = _Table(
+            across + 1, 2, _SET, len(table.nm), rays.shape[3], width / across, height / down,
+            rays.ctypes.data, jitter.ctypes.data, first - j * height / down,
+        )  # fmt: skip
+        part = sizes[first:stop]
+        compiled().gather(structs, len(structs), struct, width, first, stop - first, part.ctypes.data, sums.ctypes.data)
+        weights = rays[..., NUMBERS - 1 : len(table.nm) * NUMBERS : NUMBERS].mean(axis=2, dtype=np.float64)
+        weights = weights[..., [1, 0, 2]] if len(table.nm) > 1 else weights
+        x, share = (np.arange(width) + 0.5) / width * across, (np.arange(first, stop) + 0.5) / height * down - j
+        above, below = (np.stack([np.interp(x, np.arange(across + 1), c) for c in row.T], 1) for row in weights)
+        light = above + (below - above) * share[:, None, None]
+        weight = sums[..., 3:6]
+        rgb[first:stop] = light * np.divide(sums[..., :3], weight, out=np.zeros_like(weight), where=weight > 0)
+        return sums[..., [4, 6, 7]].sum(axis=(0, 1), dtype=np.float64)
 
-    Raises:
-        InputError: a camera that sees 85 degrees from its axis or more; no C compiler.
-    """
-    progress = progress or Progress(quiet=True)
-    check_field(camera)
-    spread = spread_over(camera, plate)
-    taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
-    with progress.stage(f"blur by {camera.name}") as report:
-        found = gather(plate, camera, spread, 1 << (samples - 1).bit_length(), threads, report)
-    for some in taken:
-        if len(some.radius_px):
-            with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                spread_highlights(found.rgb, some, plate, camera, report)
-    _say(found, len(plate.layers))
-    return replace(found, highlights=sum(len(some.radius_px) for some in taken))
-
-
-def _say(found: Gathered, layers: int) -> None:
-    if found.filled > _SAID:
-        more = "" if layers > 1 else "; layers behind (--behind, or a deep file) have it"
-        warn(f"{100 * found.filled:.1f}% of the light comes from behind edges, which the plate does not show: what is "
-             f"beside them was put there{more}")  # fmt: skip
-    if found.beyond > _SAID:
-        warn(f"{100 * found.beyond:.1f}% of the light comes from beyond the plate's borders, whose pixels were "
-             "repeated: render it with overscan")  # fmt: skip
-
-
-def check_field(camera: Camera) -> None:
-    """Refuse (InputError) a camera that a plate, which is a plane, cannot serve."""
-    width, height = camera.film_mm
-    side = np.linspace(-0.5, 0.5, _EDGE)
-    film = np.stack(np.meshgrid(side * width, side * height), 0).reshape(2, -1).astype(np.float32)
-    low, high = camera.wavelength_nm or (400.0, 700.0)
-    nm = np.full(film.shape[1], min(max(550.0, low), high), np.float32)
-    rays = camera.sample(film, np.full(film.shape, 0.5, np.float32), nm)
-    passed = rays.status == 0
-    if not passed.any():
-        raise InputError(camera.name, "film", f"({width:g} x {height:g} mm)", "a film on which light arrives")
-    widest = math.degrees(math.acos(float(np.clip((-rays.direction[2][passed]).min(), -1, 1))))
-    if widest > WIDEST_DEG:
-        expected = f"at most {WIDEST_DEG:g}: a plate is a plane, on which no wider field has room"
-        raise InputError(camera.name, "half field, degrees", round(widest, 1), expected)
+    for j, part in enumerate(in_order(threads, band, tasks()), 1):
+        lost += part
+        report(j / down)
+    filled, beyond = lost[1:] / max(lost[0], 1e-30)
+    return Gathered(rgb, float(filled), float(beyond))
 
 
 @dataclass(frozen=True)
@@ -180,3 +278,60 @@ def spread_highlights(
                 sweep.ctypes.data, width, height, picture.ctypes.data,
             )  # fmt: skip
         report((number + 1) / len(groups))
+
+
+def defocus(
+    plate: Plate, camera: Camera, samples: int = 64, threads: int = 1, highlights: bool = True,
+    progress: Progress | None = None,
+) -> Gathered:  # fmt: skip
+    """The picture that a camera takes of a plate.
+
+    Args:
+        samples: of a pixel, at most, 8 to 512; rounded up to a power of two.
+        highlights: spread pixels that are far brighter than their surroundings as discs, without noise.
+
+    Warns:
+        NeurolensWarning: light that the plate does not have.
+
+    Raises:
+        InputError: a camera that sees 85 degrees from its axis or more; no C compiler.
+    """
+    progress = progress or Progress(quiet=True)
+    check_field(camera)
+    spread = spread_over(camera, plate)
+    taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
+    with progress.stage(f"blur by {camera.name}") as report:
+        found = gather(plate, camera, spread, 1 << (samples - 1).bit_length(), threads, report)
+    for some in taken:
+        if len(some.radius_px):
+            with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
+                spread_highlights(found.rgb, some, plate, camera, report)
+    _say(found, len(plate.layers))
+    return replace(found, highlights=sum(len(some.radius_px) for some in taken))
+
+
+def _say(found: Gathered, layers: int) -> None:
+    if found.filled > _SAID:
+        more = "" if layers > 1 else "; layers behind (--behind, or a deep file) have it"
+        warn(f"{100 * found.filled:.1f}% of the light comes from behind edges, which the plate does not show: what is "
+             f"beside them was put there{more}")  # fmt: skip
+    if found.beyond > _SAID:
+        warn(f"{100 * found.beyond:.1f}% of the light comes from beyond the plate's borders, whose pixels were "
+             "repeated: render it with overscan")  # fmt: skip
+
+
+def check_field(camera: Camera) -> None:
+    """Refuse (InputError) a camera that a plate, which is a plane, cannot serve."""
+    width, height = camera.film_mm
+    side = np.linspace(-0.5, 0.5, _EDGE)
+    film = np.stack(np.meshgrid(side * width, side * height), 0).reshape(2, -1).astype(np.float32)
+    low, high = camera.wavelength_nm or (400.0, 700.0)
+    nm = np.full(film.shape[1], min(max(550.0, low), high), np.float32)
+    rays = camera.sample(film, np.full(film.shape, 0.5, np.float32), nm)
+    passed = rays.status == 0
+    if not passed.any():
+        raise InputError(camera.name, "film", f"({width:g} x {height:g} mm)", "a film on which light arrives")
+    widest = math.degrees(math.acos(float(np.clip((-rays.direction[2][passed]).min(), -1, 1))))
+    if widest > WIDEST_DEG:
+        expected = f"at most {WIDEST_DEG:g}: a plate is a plane, on which no wider field has room"
+        raise InputError(camera.name, "half field, degrees", round(widest, 1), expected)

@@ -6,6 +6,10 @@ Steps of inverse depth that go on as the surface does on either side join two pi
 A layer of a file is what has red, green, blue and depth under one name: R, G, B, Z of the picture itself, "behind.R"
 and "behind.Z", or "ViewLayer.Combined.R" and "ViewLayer.Depth.Z" of Blender. Of a deep file the first sample of each
 pixel is one layer, the second the next. The picture's own layer is the front; a ray takes whatever it meets first.
+
+A camera that takes a plate traces rays only at nodes, a sixtieth of its film apart, through one set of pupil points.
+Each channel has its own wavelengths, those that make its light from white surfaces, so that colours blur apart but have
+no noise of their own.
 """
 
 from __future__ import annotations
@@ -22,8 +26,9 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
+from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.field import Frame
-from neurolens.render.colour import SRGB, ColourSpace, conversion, converted
+from neurolens.render.colour import SRGB, ColourSpace, SpectralRange, conversion, converted
 from neurolens.render.pictures import (
     COLOURS,
     check_size,
@@ -35,6 +40,9 @@ from neurolens.render.pictures import (
 )
 
 FloatArray = NDArray[np.float32]
+NUMBERS = 5  # of the line of a ray: ax, ay, bx, by, weight
+LIGHT_NM, MIDDLE_NM = (400.0, 700.0), 550.0
+_NODES, _PITCH = 64, 8  # cells along the longer side of the film, and their least size in pixels
 FINEST = 4  # pixels a side of the smallest cells with bounds
 _STEEPEST = 0.2  # of the inverse depth: a larger step to a neighbour is an edge
 _LEVEL = 1e-4  # of the inverse depth: a smaller one is none
@@ -387,3 +395,103 @@ def _inverse_depth(
         raise InputError(path, "depth", f"({least:g} m)", "metres from the pinhole on, over 0.001, not their inverse")
     w = np.divide(1, z, out=np.zeros_like(z), where=solid)
     return np.where(nothing, np.float32(-1), w).astype(np.float32), cosine
+
+
+def channel_wavelengths(sample: FloatArray, low_nm: float, high_nm: float) -> FloatArray:
+    """Wavelengths [3, N] of red, green and blue for uniform samples [N], by their share in the film's light."""
+    light = SpectralRange(low_nm, high_nm)
+    found = []
+    for part in np.maximum(light.response * light.basis, 0):
+        reached = np.concatenate([[0.0], np.cumsum(part, dtype=np.float64)])
+        found.append(np.interp(sample, reached / reached[-1], light.edges_nm))
+    return np.array(found, np.float32)
+
+
+def turned(square: NDArray[Any], angle_rad: NDArray[Any]) -> FloatArray:
+    """Points [2, N] of the unit square whose places on the disk are turned by angles [N] (`concentric_disk`)."""
+    a, b = 2.0 * square[0] - 1.0, 2.0 * square[1] - 1.0
+    size = np.maximum(np.abs(a), np.abs(b))
+    along = 2.0 - np.divide(a, size, out=np.zeros_like(a), where=size > 0) * (
+        2.0 - np.divide(np.abs(b), size, out=np.zeros_like(a), where=size > 0)
+    )
+    # Along the sides of the square, from 0 at +x over 2 at +y to 8.
+    along = (np.where(b < 0, 8.0 - along, along) + angle_rad * (4.0 / math.pi)) % 8.0
+    x, y = (np.clip(np.abs((along - by) % 8.0 - 4.0) - 2.0, -1.0, 1.0) for by in (0.0, 2.0))
+    return np.stack([0.5 + 0.5 * size * x, 0.5 + 0.5 * size * y]).astype(np.float32)
+
+
+def turns_pupil(camera: Camera) -> bool:
+    """Whether a camera's pupil samples turn about the axis with the film point, as those of round lenses do."""
+    reach = 0.01 * min(camera.film_mm)
+    film = np.repeat(np.array([[reach, 0.0], [0.0, reach]], np.float32), 2, axis=1)
+    pupil = np.tile(np.array([[0.9, 0.5], [0.5, 0.9]], np.float32), 2)
+    low, high = camera.wavelength_nm or LIGHT_NM
+    x, y, _ = camera.sample(film, pupil, np.full(4, min(max(MIDDLE_NM, low), high), np.float32)).origin_m
+    first, second = (x + 1j * y)[::2] - (x + 1j * y)[1::2]
+    return bool(abs(second - 1j * first) < abs(second - first))
+
+
+class RayTable:
+    """Rays of a camera at nodes of its film, as lines in a plate, for one set of points of the pupil.
+
+    A point of the pupil is the same place in the lens for all film points.
+    """
+
+    def __init__(self, camera: Camera, plate: Plate, pupil: FloatArray, hue: FloatArray) -> None:
+        self.camera, self.pinhole, self.size, self.pupil = camera, plate.pinhole, plate.size, pupil
+        pitch = max(_PITCH, max(plate.size) / _NODES)
+        self.cells = tuple(max(1, math.ceil(n / pitch)) for n in plate.size)
+        self.turns = turns_pupil(camera)
+        low, high = camera.wavelength_nm or LIGHT_NM
+        if camera.dispersive and high > low:
+            self.nm = channel_wavelengths(hue, max(low, LIGHT_NM[0]), min(high, LIGHT_NM[1]))[[1, 0, 2]]
+        else:
+            self.nm = np.full((1, pupil.shape[1]), min(max(MIDDLE_NM, low), high), np.float32)
+
+    def row(self, j: int) -> FloatArray:
+        """Rays [nodes across, samples, 16 or 8] of the nodes of a row: lines and weights of green, red and blue.
+
+        Where green does not pass, the others have no weight either; where it does, they have lines, too.
+        """
+        (across, down), (width, height) = self.cells, self.camera.film_mm
+        channels, samples = self.nm.shape
+        x = (0.5 - np.arange(across + 1) / across) * width
+        film = np.empty((2, across + 1, samples, channels), np.float32)
+        film[0], film[1] = x[:, None, None], (j / down - 0.5) * height
+        shape = film.shape[1:]
+        pupil = np.broadcast_to(self.pupil[:, None, :, None], (2, *shape)).reshape(2, -1)
+        nm = np.broadcast_to(self.nm.T[None], shape).reshape(-1)
+        lines = self._lines(film.reshape(2, -1), pupil, nm).reshape(*shape, NUMBERS)
+        for k in range(1, channels):
+            lines[..., k, :4] = np.where(lines[..., k, 4:] > 0, lines[..., k, :4], lines[..., 0, :4])
+            lines[..., k, 4] *= lines[..., 0, 4] > 0
+        found = np.zeros((*shape[:2], 16 if channels > 1 else 8), np.float32)
+        found[..., : channels * NUMBERS] = lines.reshape(*shape[:2], -1)
+        return found
+
+    def at(self, place_px: NDArray[Any], pupil: FloatArray, nm: FloatArray) -> FloatArray:
+        """Lines and weights [N, 5] of the rays of film places [2, N] by points of the pupil [2, N]."""
+        return self._lines(self.film_mm(place_px), pupil, nm)
+
+    def film_mm(self, place_px: NDArray[Any]) -> FloatArray:
+        """Film points [2, N] of film places [2, N], which a picture shows upright."""
+        return ((place_px.T / self.size - 0.5) * self.camera.film_mm * (-1, 1)).T.astype(np.float32)
+
+    def unturned(self, film_mm: FloatArray, pupil: FloatArray) -> FloatArray:
+        """The samples that the camera takes for points of the pupil [2, N], seen from film points [2, N]."""
+        return turned(pupil, -np.arctan2(film_mm[1], film_mm[0])) if self.turns else pupil
+
+    def _lines(self, film: FloatArray, pupil: FloatArray, nm: FloatArray) -> FloatArray:
+        found = np.empty((len(nm), NUMBERS), np.float32)
+        pupil = self.unturned(film, pupil)
+        step = getattr(self.camera, "rays_a_call", RAYS_A_CALL)
+        for first in range(0, len(nm), step):
+            part = slice(first, first + step)
+            rays = self.camera.sample(*(np.ascontiguousarray(v[..., part]) for v in (film, pupil, nm)))
+            passed = (rays.status == 0) & (rays.direction[2] < 0)
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                lines = self.pinhole.lines(rays.origin_m, rays.direction)
+            passed &= np.isfinite(lines).all(axis=0)
+            found[part, :4] = np.where(passed, lines, 0).T
+            found[part, 4] = np.where(passed, rays.weight, 0)
+        return found

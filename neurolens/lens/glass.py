@@ -162,10 +162,11 @@ def added(glasses: Iterable[Glass], refused: Mapping[str, str]) -> Iterator[None
     try:
         yield
     finally:
-        for table, old in zip((_ADDED, _REFUSED), before, strict=True):
-            table.clear()
-            table.update(old)  # type: ignore[arg-type]
+        _ADDED.clear()
+        _REFUSED.clear()
         _FOUND.clear()
+        _ADDED.update(before[0])
+        _REFUSED.update(before[1])
 
 
 def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") -> Glass:
@@ -211,13 +212,9 @@ def by_code(code: str, count: int = 3) -> list[Glass]:
 
     def rank(g: Glass) -> float:
         # Rounded as codes are, so that all glasses of one code are equally near.
-        return round(_distance(round(g.n_d, 3) - n_d, round(g.V_d, 1) - V_d), 6)
+        return round(math.hypot((round(g.n_d, 3) - n_d) / 0.001, (round(g.V_d, 1) - V_d) / 0.5), 6)
 
     return sorted(all_glasses(), key=rank)[:count]
-
-
-def _distance(n_d: float, V_d: float) -> float:
-    return math.hypot(n_d / 0.001, V_d / 0.5)
 
 
 def _key(name: str) -> str:

@@ -2,9 +2,11 @@
 
     import mitsuba as mi
     import neurolens.mitsuba as nm
+    from neurolens.cameras.build import make_camera
+    from neurolens.lens.shot import Shot
 
     mi.set_variant("llvm_ad_spectral")
-    camera = nm.camera("models/laikin_double_gauss_50.ols-64.onnx", focus_m=3.9, f_number=2.0)
+    camera = make_camera("models/laikin_double_gauss_50.ols-64.onnx", Shot((36.0, 36.0), focus_m=3.9, f_number=2.0))
     picture = nm.render(mi.cornell_box(), camera, spp=64)
 
 or, in a scene (`<sensor type="neurolens">` in XML), after `nm.register()`:
@@ -16,7 +18,6 @@ Mitsuba itself is imported by the functions, not with this package.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,37 +26,12 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.lens.shot import Dispersion, Shot
-from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, matrix, register, require_mitsuba
+from neurolens.mitsuba.sensor import PLUGIN, matrix, register, require_mitsuba
 
-__all__ = ["camera", "load_scene", "register", "render", "require_mitsuba"]
+__all__ = ["load_scene", "register", "render", "require_mitsuba"]
 PASS_RAYS = 1 << 20  # of one wavefront: numpy holds some 200 bytes per ray
 CORNELL_BOX = "cornell-box"
-
-
-def camera(
-    spec: str | Path,
-    *,
-    film_mm: tuple[float, float] = (FILM_WIDTH_MM, FILM_WIDTH_MM),
-    focus_m: float = math.inf,
-    f_number: float | None = None,
-    dispersion: Dispersion = "full",
-) -> Camera:
-    """A camera for `render`: a model (.onnx), a lens file (.toml), "thin" or "pinhole".
-
-    Args:
-        film_mm: width and height; they have the shape of the scene's picture.
-        focus_m: distance from the film to the object in focus.
-        f_number: None is the widest. dispersion: "off" has the least noise, see `neurolens.cameras.reduced`.
-
-    Other settings: see `neurolens.cameras.build`.
-
-    Raises:
-        InputError, ModelError: as `make_camera`.
-    """
-    return make_camera(spec, Shot(film_mm, focus_m, f_number, wavelength_nm=LIGHT_NM, dispersion=dispersion))
 
 
 def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None, **parameters: Any) -> Any:

@@ -294,12 +294,12 @@ def _camera_of(props: Any, shape: float) -> Camera:
         raise InputError(PLUGIN, "camera", "(missing)", "a model (.onnx), a lens file (.toml), thin or pinhole")
     mask = props.get("aperture_mask", None)
     mask = Path(_found(mask)) if isinstance(mask, str) else mask
-    blades = (props.get(k, None) for k in ("blades", "blade_rotation_deg", "blade_curvature"))
+    blades, turned, curved = (props.get(k, None) for k in ("blades", "blade_rotation_deg", "blade_curvature"))
     size = props.get("focal_length_mm", props.get("efl_mm", None))
     more = {k: props.get(k) for k in ("f_number", "zoom", "dispersion") if props.get(k, None) is not None}
     shot = Shot(
         (width_mm, height_mm), _number_of(props, "focus_m", math.inf), focal_length_mm=size,
-        aperture=make_aperture(StopShape(*blades, mask)), wavelength_nm=LIGHT_NM, **more,
+        aperture=make_aperture(StopShape(blades, turned, curved, mask)), **more,
     )  # fmt: skip
     return make_camera(_found(name), shot)
 

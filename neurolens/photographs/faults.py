@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from neurolens.analysis.fields import Result
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import Found, Measures, measure
+from neurolens.photographs.figures import Measures, measure
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.rims import at_focal_length
 
@@ -114,24 +114,23 @@ class Tried(NamedTuple):
     """A change with the figures of the table that has it."""
 
     change: Change
-    found: Found
+    figures: Measures
 
     @property
     def score(self) -> float:
         """See `score`; less is better."""
-        return float(score(self.found.figures)[0])
+        return float(score(self.figures)[0])
 
     @property
     def sound(self) -> bool:
         """Whether the table raises no alarm."""
-        return bool(alarm(self.found.figures)[0] <= 1)
+        return bool(alarm(self.figures)[0] <= 1)
 
 
 def _best(tried: Sequence[Change], profile: Profile, focal_mm: float) -> Tried:
-    figures, off = measure([change.lens for change in tried], profile, focal_mm)
+    figures = measure([change.lens for change in tried], profile, focal_mm).figures
     n = int(np.argmin(score(figures)))
-    one = slice(n, n + 1)
-    return Tried(tried[n], Found(Measures(*(v[one] for v in figures)), (off[0][one], off[1][one], off[2][one])))
+    return Tried(tried[n], Measures(*(v[n : n + 1] for v in figures)))
 
 
 def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float, rounds: int = _ROUNDS) -> Tried:
@@ -227,7 +226,7 @@ def _helps(tried: Tried, now: Tried) -> bool:
 
 
 def _named(tried: Tried) -> dict[str, float]:
-    return {name: float(v[0]) for name, v in tried.found.figures._asdict().items()}
+    return {name: float(v[0]) for name, v in tried.figures._asdict().items()}
 
 
 def _told(figures: dict[str, float], *, limits: bool = False) -> str:

@@ -26,7 +26,7 @@ from neurolens.base.records import Timing, noisy
 from neurolens.cameras.build import as_c, ideal_as, with_dispersion
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
-from neurolens.cameras.warped import Warped
+from neurolens.cameras.reduced import Warped
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.scalars import lower
 from neurolens.plan import footprints as prints

@@ -29,6 +29,7 @@ from neurolens.render.film import PixelGrid
 from neurolens.render.job import LANES, Job, develop
 from neurolens.render.renderer import run
 from neurolens.render.scene import Scene
+from neurolens.render.world import shared_worlds
 from neurolens.shaders.osl import OslLens, osl_program
 from neurolens.shaders.source import camera_program
 
@@ -109,8 +110,9 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
     strips, samples = strips_of(scene, _STRIP_PATHS, 1, _STRIPS), min(scene.settings.camera.samples, _SAMPLES)
     rest, calls, variance = [], [], []
     for camera, weight in zip((plain, colours), weights, strict=True):
-        _strip(scene, camera, 0, (0, 1), samples)  # what is fitted or compiled once is no part of a path
-        jobs = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
+        with shared_worlds():
+            _strip(scene, camera, 0, (0, 1), samples)  # what is fitted or compiled once is no part of a path
+            jobs = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
         ns = [[1e9 * j.film.seconds[1] / (j.tiling.pixels * samples) for j in some] for some in jobs]
         several = jobs[0][0].mode == "companions" and not getattr(camera, "lateral", False)
         calls.append(float(LANES) if several else 1.0)

@@ -10,20 +10,13 @@ from pathlib import Path
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml
 from neurolens.lens.prescription import Lens
-from neurolens.readers.codev import looks_like_seq, read_seq
-from neurolens.readers.json_lens import is_blender, looks_like_json, read_blender, read_json_lens
+from neurolens.readers.codev import read_seq
+from neurolens.readers.json_lens import is_blender, read_blender, read_json_lens
 from neurolens.readers.lensfile import read_lens
-from neurolens.readers.oslo import looks_like_len, read_len
+from neurolens.readers.oslo import read_len
 from neurolens.readers.source import ReadOptions, read_text
-from neurolens.readers.tables import (
-    looks_like_flaresim,
-    looks_like_opticalbench,
-    looks_like_table,
-    read_flaresim,
-    read_opticalbench,
-    read_table,
-)
-from neurolens.readers.zemax import looks_like_zmx, read_zmx
+from neurolens.readers.tables import read_flaresim, read_opticalbench, read_table
+from neurolens.readers.zemax import read_zmx
 
 OURS = "neurolens"
 _HEAD = 20_000  # characters by which a format is recognised
@@ -31,22 +24,25 @@ _HEAD = 20_000  # characters by which a format is recognised
 
 @dataclass(frozen=True)
 class Format:
-    """A format that lenses are read from."""
+    """A format that lenses are read from; `like` finds its mark in the beginning of a text."""
 
     name: str
     suffixes: tuple[str, ...]
     read: Callable[[str | Path, ReadOptions], Lens]
-    looks_like: Callable[[str], bool]
+    like: str
 
 
+# Of a table the first line that is no comment holds numbers: a count, or those of a row.
+_NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]+)?"
+_TABLE = rf"\A(?:[^\S\n]*(?:#.*)?\n)*[^\S\n]*{_NUMBER}(?:(?:[^\S\n]+{_NUMBER}){{3}})?[^\S\n]*(?:[#\n]|\Z)"
 FORMATS = (
-    Format("Zemax", (".zmx",), read_zmx, looks_like_zmx),
-    Format("OSLO", (".len", ".osl"), read_len, looks_like_len),
-    Format("CODE V", (".seq",), read_seq, looks_like_seq),
-    Format("JSON", (".json",), read_json_lens, looks_like_json),
-    Format("Optical Bench", (".txt",), read_opticalbench, looks_like_opticalbench),
-    Format("FlareSim", (".lens",), read_flaresim, looks_like_flaresim),
-    Format("lens table", (".dat", ".txt", ".lens"), read_table, looks_like_table),
+    Format("Zemax", (".zmx",), read_zmx, r"^[^\S\n]*(?-i:SURF|MODE)(?!\S)"),
+    Format("OSLO", (".len", ".osl"), read_len, r"^[^\S\n]*LEN[^\S\n]+NEW(?!\S)"),
+    Format("CODE V", (".seq",), read_seq, r"^(?:[^\S\n]|;)*(?:RDM|LEN)(?![^\s;])"),
+    Format("JSON", (".json",), read_json_lens, r"\A\s*\{"),
+    Format("Optical Bench", (".txt",), read_opticalbench, r"^\[(?:lens data|variable distances)\][^\S\n]*$"),
+    Format("FlareSim", (".lens",), read_flaresim, r"^[^\S\n]*(?-i:surfaces:)[^\S\n]*(?:#.*)?$"),
+    Format("lens table", (".dat", ".txt", ".lens"), read_table, _TABLE),
 )
 
 
@@ -92,9 +88,9 @@ def format_of(path: str | Path) -> Format:
     Raises:
         InputError: neither tells.
     """
-    head = read_text(path)[:_HEAD]
+    head = "\n".join(read_text(path)[:_HEAD].splitlines())
     suffix = Path(path).suffix.lower()
-    by_content = next((f for f in FORMATS if f.looks_like(head)), None)
+    by_content = next((f for f in FORMATS if re.search(f.like, head, re.MULTILINE | re.IGNORECASE)), None)
     by_suffix = [f for f in FORMATS if suffix in f.suffixes]
     if by_content is None and len(by_suffix) != 1:
         known = ", ".join(f"{f.name} ({', '.join(f.suffixes)})" for f in FORMATS)

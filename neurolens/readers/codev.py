@@ -153,12 +153,6 @@ def read_seq(path: str | Path, options: ReadOptions | None = None) -> Lens:
     return lens_of(file, options)
 
 
-def looks_like_seq(head: str) -> bool:
-    """Test whether the beginning of a text is that of a CODE V file."""
-    first = [line.replace(";", " ").split()[0].upper() for line in head.splitlines() if line.replace(";", " ").split()]
-    return bool({"RDM", "LEN"} & set(first)) and "NEW" not in head.upper().split()[:3]
-
-
 def _private(file: File, command: Command) -> None:
     """Inside PRV: PWL gives wavelengths, each row a glass by its name; END closes."""
     if command.name == "END":
@@ -318,8 +312,8 @@ def _zoom(file: File, command: Command) -> None:
     surface, values, last = -1, words[1:], len(file.blocks) - 1
     if name in ("THI", "CIR"):
         match = re.fullmatch(r"S([0-9]{1,4}|O)", values[0].upper()) if values else None
-        surface = int(match[1].replace("O", "0")) if match else math.inf
-        if match is None or surface > last:
+        surface = int(match[1].replace("O", "0")) if match else last + 1
+        if surface > last:
             raise line.error(f"ZOO {name}", " ".join(values[:1]), f"a surface from S0 to S{last}")
         values = values[1:]
         if name == "THI" and not values:
@@ -346,11 +340,7 @@ def _one_gap(file: File, command: Command) -> None:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces.
-
-    Raises:
-        InputError: no surface, a solve or a shape that the lens model cannot represent.
-    """
+    """Set what follows from all surfaces."""
     first, *middle, image = file.blocks
     if not middle:
         raise InputError(file.file, "S", "(no surface)", "at least one surface between object and image")

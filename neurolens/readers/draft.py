@@ -86,8 +86,9 @@ class Block:
 
     def row(self, shape: dict[str, Any]) -> Row:
         """The row of a surface whose fields of shape are given."""
-        figures = {"thickness_mm": self.thickness, "diameter_mm": 2 * self.semi_diameter, "stop": self.stop}
-        return Row(Surface(**figures, **shape, **self.medium), self.aperture, self.name)
+        diameter = 2 * self.semi_diameter
+        surface = Surface(thickness_mm=self.thickness, diameter_mm=diameter, stop=self.stop, **shape, **self.medium)
+        return Row(surface, self.aperture, self.name)
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
     for entry in _entries(read_lines(path)):
         try:
             found.append(_glass(entry, maker))
-        except _Refused as reason:
+        except ValueError as reason:
             refused[entry.name] = f"{Path(path).name}, line {entry.line.number}: {reason}"
     return found, refused
 
@@ -183,16 +183,15 @@ def more_glasses(files: Iterable[str | Path]) -> Iterator[None]:
         yield
 
 
-class _Refused(Exception):
-    """A glass that is not read."""
-
-
 def _entries(lines: Sequence[Line]) -> list[_Entry]:
     entries: list[_Entry] = []
     for line in lines:
         word, rest = line.words[0].upper(), line.words[1:]
         if word == "NM":
-            entries.append(_entry(line, rest))
+            formula, _, n_d = line.numbers("NM", [rest[1], "0", *rest[3:4]] if len(rest) > 3 else [], 3)
+            if len(rest[0]) > MAX_NAME:
+                raise line.error("NM", f"(a name of {len(rest[0])} characters)", f"at most {MAX_NAME}")
+            entries.append(_Entry(line, rest[0], int(formula), n_d))
             if len(entries) > MAX_GLASSES:
                 raise line.error("NM", f"({len(entries)} glasses)", f"at most {MAX_GLASSES}")
         elif not entries:
@@ -210,23 +209,17 @@ def _entries(lines: Sequence[Line]) -> list[_Entry]:
     return entries
 
 
-def _entry(line: Line, rest: list[str]) -> _Entry:
-    formula, _, n_d = line.numbers("NM", [rest[1], "0", *rest[3:4]] if len(rest) > 3 else [], 3)
-    if len(rest[0]) > MAX_NAME:
-        raise line.error("NM", f"(a name of {len(rest[0])} characters)", f"at most {MAX_NAME}")
-    return _Entry(line, rest[0], int(formula), n_d)
-
-
 def _glass(entry: _Entry, maker: str) -> Glass:
+    """Return the glass of an entry; ValueError with the reason where it is not read."""
     kind, (low, high) = entry.formula, entry.range_um
     name = _FORMULAS[kind - 1] if 0 < kind <= len(_FORMULAS) else "unknown"
     if not 0 < low < high:
-        raise _Refused(f"its range LD is {low:g} to {high:g} um")
+        raise ValueError(f"its range LD is {low:g} to {high:g} um")
     form, coefficients = _form(kind, [*entry.coefficients, *[0.0] * 10], f"formula {kind} ({name})")
     absorption = tuple(sorted(entry.samples.items()))
     made = Glass(maker, entry.name, form, coefficients, (low, high), absorption if len(absorption) > 1 else ())
     if made.covers(LINE_D_NM) and not abs(made.n_d - entry.n_d) <= _OFF:
-        raise _Refused(f"its formula gives n_d = {made.n_d:.6g}, its line NM says {entry.n_d:.6g}")
+        raise ValueError(f"its formula gives n_d = {made.n_d:.6g}, its line NM says {entry.n_d:.6g}")
     return made
 
 
@@ -238,7 +231,7 @@ def _form(kind: int, c: list[float], name: str) -> tuple[str, tuple[float, ...]]
     if kind == 9:  # n^2 = A + B L^2 / (L^2 - C) + D L^2 / (L^2 - E)
         return "sellmeier", (c[0] - 1, 0.0, *c[1:5])
     if kind not in _POWERS:
-        raise _Refused(f"{name} is not read")
+        raise ValueError(f"{name} is not read")
     if c[_SIXTH_POWER.get(kind, -1)]:
-        raise _Refused(f"{name} with a sixth power is not read")
+        raise ValueError(f"{name} with a sixth power is not read")
     return "power", tuple(0.0 if k is None else c[k] for k in _POWERS[kind])

@@ -132,11 +132,6 @@ def _tells_of_other_diameters(notes: str) -> bool:
     return any(not _NOT_THE_SOURCE_S.isdisjoint(re.findall(r"\w+", rest)) for rest in clauses)
 
 
-def looks_like_json(head: str) -> bool:
-    """Test whether the beginning of a text is that of a JSON object."""
-    return head.lstrip().startswith("{")
-
-
 def _load(path: str | Path) -> dict[str, Any]:
     """Return the top-level object."""
     try:

@@ -72,11 +72,6 @@ def read_len(path: str | Path, options: ReadOptions | None = None) -> Lens:
     return lens_of(file, options)
 
 
-def looks_like_len(head: str) -> bool:
-    """Test whether the beginning of a text is that of an OSLO file."""
-    return any(line.upper().split(maxsplit=2)[:2] == ["LEN", "NEW"] for line in head.splitlines())
-
-
 def _parts(text: str) -> list[str]:
     """Return the commands of a line: "//" begins a comment, ";" ends a command, both only outside quotes."""
     bare = re.match(r'(?:[^"/]|"[^"]*"|/(?!/))*', text)

@@ -88,18 +88,6 @@ def read_table(path: str | Path, options: ReadOptions | None = None) -> Lens:
     return lens_of(draft, options)
 
 
-def looks_like_table(head: str) -> bool:
-    """Test whether the beginning of a text is that of a table: numbers in the first line that is not a comment."""
-    for row in head.splitlines():
-        words = row.partition("#")[0].split()
-        if words:
-            try:
-                return len(words) in (1, len(COLUMNS)) and all(math.isfinite(float(w)) for w in words)
-            except ValueError:
-                return False
-    return False
-
-
 def _surfaces(file: str, rows: Sequence[tuple[Line, list[float]]], factor: float) -> list[Surface]:
     flat = [k for k, (_, numbers) in enumerate(rows) if numbers[0] == 0]
     stops = [k for k, (_, numbers) in enumerate(rows) if numbers[2] == 0] or flat
@@ -152,11 +140,6 @@ def read_flaresim(path: str | Path, options: ReadOptions | None = None) -> Lens:
     draft.rows = tuple(Row(s, aperture=not s.stop) for s in rows)
     draft.film_given = bool(rows) and rows[-1].thickness_mm != 0
     return lens_of(draft, options)
-
-
-def looks_like_flaresim(head: str) -> bool:
-    """Test whether the beginning of a text is that of a .lens file: its line "surfaces:"."""
-    return any(row.partition("#")[0].strip() == "surfaces:" for row in head.splitlines())
 
 
 def _flaresim_surface(line: Line, words: list[str]) -> Surface:
@@ -238,12 +221,6 @@ def read_opticalbench(path: str | Path, options: ReadOptions | None = None) -> L
         _bend(file, line, words)
     _complete(file)
     return lens_of(file, options)
-
-
-def looks_like_opticalbench(head: str) -> bool:
-    """Test whether the beginning of a text names sections of the format."""
-    rows = {row.strip().lower() for row in head.splitlines() if row.startswith("[")}
-    return bool(rows & {"[lens data]", "[variable distances]"})
 
 
 def _read_bench(file: Bench, section: str, line: Line, words: list[str]) -> None:

@@ -114,11 +114,6 @@ def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
     return lens_of(file, options)
 
 
-def looks_like_zmx(head: str) -> bool:
-    """Test whether the beginning of a text is that of a Zemax file."""
-    return any(line.split()[:1] in (["SURF"], ["MODE"]) for line in head.splitlines())
-
-
 def _read(file: File, line: Line) -> None:
     word, rest = line.words[0].upper(), line.words[1:]
     if word.startswith("!"):
@@ -331,12 +326,7 @@ def _add_ends(file: File) -> None:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces.
-
-    Raises:
-        InputError: a file that was cut off, a shape that the lens model cannot hold, the working f-number of a near
-            object.
-    """
+    """Set what follows from all surfaces."""
     file.skipped["lines of the merit function"] += file.behind.total()
     first, *middle, image = file.blocks
     for before, block in zip(file.blocks, file.blocks[1:], strict=False):
@@ -437,7 +427,10 @@ def shape_of(block: Block) -> dict[str, Any]:
         case kind if kind.startswith(Q_TYPE):
             shape = _q_type(block)
         case "TOROIDAL" | "BICONICX":
-            shape = _crossed(block)
+            biconic, radius_x = block.kind == "BICONICX", block.parameter(1)
+            conic_x = block.parameter(2) if biconic else None
+            curve = block.rotational(() if biconic else [(2 * i - 2, block.parameter(i)) for i in range(2, 9)])
+            shape = block.crossed(curve, radius_x or math.inf, conic_x)
         case "PARAXIAL":
             shape = {"radius_mm": math.inf, "focal_mm": block.parameter(1)}
             block.parameters.pop(2, None)
@@ -463,11 +456,3 @@ def _q_type(block: Block) -> dict[str, Any]:
     if form == 1:
         assume(block.start.file, f"line {block.start.number}: {block.kind}: 1 in XDAT 1 is taken to mean Qcon")
     return block.q_type(block.kind, form == 1, values, radius)
-
-
-def _crossed(block: Block) -> dict[str, Any]:
-    """Return a toroidal or biconic surface."""
-    biconic, radius_x = block.kind == "BICONICX", block.parameter(1)
-    conic_x = block.parameter(2) if biconic else None
-    curve = block.rotational(() if biconic else [(2 * i - 2, block.parameter(i)) for i in range(2, 9)])
-    return block.crossed(curve, radius_x or math.inf, conic_x)

@@ -333,10 +333,10 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
     try:
         with read_arrays(path, ("sums", "done")) as (about, read):
             if about["format"] != _FORMAT:
-                raise InputError(path, "format", about["format"], f"{_FORMAT}, {_AGAIN}")
+                raise InputError(path, "format", about["format"], str(_FORMAT))
             if differs := difference(about["render"], identity):
                 place, there, here = differs
-                raise InputError(path, place, there, f"{here} as asked now, {_AGAIN}")
+                raise InputError(path, place, there, f"{here} as asked now")
             _check_tiling(path, about, film.tiling)
             done = read("done", np.empty_like(film.done))
             _check_samples(path, about["samples"], film.tiling, done)
@@ -352,8 +352,6 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
             film.begin()
             return {name: float(value) for name, value in about["spent"].items()}
     except InputError as error:
-        if "--restart" in error.expected:
-            raise
         raise InputError(path, error.field, error.value, f"{error.expected}, {_AGAIN}") from None
     except FileNotFoundError:
         raise InputError(path, "file", "(missing)", "a checkpoint of this render") from None
@@ -375,7 +373,7 @@ def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
         raise ValueError("impossible times")
     if (about["tile"], about["step"]) != (tiling.tile, tiling.step):
         expected = f"{tiling.samples} as asked now: below {max(tiling.step, about['step'])} samples none can be added"
-        raise InputError(path, "samples", about["samples"], f"{expected}; give the same, {_AGAIN}")
+        raise InputError(path, "samples", about["samples"], f"{expected}; give the same")
 
 
 def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.int64]) -> None:
@@ -387,6 +385,6 @@ def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.in
         return
     most = int(had.max())
     if most > tiling.samples:
-        raise InputError(path, "samples", most, f"{tiling.samples} at most, as asked now: ask for more, {_AGAIN}")
-    expected = f"a multiple of {tiling.step}, which alone can be raised to {tiling.samples}; give the same, {_AGAIN}"
+        raise InputError(path, "samples", most, f"{tiling.samples} at most, as asked now: ask for more")
+    expected = f"a multiple of {tiling.step}, which alone can be raised to {tiling.samples}; give the same"
     raise InputError(path, "samples", samples, expected)

@@ -59,9 +59,14 @@ def lit(value: FloatArray | NDArray[np.bool_]) -> Index:
 
 
 def deposit(radiance: FloatArray, slot: Index, value: FloatArray) -> None:
-    """Add values [lanes, n] to the slots [n] of a batch, none of which occurs twice."""
-    for lane, part in zip(radiance, value, strict=True):
-        lane[slot] += part
+    """Add values [lanes, n] to the slots [n] of a batch's radiance [N, lanes], none of which occurs twice."""
+    lanes = len(value)
+    # The lanes of a slot move as one number: half the time of four.
+    together = radiance.view(np.complex128 if lanes == 4 else f"V{4 * lanes}")[:, 0]
+    found = together.take(slot)
+    for part, light in zip(found.view(np.float32).reshape(-1, lanes).T, value, strict=True):
+        part += light
+    together[slot] = found
 
 
 class Vertex:
@@ -257,7 +262,7 @@ def trace(
             weight 0 are left out.
         shared: [N] number of wavelengths that share a path; left out, all lanes do.
     """
-    radiance = np.zeros(weight.shape, np.float32)
+    radiance = np.zeros(weight.shape[::-1], np.float32)
     count = weight.shape[-1]
     density, together = np.full(count, SPECULAR), np.full(count, len(weight), np.float32)
     shared = together if shared is None else shared
@@ -287,7 +292,7 @@ def trace(
             alive_rows = lit(paths.throughput)
             if alive_rows.size < paths.slot.size:
                 paths = paths.take(alive_rows)
-    return radiance
+    return radiance.T
 
 
 def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], aim: bool, radiance: FloatArray) -> None:

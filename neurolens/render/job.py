@@ -185,7 +185,8 @@ class Job:
         """
         if lens.places is not None:
             return self._spill(sums, value, bins, lens, tile)
-        light = np.einsum("lcn,ln->cn", self._response.take(bins, axis=-1, mode="clip"), value)
+        response = self._response.take(bins, axis=-1, mode="clip")
+        light = np.einsum("lcn,ln->cn", response, np.ascontiguousarray(value))
         luminance = self.luminance_row.astype(np.float32) @ light
         dropped = ~(np.abs(luminance) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
@@ -203,7 +204,7 @@ class Job:
         stop = min(start + len(sums) + self._near, self.grid.width * self.grid.height)
         spill, lateral = np.zeros((stop - first, 4)), bool(getattr(self.camera, "lateral", False))
         grid = _Grid(self.grid.width, self.grid.height, lateral, *self.grid.film_mm)
-        arrays = [np.ascontiguousarray(a) for a in (self._bins, bins, value, lens.weight, lens.places)]
+        arrays = [np.ascontiguousarray(a) for a in (self._bins, bins, value.T, lens.weight, lens.places)]
         size = len(sums), len(bins) // len(sums), start, first, len(spill)
         pointers = (a.ctypes.data for a in (*arrays, sums, spill))
         _light_of_tile(self.spectral.bins)(*size, ctypes.byref(grid), *pointers)
@@ -256,9 +257,9 @@ class Job:
             parts.append(LensRays(origin, self._axes @ rays.direction, weight, places))
         if len(parts) == 1:
             return parts[0]
-        return LensRays(
-            *(None if some[0] is None else np.concatenate(some, axis=-1) for some in zip(*parts, strict=True))
-        )
+        each = zip(*parts, strict=True)
+        joined: list[Any] = [None if some[0] is None else np.concatenate(some, axis=-1) for some in each]
+        return LensRays(*joined)
 
     def _camera_wavelengths(self, hue: FloatArray, lanes: int) -> FloatArray:
         """Wavelengths [lanes, N] for the camera, clipped to its range if it does not disperse."""

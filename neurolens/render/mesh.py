@@ -1,93 +1,352 @@
-"""Triangle meshes: from the tables of a scene, or its files, to what rays hit, by Embree."""
+"""Triangle meshes of OBJ and PLY files, or of tables of the scene, placed in it; nothing is merged or repaired.
+
+Files are checked so that no vertex and no face is lost silently. Texture coordinates and normals of an OBJ file with
+materials count face by face, of one that has a material of the scene where every face has them. Of the MTL files
+that it names, diffuse colours and pictures are read (Kd, map_Kd) and nothing else; a material of the scene with the
+name that `usemtl` says comes before theirs.
+
+PLY files are ASCII, or binary of either byte order, and their faces may have any number of corners, each another; what
+else a file holds (colours, edges, flags of faces) is passed over. Source: G. Turk, The PLY Polygon File Format (1994).
+"""
 
 from __future__ import annotations
 
 import math
+import os
+import re
+import warnings
+from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from importlib.util import find_spec
-from pathlib import Path
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, NeurolensError, warn
-from neurolens.cameras.contract import FloatArray
-from neurolens.render.meshfile import TriangleSet, read_file, read_library, whole_values
-from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Rays, slabs
+from neurolens.base.errors import InputError, warn
+from neurolens.base.files import read_bytes
 from neurolens.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshSettings, Texture, Vector
 
 _LARGEST, _LARGEST_UV = 1e60, 1e6  # areas are finite; texture coordinates have pixels left in float32
-_STEP = np.float32(1e-5)  # m by which a ray that met its own start surface is moved on
+_LARGEST_HEADER = 100_000
+_KINDS = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64".split()
+_TYPES = dict(zip(_KINDS, ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8") * 2, strict=True))
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_CORNERS = ("vertex_indices", "vertex_index")
+_COORDINATES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
+LARGEST_FILE = 500_000_000  # bytes
+_LONGEST = 60  # characters of a number or a corner
+_INDEX = r"-?[1-9][0-9]{0,9}"
+_CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
+# Of each kind of line: the fewest and most words after it, how many are used, what is expected.
+_OBJ_LINES = {"v": (3, 7, 3, "v X Y Z"), "vt": (2, 3, 2, "vt U V"), "vn": (3, 3, 3, "vn X Y Z")}
+_LARGEST_MTL, _MOST = 4_000_000, 1000  # bytes of an MTL file, materials
+_GREY: Vector = (0.8, 0.8, 0.8)  # of a material that says nothing
 
 
-def has_embree() -> bool:
-    """Whether Embree is installed, which has no wheel for some machines."""
-    return find_spec("embreex") is not None
+@dataclass(frozen=True)
+class TriangleSet:
+    """A mesh as read.
+
+    Attributes:
+        vertices: [V, 3] float64 m. faces: [T, 3] counted from 0. uv: [V, 2] texture coordinates, from the lower left
+            corner of a picture, or None. normals: [V, 3] unit vectors to interpolate, or None.
+        libraries: MTL files that an OBJ file names. materials, objects: of each of its triangles, by name.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    uv: NDArray[np.float64] | None = None
+    normals: NDArray[np.float64] | None = None
+    libraries: Sequence[str] = ()
+    materials: Sequence[str] = ()
+    objects: Sequence[str] = ()
 
 
-class Mesh:
-    """Triangles [T, 3 corners, 3] in m, for Embree; `each` of them in a row are one surface, from `first` on.
+def whole_values(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Values of vertices, None where some have none (NaN)."""
+    return None if values is None or np.isnan(values).any() else values
+
+
+def read_file(scene: Path, field: str, path: Path, whole: bool = True) -> TriangleSet:
+    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units, polygons cut into triangles.
+
+    Without `whole`, texture coordinates and normals of an OBJ file are NaN at corners that have none; with it they
+    count where all corners have them. Errors as of `read_mesh`.
+    """
+    kind = path.suffix.lower()
+    try:
+        if kind not in (".obj", ".ply"):
+            raise InputError(scene, field, str(path), "a mesh file that ends in .obj or .ply")
+        content = read_bytes(path, LARGEST_FILE, "a mesh file", (scene, field))
+        mesh = _read_obj(scene, field, path, content) if kind == ".obj" else read_polygons(content)
+    except ValueError as error:
+        raise InputError(scene, field, str(path), f"a whole PLY file ({error})") from None
+    return replace(mesh, uv=whole_values(mesh.uv), normals=whole_values(mesh.normals)) if whole else mesh
+
+
+def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSet:
+    """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans."""
+    if b"\0" in content:
+        raise InputError(scene, field, str(path), "a text file, without zero bytes")
+    # Only comments and names can hold more than ASCII, in any encoding. A line may go on after a backslash.
+    text = content.decode("utf-8-sig", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
+    values: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
+    corners: dict[tuple[int, ...], int] = {}
+    faces, libraries, materials, objects = list[tuple[int, ...]](), list[str](), list[str](), list[str]()
+    names = {"usemtl": "", "o": ""}  # of the material and of the object
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = line.partition("#")[0].strip()
+        kind, *words = bare.split() or [""]
+        place = f"{field} {path.name}, line {number}"
+        if kind == "mtllib":
+            libraries.append(bare[len(kind) :].strip())  # names may hold blanks
+        elif kind in names:
+            names[kind] = bare[len(kind) :].strip()
+        elif kind == "f":
+            if len(words) < 3 or not all(len(word) <= _LONGEST and _CORNER.fullmatch(word) for word in words):
+                raise InputError(scene, place, line[:60], "f I J K, counted from 1, or back from -1")
+            first, *rest = (corners.setdefault(c, len(corners)) for c in _corners(scene, place, words, values))
+            faces += [(first, *edge) for edge in pairwise(rest)]
+            materials += [names["usemtl"]] * (len(rest) - 1)
+            objects += [names["o"]] * (len(rest) - 1)
+        elif kind in _OBJ_LINES:
+            least, most, used, form = _OBJ_LINES[kind]
+            if not least <= len(words) <= most or not all(map(_is_number, words)):
+                raise InputError(scene, place, line[:60], form)
+            values[kind].append([float(word) for word in words[:used]])
+    rows = np.array(list(corners), np.intp).reshape(-1, 3).T
+    vertices, uv, normals = (
+        None
+        if row.size and (row < 0).all()
+        else np.array([*values[kind], [math.nan] * _OBJ_LINES[kind][2]], np.float64)[row]
+        for kind, row in zip(values, rows, strict=True)
+    )
+    assert vertices is not None  # every corner has one
+    triangles = np.array(faces, np.int64).reshape(-1, 3)
+    return TriangleSet(vertices, triangles, uv, normals, libraries, materials, objects)
+
+
+def _is_number(word: str) -> bool:
+    """Whether a word is a decimal number; infinity, NaN and what only Python takes for one are not."""
+    try:
+        return len(word) <= _LONGEST and not word.strip("0123456789+-.eE") and math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
+def _corners(scene: Path, field: str, words: list[str], values: dict[str, list[list[float]]]) -> list[tuple[int, ...]]:
+    """Corners of a face as rows of `values`, -1 for what they leave out; the file may count back from the last one.
+
+    Refused are corners that refer to something that does not come before them, and corners of unlike forms.
+    """
+    if len({tuple(map(bool, word.split("/"))) for word in words}) > 1:
+        raise InputError(scene, field, " ".join(words)[:60], "corners of the same form, as in 1/1 2/2 3/3")
+    corners = []
+    for word in words:
+        corner = [-1, -1, -1]
+        for k, (kind, index) in enumerate(zip(values, word.split("/"), strict=False)):
+            if index:
+                count = len(values[kind])
+                corner[k] = int(index) + (count if index.startswith("-") else -1)
+                if not 0 <= corner[k] < count:
+                    raise InputError(scene, field, word, f"{kind} from 1 to {count}, the lines before")
+        corners.append(tuple(corner))
+    return corners
+
+
+def read_library(scene: Path, mesh: Path, libraries: list[str]) -> dict[str, tuple[Vector, Path | None]]:
+    """Colour, and picture beside the scene if there is one, of every material of the MTL files."""
+    found: dict[str, tuple[Vector, Path | None]] = {}
+    for listed in libraries:
+        whole = (scene.parent / mesh).parent / PurePosixPath(listed)
+        for name in [listed] if os.path.isfile(whole) else listed.split():  # several names, or one with blanks
+            file = mesh.parent / PurePosixPath(name.replace("\\", "/"))
+            found |= _read_mtl(scene.parent / file, file.parent)
+            if len(found) > _MOST:
+                raise InputError(file, "newmtl", f"({len(found)} materials)", f"at most {_MOST}")
+    return found
+
+
+def _read_mtl(path: Path, folder: Path) -> dict[str, tuple[Vector, Path | None]]:
+    """Materials of an MTL file; `folder`: where it lies, seen from the scene.
 
     Raises:
-        NeurolensError: Embree is not installed.
+        InputError: as of `read_bytes`; a colour or picture that is none.
     """
+    content = read_bytes(path, _LARGEST_MTL, "an MTL file beside the OBJ file")
+    found: dict[str, tuple[Vector, Path | None]] = {}
+    name = ""
+    for number, line in enumerate(content.decode("utf-8-sig", "replace").splitlines(), 1):
+        word, _, rest = line.partition("#")[0].strip().partition(" ")
+        place, rest = f"line {number}, {word}", rest.strip()
+        if word == "newmtl":
+            name = rest
+            found[name] = (_GREY, None)
+        elif word in ("Kd", "map_Kd") and name not in found:
+            raise InputError(path, place, rest[:60], "newmtl before it")
+        elif word == "Kd":  # linear RGB; one number stands for three
+            words = rest.split()
+            values = [float(w) for w in words if _is_number(w) and 0 <= float(w) <= 1]
+            if len(words) not in (1, 3) or len(values) != len(words):
+                raise InputError(path, place, rest[:60], "three numbers from 0 to 1")
+            red, green, blue = (values * 3)[:3]
+            found[name] = ((red, green, blue), found[name][1])
+        elif word == "map_Kd":
+            if not rest or rest.startswith("-"):
+                raise InputError(path, place, rest[:60], "the name of a picture, without options")
+            found[name] = (found[name][0], folder / PurePosixPath(rest.replace("\\", "/")))
+    return found
 
-    def __init__(self, first: int, triangles: FloatArray64, each: int = 1) -> None:
+
+class Property(NamedTuple):
+    """A value of each element of a kind in a PLY file, or a list of values, whose length is of type `length`."""
+
+    name: str
+    kind: str
+    length: str = ""
+
+
+@dataclass(frozen=True)
+class Element:
+    """A kind of element in a PLY file, how many the header promises, and what each has."""
+
+    name: str
+    count: int
+    properties: list[Property]
+
+
+def read_polygons(content: bytes) -> TriangleSet:
+    """Read the bytes of a PLY file; polygons are cut into fans.
+
+    Raises:
+        ValueError: no PLY file, or one that ends early; says what is wrong.
+    """
+    head, end, _ = content[:_LARGEST_HEADER].partition(b"end_header")
+    if not head.startswith(b"ply") or not end:
+        raise ValueError("expected a PLY file, which begins with ply and a header")
+    order, elements = _header(head.decode("ascii", "replace"))
+    for element in elements:
+        if element.count > len(content):
+            raise ValueError(f"{element.count} elements {element.name} in {len(content)} bytes")
+    columns, faces = dict[str, NDArray[np.float64]](), np.empty((0, 3), np.int64)
+    try:
+        body = _Body(content[content.index(b"\n", len(head)) + 1 :], order)
+        for element in elements:
+            lists = any(p.length for p in element.properties)
+            found, fans = ({}, body.fans(element)) if lists else (body.columns(element), faces)
+            columns = found if element.name == "vertex" else columns
+            faces = fans if element.name == "face" else faces
+    except (IndexError, OverflowError):
+        raise ValueError("the file ends before its last element") from None
+
+    def stacked(*names: str) -> NDArray[np.float64] | None:
+        return np.stack([columns[name] for name in names], 1) if columns.keys() >= set(names) else None
+
+    vertices, uvs = stacked(*"xyz"), (stacked(*pair) for pair in _COORDINATES)
+    assert vertices is not None  # the header has them
+    return TriangleSet(vertices, faces, next((uv for uv in uvs if uv is not None), None), stacked("nx", "ny", "nz"))
+
+
+def _header(text: str) -> tuple[str, list[Element]]:
+    """The byte order, "" of ASCII, and the kinds of elements in their order."""
+    order, elements = None, list[Element]()
+    for line in text.splitlines()[1:]:
+        match line.split():
+            case ["format", form, _] if form in _FORMATS:
+                order = _FORMATS[form]
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,12}", count):
+                elements.append(Element(name, int(count), []))
+            case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys() and elements:
+                if _TYPES[length][0] == "f" or (name in _CORNERS and _TYPES[kind][0] == "f"):
+                    raise ValueError("lists whose length is a fraction, or faces that name vertices by fractions")
+                elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[length]))
+            case ["property", kind, name] if kind in _TYPES and elements:
+                elements[-1].properties.append(Property(name, _TYPES[kind]))
+            case [] | ["comment", *_] | ["obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"{line[:60]!r} in its header")
+    vertex = next((e for e in elements if e.name == "vertex"), None)
+    if order is None or vertex is None or any(p.length for p in vertex.properties):
+        raise ValueError("its header names no format, or no vertices of plain numbers")
+    if not {p.name for p in vertex.properties} >= set("xyz"):
+        raise ValueError("its vertices have no x, y and z")
+    return order, elements
+
+
+def _numbers(text: bytes) -> NDArray[np.float64]:
+    """The numbers of an ASCII file, without a Python object for each."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
         try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError:
-            raise NeurolensError("meshes need Embree, which is not installed: pip install embreex") from None
-        self.first, self._each = first, each
-        corners = np.ascontiguousarray(triangles, np.float32)
-        # Robust: watertight at the edges that triangles share.
-        self._scene = EmbreeScene(robust=True)
-        self._triangles = TriangleMesh(self._scene, corners)
-        self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-
-    @classmethod
-    def of_rectangles(cls, first: int, corners: FloatArray64) -> Mesh:
-        """Rectangles [T, 3 corners, 3], whose corner 0 lies between the other two: two triangles each."""
-        far = corners[:, 1] + corners[:, 2] - corners[:, 0]
-        others = np.stack([far, corners[:, 2], corners[:, 1]], axis=1)
-        return cls(first, np.stack([corners, others], axis=1).reshape(-1, 3, 3), each=2)
-
-    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        entry, exit_ = slabs(rays, self._low, self._high)
-        np.minimum(exit_, best, out=exit_)
-        np.maximum(entry, NEAREST, out=entry)
-        # The box of a flat mesh is flat: a small margin keeps its triangles inside.
-        ray = np.flatnonzero(entry * np.float32(1 - 1e-5) <= exit_)
-        start = rays.origin.take(ray, axis=1)
-        moved = np.zeros(len(ray), np.float32)
-        while ray.size:
-            direction = rays.direction.take(ray, axis=1)
-            reach = np.minimum(best.take(ray) - moved, np.float32(1e30))
-            origin, towards = np.ascontiguousarray(start.T), np.ascontiguousarray(direction.T)
-            hit = self._scene.run(origin, towards, dists=reach, output=True)
-            met = np.flatnonzero(hit["primID"] >= 0)
-            distance = hit["tfar"][met] + moved[met]
-            ok = (distance > NEAREST) & (distance < best[ray[met]])
-            best[ray[met[ok]]] = distance[ok]
-            found[ray[met[ok]]] = self.first + hit["primID"][met[ok]] // self._each
-            again = met[distance <= NEAREST]
-            ray, moved = ray[again], moved[again] + _STEP
-            start = start.take(again, axis=1) + direction.take(again, axis=1) * _STEP
+            return np.fromstring(text, np.float64, sep=" ")
+        except (ValueError, DeprecationWarning):  # by version
+            raise ValueError("it holds words that are no numbers") from None
 
 
-def triangle_planes(corners: FloatArray64) -> FloatArray64:
-    """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
+class _Body:
+    """The part of a PLY file after its header: bytes in an order ("<", ">"), or the numbers of an ASCII file ("").
 
-    Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
+    It is read from the place `at` on, which counts bytes, or numbers. IndexError: it ends too early.
     """
-    a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(edge_b, edge_c)
-    area2 = np.maximum(np.sum(normal**2, axis=1, keepdims=True), 1e-300)  # a triangle of less is never hit
-    unit = normal / np.sqrt(area2)
-    across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
-    rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]
-    return np.stack(rows, axis=1)
+
+    def __init__(self, content: bytes, order: str) -> None:
+        self._content, self._order, self._at = content, order, 0
+        self._values: NDArray[Any] = np.frombuffer(content, np.uint8) if order else _numbers(content)
+
+    def _size(self, kind: str) -> int:
+        return int(kind[1]) if self._order else 1
+
+    def columns(self, element: Element) -> dict[str, NDArray[np.float64]]:
+        """The values by name of the next elements, which have no lists."""
+        kinds = [p.kind for p in element.properties]
+        start, self._at = self._at, self._at + element.count * sum(map(self._size, kinds))
+        if self._at > self._values.size:
+            raise IndexError
+        values: Any = self._values[start : self._at]
+        if self._order:
+            rows = values.view(np.dtype([(f"{k}", self._order + kind) for k, kind in enumerate(kinds)]))
+            values = [rows[f"{k}"] for k in range(len(kinds))]
+        else:
+            values = values.reshape(element.count, len(kinds)).T
+        with np.errstate(invalid="ignore"):  # NaN, which the mesh is refused for
+            return {p.name: v.astype(np.float64) for p, v in zip(element.properties, values, strict=True)}
+
+    def fans(self, element: Element) -> NDArray[np.int64]:
+        """The polygons of the next elements, in their order, as fans of triangles [T, 3]; none without corners."""
+        big: Literal["big", "little"] = "big" if self._order == ">" else "little"
+        starts, counts, form = array("q"), array("q"), ""  # where the corners of each begin, and how many there are
+        at, end = self._at, self._values.size
+        for _ in range(element.count):
+            for name, kind, length in element.properties:
+                count = 1
+                if length:
+                    first, at = at, at + self._size(length)
+                    number = self._content[first:at] if self._order else self._values[first]
+                    count = int.from_bytes(number, big) if isinstance(number, bytes) else int(number)
+                    if name in _CORNERS:
+                        starts.append(at)
+                        counts.append(count)
+                        form = kind
+                at += count * self._size(kind)
+                if count < 0 or at > end:
+                    raise IndexError
+        self._at = at
+        start, many = np.frombuffer(starts, np.int64), np.frombuffer(counts, np.int64)
+        if (few := many[many < 3]).size:
+            raise ValueError(f"a face of {few[0]} corners")
+        fans, face = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+        for count in np.unique(many).tolist():
+            rows = np.flatnonzero(many == count)
+            taken = self._values[start[rows][:, None] + np.arange(count * self._size(form))]
+            index = (taken.view(self._order + form) if self._order else taken).astype(np.int64)
+            corner = np.broadcast_to(index[:, :1], (len(rows), count - 2))
+            fans.append(np.stack([corner, index[:, 1:-1], index[:, 2:]], 2).reshape(-1, 3))
+            face.append(np.repeat(rows, count - 2))
+        return np.concatenate(fans)[np.argsort(np.concatenate(face), kind="stable")]
 
 
 def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:
@@ -170,33 +429,6 @@ def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> T
         raise InputError(scene, f"{field}.faces[{k}]", faces[k].tolist(), expected)
     warn(f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out")
     return replace(mesh, faces=faces[~flat])
-
-
-def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
-    """Whether a point [3] lies inside a closed mesh whose triangles face outwards.
-
-    By the winding number, the sum of the solid angles of the triangles over 4 pi (van Oosterom and Strackee 1983): 1
-    inside, 0 outside. A room, whose triangles face inwards, has -1; for an open mesh it means nothing.
-    """
-    corners = mesh.vertices[mesh.faces]
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    if not np.all((point > low) & (point < high)) or not _is_closed(corners):
-        return False
-    a, b, c = np.moveaxis(corners - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
-    volume = np.sum(a * np.cross(b, c), axis=1)
-    ab, bc, ca = (np.sum(x * y, axis=1) for x, y in ((a, b), (b, c), (c, a)))
-    solid = 2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
-    return bool(solid.sum() / (4 * np.pi) > 0.5)
-
-
-def _is_closed(corners: NDArray[np.float64]) -> bool:
-    """Whether each edge of triangles [T, 3, 3], by position, runs as often forwards as backwards."""
-    _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    faces = number.reshape(-1, 3)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    forth, back = (np.unique(pair, axis=0, return_counts=True) for pair in (edges, edges[:, ::-1]))
-    return forth[0].shape == back[0].shape and all(np.array_equal(x, y) for x, y in zip(forth, back, strict=True))
 
 
 class Parts:

@@ -1,4 +1,4 @@
-"""Analytic shapes: where rays of a batch meet them.
+"""Shapes: where rays of a batch meet them, analytic ones by numpy, triangles by Embree.
 
 Each shape improves, in place, the nearest hit known so far: `best` [N] float32 distances in metres and `found` [N]
 int32 surface numbers. A shape owns surface numbers from `first` on. Arithmetic stays in a few arrays the size
@@ -8,11 +8,13 @@ of the batch, which live in the cache; tests are ordered so that the cheap rejec
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import NeurolensError
 from neurolens.cameras.contract import FloatArray
 
 IntArray = NDArray[np.int32]
@@ -210,6 +212,7 @@ def slabs(rays: Rays, low: FloatArray, high: FloatArray) -> tuple[FloatArray, Fl
 
 
 MANY_SPHERES = 1024  # beyond, clusters are faster than testing all
+_STEP = np.float32(1e-5)  # m by which a ray that met its own start triangle is moved on
 _LARGE_M = 1000.0  # in float32 the surface of larger spheres would lie behind the rays that leave it
 
 
@@ -323,3 +326,72 @@ def _clusters(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.
     axis = int(np.argmax(np.ptp(centres[rows], axis=0)))
     halves = np.array_split(rows[np.argsort(centres[rows, axis], kind="stable")], 2)
     return [group for half in halves for group in _clusters(half, centres)]
+
+
+def has_embree() -> bool:
+    """Whether Embree is installed, which has no wheel for some machines."""
+    return find_spec("embreex") is not None
+
+
+class Mesh:
+    """Triangles [T, 3 corners, 3] in m, for Embree; `each` of them in a row are one surface, from `first` on.
+
+    Raises:
+        NeurolensError: Embree is not installed.
+    """
+
+    def __init__(self, first: int, triangles: FloatArray64, each: int = 1) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError:
+            raise NeurolensError("meshes need Embree, which is not installed: pip install embreex") from None
+        self.first, self._each = first, each
+        corners = np.ascontiguousarray(triangles, np.float32)
+        # Robust: watertight at the edges that triangles share.
+        self._scene = EmbreeScene(robust=True)
+        self._triangles = TriangleMesh(self._scene, corners)
+        self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+
+    @classmethod
+    def of_rectangles(cls, first: int, corners: FloatArray64) -> Mesh:
+        """Rectangles [T, 3 corners, 3], whose corner 0 lies between the other two: two triangles each."""
+        far = corners[:, 1] + corners[:, 2] - corners[:, 0]
+        others = np.stack([far, corners[:, 2], corners[:, 1]], axis=1)
+        return cls(first, np.stack([corners, others], axis=1).reshape(-1, 3, 3), each=2)
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        entry, exit_ = slabs(rays, self._low, self._high)
+        np.minimum(exit_, best, out=exit_)
+        np.maximum(entry, NEAREST, out=entry)
+        # The box of a flat mesh is flat: a small margin keeps its triangles inside.
+        ray = np.flatnonzero(entry * np.float32(1 - 1e-5) <= exit_)
+        start = rays.origin.take(ray, axis=1)
+        moved = np.zeros(len(ray), np.float32)
+        while ray.size:
+            direction = rays.direction.take(ray, axis=1)
+            reach = np.minimum(best.take(ray) - moved, np.float32(1e30))
+            origin, towards = np.ascontiguousarray(start.T), np.ascontiguousarray(direction.T)
+            hit = self._scene.run(origin, towards, dists=reach, output=True)
+            met = np.flatnonzero(hit["primID"] >= 0)
+            distance = hit["tfar"][met] + moved[met]
+            ok = (distance > NEAREST) & (distance < best[ray[met]])
+            best[ray[met[ok]]] = distance[ok]
+            found[ray[met[ok]]] = self.first + hit["primID"][met[ok]] // self._each
+            again = met[distance <= NEAREST]
+            ray, moved = ray[again], moved[again] + _STEP
+            start = start.take(again, axis=1) + direction.take(again, axis=1) * _STEP
+
+
+def triangle_planes(corners: FloatArray64) -> FloatArray64:
+    """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
+
+    Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
+    """
+    a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(edge_b, edge_c)
+    area2 = np.maximum(np.sum(normal**2, axis=1, keepdims=True), 1e-300)  # a triangle of less is never hit
+    unit = normal / np.sqrt(area2)
+    across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
+    rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]
+    return np.stack(rows, axis=1)

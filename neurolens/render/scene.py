@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import F_NUMBER, FILM_MM, from_dict, said, within
@@ -21,8 +22,7 @@ from neurolens.lens.shot import Shot, StopShape
 from neurolens.render import scenetables as tables
 from neurolens.render.colour import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.images import make_aperture, read_environment, read_pictures
-from neurolens.render.mesh import Parts, encloses
-from neurolens.render.meshfile import TriangleSet
+from neurolens.render.mesh import Parts, TriangleSet
 from neurolens.render.scenetables import (
     BLACK,
     Checked,
@@ -289,6 +289,33 @@ def _check_texture(
             raise InputError(path, place, name, "a mesh file with texture coordinates, or no texture")
     elif kind not in ("quads", "discs") and texture.kind == "image" and texture.size_m is None:
         raise InputError(path, f"textures.{name}.size_m", "(missing)", "width, height in m")
+
+
+def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
+    """Whether a point [3] lies inside a closed mesh whose triangles face outwards.
+
+    By the winding number, the sum of the solid angles of the triangles over 4 pi (van Oosterom and Strackee 1983): 1
+    inside, 0 outside. A room, whose triangles face inwards, has -1; for an open mesh it means nothing.
+    """
+    corners = mesh.vertices[mesh.faces]
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    if not np.all((point > low) & (point < high)) or not _is_closed(corners):
+        return False
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    volume = np.sum(a * np.cross(b, c), axis=1)
+    ab, bc, ca = (np.sum(x * y, axis=1) for x, y in ((a, b), (b, c), (c, a)))
+    solid = 2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return bool(solid.sum() / (4 * np.pi) > 0.5)
+
+
+def _is_closed(corners: NDArray[np.float64]) -> bool:
+    """Whether each edge of triangles [T, 3, 3], by position, runs as often forwards as backwards."""
+    _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = number.reshape(-1, 3)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forth, back = (np.unique(pair, axis=0, return_counts=True) for pair in (edges, edges[:, ::-1]))
+    return forth[0].shape == back[0].shape and all(np.array_equal(x, y) for x, y in zip(forth, back, strict=True))
 
 
 def _check_camera(path: Path, settings: SceneSettings, triangles: Sequence[TriangleSet]) -> None:

@@ -65,6 +65,7 @@ static void arrive(Arrivals *restrict to, const Grid *grid, int row, int column,
 }
 
 /* pixels, samples: those of the tile, one after the other from `start` on in the picture; sums: [pixels, COLUMNS].
+   value: [paths, LANES]; weight: [LANES, paths]; places: [LANES, 2, paths].
    spill: [cells, 4], of the picture's pixels from `first` on; all samples' companions are in it. */
 void light_of_tile(
     size_t pixels, size_t samples, size_t start, size_t first, size_t cells, const Grid *grid, const Bin *table,
@@ -83,7 +84,7 @@ void light_of_tile(
         sum[LUMINANCE2] = sum[DROPPED] = 0;
         for (int lane = 0; lane < LANES; lane++)
             for (size_t s = 0; s < samples; s++) {
-                radiance[lane][s] = value[lane * count + begin + s];
+                radiance[lane][s] = value[(begin + s) * LANES + lane];
                 open += weight[lane * count + begin + s];
             }
         for (size_t s = 0; s < samples; s++) {

@@ -27,19 +27,21 @@ from neurolens.render.lights import (
     Surroundings,
 )
 from neurolens.render.materials import CoatTable
-from neurolens.render.mesh import Mesh, has_embree, triangle_planes
 from neurolens.render.primitives import (
     MANY_SPHERES,
     AxisQuad,
     Box,
     Disc,
     IntArray,
+    Mesh,
     Plane,
     Primitive,
     Quad,
     Rays,
     SphereClusters,
     Spheres,
+    has_embree,
+    triangle_planes,
 )
 from neurolens.render.scene import Scene
 from neurolens.render.scenetables import BLACK, Emitter, Material, Texture

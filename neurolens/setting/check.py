@@ -116,11 +116,9 @@ def _focal_length(lens: Lens, efl: float, stated: float | None, plane: str = "")
 
 def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
     tabled, last = float(lens.surfaces[-1].thickness_mm), float(lens.vertices_mm[-2])
-    doubt = ""
-    if efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl:
-        film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
-        doubt = f"{film}, its focus is at {last + computed:.2f} mm"
-    return Check("back focus, mm", computed, tabled, doubt)
+    film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
+    wrong = efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl
+    return Check("back focus, mm", computed, tabled, f"{film}, its focus is at {last + computed:.2f} mm" * wrong)
 
 
 def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:
@@ -135,11 +133,9 @@ def _beam(lens: Lens, data: FirstOrder) -> Check:
     """Whether the rims let the axial beam of the stop through: its f-number against that of the widest real beam."""
     height, blocker = axial_beam(lens)
     n = abs(data.efl_mm) / (2 * height) if height > 0 else math.inf
-    doubt = ""
-    wanted = max(data.f_number, lens.f_number)
-    if n > (1 + BEAM_TOLERANCE) * wanted and blocker is not None and blocker != lens.stop_index:
-        doubt = f"the rim of surface {blocker} limits the axial beam to f/{n:.3g}, the stop to f/{data.f_number:.3g}"
-    return Check("f-number of the axial beam", n, None, doubt)
+    wrong = n > (1 + BEAM_TOLERANCE) * max(data.f_number, lens.f_number) and blocker not in (None, lens.stop_index)
+    doubt = f"the rim of surface {blocker} limits the axial beam to f/{n:.3g}, the stop to f/{data.f_number:.3g}"
+    return Check("f-number of the axial beam", n, None, doubt * wrong)
 
 
 def _edges(lens: Lens) -> Check:

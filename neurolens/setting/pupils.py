@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -325,6 +326,7 @@ def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> l
     return coarse
 
 
+@lru_cache(maxsize=16)
 def image_radius_mm(lens: Lens) -> tuple[float, str]:
     """Return the radius of the lit film, and where it comes from.
 

@@ -35,7 +35,7 @@ _EDGES, _HALVINGS, _CODES, _RARE = 20_000, 12, 4000, 300  # rays between which e
 _ZONES, _FEW = (8, 3, 3), 2500  # of film radius squared, azimuth and stop; rays that tell about a zone
 _ALL = int(np.prod(_ZONES))
 _SQUEEZES = (1.0, 0.7, 0.5, 0.35, 1.4, 2.0)  # those that are tried
-_ROUNDS, _HEAVIER = 8, 20.0  # of least squares; by how much rays that a circle would lose weigh more
+_ROUNDS, _HEAVIER = 20, 20.0  # of least squares; by how much rays that a circle would lose weigh more
 _RIDGE, _CALM = 1e-9, 1e-3  # of the equations' diagonal; rays, by whose force numbers stay at those of all states
 _ALLOWED = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
 LOST = 1e-3  # of a zone's rays are lost in all
@@ -96,7 +96,8 @@ def _fit_circles(
     counts = np.max([np.bincount(e.codes, minlength=_CODES) for e in edges], axis=0)
     counts[: st.NO_SOLUTION + 1] = counts[st.blocked(lenses[0].stop_surface, st.RIM)] = 0
     rims = np.flatnonzero(counts > _RARE)
-    fits = [_fit_rims(edges, pupils, exponents, int(code)) for code in rims]
+    lit = [r.at(np.flatnonzero(r.passed)[:_EDGES]) for r in rays]
+    fits = [_fit_rims(edges, lit, pupils, exponents, int(code)) for code in rims]
     for k, (pupil, drawn) in enumerate(zip(pupils, rays, strict=True)):
         numbers = np.array([fit[k] for fit in fits]).reshape(len(rims), -1)
         pupils[k] = _with_circles(replace(pupil, wide=_disc(pupil, drawn, len(rims))), exponents, numbers)
@@ -167,24 +168,35 @@ def _codes(lens: ShaderLens, pupil: PupilCircles, rays: _Rays, point: Array) -> 
     return through.status(film, point, nm[0], z[0], lens.stop_radius_mm)
 
 
-def _fit_rims(edges: Sequence[_Rays], pupils: Sequence[PupilCircles], exponents: Exponents, code: int) -> list[Array]:
+def _fit_rims(
+    edges: Sequence[_Rays], lit: Sequence[_Rays], pupils: Sequence[PupilCircles], exponents: Exponents, code: int
+) -> list[Array]:
     """Numbers [M + 1] of a rim's circle in every state: least squares, which stay near those of all states together
-    where no ray tells otherwise."""
-    rows = [_features(r.at(np.flatnonzero(r.codes == code)), p, exponents) for r, p in zip(edges, pupils, strict=True)]
-    together = _least(np.concatenate(rows, 1), np.zeros(len(exponents)))
-    return [np.append(_least(row, together), 1.0) for row in rows]
+    where no ray tells otherwise.
+
+    Args:
+        edges: of `_edges`. lit: rays that pass.
+    """
+    rows, on_edge = [], []
+    for at_rims, inside, pupil in zip(edges, lit, pupils, strict=True):
+        parts = (at_rims.at(np.flatnonzero(at_rims.codes == code)), inside)
+        features = [_features(part, pupil, exponents) for part in parts]
+        rows.append(np.concatenate(features, 1))
+        on_edge.append(np.repeat([1.0, 0.0], [f.shape[1] for f in features]))
+    together = _least(np.concatenate(rows, 1), np.concatenate(on_edge), np.zeros(len(exponents)))
+    return [np.append(_least(*row, together), 1.0) for row in zip(rows, on_edge, strict=True)]
 
 
-def _least(features: Array, near: Array) -> Array:
-    """Numbers [M] for which a margin, with the last number 1, is nearly 0 on all rays, rather above it than below, and
-    which lie near others."""
-    size = np.sqrt(np.square(features).mean(1)) if features.shape[1] else np.ones(len(features))
-    scaled, numbers, weight = features / size[:, None], near, np.ones(features.shape[1])
-    matrix, lacks = scaled[:-1], -features[-1] - near @ features[:-1]
+def _least(features: Array, on_edge: Array, near: Array) -> Array:
+    """Numbers [M] for which a margin, with the last number 1, is nearly 0 on the edge, rather above it than below, not
+    below 0 for rays inside, and which lie near others; `on_edge` [N] is 1 or 0."""
+    size = np.sqrt(np.square(features).mean(1))
+    matrix, numbers, weight = features[:-1] / size[:-1, None], near, on_edge
+    lacks = -features[-1] - near @ features[:-1]
     calm = np.eye(len(matrix)) * (_CALM + _RIDGE * len(weight))
     for _ in range(_ROUNDS):
         numbers = near + np.linalg.solve((matrix * weight) @ matrix.T + calm, matrix @ (weight * lacks)) / size[:-1]
-        weight = np.where(numbers @ features[:-1] + features[-1] < 0, _HEAVIER, 1.0)
+        weight = np.where(numbers @ features[:-1] + features[-1] < 0, _HEAVIER, on_edge)
     return numbers
 
 

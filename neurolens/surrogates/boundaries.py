@@ -34,7 +34,7 @@ GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
 # Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
-# those errors, or by hardly more than with all terms. At a quarter as many rays were clipped wrongly as with all;
+# those errors, or by hardly more than with all terms. At a quarter hardly more rays were clipped wrongly than with all;
 # networks clipped more, and keep all. Of the transmittance, which nothing is decided by, a larger share is enough.
 NEEDED_SHARE, _NEARLY, _THROUGH_SHARE = 0.25, 1.2, 0.6
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.

@@ -66,7 +66,7 @@ def test_opencv_projects_to_the_same_pixels(kind: str, tmp_path: Path) -> None:
     found = example(kind)
     direction = rays(min(found.widest_rad, 1.5))
     path = tmp_path / "camera.yaml"
-    path.write_text(files._file_storage(found, 0.25))
+    files.write_projection(tmp_path / "camera", found, {"rms_px": 0.25})
     stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix, numbers = (stored.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
     assert (stored.getNode("image_width").real(), stored.getNode("avg_reprojection_error").real()) == (1920, 0.25)

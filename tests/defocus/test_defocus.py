@@ -18,9 +18,8 @@ from neurolens.cameras.field import field_of, frame_of
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
-from neurolens.defocus.gather import gather, spread_over
 from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.picture import spread_highlights, take_highlights
+from neurolens.defocus.picture import gather, spread_highlights, spread_over, take_highlights
 from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot

@@ -1,7 +1,5 @@
 """Measurements: goals that cannot be missed unseen, kept rows, promises, pupils, benches on known times."""
 
-from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import lens_models
@@ -9,11 +7,11 @@ import numpy as np
 import pytest
 from shipped import whole
 
-from experiments import lab, osl_noise
+from experiments import lab
 from experiments import pupils as passage
 from experiments.__main__ import main
 from experiments.promises import Outcome, read_index, report_outcome
-from experiments.pupils import CASES, TABLE_5_3
+from experiments.pupils import CASES
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.program import SCENE_RAY
@@ -31,6 +29,8 @@ from neurolens.trace.tracegraph import exact_graph
         (["models", "--list", "no.toml"], "no.toml"),
         (["gallery", "comma"], "did you mean 'coma'"),
         (["osl-noise", "--blender-python", "no-blender"], "no-blender"),
+        (["surrogates", "cooke_triplet_50", "--methods", "nonsense"], "ols-64"),
+        (["surrogates", "cooke_triplet_50", "lenses/cooke_triplet_50.toml"], "names differ"),
     ],
 )
 def test_what_is_not_there_is_one_line_and_leaves_no_folder(
@@ -65,23 +65,6 @@ def test_a_speed_below_its_floor_fails() -> None:
 SAMPLES = 2**13
 
 
-@cache
-def test_noise_in_cycles_is_judged_in_the_worse_pattern() -> None:
-    rows = [
-        {"scene": s, "pattern": p, "camera": c, "noise": {"16": [n, n, n]}, "samples 0.01": taken}
-        for s, p, c, n, taken in (
-            ("sky", "AUTOMATIC", osl_noise.OFF, 0.01, 80.0),
-            ("sky", "AUTOMATIC", osl_noise.ON, 0.05, 96.0),
-            ("open", "AUTOMATIC", osl_noise.OFF, 0.1, 100.0),
-            ("open", "AUTOMATIC", osl_noise.ON, 0.14, 120.0),
-            ("open", "TABULATED_SOBOL", osl_noise.OFF, 0.1, 100.0),
-            ("open", "TABULATED_SOBOL", osl_noise.ON, 0.16, 110.0),
-        )
-    ]
-    found = [(g.measured, g.verdict) for g in osl_noise.goals(rows)]
-    assert found == [(1.2, "reached"), (pytest.approx(1.6), "missed"), (1.2, "reached")]
-
-
 def measured(lens: str, f_number: float) -> lab.Row:
     case = next(c for c in CASES if (c.lens, c.f_number) == (lens, f_number))
     return passage.measure(case, SAMPLES)
@@ -103,15 +86,6 @@ def test_tessar_through_the_rear_rim_is_steinerts() -> None:
     row = measured("brendel_tessar_100", 4.0)
     for method in ("rear rim", "pixel disc"):
         assert 100 * row["rates"][method]["passed"] == pytest.approx(row["theirs_percent"][method], abs=3)
-
-
-def test_pixel_of_table_5_3() -> None:
-    rows = list(passage.pixel_rates(SAMPLES))
-    assert [n for n, _, _ in rows] == list(TABLE_5_3)
-    # Once vignetting is past, the rate goes with the area of the stop.
-    areas = [rate * n**2 for n, rate, _ in rows[1:6]]
-    for area, later in pairwise(areas):
-        assert later / area == pytest.approx(1, rel=0.1)
 
 
 def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:

@@ -14,5 +14,4 @@ def test_merging_survives_what_the_harness_does(tmp_path: Path) -> None:
     assert main(["survive", "--only", "merge", "--kills", "1", "--output", str(tmp_path)]) == 0
     row = (tmp_path / "survive.md").read_text().splitlines()[-1].split(" | ")
     same, whole = map(int, row[3].split(" of "))  # runs that ended; one that a kill came too late for is one, too
-    assert row[:2] == ["| merge", "1"] and same == whole >= 1 and row[4] == "0"
-    assert row[5:] == ["exit 2, 1 line, same after", "exit 0 and 0, same", "same", "exit 2, 1 line |"]
+    assert row[:2] == ["| merge", "1"] and same == whole >= 1 and row[4] == "0 |"

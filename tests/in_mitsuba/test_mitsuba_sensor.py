@@ -15,10 +15,12 @@ from PIL import Image
 
 from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.cli import main
-from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
+from neurolens.lens.shot import Shot
+from neurolens.mitsuba import load_scene, register, render, require_mitsuba
 from neurolens.render.pictures import read_exr
 from neurolens.render.renderer import render as our_render
 from neurolens.render.scene import scene_from_tables
@@ -40,7 +42,7 @@ def variant(name: str) -> Any:
 @pytest.fixture(scope="module")
 def lens() -> Camera:
     """A real lens, wide open, on a film that it vignettes."""
-    return camera(MODEL, film_mm=(26.0, 26.0), focus_m=3.9, f_number=2.0)
+    return make_camera(MODEL, Shot((26.0, 26.0), 3.9, 2.0))
 
 
 def furnace(mi: Any, size: int) -> dict[str, Any]:
@@ -115,7 +117,7 @@ def test_scalar_variants_see_the_same_white(name: str) -> None:
     mi = variant(name)
     seen = render(load_scene(furnace(mi, 2)), ThinLens(50.0, 2.0, 3.9, (26.0, 26.0)), spp=16)
     np.testing.assert_allclose(seen.mean(), 0.92, atol=0.1)  # cos^4 over the film
-    chosen = camera(MODEL, film_mm=(2.0, 2.0), focus_m=3.9, f_number=2.0)
+    chosen = make_camera(MODEL, Shot((2.0, 2.0), 3.9, 2.0))
     seen = render(load_scene(furnace(mi, 2)), chosen, spp=32)
     np.testing.assert_allclose(seen.mean(), 1, atol=0.2)
 

@@ -8,8 +8,7 @@ import pytest
 from render_helpers import diffuse, world
 
 from neurolens.base.errors import NeurolensError
-from neurolens.render.mesh import Mesh
-from neurolens.render.primitives import Quad, Rays, SphereClusters, Spheres
+from neurolens.render.primitives import Mesh, Quad, Rays, SphereClusters, Spheres
 from neurolens.render.world import World
 
 RANDOM = np.random.default_rng(11)

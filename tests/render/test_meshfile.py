@@ -11,10 +11,9 @@ from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.settings import from_dict
-from neurolens.render import meshfile
+from neurolens.render import mesh as meshes
 from neurolens.render.colour import SpectralRange
-from neurolens.render.mesh import read_mesh
-from neurolens.render.meshfile import TriangleSet, read_file
+from neurolens.render.mesh import TriangleSet, read_file, read_mesh
 from neurolens.render.primitives import Rays
 from neurolens.render.scene import Scene, scene_from_tables
 from neurolens.render.scenetables import MeshSettings
@@ -204,7 +203,7 @@ def test_large_and_missing_files_are_refused_before_they_are_read(
 ) -> None:
     path = tmp_path / "a.obj"
     path.write_bytes(obj())
-    monkeypatch.setattr(meshfile, "LARGEST_FILE", 100)
+    monkeypatch.setattr(meshes, "LARGEST_FILE", 100)
     with pytest.raises(InputError, match="at most 100 bytes"):
         read_file(HERE, "meshes[0].file", path)
     for missing in (tmp_path / "none.ply", tmp_path):

@@ -13,9 +13,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.lens.apertures import Aperture
 from neurolens.render import images
-from neurolens.render.mesh import encloses
 from neurolens.render.renderer import render
-from neurolens.render.scene import load_scene, scene_from_tables
+from neurolens.render.scene import encloses, load_scene, scene_from_tables
 
 SCENES = Path(__file__).parent.parent.parent / "experiments" / "scenes"
 TEXTURES = {

@@ -203,7 +203,7 @@ def test_maps_of_an_anamorphic_lens_tell_their_pixels_shape_and_both_pupils(
     before = row["before_film_mm"]
     assert before[0] - before[1] == pytest.approx(y - x) == pytest.approx(33.16, abs=0.01)
     camera = make_camera(lens, Shot(film_mm=film, focus_m=1.5, f_number=22.0))
-    square, _ = stratified(64, (550.0, 550.0))
+    square, _ = stratified(192, (550.0, 550.0))
     sizes = []
     for k in range(2):
         point = np.zeros((3, square.shape[1]), np.float32)

@@ -18,7 +18,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.ideal import Pinhole
-from neurolens.cameras.warped import Warped
+from neurolens.cameras.reduced import Warped
 from neurolens.cli import main
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
@@ -248,7 +248,6 @@ def fitted_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Probe, "maps", property(lambda probed: probed.camera_maps))
         patch.setattr(pupil_fit, "_RAYS", 3000)
-        patch.setattr(pupil_fit, "_FIRST", 15_000)
         patch.setattr(focusing, "_RINGS", 96)
         patch.setattr(tried, "lens_of", lambda file, zoom, report: shader_of(file.name, zoom))
         yield

@@ -11,7 +11,7 @@ from neurolens.base.errors import InputError
 from neurolens.plan import plan as traded
 from neurolens.plan.candidates import Choice
 from neurolens.plan.costs import Work
-from neurolens.plan.plan import best_within, front, in_seconds, spread
+from neurolens.plan.plan import best_within, front, in_seconds
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
 
@@ -55,16 +55,6 @@ def test_the_front_holds_what_nothing_betters_and_time_buys_the_most_faithful() 
     assert [c.name for c in front(offered)] == ["a", "b", "c"]
     bought = {s: best_within(offered, s) for s in (0.5, 1.0, 5.0, 9.0)}
     assert [c and c.name for c in bought.values()] == [None, "a", "b", "c"]
-
-
-def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
-    many = [choice(str(k), 1 / (k + 1), 0.0, s=float(k)) for k in range(30)]
-    for chosen in (0, 7, 13, 29):
-        names = [c.name for c in spread(many, many[chosen], 6)]
-        assert len(names) == 6 and {"0", "29", str(chosen)} <= set(names) and names == sorted(names, key=int)
-    assert spread(many[:3], None, 6) == many[:3]
-    beside = choice("beside", 0.5, 0.0, s=2.5)  # a choice that another camera betters is shown, too
-    assert beside in spread(many, beside, 6) and spread(many[:2], beside) == [*many[:2], beside]
 
 
 def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from neurolens.setting.states import set_lens
 from neurolens.study.rays import ray_errors
 from neurolens.surrogates import polynomial
 from neurolens.surrogates.boundaries import stop_crossing
-from neurolens.surrogates.cores import DIRECTION, STOP, InvariantPolynomial
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial
 from neurolens.surrogates.fit import fit_model
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import (
@@ -42,6 +42,7 @@ from neurolens.surrogates.targets import (
     fit_encoding,
     scales_of,
 )
+from neurolens.surrogates.terms import monomials, solve, vector_columns
 
 ROOT = Path(__file__).parents[2] / "lenses"
 
@@ -208,6 +209,23 @@ def test_more_terms_than_candidates_keep_all_candidates() -> None:
     dense = model(ModelSettings("dense", degree=2))
     assert fitted.core.coefficients_per_vector == dense.core.coefficients_per_vector
     assert film_um(fitted) == pytest.approx(film_um(dense), rel=1e-6)
+
+
+def test_the_position_has_fewer_terms_than_the_direction_and_neither_errs_more() -> None:
+    data, settings = prepared(), ModelSettings("ols", terms=36)
+    fewer = fit_polynomial(data, settings)
+    position, direction = (int((fewer.ab[k] != 0).sum()) for k in (POSITION, DIRECTION))
+    assert position < 0.85 * direction <= 0.85 * 36
+    rows = vector_columns(monomials(data.train.field.invariants(), fewer.exponents), data.train.field)
+    either = (fewer.ab[:2] != 0).any(0).reshape(-1)
+    shared = solve(rows[either], data.train.vectors[:2].flatten(1)) @ rows[either]
+    weight = torch.tensor(film_equivalent_weights(data.pairs.lens, data.pairs.domain))[:, None]
+
+    def off(found: Tensor) -> Tensor:
+        return (weight * (found - data.train.vectors[:2].flatten(1))).norm(dim=1)
+
+    own = off(torch.stack([*fewer(data.train.field)[0][:2]]).flatten(1))
+    assert own[DIRECTION] < 1.15 * off(shared)[DIRECTION] and own[POSITION] < own[DIRECTION] / 2
 
 
 def test_growth_goes_on_where_directions_err_and_takes_nothing_from_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -47,17 +48,14 @@ class Library:
         icons = {name: self._icon(name, lens.picture) for name, lens in self.lenses.items()}
         self.bokeh = {name: self._icon(f"bokeh of {name}", lens.bokeh) for name, lens in self.lenses.items()}
 
-        def shown(order: str, lens_id: str) -> int:
-            """The picture of a lens in a menu: its section; its bokeh where lenses are sorted by their character."""
-            return (self.bokeh[lens_id] if order in facts.CHARACTER else 0) or icons[lens_id]
-
-        self.items = {
-            order: [
-                (lens.lens_id, lens.entry(order), lens.source, shown(order, lens.lens_id), lens.number)
+        self.items = {}
+        for order in facts.ORDERS:
+            # The section of a lens in the menu; its bokeh where lenses are sorted by their character.
+            shown = icons | {k: v for k, v in self.bokeh.items() if v and order in facts.CHARACTER}
+            self.items[order] = [
+                (lens.lens_id, lens.entry(order), lens.source, shown[lens.lens_id], lens.number)
                 for lens in facts.ordered(self.lenses.values(), order)
             ]
-            for order in facts.ORDERS
-        }
 
     def _icon(self, name: str, picture: Path | None) -> int:
         """The number of a picture, which Blender reads when it is first shown; 0 without one."""
@@ -330,15 +328,10 @@ def warn_of_black(scene: Any, _graph: Any = None) -> None:
             print(f"neurolens: camera {found.name!r}, frame {scene.frame_current}: {line}", file=sys.stderr)
 
 
-def _wrapped(layout: Any, text: str, icon: str, width: int = 60) -> None:
+def _wrapped(layout: Any, text: str, icon: str) -> None:
     """A sentence in lines that the panel can show."""
-    words, line, first = text.split(), "", True
-    for word in [*words, None]:
-        if word is None or len(line) + len(word) > width:
-            layout.label(text=line, icon=icon if first else "BLANK1")
-            line, first = "", False
-        if word is not None:
-            line = f"{line} {word}".strip()
+    for number, line in enumerate(textwrap.wrap(text, 60, break_long_words=False)):
+        layout.label(text=line, icon="BLANK1" if number else icon)
 
 
 CLASSES = (
