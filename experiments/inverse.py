@@ -22,9 +22,9 @@ from experiments import lab
 from experiments.lab import Report, Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.graph.derive import solve, with_jacobian
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.graph.newton import solve, with_jacobian
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice

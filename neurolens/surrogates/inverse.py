@@ -22,10 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.derive import derivative, determinant, limited_newton, with_derivatives
 from neurolens.graph.interpret import evaluate, monomials
 from neurolens.graph.ir import Exponents, Graph, Value, pruned
-from neurolens.graph.newton import determinant, limited_newton
 from neurolens.graph.program import RAY
 from neurolens.surrogates.assemble import (
     EXACT,
