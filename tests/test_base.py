@@ -412,3 +412,19 @@ def test_settings_are_options(capsys: pytest.CaptureFixture[str]) -> None:
         ["--cell", "--rays", "--fast", "--kind"]
     )
     assert "(default" not in over.format_help()
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> None:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress({"trace": 10, "fit": 60}, stream=stream, interval_s=5, clock=clock)
+    with progress.stage("trace") as report:
+        clock.now += 6
+        report(0.25)
+    assert stream.getvalue().splitlines()[0] == "trace:  25%, 6.0 s, 18 s left (in all 1 min 18 s left)"

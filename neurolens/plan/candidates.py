@@ -183,10 +183,9 @@ class Trial:
         """A camera with its cost."""
         choice, (timing, weights) = judged.choice, judged.cost()
         times = weights * self.work.noise[choice.disperses]
-        a_path = timing["min"] * self.work.calls[choice.disperses]
         return replace(
             choice,
-            cost=a_path * (1.0 if self.probed.asked.denoised else times),
+            cost=timing["min"] * (1.0 if self.probed.asked.denoised else times),
             noise=times,
             spread=timing["median"] / timing["min"] if timing["min"] else 1.0,
             # A shader that does not focus so near shows nothing.

@@ -26,7 +26,7 @@ from neurolens.cameras.model import OnnxCamera
 from neurolens.graph.program import Program
 from neurolens.plan.footprints import Array, Places
 from neurolens.render.film import PixelGrid
-from neurolens.render.job import LANES, Job, develop
+from neurolens.render.job import Job, develop
 from neurolens.render.renderer import run
 from neurolens.render.scene import Scene
 from neurolens.render.world import shared_worlds
@@ -55,13 +55,11 @@ class Work:
     """The parts of the cost of a path that all cameras of a kind share; each pair is without and with dispersion.
 
     Attributes:
-        rest: cost of a path besides its evaluations of the camera; 0 where the camera alone counts.
-        calls: evaluations of the camera on a path.
+        rest: cost of a path besides a ray of the camera, the hero's; 0 where the camera alone counts.
         noise: variance at equal samples and equal weights, over that of cameras that do not disperse.
     """
 
     rest: tuple[float, float] = (0.0, 0.0)
-    calls: tuple[float, float] = (1.0, 1.0)
     noise: tuple[float, float] = (1.0, 1.0)
 
 
@@ -108,15 +106,13 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
             for `noise`.
     """
     strips, samples = strips_of(scene, _STRIP_PATHS, 1, _STRIPS), min(scene.settings.camera.samples, _SAMPLES)
-    rest, calls, variance = [], [], []
+    rest, variance = [], []
     for camera, weight in zip((plain, colours), weights, strict=True):
         with shared_worlds():
             _strip(scene, camera, 0, (0, 1), samples)  # what is fitted or compiled once is no part of a path
             jobs = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
         ns = [[1e9 * j.film.seconds[1] / (j.tiling.pixels * samples) for j in some] for some in jobs]
-        several = jobs[0][0].mode == "companions" and not getattr(camera, "lateral", False)
-        calls.append(float(LANES) if several else 1.0)
-        besides = float(np.min(ns, axis=0).mean()) - calls[-1] * ns_a_ray(camera, places)["min"]
+        besides = float(np.min(ns, axis=0).mean()) - ns_a_ray(camera, places)["min"]
         rest.append(max(besides, 0.0))
         one, two = (np.concatenate([develop(j)[0] for j in some]).astype(np.float64) for some in jobs)
         apart = np.square(one - two).mean(axis=-1)  # twice the variance
@@ -124,7 +120,7 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
         mean = max(float(one.mean()), 1e-30)
         variance.append(float(np.minimum(apart, most).mean()) / mean**2 / noise(weight, places.share))
     ratio = variance[1] / variance[0] if variance[0] > 0 and math.isfinite(variance[1]) else 1.0
-    return Work((rest[0], rest[1]), (calls[0], calls[1]), (1.0, ratio))
+    return Work((rest[0], rest[1]), (1.0, ratio))
 
 
 def strips_of(scene: Scene, paths: int, least: int, count: int = 3) -> list[tuple[int, int]]:

@@ -167,7 +167,7 @@ def work_for(scene: Scene, probed: Probe, target: Target) -> Work:
 def exact_suffices(probed: Probe, work: Work) -> bool:
     """Whether not even a model that costs nothing would save enough, so that nothing needs to be fitted."""
     rest = work.rest[probed.exact.dispersive]
-    exact = work.calls[probed.exact.dispersive] * ns_a_ray(probed.exact, probed.places)["min"] if rest else math.inf
+    exact = ns_a_ray(probed.exact, probed.places)["min"] if rest else math.inf
     return recommended((0.0,), float, exact, rest, ALIKE) == exact
 
 

@@ -37,8 +37,8 @@ _ALL = int(np.prod(_ZONES))
 _SQUEEZES = (1.0, 0.7, 0.5, 0.35, 1.4, 2.0)  # those that are tried
 _ROUNDS, _HEAVIER = 20, 20.0  # of least squares; by how much rays that a circle would lose weigh more
 _RIDGE, _CALM = 1e-9, 1e-3  # of the equations' diagonal; rays, by whose force numbers stay at those of all states
-_ALLOWED = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
-LOST = 1e-3  # of a zone's rays are lost in all
+_ALLOWED = (4e-4, 4e-4, 3e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
+LOST, _SURE = 1e-3, 6e-4  # of a zone's rays are lost in all; by the rays that tell
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
 _DRAWN, _DISC_LOST = 24, 6e-4  # draws of rays that tell how wide a disc has to be; what may be lost
 _INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
@@ -116,27 +116,28 @@ def _widened(
     states = [*zip(np.eye(len(pupils)), lenses, strict=True), *between]
     lost = np.ones(len(states))
     for seed, allowed in enumerate((*_ALLOWED, 0.0)):
-        for k in np.flatnonzero(lost > LOST):
+        for k in np.flatnonzero(lost > _SURE):
             weights, lens = states[k]
             mixed = pupils[0].mixed(pupils[1:], weights)
             rays = _drawn(lens, mixed, 1 + seed)
             within = evaluate(mixed.checked, rays.inputs)["within"]
-            lost[k] = _lost(rays, within) if seed else 1.0
-            if allowed and lost[k] > LOST:
+            lost[k] = _lost(rays, within) if seed > 1 else 1.0
+            if allowed and lost[k] > _SURE:
                 needs = [[n for _, n in _needs(rays, margin, allowed / len(within))] for margin in within[1:]]
                 more = np.array([max([0.0, *need]) for need in needs])
                 near = weights > _NEIGHBOUR * weights.max()  # the nodes on both sides of a state between them
                 more /= weights[near].sum()
-                pupils = [_wider(p, more) if w else p for p, w in zip(pupils, near, strict=True)]
+                wide = _disc(mixed, rays, len(more))
+                pupils = [_wider(p, more, wide) if w else p for p, w in zip(pupils, near, strict=True)]
                 for other, (mix, _) in enumerate(states):  # a state loses by what widens a node that it subtracts
                     lost[other] = 1.0 if (mix[near] < 0).any() else lost[other]
     return pupils, float(lost.max())
 
 
-def _wider(pupil: PupilCircles, more: Array) -> PupilCircles:
-    numbers = pupil.numbers.copy()
+def _wider(pupil: PupilCircles, more: Array, wide: tuple[float, float, float]) -> PupilCircles:
+    numbers, (first, second, _) = pupil.numbers.copy(), pupil.wide
     numbers[:, 0, (pupil.exponents == 0).all(1)] += more[:, None]
-    return replace(pupil, numbers=numbers)
+    return replace(pupil, numbers=numbers, wide=(max(first, wide[0]), max(second, wide[1]), 0.0))
 
 
 def _edges(lens: ShaderLens, pupil: PupilCircles, rays: _Rays) -> _Rays:

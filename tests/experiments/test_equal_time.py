@@ -104,3 +104,13 @@ def test_after_n_passes_the_variance_is_an_nth(scene: dict[str, Row]) -> None:
         assert [error_after(camera, n * pass_s) - bias2 for n in (1, 2, 8)] == pytest.approx(
             [variance / n for n in (1, 2, 8)]
         )
+
+
+def test_levels_hold_the_error_of_their_samples(scene: dict[str, Row]) -> None:
+    weight = float(np.mean(1 / (truth() ** 2 + 0.01)))
+    levels = scene["exact"]["levels"]
+    assert [level["samples"] for level in levels] == [1, 2, 4, 8, 16]
+    for level in levels:
+        assert level["rel_mse"] == pytest.approx(weight * 0.16 / level["samples"], rel=0.2)
+        assert level["seconds_min"] == pytest.approx(0.02 * level["samples"])
+    assert [level["flip"] for level in levels] == sorted((level["flip"] for level in levels), reverse=True)

@@ -10,13 +10,16 @@ from shipped import whole
 from experiments import lab
 from experiments import pupils as passage
 from experiments.__main__ import main
+from experiments.methods import Bench, BenchSettings
 from experiments.promises import Outcome, read_index, report_outcome
 from experiments.pupils import CASES
+from experiments.surrogates import chosen_rows
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.surrogates.pairs import sample_domain
+from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
+from neurolens.surrogates.pairs import PairSettings, sample_domain
 from neurolens.trace.tracegraph import exact_graph
 
 
@@ -102,3 +105,14 @@ def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:
     passed = found["status"] == st.PASSED
     assert passed.mean() > 0.1 and len(np.unique(found["status"])) > 3 and "transmittance" not in alone
     assert all(np.array_equal(alone[name][passed], found[name][passed]) for name in SCENE_RAY)
+
+
+def test_a_lens_of_another_stop_is_another_lens(tmp_path: Path) -> None:
+    """The hash of its glass is the same: the stop alone makes other records."""
+    text, marks = (lab.LENSES / "cooke_triplet_50.toml").read_text(encoding="utf-8"), []
+    for name, stop in (("a", "diameter_mm = 7.6124"), ("b", "diameter_mm = 6.0")):
+        file = tmp_path / f"{name}.toml"
+        file.write_text(text.replace("diameter_mm = 7.6124", stop), encoding="utf-8")
+        bench = Bench(LensChoice(file), BenchSettings(DomainChoice(), PairSettings(), EvaluationChoice()), tmp_path)
+        marks.append((bench.lens.sha256, bench.fingerprint(chosen_rows([])[0])))
+    assert marks[0][0] == marks[1][0] and marks[0][1] != marks[1][1]

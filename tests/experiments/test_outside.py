@@ -1,13 +1,21 @@
-"""Random numbers through an exported model."""
+"""Vignetting of fitted models against the exact lens, and random numbers through an exported one."""
+
+from pathlib import Path
 
 import lens_models
 import numpy as np
 import pytest
+from vignetting_oracle import vignetting_errors
 
 from experiments import outside
+from experiments.vignetting import DOMAINS, OPENINGS, opening_errors
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
+from neurolens.study.experiment import LensChoice
+from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.pairs import PairSettings, make_pairs
 
+LENSES = Path(__file__).parents[2] / "lenses"
 pytestmark = pytest.mark.whole  # a command of its own
 
 
@@ -26,3 +34,23 @@ def test_broken_promises_are_counted() -> None:
     found = outside.send(model, 40_000, seed=7)
     assert found.broken[outside.PASSES_OUTSIDE] > 10_000 and found.broken[outside.NOT_FINITE] > 1000
     assert found.passed == 40_000
+
+
+def test_every_opening_with_one_fit() -> None:
+    """A circular fisheye, whose film is dark beyond a circle."""
+    lens = LensChoice(LENSES / "shimizu_fisheye_220.toml").read()
+    pairs = make_pairs(lens, DOMAINS["infinity"].of(lens), PairSettings(train=8000, held_out=10, rim=12000))
+    fisheye = fit_model(prepare(pairs), ModelSettings("ols", terms=50, planes=False))
+    found = opening_errors(fisheye.lens, fisheye, 60_000)
+    for name in OPENINGS:
+        false_pass, false_block = found[name]["false_pass"], found[name]["false_block"]
+        assert false_pass is not None and false_pass < 0.001
+        assert false_block is not None and false_block < 0.001
+    # The exact lens stopped down, traced so, passes what crosses within.
+    radius = fisheye.domain.stop_radius_mm / 2
+    same = vignetting_errors(fisheye.lens, fisheye.domain, fisheye.predict, stop_radius_mm=radius, count=60_000)
+    assert same["passing_share"] == found["2 stops"]["passing"] / 60_000
+    assert (same["false_pass"], same["false_block"]) == (
+        found["2 stops"]["false_pass"],
+        found["2 stops"]["false_block"],
+    )

@@ -160,3 +160,37 @@ def test_the_library_is_sorted_by_each_key(sort: str, capsys: pytest.CaptureFixt
     rising = sort in lens_list._SORTS or sort == "cats-eye"
     assert known == sorted(known, reverse=not rising) and len(known) > 30
     assert found[len(known) :] == [None] * (len(rows) - len(known))
+
+
+def test_a_changed_file_is_not_the_index_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lenses").mkdir()
+    file = tmp_path / "lenses" / "a.toml"
+    file.write_text("name = 1\n")
+    entry = {"file": "a.toml", "sha256": sha256_of(file), "row": {"efl_mm": 5.0}}
+    (tmp_path / "lenses" / lens_list.INDEX).write_text(json.dumps(entry) + "\n")
+    monkeypatch.setattr(lens_list, "library", lambda: tmp_path)
+    index = lens_list.read_index()
+    assert lens_list.kept_row(file, index) == {"lens": "a", "file": str(file), "efl_mm": 5.0}
+    (tmp_path / "a.toml").write_text("name = 1\n")
+    assert lens_list.kept_row(tmp_path / "a.toml", index) is None  # another folder's
+    file.write_text("name = 2\n")
+    assert lens_list.kept_row(file, index) is None
+
+
+def test_a_folder_of_ones_own_is_sorted_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A lens whose rims are a guess says so; one that cannot be read stands last."""
+    for name, words in (("a", ('rims = "source"',)), ("b", ('rims = "derived"', "diameter_mm = 12.0"))):
+        text = Path("lenses/thorlabs_lb1471_biconvex_50.toml").read_text()
+        (tmp_path / f"{name}.toml").write_text(text if name == "a" else _renamed(text, words))
+    (tmp_path / "broken.toml").write_text("schema = 1\n")
+    assert main(["lens", str(tmp_path), "--sort", "swirl"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert "cat's eye" in out[0] and out[3].startswith("broken")
+    assert [line.count("~") for line in out[1:3] if line.startswith("b ")] == [2]
+    assert main(["lens", "laikin_double_gauss_50", "--sort", "swirl"]) == 2
+
+
+def _renamed(text: str, words: tuple[str, ...]) -> str:
+    assert 'rims = "' in text
+    start = text.index('rims = "')
+    return text[:start] + words[0] + text[text.index("\n", start) :]

@@ -96,3 +96,21 @@ def test_without_flip_evaluator_the_extra_is_named(picture: np.ndarray, monkeypa
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     with pytest.raises(NeurolensError, match=r"\.\[train\]"):
         scenes.flip(picture, picture)
+
+
+def test_comparing_fewer_renders_uses_the_floor_of_the_same_pairs_and_a_floor_of_zero_gives_no_ratio(
+    picture: np.ndarray,
+) -> None:
+    exact = [noisy(picture, 0.02 * (1 + seed), seed) for seed in range(4)]
+    figures = scenes.compare(exact[:1], exact)
+    assert figures.pairs == 1 and figures.paired_share == 0.0
+    assert figures.noise_floor_flip == scenes.compare(exact, exact).noise_floor_flip
+    figures = scenes.compare([picture * 1.1] * 4, [picture] * 4)
+    assert figures.noise_floor_flip == 0.0 and figures.paired_share is None and figures.flip_paired > 0
+
+
+def test_bad_counts_are_refused(picture: np.ndarray) -> None:
+    with pytest.raises(InputError, match="at least 4"):
+        scenes.compare([picture], [picture] * 3)
+    with pytest.raises(InputError, match="surrogate renders"):
+        scenes.compare([picture] * 5, [picture] * 4)

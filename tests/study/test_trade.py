@@ -11,7 +11,7 @@ from neurolens.base.errors import InputError
 from neurolens.plan import plan as traded
 from neurolens.plan.candidates import Choice
 from neurolens.plan.costs import Work
-from neurolens.plan.plan import best_within, front, in_seconds
+from neurolens.plan.plan import best_within, front, in_seconds, spread
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
 
@@ -69,3 +69,13 @@ def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypat
     for wrong in ({"flip_budget": 1.5}, {"flip_budget": 0.1, "afterwards": ("distortion",)}):
         with pytest.raises(InputError):
             traded.plan_seen(shown, read_lens(LENS), **wrong)
+
+
+def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
+    many = [choice(str(k), 1 / (k + 1), 0.0, s=float(k)) for k in range(30)]
+    for chosen in (0, 7, 13, 29):
+        names = [c.name for c in spread(many, many[chosen], 6)]
+        assert len(names) == 6 and {"0", "29", str(chosen)} <= set(names) and names == sorted(names, key=int)
+    assert spread(many[:3], None, 6) == many[:3]
+    beside = choice("beside", 0.5, 0.0, s=2.5)  # a choice that another camera betters is shown, too
+    assert beside in spread(many, beside, 6) and spread(many[:2], beside) == [*many[:2], beside]

@@ -65,6 +65,21 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
         return folder, run_experiment(experiment, Path(folder.name) / "out", progress=Progress(quiet=True))
 
 
+def test_leaves_everything_in_one_folder(run: tuple[Path, dict]) -> None:
+    out = run[0] / "out"
+    written = json.loads((out / "results.json").read_text())
+    assert (out / "report.html").read_text().startswith("<!")
+    for record in written["models"]:
+        assert (out / record["file"]).stat().st_size == record["bytes"]
+    for record in [*written["images"], *written["figures"]]:
+        picture = out / (record.get("file_png") or record["file"])
+        assert picture.stat().st_size > 1000, picture
+    assert (out / "config.toml").exists()
+    assert "illumination" in " ".join(f["file"] for f in written["figures"])
+    assert written["image_settings"]["pixels_per_degree"] == 67
+    assert "67" in (out / "report.html").read_text().partition("Image comparison")[2][:400]
+
+
 def test_errors_are_in_the_order_that_physics_gives_and_hold_when_stopped_down(run: tuple[Path, dict]) -> None:
     thick, fitted, network = run[1]["models"]
     assert thick["rms_um"] > 20 * fitted["rms_um"] > 0

@@ -166,6 +166,17 @@ def rate_and_light(some: Lens, pupil: RadialPupil, count: int = 20_000) -> tuple
 GAUSS, FISHEYE = ("tronnier_double_gauss_100", 100.0, 4.0), ("muller_fisheye_100", 14.0, 5.6)
 
 
+def test_the_paraxial_exit_pupil_loses_light_off_the_axis() -> None:
+    """The image of the stop as the film's centre sees it (Kolb et al. 1995)."""
+    some = lens("tronnier_double_gauss_100", 100.0, 4.0)
+    seen, wide = first_order(some), hull_disc(some, FILM_RADIUS)
+    radius = np.full_like(wide.along, seen.exit_pupil_diameter_mm / 2)
+    paraxial = replace(wide, pupil_z_mm=seen.exit_pupil_z_mm, along=radius, across=radius)
+    rate, light = rate_and_light(some, paraxial)
+    assert rate > 0.99
+    assert light < 0.99 * rate_and_light(some, wide)[1]
+
+
 @pytest.mark.parametrize(
     ("name", "case"),
     [("hull", GAUSS), ("boxes", FISHEYE), *whole(*((name, case) for name in METHODS for case in (GAUSS, FISHEYE)))],
