@@ -31,7 +31,7 @@ from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_exr, write_png
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
-from neurolens.study.image import flip, rel_mse
+from neurolens.study.scenes import flip, rel_mse
 
 LENS = "leica_summilux_m_50mm_f1_4"
 SCENES = ("room", "garden", "lights", "chess", "studio", "lamps")

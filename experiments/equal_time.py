@@ -32,7 +32,7 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, load_scene
 from neurolens.study import scenes
-from neurolens.study.image import EPS, flip
+from neurolens.study.scenes import EPS, flip
 from neurolens.surrogates.model import Domain
 
 Floats = NDArray[np.float64]

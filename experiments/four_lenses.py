@@ -20,7 +20,7 @@ from neurolens.cameras.build import FUSED, make_camera
 from neurolens.lens.shot import Shot
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
-from neurolens.study.image import Image, to_srgb
+from neurolens.study.scenes import Image, to_srgb
 
 SCENE = lab.SCENES / "chess.toml"
 _GAP = 6  # pixels between the pictures

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
+from experiments.exact_race import exact_candidates
 from experiments.lab import Report, Row
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxlens import open_session
@@ -28,13 +29,12 @@ from neurolens.graph.scalars import lower
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
 from neurolens.study.rays import ray_errors
-from neurolens.study.speed import Call, Candidate, exact_candidates, model_candidate, program_candidate
+from neurolens.study.speed import Call, Candidate, model_candidate, program_candidate
 from neurolens.surrogates.assemble import ALL, RAY_ONLY
-from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import FilmRays, PairSettings, domain_of, make_pairs
 from neurolens.surrogates.source import Fix, fixed_models, fused_program
 from neurolens.trace.tracegraph import exact_graph
 

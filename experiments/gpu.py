@@ -32,10 +32,9 @@ from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Progra
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_glsl
 from neurolens.study.rays import ray_errors
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.pairs import PairSet, trace_pairs
+from neurolens.surrogates.pairs import FilmRays, PairSet, sample_domain, trace_pairs
 from neurolens.surrogates.source import fused_program
 from neurolens.trace.surfaces import Rays
 from neurolens.trace.tracegraph import exact_graph

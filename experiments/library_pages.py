@@ -125,8 +125,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     from neurolens.readers.source import read_text
     from neurolens.setting.check import check_lens
     from neurolens.study import pages
-    from neurolens.study.character import character_or_none
-    from neurolens.study.describe import lens_row, rim_doubts
+    from neurolens.study.describe import character_or_none, lens_row, rim_doubts
 
     row = lens_row(lens, check_lens(lens))
     figures, notes = [], []
@@ -174,7 +173,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     from neurolens.analysis.spots import spots
     from neurolens.cli.analyse import analysis_of
     from neurolens.setting.states import set_lens
-    from neurolens.study.character import FIELDS, FOCUS
+    from neurolens.study.describe import FIELDS, FOCUS
 
     scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import lab
+from experiments.exact_race import exact_candidates
 from experiments.lab import Row
 from experiments.promises import read_index
 from neurolens import __version__
@@ -38,7 +39,7 @@ from neurolens.study.check import check_model, check_states
 from neurolens.study.experiment import DomainChoice, Experiment, LensChoice, check_names
 from neurolens.study.measure import Measured, fit_and_measure, shared_rays
 from neurolens.study.rays import REFERENCE_RADIUS_MM
-from neurolens.study.speed import exact_candidates, model_candidate, model_candidates, race
+from neurolens.study.speed import model_candidate, model_candidates, race
 from neurolens.study.train import fit_and_measure_states, state_settings
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
 from neurolens.surrogates.model import Domain

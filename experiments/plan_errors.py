@@ -29,8 +29,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter  # type: ignore[import
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.plan import footprints as prints
 from neurolens.plan.footprints import Footprints, Places
-from neurolens.plan.light import parts_of, spectrum_seen
-from neurolens.plan.probe import COUNTED
+from neurolens.plan.probe import COUNTED, parts_of, spectrum_seen
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 from neurolens.render.settings import FilmSettings

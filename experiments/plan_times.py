@@ -46,18 +46,18 @@ def case(name: str, args: argparse.Namespace) -> list[lab.Row]:
     film = shot.film_mm[0], shot.film_mm[0] * shot.height / shot.width
     scene = replace(scene, settings=replace(scene.settings, camera=replace(shot, film_mm=film)))
     models = [lab.MODELS / f"{LENS}.{MODEL}.onnx"]
-    made, offered = plans._priced(scene, lab.lens_of(LENS), 1e9, models=models)
+    made = plans._priced(scene, lab.lens_of(LENS), 1e9, models=models)
     rows: list[lab.Row] = []
-    for offer in offered:
-        if offer.choice.name in (EXACT, PLAIN) or offer.choice.name.endswith(MODEL):
-            camera: Any = camera_of(made.probed, offer.choice)
+    for choice in made.choices:
+        if choice.name in (EXACT, PLAIN) or choice.name.endswith(MODEL):
+            camera: Any = camera_of(made.probed, choice)
             area = getattr(camera, "area", 1.0)
-            if offer.choice.name == PLAIN:  # the map is applied afterwards, to a larger picture
+            if choice.name == PLAIN:  # the map is applied afterwards, to a larger picture
                 camera = as_c(ideal_as("thick:", made.probed.exact.lens, made.probed.asked.shot))
             render(scene, camera, threads=1, samples=1)  # compiles what it needs
             seconds, variance = rendered(scene, camera)
-            rows.append({"scene": name, "camera": offer.choice.name.rpartition(".")[2] or offer.choice.name,
-                         "planned": offer.seconds, "seconds": area * seconds, "variance": variance})  # fmt: skip
+            rows.append({"scene": name, "camera": choice.name.rpartition(".")[2] or choice.name,
+                         "planned": choice.seconds, "seconds": area * seconds, "variance": variance})  # fmt: skip
     (exact,) = (row for row in rows if row["camera"] == EXACT)
     for row in rows:
         row["measured"] = row["seconds"] * row["variance"] / exact["variance"]

@@ -36,8 +36,8 @@ from experiments.tracer_race import Hand, by_figures, compiled
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens
 from neurolens.study.speed import Unavailable
-from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import FilmRays
 
 Numbers = NDArray[np.float64]
 WAVELENGTH_NM = glass.LINE_D_NM

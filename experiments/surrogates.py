@@ -102,8 +102,8 @@ def _settings(args: argparse.Namespace) -> BenchSettings:
     rounds = args.rounds if args.rounds is not None else (3 if args.quick else 10)
     # The goals are stated for 400-700 nm.
     domain = DomainChoice(focus_m=None if args.near else (math.inf, math.inf), wavelength_nm=(400.0, 700.0))
-    evaluation = EvaluationChoice(50_000 if args.quick else 200_000, rounds, not args.quick)
-    return BenchSettings(domain, PairSettings(rays, rays, rays, args.seed), evaluation)
+    evaluation = EvaluationChoice(50_000 if args.quick else 200_000, rounds)
+    return BenchSettings(domain, PairSettings(rays, rays, rays, args.seed), evaluation, not args.quick)
 
 
 def _conditions(args: argparse.Namespace, settings: BenchSettings) -> str:

@@ -31,8 +31,8 @@ from neurolens.graph.scalars import lower
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, cauchy, index_of
 from neurolens.lens.prescription import Lens, Medium, Surface
 from neurolens.study.speed import FUSED_BATCHES, Call, Candidate, CompiledSource, Unavailable, program_candidate
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import FilmRays, domain_of, sample_domain
 from neurolens.trace.tracegraph import exact_graph
 
 REFERENCE = lab.ROOT.parent / "shared" / "data" / "reference_tracer"

@@ -19,8 +19,8 @@ from neurolens.base import status as st
 from neurolens.flare.ghosts import coated
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays
-from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import domain_of, sample_domain
 from neurolens.trace.rays import follow
 
 COATINGS = {"bare": None, "coated": "quarter-wave"}

@@ -36,10 +36,9 @@ from neurolens.study.describe import read_quietly
 from neurolens.study.experiment import DomainChoice, LensChoice
 from neurolens.study.measure import onnx_predictor
 from neurolens.study.rays import SEED, false_shares, relative_illumination
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import make_pairs, trace_pairs
+from neurolens.surrogates.pairs import FilmRays, make_pairs, sample_domain, trace_pairs
 
 # By how many stops the lens is closed, and its blades.
 OPENINGS: dict[str, tuple[int, Aperture | None]] = {

@@ -25,9 +25,8 @@ from neurolens.study.plots import AXIS_LABELS, error_axes, error_line
 from neurolens.study.rays import ray_errors
 from neurolens.study.train import fit_and_measure_states
 from neurolens.surrogates.axes import Axis
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.fit import ModelSettings, StateSettings, StateSpace, axes_of, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states import StateSettings, StateSpace, axes_of
 from neurolens.surrogates.terms import pinned_threads
 
 # Coefficients per vector, rays of a node, rays of a single fit's test.

@@ -23,12 +23,11 @@ from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.card import CARD_KEY, MODEL_KEY, read_card
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, as_model, fit_model, prepare
-from neurolens.surrogates.fits.network import fit_network
 from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.network import fit_network
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
 from neurolens.surrogates.source import at_wavelength
 
 LENSES = Path(__file__).parents[1] / "lenses"

@@ -70,10 +70,7 @@ SLOW |= {"neurolens.shaders.lens_source", "neurolens.cli.flare", "neurolens.cli.
 LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "defocus", "cli")
 LEAN_MODULES = {
     *(f"neurolens.trace.{name}" for name in ("arithmetic", "shapes", "surfaces")),
-    *(
-        f"neurolens.surrogates.{name}"
-        for name in ("assemble", "axes", "card", "cores", "file", "inverse", "lightfield")
-    ),
+    *(f"neurolens.surrogates.{name}" for name in ("assemble", "axes", "card", "cores", "file", "inverse")),
     *(f"neurolens.surrogates.{name}" for name in ("model", "source")),
 }
 

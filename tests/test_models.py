@@ -22,10 +22,9 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.check import check_states, promises_of, space_of_card
 from neurolens.study.measure import FreshRays, fresh_rays, measure, onnx_predictor
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import FilmRays, PairSettings, make_pairs, sample_domain
 
 ROOT = Path(__file__).parents[1]
 MODELS = ROOT / "models"

@@ -8,9 +8,8 @@ import torch
 from neurolens.base import status as st
 from neurolens.lens.prescription import Lens
 from neurolens.study.rays import SEED, ZONES, false_shares
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.pairs import FilmRays, sample_domain, trace_pairs
 
 _BATCH = 65536
 

@@ -37,12 +37,11 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.render.images import make_aperture
 from neurolens.render.scene import Scene
 from neurolens.setting.states import set_lens
-from neurolens.study.image import Image
 from neurolens.study.measure import fit_and_measure, known_record
-from neurolens.surrogates.domain import domain_of
+from neurolens.study.scenes import Image
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
 
 _CLEAR = 0.95  # rims over the radius of curvature, at most
 _VIGNETTING_RAYS = 50_000

@@ -43,8 +43,8 @@ from neurolens.base.progress import Progress, Report
 from neurolens.base.records import versions
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
-from neurolens.study.image import Image, to_srgb
 from neurolens.study.plots import rounded_up
+from neurolens.study.scenes import Image, to_srgb
 
 SCHEMA = 1
 _CAMERAS = 2  # counts changes of what a column's camera is: figures of earlier ones are made again

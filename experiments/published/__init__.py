@@ -23,8 +23,7 @@ from experiments.published.taylor import fit_taylor
 from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import Core
 from neurolens.surrogates.fit import as_model, fit_model
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Gate, LensModel
+from neurolens.surrogates.model import Encoding, Gate, LensModel
 from neurolens.surrogates.targets import ModelSettings, Prepared
 from neurolens.surrogates.terms import pinned_threads
 

@@ -24,8 +24,7 @@ from experiments.published.data import Outputs, RawData, RawPolynomial, outer_pu
 from experiments.published.polynomials import fit_dense
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
-from neurolens.surrogates.cores import Composite, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.lightfield import ROUND
+from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.targets import film_equivalent, targets_of
 from neurolens.surrogates.terms import Exponents, Sweep, forward, further, monomials, replace_terms

@@ -14,16 +14,19 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.surrogates.cores import DIRECTION, POSITION, Array, Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.gates import gate_reach
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Gate
+from neurolens.surrogates.model import Encoding, Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.targets import ModelSettings, Prepared, scales_of
-from neurolens.surrogates.terms import Exponents, monomials, raw_exponents, raw_variables, united
+from neurolens.surrogates.targets import ModelSettings, Prepared, gate_reach, scales_of
+from neurolens.surrogates.terms import Exponents, monomials, ordered, powers, united
 
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
 OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")
 PARITY = ((1, 0), (0, 1), (1, 0), (0, 1), (1, 0), (0, 1), (0, 0))
+
+
+def raw_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
+    """[M, 5] exponents of p_x, p_y, u_x, u_y, w up to a total `degree`: the basis of the published lens polynomials."""
+    return ordered(powers(5, degree) if dispersive else [(*p, 0) for p in powers(4, degree)])
 
 
 @dataclass(frozen=True)
@@ -216,7 +219,8 @@ class RawData:
 
     def variables(self, rays: PairSet) -> Tensor:
         """[5, N] x, y, slopes, w."""
-        return raw_variables(self.encoding(rays.inputs))
+        field = self.encoding(rays.inputs)
+        return torch.cat([field.p, field.u, field.w[None]])
 
     @cached_property
     def outputs(self) -> tuple[Outputs, ...]:

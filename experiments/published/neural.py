@@ -29,11 +29,9 @@ from experiments.published.data import PublishedSettings, RawData, raw_rows
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cores import Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.lightfield import ROUND
+from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.model import Gate
-from neurolens.surrogates.pairs import PairSet, trace_pairs
+from neurolens.surrogates.pairs import PairSet, sample_domain, trace_pairs
 from neurolens.surrogates.targets import scales_of
 
 NETWORKS = 3  # whose mean is taken

@@ -27,8 +27,7 @@ from experiments.published.rtf import meridian_of, turn, turned_back
 from neurolens.graph.interpret import monomials
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.cores import Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.pairs import FilmRays, trace_pairs
 from neurolens.surrogates.targets import scales_of
 
 Array = NDArray[np.float64]

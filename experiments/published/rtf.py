@@ -28,11 +28,9 @@ from experiments.published.data import RawData, stable_solve
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cores import Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.cores import Core, CoreValues, Field, LightField, Units, stored_as
 from neurolens.surrogates.model import Gate
-from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.pairs import FilmRays, trace_pairs
 from neurolens.surrogates.targets import scales_of
 from neurolens.surrogates.terms import Exponents, monomials
 

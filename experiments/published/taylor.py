@@ -29,7 +29,7 @@ from experiments.published.data import RawPolynomial, raw_polynomial
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.targets import scales_of
 from neurolens.surrogates.terms import ordered
 from neurolens.trace.rays import trace

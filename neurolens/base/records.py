@@ -53,8 +53,7 @@ class Results:
             `measure.CARD_KEYS`, stopped_down and zones as of `measure.Findings`, poor (errors that are visible in a
             picture), coefficients_per_vector (A and B terms both count; of a raw basis all scalars of the vector),
             parameters (of the whole model, rims included), bytes, fit_s, load_s, ns_per_ray (`Timing`) in onnxruntime,
-            speedup_over_compiled (minima of the same run), fused_ns_per_ray as C, fused_speedup and break_even_rays
-            (of it, against the exact lens as C), note.
+            fused_ns_per_ray as C, fused_speedup and break_even_rays (of it, against the exact lens as C), note.
         target: of `target_record`, where an error was asked for.
         settings: the resolved configuration.
         exact: exact tracers on the clock.

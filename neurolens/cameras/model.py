@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.cameragraph import LensGraph, status_graph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
-from neurolens.cameras.onnxlens import InverseRays, LensRays, OnnxInverse, OnnxLens, load_inverse, load_model
+from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
 from neurolens.cameras.sampling import (
     beyond_circle,
@@ -31,6 +31,7 @@ from neurolens.lens.prescription import Surface
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.card import DOMAIN_SLACK, state_for
+from neurolens.surrogates.inverse import InverseModel, InverseRays, inverse_of
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
@@ -124,30 +125,20 @@ class OnnxCamera(LensCamera):
     @property
     def front(self) -> Surface | None:
         """The front surface of the lens, as the inverse map has it."""
-        return self._inverse.front
+        return self.model.fitted.front
 
     def _traced_back(
         self, position: NDArray[np.float64], direction: NDArray[np.float64], wavelength_nm: FloatArray
     ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
-        """By the inverse map of scene rays, NAME.scene.onnx beside the model; what it does not find is NO_SOLUTION."""
+        """By the model's inverse map of scene rays; what it does not find is NO_SOLUTION."""
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
         out = self._inverse.from_scene(position, direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
-        return out.rays[:2].astype(np.float64), np.maximum(out.transmittance, 0), scene.status_of(out)
+        return out.rays[:2], np.maximum(out.transmittance, 0).astype(np.float32), scene.status_of(out)
 
     @cached_property
-    def _inverse(self) -> OnnxInverse:
-        """The inverse map.
-
-        Raises:
-            InputError: no such file, or a model of many states, whose inverse is not exported.
-        """
-        if self.model.axes:
-            raise InputError(self.model.path, "inverse", "(a model of many states)", "a model of one state")
-        try:
-            return load_inverse(self.model.path, self.model.card["lens"]["sha256"])
-        except ModelError as error:
-            raise InputError(self.model.path, "inverse", f"({error})", "a model exported with --inverse") from error
+    def _inverse(self) -> InverseModel:
+        return inverse_of(self.model.fitted)
 
 
 @dataclass(frozen=True)

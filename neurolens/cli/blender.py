@@ -286,7 +286,7 @@ def packed_of(
 
 
 def _character(lens: Lens) -> dict[str, Any]:
-    from neurolens.study.character import character_or_none
+    from neurolens.study.describe import character_or_none
 
     figures, discs = character_or_none(lens)
     return {"character": figures, "bokeh": None if discs is None else b64encode(discs).decode()}

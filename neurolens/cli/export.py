@@ -26,12 +26,11 @@ from neurolens.surrogates import source
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
-    from neurolens.surrogates.pairs import RayPairs
 
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _CAMERA = "camera: what a whole camera is set to"
-# Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
-_HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
+# Rays for the errors of an ONNX file with fixed inputs.
+_HELD_OUT, _VIGNETTING = 20_000, 100_000
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 
 
@@ -238,8 +237,9 @@ def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[sourc
 
 def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
     """Write a model as ONNX, with the errors of its card, or with new ones where something was fixed (None)."""
-    from neurolens.study.measure import fresh_rays, measure_on
+    from neurolens.study.measure import FRESH, fresh_rays, measure_on
     from neurolens.surrogates.export import export_onnx
+    from neurolens.surrogates.pairs import PairSettings, make_pairs
 
     if len(models) > 1:
         wavelengths = [m.domain.wavelength_nm[0] for m in models]
@@ -248,7 +248,8 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
     if card is not None:
         export_onnx(model, out, card["errors"], derivatives=derivatives)
         return
-    seed, held_out = _seed(model), _pairs(model, train=1).held_out
+    seed = int(model.settings.get("rays_seed") or 0) + FRESH
+    held_out = make_pairs(model.lens, model.domain, PairSettings(1, _HELD_OUT, 1, seed)).held_out
     with atomic_path(out) as measured:  # a file without its errors never has the final name
         export_onnx(model, measured, {})
         rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
@@ -257,26 +258,8 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
 
 
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
-    """Write both inverse maps beside the model's file; returns their files and the share of fresh rays that each
-    finds."""
+    """Write both inverse maps beside the model's file; returns their files and the share of rays that each finds."""
     from neurolens.surrogates.export import export_inverse
-    from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+    from neurolens.surrogates.inverse import inverse_of
 
-    pairs = _pairs(model, train=_TRAIN)
-    inverse = fit_inverse(model, pairs)
-    converged = convergence(inverse, pairs.held_out.inputs)
-    files = export_inverse(inverse, out, load_model(out).card["errors"])
-    return {"inverse": {n: {"file": str(f), **converged[n]} for n, f in zip(("stop", "scene"), files, strict=True)}}
-
-
-def _pairs(model: LensModel, train: int) -> RayPairs:
-    from neurolens.surrogates.pairs import PairSettings, make_pairs
-
-    return make_pairs(model.lens, model.domain, PairSettings(train, _HELD_OUT, train, seed=_seed(model)))
-
-
-def _seed(model: LensModel) -> int:
-    """Of rays that the fit has not seen."""
-    from neurolens.study.measure import FRESH
-
-    return int(model.settings.get("rays_seed") or 0) + FRESH
+    return {"inverse": export_inverse(inverse_of(model), out, load_model(out).card["errors"])}

@@ -17,7 +17,7 @@ from neurolens.base.settings import changed, setting
 from neurolens.cli import arguments as cli
 
 INDEX = "index.jsonl"  # in lenses/: a line a lens, {file, sha256, row}, by `python -m experiments lens-index`
-CHARACTER = {  # keys of --sort: the figure of `study.character`, and its heading; strongest first
+CHARACTER = {  # keys of --sort: the figure of `study.describe`, and its heading; strongest first
     "cats-eye": ("cats_eye", "cat's eye"), "swirl": ("swirl", "swirl"), "bubbles": ("bubble", "bubbles"),
     "softness": ("softness_um", "soft um"), "flare": ("flare", "flare"),
 }  # fmt: skip
@@ -102,7 +102,7 @@ examples:
         """Print and draw one lens."""
         from neurolens.readers.any_format import read_any
         from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
-        from neurolens.surrogates.domain import domain_of
+        from neurolens.surrogates.pairs import domain_of
 
         began = time.perf_counter()
         with warned(file) as notes:

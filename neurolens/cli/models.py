@@ -16,7 +16,7 @@ from neurolens.base.lensname import lens_id_of
 from neurolens.base.records import program, reaches, time_of
 from neurolens.base.settings import setting, whole
 from neurolens.cli import arguments as cli
-from neurolens.study.advice import CLOSE_UM, Advice, advice, expected_exact, to_use
+from neurolens.study.pages import CLOSE_UM, Advice, advice, expected_exact, to_use
 
 if TYPE_CHECKING:
     from neurolens.study.check import Promise

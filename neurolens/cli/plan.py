@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
     from neurolens.plan import plan as plans
     from neurolens.plan.candidates import Choice
-    from neurolens.plan.plan import Offer, Trade
+    from neurolens.plan.plan import Trade
     from neurolens.plan.probe import SceneNeeds
     from neurolens.render.scene import Scene
 
@@ -122,8 +122,7 @@ trade.png and trade.json (default: runs/trade-SCENE-LENS)."""
 
     def _plan(self, scene: Scene, lens: Lens, folder: Path, look: Mapping[str, Any]) -> int:
         """Plan, write and print."""
-        from neurolens.plan.plan import plan, plan_seen, plan_within
-        from neurolens.plan.plots import plot_effects
+        from neurolens.plan.plan import plan, plan_seen, plan_within, plot_effects
 
         with self.progress({"plan": 10}).stage("plan") as report:
             more = {**look, "zoom": self.zoom, "report": report}
@@ -141,32 +140,27 @@ trade.png and trade.json (default: runs/trade-SCENE-LENS)."""
 
     def _trade(self, result: Trade, folder: Path, title: str) -> int:
         """Draw, write, print; 1 where no camera keeps the budget."""
-        from neurolens.plan.plots import plot_trade
-        from neurolens.study.plots import side_by_side
+        from neurolens.plan.plan import plot_trade
+        from neurolens.study.scenes import side_by_side
 
         folder.mkdir(parents=True, exist_ok=True)
-        plot_trade(result, folder / "trade.png", title)
-        chosen = result.chosen
-        pictures = {
-            "● " * (s.offer == chosen) + _short(s.offer): s for s in result.shown if s.offer.choice.error_px > 0
-        }
-        exact = "● exact" if chosen is not None and chosen.choice.error_px == 0 else "exact"
+        plot_trade(result.plan, folder / "trade.png", title)
+        made, chosen = result.plan, result.plan.best
+        pictures = {"● " * (s.choice == chosen) + _short(s.choice): s for s in result.shown if s.choice.error_px > 0}
+        exact = "● exact" if chosen is not None and chosen.error_px == 0 else "exact"
         side_by_side(
             {exact: result.exact, **{k: s.rgb for k, s in pictures.items()}},
             {k: s.difference for k, s in pictures.items()}, folder / "pictures.png",
-            {k: f"{_time(result, s.offer)}, {cli.number(s.offer.choice.error_px, 2)} px\nFLIP {cli.number(s.flip, 2)}"
+            {k: f"{_time(made, s.choice)}, {cli.number(s.choice.error_px, 2)} px\nFLIP {cli.number(s.flip, 2)}"
              for k, s in pictures.items()},
         )  # fmt: skip
         atomic_write_text(folder / "trade.html", _trade_page(result, folder, title))
-        flips = {s.offer.choice.name: s.flip for s in result.shown}
-        rows = [
-            {**asdict(o.choice), "seconds": o.seconds, "camera_seconds": o.camera, "flip": flips.get(o.choice.name)}
-            for o in result.offered
-        ]
+        flips = {s.choice.name: s.flip for s in result.shown}
+        rows = [{**asdict(c), "flip": flips.get(c.name)} for c in made.choices]
         data: dict[str, Any] = {"scene": str(self.scene), "lens": str(self.lens), "target": self.target}
-        data |= {"unit": result.unit, "work": asdict(result.plan.work), "cameras": rows, "alike": result.plan.alike}
-        data |= {"front": [o.choice.name for o in result.front], "chosen": chosen and chosen.choice.name}
-        data |= {"half": result.half and result.half.choice.name}
+        data |= {"unit": made.unit_s, "work": asdict(made.work), "cameras": rows, "alike": made.alike}
+        data |= {"front": [c.name for c in made.front], "chosen": chosen and chosen.name}
+        data |= {"half": result.half and result.half.name}
         write_json(folder / "trade.json", plain(data))
         return self.answer(data, lambda: _trade_text(result, folder), 0 if chosen else 1)
 
@@ -183,7 +177,7 @@ def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
 
 
 def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
-    from neurolens.plan.light import STRAY
+    from neurolens.plan.probe import STRAY
 
     rows = [
         (e.name, cli.number(e.worth, 3), cli.number(e.median, 3), "px" if e.unit == "px" else "of light",
@@ -228,8 +222,6 @@ def _needs(asked: SceneNeeds) -> str:
 
 def _use(result: plans.Plan) -> str:
     """The camera to use, or that there is none."""
-    from neurolens.plan.plan import offers
-
     best, seconds, flip = result.best, result.budget_s, result.budget_flip
     if best is None:
         nearest = min(result.choices, key=lambda c: c.error_px, default=None)
@@ -243,10 +235,9 @@ def _use(result: plans.Plan) -> str:
         "a path times noise"
     ]
     if result.work.rest[best.disperses]:
-        (offer,) = offers(result.probed.scene, result.probed, [best], result.work)
         lines.append(
-            f"The picture takes {cli.number(offer.seconds, 3)} s of one thread to the noise that the scene's samples "
-            f"have with the exact lens, the camera {cli.number(offer.camera, 2)} s of that"
+            f"The picture takes {cli.number(best.seconds, 3)} s of one thread to the noise that the scene's samples "
+            f"have with the exact lens, the camera {cli.number(best.camera_seconds, 2)} s of that"
         )
     if len(result.alike) > 1:
         lines.append(f"Any of these takes about as long: {', '.join(result.alike)}")
@@ -278,31 +269,31 @@ def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> 
     return [f"  {program()} {shlex.join(words)}"]
 
 
-def _short(offer: Offer) -> str:
-    return offer.choice.name.rpartition(".")[2]
+def _short(choice: Choice) -> str:
+    return choice.name.rpartition(".")[2]
 
 
-def _time(result: Trade, offer: Offer) -> str:
-    return f"{'~' * offer.choice.noisy}{cli.number(offer.seconds, 3)} {result.unit}"
+def _time(made: plans.Plan, choice: Choice) -> str:
+    return f"{'~' * choice.noisy}{cli.number(choice.seconds, 3)} {made.unit_s}"
 
 
 def _sentences(result: Trade) -> list[str]:
     """The choice for the budget, and what half of its time buys."""
-    chosen, half = result.chosen, result.half
+    made, chosen, half = result.plan, result.plan.best, result.half
     if chosen is None:
-        return [f"No camera keeps {result.plan.budget_px:g} px."]
-    sentences = [f"For {result.plan.budget_px:g} px: {_short(chosen)}, with which the {result.what} takes "
-            f"{_time(result, chosen)}, {cli.number(chosen.choice.error_px, 3)} px"]  # fmt: skip
-    if result.what != "camera":
-        sentences[0] += f"; the camera takes {cli.number(chosen.camera, 2)} {result.unit} of that"
-    if len(result.plan.alike) > 1:
-        sentences.append(f"Any of these takes about as long: {', '.join(result.plan.alike)}")
-    other = half or result.front[0]
+        return [f"No camera keeps {made.budget_px:g} px."]
+    sentences = [f"For {made.budget_px:g} px: {_short(chosen)}, with which the {made.what} takes "
+            f"{_time(made, chosen)}, {cli.number(chosen.error_px, 3)} px"]  # fmt: skip
+    if made.what != "camera":
+        sentences[0] += f"; the camera takes {cli.number(chosen.camera_seconds, 2)} {made.unit_s} of that"
+    if len(made.alike) > 1:
+        sentences.append(f"Any of these takes about as long: {', '.join(made.alike)}")
+    other = half or made.front[0]
     buys = (
         f"Half of that buys {_short(other)}:" if half else f"Half of that buys no camera: the least is {_short(other)},"
     )
-    sentences.append(f"{buys} {_time(result, other)}, {cli.number(other.choice.error_px, 3)} px")
-    if later := " and ".join(result.plan.asked.afterwards):
+    sentences.append(f"{buys} {_time(made, other)}, {cli.number(other.error_px, 3)} px")
+    if later := " and ".join(made.asked.afterwards):
         sentences.append(
             f"Pixels leave out {later}, which compositing adds; FLIP and the pictures, taken before it, do not"
         )
@@ -311,23 +302,23 @@ def _sentences(result: Trade) -> list[str]:
 
 def _cameras(result: Trade) -> pages.Table:
     """Every camera with its figures: a disc before the choice for the budget, a ring where no other betters it."""
-    flips = {s.offer.choice.name: s.flip for s in result.shown}
+    made, flips = result.plan, {s.choice.name: s.flip for s in result.shown}
     records = [
-        {**asdict(o.choice), "seconds": {"min": o.seconds, "median": o.seconds + o.more},
-         "camera": o.camera, "flip": flips.get(o.choice.name)} for o in result.offered
-    ]  # fmt: skip
-    of = f"of the {result.what}, one thread, to the exact lens's noise with the scene's samples; ~ noisy"
+        {**asdict(c), "seconds": {"min": c.seconds, "median": c.seconds + c.more}, "flip": flips.get(c.name)}
+        for c in made.choices
+    ]
+    of = f"of the {made.what}, one thread, to the exact lens's noise with the scene's samples; ~ noisy"
     columns = (
         pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
         pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
-        pages.Column(result.unit, "seconds.min", about=of),
-        pages.Column("in the camera", "camera", digits=2, about=f"{result.unit} of these"),
+        pages.Column(made.unit_s, "seconds.min", about=of),
+        pages.Column("in the camera", "camera_seconds", digits=2, about=f"{made.unit_s} of these"),
         pages.Column("noise", "noise", about="times the paths that equal error takes"),
         pages.Column("FLIP", "flip", digits=2, about="of the small pictures, from the exact lens's"),
     )
-    front = result.front
-    marks = ["● " if o == result.chosen else "○ " if o in front else "" for o in result.offered]
-    names = [f"{m}{_short(o)}" for m, o in zip(marks, result.offered, strict=True)]
+    front = made.front
+    marks = ["● " if c == made.best else "○ " if c in front else "" for c in made.choices]
+    names = [f"{m}{_short(c)}" for m, c in zip(marks, made.choices, strict=True)]
     return pages.table(names, records, columns)
 
 

@@ -19,7 +19,7 @@ from neurolens.base.records import NOISY, noisy
 from neurolens.base.settings import setting, whole
 from neurolens.base.tasks import Processes, cores
 from neurolens.cli import arguments as cli
-from neurolens.study.advice import advice, ns_text
+from neurolens.study.pages import advice, ns_text
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,8 +37,8 @@ from neurolens.shaders.blender_shader import lens_of
 from neurolens.study.experiment import DomainChoice
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.fits.polynomial import fit_planes
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.polynomial import fit_planes
 from neurolens.surrogates.targets import ModelSettings, Prepared
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
@@ -67,6 +67,9 @@ class Choice:
         flip: of its picture, where a budget of FLIP asked for it.
         spread: how many times as long as the least the median of its timed calls took (1 where cost is counted).
         disperses: whether its picture depends on the wavelength.
+        seconds: of one thread, of the whole picture to the noise of the exact lens (10^9 operations where no time is
+            known), by the least of the camera's timed calls; by their median the picture takes `more` than that.
+        camera_seconds: the camera's share of them.
     """
 
     name: str
@@ -81,6 +84,9 @@ class Choice:
     flip: float | None = None
     spread: float = 1.0
     disperses: bool = False
+    seconds: float = math.inf
+    more: float = 0.0
+    camera_seconds: float = 0.0
 
     @property
     def noisy(self) -> bool:

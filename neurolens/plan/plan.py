@@ -9,7 +9,7 @@ alike, and the exact lens is taken where it is one of them.
 Seconds are of one thread and of the whole picture at the scene's own size, to the noise that the exact lens has with
 the scene's samples. What a path takes besides its camera, and how dispersion adds to noise, is measured by strips of
 the picture in our renderer; in other targets the camera alone counts, in Cycles under a white sky. There cameras count
-as alike up to `advice.SAVING`, for what else a path takes is not known.
+as alike up to `pages.SAVING`, for what else a path takes is not known.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 import bisect
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.analysis.plots import INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import split_kind
 from neurolens.base.progress import Report
@@ -39,9 +40,10 @@ from neurolens.plan.costs import ALONE, UNIT, Work, noise, ns_a_ray, small, stri
 from neurolens.plan.probe import LIGHT, Effect, Probe, SceneNeeds, effects_of, probe
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
-from neurolens.study.advice import SAVING, recommended
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
-from neurolens.study.image import Image, flip_map
+from neurolens.study.pages import SAVING, recommended
+from neurolens.study.plots import CHOSEN, error_scale, family_colour, log_norm, noisy_lines, place_labels
+from neurolens.study.scenes import Image, flip_map
 
 _SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
 _ACROSS, _SAMPLES = 240, 16  # of pictures
@@ -77,6 +79,21 @@ class Plan:
     work: Work = ALONE
     alike: tuple[str, ...] = ()
 
+    @property
+    def what(self) -> str:
+        """What takes the seconds of its cameras."""
+        return "whole picture" if any(self.work.rest) else "camera"
+
+    @property
+    def front(self) -> list[Choice]:
+        """The cameras that no other betters, see `front`."""
+        return front(self.choices)
+
+    @property
+    def unit_s(self) -> str:
+        """The unit of `Choice.seconds`."""
+        return "s" if self.unit == "ns" else "10^9 operations"
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: all fields but `probed`."""
         fields = asdict(replace(self, probed=None))  # type: ignore[arg-type]
@@ -96,7 +113,7 @@ class Plan:
             return format_toml({"title": title, "camera": camera})
         file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
         choice = LensChoice(file, zoom=asked.zoom, f_number=asked.f_number)
-        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
+        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0)
         return to_toml(Experiment(title, choice, (best.settings,), self.domain, PAIRS, checks, camera=camera))
 
 
@@ -154,13 +171,6 @@ def exact_suffices(probed: Probe, work: Work) -> bool:
     return recommended((0.0,), float, exact, rest, ALIKE) == exact
 
 
-def best_of(within: Sequence[Choice], work: Work | None, denoised: bool = False) -> Choice | None:
-    """The camera to use of those within a budget; `work` as for `decided`."""
-    exact = next((c for c in within if c.name == EXACT and math.isfinite(c.cost)), None)
-    cost = partial(Choice.whole, work=work or ALONE, denoised=denoised)
-    return recommended(within, cost, exact if work is not None else None, saving=_alike(work or ALONE))
-
-
 def _alike(work: Work) -> float:
     """The factor up to which costs count as the same."""
     return ALIKE if any(work.rest) else SAVING
@@ -172,38 +182,38 @@ def decided(probed: Probe, tried: Sequence[Choice], budget_px: float, target: Ta
     Args:
         work: of a path; None chooses the cheapest camera, whatever it saves.
     """
-    denoised, known = bool(probed.asked and probed.asked.denoised), work or ALONE
-    cost = partial(Choice.whole, work=known, denoised=denoised)
-    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=cost))
+    known = work or ALONE
+    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in in_seconds(probed, tried, known))
     held = [c for c in ranked if c.within]
-    best, effects = best_of(held, work, denoised), effects_of(probed, budget_px)
-    alike = tuple(c.name for c in held if cost(c) <= _alike(known) * cost(held[0]))
+    exact = next((c for c in held if c.name == EXACT and math.isfinite(c.cost)), None) if work else None
+    best = recommended(held, lambda c: c.seconds, exact, saving=_alike(known))
+    alike = tuple(c.name for c in held if c.seconds <= _alike(known) * held[0].seconds)
+    effects = effects_of(probed, budget_px)
     return Plan(
         probed.asked, budget_px, None, target, UNIT[target], shot_domain(probed), effects, ranked, best, probed,
         work=known, alike=alike,
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Offer:
-    """A camera with the seconds of one thread that its picture takes (10^9 operations, where no time is known).
+def in_seconds(probed: Probe, tried: Sequence[Choice], work: Work) -> list[Choice]:
+    """Cameras by rising seconds, to the noise that the exact lens has with the scene's samples."""
+    denoised, shot = probed.asked.denoised, probed.scene.settings.camera
+    exact = noise(probed.seen.weight, probed.places.share) * work.noise[probed.exact.dispersive]
+    paths = 1e-9 * shot.width * shot.height * shot.samples / (1.0 if denoised else exact)
 
-    Attributes:
-        seconds: by the least of the camera's timed calls; by their median the picture takes `more` than that.
-        camera: the camera's share of them.
-    """
+    def priced(c: Choice) -> Choice:
+        camera = paths * c.cost
+        more = camera * (c.spread - 1) if math.isfinite(camera) else 0.0
+        return replace(c, seconds=paths * c.whole(work, denoised), more=more, camera_seconds=camera)
 
-    choice: Choice
-    seconds: float
-    more: float = 0.0
-    camera: float = 0.0
+    return sorted(map(priced, tried), key=lambda c: c.seconds)
 
 
 @dataclass(frozen=True)
 class CameraPicture:
     """A camera's small picture [H, W, 3], linear, and its FLIP from the exact lens's of the same random numbers."""
 
-    offer: Offer
+    choice: Choice
     rgb: FloatArray
     difference: Image
 
@@ -215,46 +225,29 @@ class CameraPicture:
 
 @dataclass(frozen=True)
 class Trade:
-    """Every camera that was priced, by rising seconds; the plan for the budget; and pictures of those to look at.
+    """A plan in which every camera has its seconds, and pictures of those to look at.
 
     Attributes:
-        unit: of `Offer.seconds`. samples: a pixel of the pictures.
-        exact: the lens's picture.
+        samples: a pixel of the pictures. exact: the lens's picture.
     """
 
     plan: Plan
-    offered: tuple[Offer, ...]
-    unit: str
     samples: int
     exact: FloatArray
     shown: tuple[CameraPicture, ...]
 
     @property
-    def what(self) -> str:
-        """What takes the seconds."""
-        return "whole picture" if any(self.plan.work.rest) else "camera"
-
-    @property
-    def front(self) -> list[Offer]:
-        """The cameras that no other betters, see `front`."""
-        return front(self.offered)
-
-    @property
-    def chosen(self) -> Offer | None:
-        """The plan's camera."""
-        return next((o for o in self.offered if self.plan.best is not None and o.choice == self.plan.best), None)
-
-    @property
-    def half(self) -> Offer | None:
+    def half(self) -> Choice | None:
         """The best camera for half of the seconds that the picture of the chosen one takes."""
-        return None if self.chosen is None else best_within(self.offered, self.chosen.seconds / 2)
+        best = self.plan.best
+        return None if best is None else best_within(self.plan.choices, best.seconds / 2)
 
 
 def _priced(
     scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
     folder: Path | None = None, report: Report | None = None, **look: Any,
-) -> tuple[Plan, list[Offer]]:  # fmt: skip
-    """A plan in which every camera has its cost, and its cameras by rising seconds; arguments as for `plan`."""
+) -> Plan:  # fmt: skip
+    """A plan in which every camera has its seconds; arguments as for `plan`."""
     say = report or (lambda done, left=None: None)
     probed = probe(scene, lens, **look)
     work = work_for(scene, probed, target)
@@ -263,7 +256,7 @@ def _priced(
         report=lambda done, left=None: say(0.5 * done), work=work,
     )  # fmt: skip
     made = decided(probed, tried, budget_px, target, work)
-    return made, offers(scene, probed, made.choices, work)
+    return replace(made, choices=tuple(c for c in made.choices if math.isfinite(c.seconds)))
 
 
 def trade(scene: Scene, lens: Lens, budget_px: float, *, samples: int = _SAMPLES, **options: Any) -> Trade:
@@ -274,11 +267,10 @@ def trade(scene: Scene, lens: Lens, budget_px: float, *, samples: int = _SAMPLES
     if not budget_px >= 0:
         raise InputError("trade", "budget_px", budget_px, "0 or more pixels")
     say: Report = options.get("report") or (lambda done, left=None: None)
-    made, offered = _priced(scene, lens, budget_px, **options)
-    some = spread(front(offered), next((o for o in offered if o.choice == made.best), None))
+    made = _priced(scene, lens, budget_px, **options)
+    some = spread(front(made.choices), made.best)
     exact, pictures = _pictures(scene, made.probed, some, samples, lambda done, left=None: say(0.5 + 0.5 * done))
-    unit = "s" if made.unit == "ns" else "10^9 operations"
-    return Trade(made, tuple(offered), unit, samples, exact, tuple(pictures))
+    return Trade(made, samples, exact, tuple(pictures))
 
 
 def plan_within(scene: Scene, lens: Lens, seconds: float, **options: Any) -> Plan:
@@ -289,11 +281,9 @@ def plan_within(scene: Scene, lens: Lens, seconds: float, **options: Any) -> Pla
     target = options.get("target", "render")
     if not seconds > 0 or UNIT[target] != "ns":
         raise InputError("plan", "budget", f"({seconds:g} s for {target})", "above 0, and a target whose time is known")
-    made, offered = _priced(scene, lens, 0.0, **options)
-    offer = best_within(offered, seconds)
-    fits = {id(o.choice) for o in offered if o.seconds <= seconds and o.choice.light_error <= LIGHT}
-    choices = [replace(c, within=id(c) in fits) for c in made.choices]
-    return _rebudgeted(made, choices, None if offer is None else replace(offer.choice, within=True), budget_s=seconds)
+    made = _priced(scene, lens, 0.0, **options)
+    choices = [replace(c, within=c.seconds <= seconds and c.light_error <= LIGHT) for c in made.choices]
+    return _rebudgeted(made, choices, best_within(choices, seconds), budget_s=seconds)
 
 
 def _rebudgeted(made: Plan, choices: Sequence[Choice], best: Choice | None, **budget: Any) -> Plan:
@@ -316,13 +306,12 @@ def plan_seen(scene: Scene, lens: Lens, flip_budget: float, **options: Any) -> P
     if options.get("afterwards"):
         raise InputError("plan", "afterwards", ", ".join(options["afterwards"]), "nothing with a budget of FLIP")
     say: Report = options.get("report") or (lambda done, left=None: None)
-    made, offered = _priced(scene, lens, 0.0, **options)
-    by_time = front(offered)
+    made = _priced(scene, lens, 0.0, **options)
+    by_time = front(made.choices)
     exact = _strips(scene, made.probed.exact)
     flips: dict[str, float] = {}
 
-    def holds(offer: Offer) -> bool:
-        choice = offer.choice
+    def holds(choice: Choice) -> bool:
         pairs = zip(_strips(scene, camera_of(made.probed, choice)), exact, strict=True)
         flips[choice.name] = 0.0 if choice.error_px == 0 else float(np.mean([flip_map(*pair) for pair in pairs]))
         say(1 - 0.5 ** (1 + len(flips)))
@@ -333,7 +322,7 @@ def plan_seen(scene: Scene, lens: Lens, flip_budget: float, **options: Any) -> P
         return replace(choice, flip=value, within=value is not None and value <= flip_budget)
 
     first = bisect.bisect_left(by_time, True, key=holds)
-    best = judged(by_time[first].choice) if first < len(by_time) else None
+    best = judged(by_time[first]) if first < len(by_time) else None
     return _rebudgeted(made, [*map(judged, made.choices)], best, budget_flip=flip_budget)
 
 
@@ -343,38 +332,20 @@ def _strips(scene: Scene, camera: Camera) -> list[FloatArray]:
     return [drawn(rows=rows).rgb for rows in strips_of(scene, _STRIP_PATHS, _STRIP_ROWS)]
 
 
-def paths(scene: Scene) -> int:
-    """The paths of a picture of the scene's own size and samples."""
-    shot = scene.settings.camera
-    return shot.width * shot.height * shot.samples
-
-
-def offers(scene: Scene, probed: Probe, tried: Sequence[Choice], work: Work) -> list[Offer]:
-    """Cameras of known cost by rising seconds, to the noise that the exact lens has with the scene's samples."""
-    denoised = probed.asked.denoised
-    exact = noise(probed.seen.weight, probed.places.share) * work.noise[probed.exact.dispersive]
-    count = 1e-9 * paths(scene) / (1.0 if denoised else exact)
-    some = ((c, c.whole(work, denoised)) for c in tried)
-    offered = (
-        Offer(c, count * ns, count * c.cost * (c.spread - 1), count * c.cost) for c, ns in some if math.isfinite(ns)
-    )
-    return sorted(offered, key=lambda o: o.seconds)
-
-
-def front(offered: Sequence[Offer]) -> list[Offer]:
+def front(choices: Sequence[Choice]) -> list[Choice]:
     """The cameras of right light that no other betters in error and seconds."""
-    bright = [o for o in offered if o.choice.light_error <= LIGHT]
-    return [bright[i] for i in pareto_front([(o.seconds, o.choice.error_px) for o in bright])]
+    bright = [c for c in choices if c.light_error <= LIGHT]
+    return [bright[i] for i in pareto_front([(c.seconds, c.error_px) for c in bright])]
 
 
-def best_within(offered: Sequence[Offer], seconds: float) -> Offer | None:
+def best_within(choices: Sequence[Choice], seconds: float) -> Choice | None:
     """The most faithful camera whose picture takes no longer."""
-    affordable = (o for o in front(offered) if o.seconds <= seconds)
-    return min(affordable, key=lambda o: (o.choice.error_px, o.seconds), default=None)
+    affordable = (c for c in front(choices) if c.seconds <= seconds)
+    return min(affordable, key=lambda c: (c.error_px, c.seconds), default=None)
 
 
 def _pictures(
-    scene: Scene, probed: Probe, offered: Sequence[Offer], samples: int, report: Report
+    scene: Scene, probed: Probe, some: Sequence[Choice], samples: int, report: Report
 ) -> tuple[FloatArray, list[CameraPicture]]:
     """The exact lens's small picture, and those of cameras: equal samples, the same random numbers."""
     film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
@@ -382,22 +353,122 @@ def _pictures(
     drawn = partial(render, scene, width=width, height=height, samples=samples, film=film)
     exact = drawn(probed.exact).rgb
     pictures = []
-    for k, offer in enumerate(offered):
-        report((k + 1) / (len(offered) + 1))
-        same = offer.choice.error_px == 0
-        rgb = exact if same else drawn(camera_of(probed, offer.choice)).rgb
-        pictures.append(CameraPicture(offer, rgb, np.zeros(rgb.shape[:2]) if same else flip_map(rgb, exact)))
+    for k, choice in enumerate(some):
+        report((k + 1) / (len(some) + 1))
+        same = choice.error_px == 0
+        rgb = exact if same else drawn(camera_of(probed, choice)).rgb
+        pictures.append(CameraPicture(choice, rgb, np.zeros(rgb.shape[:2]) if same else flip_map(rgb, exact)))
     return exact, pictures
 
 
-def spread(offered: Sequence[Offer], chosen: Offer | None, most: int = _SHOWN) -> list[Offer]:
+def spread(choices: Sequence[Choice], chosen: Choice | None, most: int = _SHOWN) -> list[Choice]:
     """At most so many of a front, evenly, and the chosen one among them, even where it is not on the front."""
-    if chosen is not None and chosen not in offered:
-        offered = sorted([*offered, chosen], key=lambda o: o.seconds)
-    if len(offered) <= most:
-        return list(offered)
-    rows = {round(k * (len(offered) - 1) / (most - 1)) for k in range(most)}
-    at = [k for k, o in enumerate(offered) if o == chosen]
+    if chosen is not None and chosen not in choices:
+        choices = sorted([*choices, chosen], key=lambda c: c.seconds)
+    if len(choices) <= most:
+        return list(choices)
+    rows = {round(k * (len(choices) - 1) / (most - 1)) for k in range(most)}
+    at = [k for k, c in enumerate(choices) if c == chosen]
     if at and not rows & set(at):
         rows = rows - {min(rows, key=lambda k: (abs(k - at[0]), k))} | set(at)
-    return [offered[k] for k in sorted(rows)]
+    return [choices[k] for k in sorted(rows)]
+
+
+_MAPS_A_ROW = 4
+# Light that an effect takes is dark, light that it adds is orange; none is white.
+_SIGNED = ("#10183a", "#4d6796", "#c9d1de", "#ffffff", "#f6cfae", "#e58a45", CHOSEN)
+_TITLES = {"px": "pixels (logarithmic)", "relative": "% of the light\n(dark: taken, orange: added)"}
+
+
+def plot_effects(plan: Plan, path: Path, title: str) -> None:
+    """Draw effects as bars with the budget, the error of every timed camera against its time, and maps of the effects
+    that a camera needs: those in pixels, then those of light, each with one scale."""
+    asked = plan.asked
+    shown = [e for e in plan.effects if e.needed and e.name in plan.probed.maps]
+    groups = {unit: [e.name for e in shown if e.unit == unit] for unit in _TITLES}
+    groups = {unit: names for unit, names in groups.items() if names}
+    heights = [4.2, *(1.6 * -(-len(names) // _MAPS_A_ROW) + 0.15 for names in groups.values())]
+    subtitle = f"f/{asked.f_number:.3g}, focus {asked.shot.focus_m:g} m; 95% of the picture keeps these figures"
+    with drawing(path, 9.5, sum(heights), title, subtitle) as figure:
+        if not groups:
+            _bars_and_trade(plan, figure)
+            return
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
+        _bars_and_trade(plan, above)
+        for part, (unit, names) in zip(below, groups.items(), strict=True):
+            _maps(part, {name: plan.probed.maps[name][1] for name in names}, unit, asked.shot.film_mm)
+
+
+def _maps(figure: Any, maps: Mapping[str, Any], unit: str, film_mm: tuple[float, float]) -> None:
+    """Maps of effects of one unit, upright, in one scale of colours with its bar."""
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    colours: Any = "magma"
+    if unit == "px":
+        low, high = error_scale(maps.values(), 98)
+        norm = log_norm(low, high)
+        maps = {name: np.maximum(value, low) for name, value in maps.items()}
+    else:
+        maps = {name: 100 * value for name, value in maps.items()}
+        high = error_scale([np.abs(value) for value in maps.values()], 98)[1]
+        norm, colours = Normalize(-high, high), LinearSegmentedColormap.from_list("signed", _SIGNED)
+    cells = figure.subplots(-(-len(maps) // _MAPS_A_ROW), _MAPS_A_ROW, squeeze=False)
+    for axes, (name, value) in zip(cells.ravel(), maps.items(), strict=False):
+        extent = (0, film_mm[0], 0, film_mm[1])
+        picture = axes.imshow(value, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+        axes.set_title(name, fontsize=8)
+        axes.set(xticks=[], yticks=[])
+    for axes in cells.ravel()[len(maps) :]:
+        axes.set_axis_off()
+    bar = figure.colorbar(picture, ax=cells, extend="both", aspect=12 * len(cells), pad=0.015)
+    bar.ax.tick_params(labelsize=6.5)
+    bar.set_label(_TITLES[unit], fontsize=7)
+    if unit == "px":
+        plain_log_ticks(bar.ax.yaxis)
+
+
+def _bars_and_trade(plan: Plan, figure: Any) -> None:
+    wide = [e for e in plan.effects if e.unit == "px"][::-1]
+    bars, trade = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
+    least = max(min((e.worth for e in wide if e.worth > 0), default=1e-3) / 3, 1e-4)
+    colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in wide]
+    bars.barh([e.name for e in wide], [max(e.worth, least) for e in wide], color=colours, left=0)
+    bars.set_xscale("log")
+    bars.set_xlim(left=least)
+    bars.set_xlabel("worth (pixels), grey: left out")
+    _cameras(trade, plan)
+    trade.set_xlabel(f"{plan.unit_s} of the {plan.what}, --for {plan.target}")
+    if plan.budget_px > 0:
+        bars.axvline(plan.budget_px, color=CHOSEN, lw=1.2)
+    plain_log_ticks(bars.xaxis)
+
+
+def _cameras(axes: Any, plan: Plan) -> None:
+    """Errors of cameras over their least time, with their median: within the budget in colour, the chosen one with a
+    ring. From a noisy time a line leads to the median of its repeats."""
+    timed = [c for c in plan.choices if 0 < c.seconds < float("inf") and c.error_px < float("inf")]
+    points = [(c.seconds, max(c.error_px, 1e-4)) for c in timed]
+    axes.scatter(*np.reshape(points, (-1, 2)).T, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
+    ring = {"s": 150, "fc": "none", "ec": CHOSEN, "lw": 1.8}
+    for point in (p for p, c in zip(points, timed, strict=True) if c == plan.best):
+        axes.scatter(*point, **ring)
+    noisy_lines(axes, [(y, x, x + c.more) for (x, y), c in zip(points, timed, strict=True) if c.noisy])
+    axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
+    place_labels(axes, points, [c.name.rpartition(".")[2] or c.name for c in timed])  # a model without its lens
+    if plan.budget_px > 0:
+        axes.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+    if any(axes.get_legend_handles_labels()):
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
+    plain_log_ticks(axes.xaxis, axes.yaxis)
+
+
+def plot_trade(plan: Plan, path: Path, title: str) -> None:
+    """Error of every camera against its seconds, with the front of those that no other betters."""
+    best = plan.front
+    subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
+    with drawing(path, 8.5, 5.0, title, subtitle) as figure:
+        axes = figure.subplots()
+        at = [c.seconds for c in best], [max(c.error_px, 1e-4) for c in best]
+        axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
+        axes.set_xlabel(f"{plan.unit_s} of the {plan.what}, one thread, to equal noise")
+        _cameras(axes, plan)

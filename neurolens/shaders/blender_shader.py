@@ -122,7 +122,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     from neurolens.setting.focusing import focus_states
     from neurolens.setting.pupils import pupil_plane_z_mm
     from neurolens.setting.states import set_lens
-    from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
+    from neurolens.surrogates.fit import StateSpace, axes_of, gap_axis
     from neurolens.trace.tracegraph import TRANSMITTANCE
 
     lens, state = read_any(file), None if zoom == RANGE else zoom

@@ -25,8 +25,8 @@ from neurolens.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import Array, Focusing, film_extras, followed, state_ranges
 from neurolens.surrogates.axes import Axis, mixture_of, weights
+from neurolens.surrogates.fit import gap_axis, zoom_axis
 from neurolens.surrogates.source import DOUBLE, Written, checked_name, lines_of, write_program
-from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths

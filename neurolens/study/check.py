@@ -38,8 +38,8 @@ from neurolens.study.measure import (
 )
 from neurolens.study.rays import ZONES, EachRay, false_shares, ray_errors
 from neurolens.surrogates.axes import Axis
+from neurolens.surrogates.fit import State, StateSpace
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.states import State, StateSpace
 
 # How much worse than promised a figure may be on other rays: standard deviations of the estimate from a sample of this
 # size, at least a tenth, at most a half. A largest error has no such bound: more rays find larger ones.

@@ -22,11 +22,9 @@ from neurolens.readers.any_format import OURS, kind_of, read_any
 from neurolens.readers.lensfile import write_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.rays import PIXELS_ACROSS, frame_width_mm
-from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.fit import ModelSettings, StateSpace, axes_of
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings
-from neurolens.surrogates.states import StateSpace, axes_of
+from neurolens.surrogates.pairs import PairSettings, domain_of
 
 # Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens), and the object 8 before the
 # front vertex, where a long lens of short focus has less room than that.
@@ -172,15 +170,10 @@ class TargetChoice:
 
 @dataclass(frozen=True)
 class EvaluationChoice:
-    """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread.
-
-    Attributes:
-        compile_exact: whether the exact tracer compiled by torch runs, too: half a minute of compiling.
-    """
+    """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread."""
 
     vignetting_rays: int = 200_000
     rounds: int = 15
-    compile_exact: bool = True
 
 
 @dataclass(frozen=True)
@@ -226,7 +219,6 @@ class Experiment:
     evaluation: EvaluationChoice = field(default_factory=EvaluationChoice)
     render: RenderChoice = field(default_factory=RenderChoice)
     target: TargetChoice | None = None
-    save_pairs: bool = False
     camera: str | None = None
 
     def __post_init__(self) -> None:
@@ -323,6 +315,6 @@ def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> 
         "title": f"Models of {Path(lens_file).stem}",
         "lens": {"file": str(lens_file)},
         "model": list(_LADDER) if asked else [{"method": "ols", "terms": 64}, {"method": "mlp", "units": 16}],
-        "evaluation": {"rounds": 8, "compile_exact": False},
+        "evaluation": {"rounds": 8},
     }
     return from_dict(Experiment, apply_overrides(tables, overrides), "--set")

@@ -31,12 +31,19 @@ from neurolens.study.rays import (
     each_ray,
     false_shares,
 )
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
-from neurolens.surrogates.fits.network import clear_training
 from neurolens.surrogates.model import Domain, Prediction
-from neurolens.surrogates.pairs import PairSet, PairSettings, join_pairs, make_pairs, trace_pairs
+from neurolens.surrogates.network import clear_training
+from neurolens.surrogates.pairs import (
+    FilmRays,
+    PairSet,
+    PairSettings,
+    join_pairs,
+    make_pairs,
+    sample_domain,
+    trace_pairs,
+)
 from neurolens.trace.surfaces import Rays
 
 # Whole stops closed, by the name of the state.

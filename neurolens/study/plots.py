@@ -1,4 +1,4 @@
-"""Plots of a run: error against time and size, renders beside their errors, illumination, error over zoom and focus."""
+"""Plots of a run: error against time and size, illumination, error over zoom and focus."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike
 from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.base.records import NOISY, noisy, pareto_front, time_of
-from neurolens.study.advice import ns_text
-from neurolens.study.image import checked_image, to_srgb
-from neurolens.study.pages import Record, number
+from neurolens.study.pages import Record, ns_text, number
 from neurolens.study.rays import Illumination
 from neurolens.surrogates.axes import Axis
 
@@ -76,7 +74,7 @@ def trade_plot(
         noisy_lines(left, [(e, t["min"], t["median"]) for e, t in timings if t is not None and noisy(t)])
         for tracer in exact:
             if time := number(tracer, "ns_per_ray.min"):
-                look = {"color": INK, "lw": 1.0, "ls": "--" if "compiled" in tracer["name"] else ":"}
+                look = {"color": INK, "lw": 1.0, "ls": ":"}
                 look |= {"color": CHOSEN, "lw": 2.0} if tracer["name"] == use else {}
                 label = f"{tracer['name']} {ns_text(time_of(tracer))}" + ": use" * (tracer["name"] == use)
                 left.axvline(time, label=label, **look)
@@ -162,69 +160,6 @@ def _corners(width: float, height: float) -> list[tuple[float, float]]:
         corners += [(gap, row) for row in rows] + [(-width - gap, row) for row in rows]
         corners += [(-width / 2, gap), (-width / 2, -height - gap)]
     return corners
-
-
-_COLUMNS = 4  # with more, each picture would be too small
-
-
-def side_by_side(
-    images: Mapping[str, ArrayLike], error_maps: Mapping[str, ArrayLike], path: str | Path,
-    captions: Mapping[str, str] | None = None, title: str = "",
-) -> Path:  # fmt: skip
-    """Renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
-
-    Args:
-        images: name to linear RGB [H, W, 3], shown through `image.to_srgb`; all of one shape.
-        error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
-            All share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
-        path: PNG, PDF or SVG to write.
-        captions: name to one or two lines shown below its picture.
-    Raises:
-        InputError: no image, shapes that differ, values that are not finite, a map without its image.
-    """
-    pictures = {name: checked_image(image, name) for name, image in images.items()}
-    maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
-    _check_shapes(pictures, maps)
-    low, high = error_scale(maps.values(), 99.5)
-    height, width = next(iter(pictures.values())).shape[:2]
-    rows, each = math.ceil(len(pictures) / _COLUMNS), 2 if maps else 1
-    columns = math.ceil(len(pictures) / rows)
-    wide = max(2.45, 7.6 / columns)
-    note = {"xycoords": "axes fraction", "xytext": (0, -5), "textcoords": "offset points", "ha": "center", "va": "top"}
-    with drawing(path, columns * wide + 1, rows * (each * wide * height / width + 1), title) as figure:
-        figure.set_layout_engine("compressed", h_pad=0.06)  # for pictures, which keep their aspect
-        grid = figure.subplots(each * rows, columns, squeeze=False)
-        for axes in grid.flat:
-            axes.set_axis_off()
-        for k, (name, picture) in enumerate(pictures.items()):
-            above, below = (grid[k // columns * each + i, k % columns] for i in (0, each - 1))
-            above.imshow(to_srgb(picture), interpolation="nearest")
-            above.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
-            if name in maps:
-                look = {"cmap": "magma", "norm": log_norm(low, high), "interpolation": "nearest"}
-                shown = below.imshow(np.maximum(maps[name], low), **look)
-            captioned = below if name in maps else above
-            captioned.annotate((captions or {}).get(name, ""), (0.5, 0), fontsize=8.6, color="#444444", **note)
-        if maps:
-            label = "FLIP difference, no unit: 0 none, 1 the most (logarithmic, one scale for all)"
-            bar = figure.colorbar(shown, ax=grid, label=label, aspect=40, extend="both")
-            bar.outline.set_visible(False)
-            plain_log_ticks(bar.ax.yaxis)
-    return Path(path)
-
-
-def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
-    if not pictures:
-        raise InputError("side by side", "images", "(none)", "at least one image")
-    first = next(iter(pictures.values())).shape
-    for name, picture in pictures.items():
-        if picture.shape != first:
-            raise InputError("side by side", f"image {name}", f"({picture.shape})", f"the shape of the first, {first}")
-    for name, error in maps.items():
-        if name not in pictures:
-            raise InputError("side by side", "error map", name, "the name of an image: " + ", ".join(pictures))
-        if error.shape != first[:2] or not np.isfinite(error).all():
-            raise InputError("side by side", f"error map {name}", f"({error.shape})", f"finite values, {first[:2]}")
 
 
 _DECADES = 3  # of a scale of errors

@@ -21,9 +21,8 @@ from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays, image_radius_mm
-from neurolens.surrogates.domain import FilmRays, focused_plane_z_mm, sample_domain
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSet
+from neurolens.surrogates.pairs import FilmRays, PairSet, focused_plane_z_mm, sample_domain
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 

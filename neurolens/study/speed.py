@@ -37,12 +37,12 @@ from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays
 from neurolens.study.rays import frame_width_mm
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import FilmRays, sample_domain
 from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.terms import pinned_threads
-from neurolens.trace.rays import Traced, compile_tracing, trace
+from neurolens.trace.rays import Traced, trace
 from neurolens.trace.tracegraph import exact_graph
 
 # Rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache.
@@ -50,7 +50,7 @@ POOL = 65536
 BATCHES = (4096, 8192, 16384)
 _SAMPLE_S = 0.001  # least time of a sample; short ones fit between the interruptions of a busy machine
 _SAMPLES = 5  # samples of a round, of which the best counts
-_PREPARING = 0.7  # approximate share of compilation in a race's time
+_PREPARING = 0.7  # approximate share of preparation in a race's time
 
 Call = Callable[[], object]
 
@@ -150,7 +150,6 @@ def race(
     before = _load()
     pool = _pool(domain)
     with pinned_threads(), torch.no_grad():
-        torch._dynamo.reset()  # torch limits the number of recompilations of a function
         for i, c in enumerate(candidates):
             try:
                 passes[c.name] = _best_batch(c, pool)
@@ -207,68 +206,37 @@ def _load() -> float | None:
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
-# Names of `exact_candidates` of a whole camera, and of `exact_c_candidate`.
-EXACT = ("exact eager", "exact compiled", "exact C")
+# Names of the exact tracers: of torch, and as C.
+EXACT = ("exact eager", "exact C")
 EAGER_BATCHES = (8192, 16384, 32768)
-COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation
 
 
-def exact_candidates(
-    lens: Lens, domain: Domain, *, transmittance: bool = True, build_rays: bool = True, compiled: bool = True,
-    label: str = "exact",
-) -> list[Candidate]:  # fmt: skip
-    """The exact tracer in float32, eager and compiled: every surface, stop, rims and dispersion, status out.
+def exact_candidate(lens: Lens, domain: Domain) -> Candidate:
+    """The exact tracer of torch in float32: every surface, stop, rims, transmittance and dispersion, status out."""
 
-    Args:
-        transmittance: whether to follow it, as surrogates do.
-        build_rays: start from film and pupil points, as surrogates do; else from camera rays made beforehand.
-        compiled: whether to include the compiled one.
-        label: names are "{label} eager" and "{label} compiled".
-    """
+    def run(*columns: Any) -> Traced:
+        *points, wavelength = columns
+        fx, fy, fz, px, py = points
+        return trace(lens, camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength, transmittance=True)
 
-    def tracing(rays: Any, wavelength: Any) -> Traced:
-        return trace(lens, rays, wavelength, transmittance=transmittance)
+    return Candidate(EXACT[0], lambda rays: partial(run, *eager_arguments(rays)), EAGER_BATCHES)
 
-    def whole(fx: Any, fy: Any, fz: Any, px: Any, py: Any, wavelength: Any) -> Traced:
-        return tracing(camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
 
-    def arguments(rays: FilmRays) -> tuple[Any, ...]:
-        fx, fy, fz, px, py, wavelength = (c.to(torch.float32).contiguous() for c in rays.columns())
-        points = fx, fy, fz[0].clone(), px, py  # one film plane, as in a picture
-        return (*points, wavelength) if build_rays else (camera_rays(*points, domain.pupil_z_mm), wavelength)
-
-    run: Callable[..., Traced] = whole if build_rays else tracing
-    fast = compile_tracing(run, fullgraph=True) if compiled else run
-
-    def prepare_compiled(rays: FilmRays) -> Call:
-        call = partial(fast, *arguments(rays))
-        try:
-            call()
-        except Exception as error:  # of many types: no compiler, a compiler that fails, an unsupported platform
-            raise Unavailable(f"torch cannot compile here: {_reason(error)}") from error
-        return call
-
-    eager = Candidate(f"{label} eager", lambda rays: partial(run, *arguments(rays)), EAGER_BATCHES)
-    return [eager, Candidate(f"{label} compiled", prepare_compiled, COMPILED_BATCHES)] if compiled else [eager]
+def eager_arguments(rays: FilmRays) -> tuple[Any, ...]:
+    """The columns of rays in float32, with one film plane, as in a picture."""
+    fx, fy, fz, px, py, wavelength = (c.to(torch.float32).contiguous() for c in rays.columns())
+    return fx, fy, fz[0].clone(), px, py, wavelength
 
 
 def exact_c_candidate(lens: Lens, domain: Domain) -> Candidate:
     """The exact trace as C, by the same writer and flags as the models: the measure of a model as C."""
     graph = exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)
-    return program_candidate(EXACT[2], lower(graph), domain)
+    return program_candidate(EXACT[1], lower(graph), domain)
 
 
 def exact_records(timed: Race) -> list[ExactRecord]:
     """Records of the exact tracers that a race timed, or that could not run."""
     return [timed.record(name) for name in EXACT if name in timed.ns or name in timed.unavailable]
-
-
-def _reason(error: BaseException) -> str:
-    # Torch wraps the reason: the innermost cause is the informative one.
-    while error.__cause__ is not None:
-        error = error.__cause__
-    text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
-    return f"{type(error).__name__}: {text}"[:200]
 
 
 def camera_candidate(camera: Camera, domain: Domain, name: str | None = None) -> Candidate:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -20,11 +21,9 @@ from neurolens.base.records import Results, reaches, target_record, versions, wr
 from neurolens.cameras.model import load_model
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.study.advice import CLOSE_UM, exact_of, to_use
 from neurolens.study.check import card_errors, errors_at, random_states
 from neurolens.study.describe import layout_profile
 from neurolens.study.experiment import Experiment, keep_inputs
-from neurolens.study.image import SETTINGS
 from neurolens.study.measure import (
     FRESH,
     MORE,
@@ -36,15 +35,15 @@ from neurolens.study.measure import (
     shared_rays,
     what_is_poor,
 )
-from neurolens.study.pages import write_report
+from neurolens.study.pages import CLOSE_UM, exact_of, to_use, write_report
 from neurolens.study.plots import illumination_plot, states_plot, trade_plot
 from neurolens.study.rays import Illumination, pixel_um, relative_illumination
-from neurolens.study.scenes import Pictures, domain_facts, render_all
+from neurolens.study.scenes import SETTINGS, Pictures, render_all
 from neurolens.study.speed import (
     EXACT,
     Race,
     exact_c_candidate,
-    exact_candidates,
+    exact_candidate,
     exact_records,
     ideal_cameras,
     model_candidates,
@@ -52,9 +51,8 @@ from neurolens.study.speed import (
     time_model,
 )
 from neurolens.surrogates.export import export_states
-from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
-from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
-from neurolens.surrogates.states import StateSettings, StateSpace, fit_states
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, StateSettings, StateSpace, fit_states, prepare
+from neurolens.surrogates.pairs import RayPairs, make_pairs
 from neurolens.surrogates.terms import pinned_threads
 
 _IDEAL = ("thin lens", "pinhole")
@@ -110,8 +108,6 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
     settings = keep_inputs(experiment, folder)
     with progress.stage("trace ray pairs") as report:
         pairs = make_pairs(lens, domain, experiment.pairs, report)
-        if experiment.save_pairs:
-            save_pairs(pairs, folder / "pairs.npz")
         prepared = prepare(pairs)
     count, target = experiment.evaluation.vignetting_rays, experiment.target
     within_um = target.within_um(domain.film_radius_mm) if target else None
@@ -160,7 +156,7 @@ def _plan(experiment: Experiment) -> dict[str, float]:
     plan: dict[str, float] = {"trace ray pairs": 3}
     for m in experiment.model:
         plan[f"fit {m.label}"] = 0.06 * m.steps * (m.units * m.layers / 32) ** 2.5 if m.method in NETWORKS else 3
-    plan["race for speed"] = (45 if experiment.evaluation.compile_exact else 5) + 2 * len(experiment.model)
+    plan["race for speed"] = 5 + 2 * len(experiment.model)
     plan |= {"render": 40} if experiment.render.scenes else {}
     return plan
 
@@ -168,23 +164,20 @@ def _plan(experiment: Experiment) -> dict[str, float]:
 def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measured], progress: Progress) -> Race:
     """Time the exact tracers and all models in one run, and add times, speed-ups and break-even to the records.
 
-    Models run in onnxruntime and, with a compiler, as C; the exact lens eager, as C, and compiled by
-    torch where that is asked for.
+    Models run in onnxruntime and, with a compiler, as C; the exact lens by torch and as C.
     """
     chosen, lens, domain = experiment.evaluation, prepared.pairs.lens, prepared.pairs.domain
     if not chosen.rounds:
         return Race({}, {})
     with progress.stage("race for speed") as report:
-        candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
-        candidates += [exact_c_candidate(lens, domain)]
+        candidates = [exact_candidate(lens, domain), exact_c_candidate(lens, domain)]
         candidates += model_candidates({m.settings.label: m.file for m in measured}, domain)
         candidates += ideal_cameras(lens, domain)
         timed = race(candidates, domain, rounds=chosen.rounds, report=report)
     for m in measured:
         cost = m.record["fit_s"], m.record["load_s"]
-        ns, speedup, _ = timed.gain(m.settings.label, EXACT[1], *cost)
-        fused_ns, fused_speedup, pays = timed.gain(f"{m.settings.label} fused", EXACT[2], *cost)
-        m.record.update(ns_per_ray=ns, speedup_over_compiled=speedup)
+        fused_ns, fused_speedup, pays = timed.gain(f"{m.settings.label} fused", EXACT[1], *cost)
+        m.record.update(ns_per_ray=timed.timing(m.settings.label))
         m.record.update(fused_ns_per_ray=fused_ns, fused_speedup=fused_speedup)
         if fused_speedup is not None:
             m.record["break_even_rays"] = pays
@@ -231,7 +224,11 @@ def _describe_lens(lens: Lens) -> dict[str, Any]:
 def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
     domain = pairs.domain
     return {
-        **domain_facts(lens, domain),
+        "film_radius_mm": domain.film_radius_mm,
+        "f_number": first_order(lens).f_number,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["infinity" if f == math.inf else f for f in domain.focus_m],
+        "nearest_m": domain.nearest_m,
         "pupil_plane_z_mm": domain.pupil_z_mm,
         "pupil_radius_mm": domain.pupil_radius_mm,
         "passing_share": len(pairs.train) / pairs.tested,

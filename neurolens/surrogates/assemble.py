@@ -22,8 +22,7 @@ from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Fi
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Surface
-    from neurolens.surrogates.lightfield import Encoding
-    from neurolens.surrogates.model import LensModel
+    from neurolens.surrogates.model import Encoding, LensModel
 
 Array = NDArray[np.float64]
 

@@ -27,13 +27,22 @@ from neurolens.setting.focusing import at_infinity
 from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.axes import STATE
 from neurolens.surrogates.card import CARD_KEY, CARD_KIND, CARD_SCHEMA, MODEL_KEY, POLARISED, card_to_json
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import as_stored, coefficients_text, onnx_of
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, front_index, scene_graph, stop_graph
+from neurolens.surrogates.inverse import (
+    STEPS,
+    TOLERANCE,
+    InverseModel,
+    convergence,
+    front_index,
+    passing_rays,
+    scene_graph,
+    stop_graph,
+)  # fmt: skip
 from neurolens.surrogates.model import Domain, LensModel, Prediction
+from neurolens.surrogates.pairs import FilmRays, sample_domain
 
 if TYPE_CHECKING:
-    from neurolens.surrogates.states import StateModel
+    from neurolens.surrogates.fit import StateModel
 
 UNITS = {
     "rays": ["film_x mm", "film_y mm", "pupil_x mm", "pupil_y mm", "wavelength nm"],
@@ -44,6 +53,7 @@ UNITS = {
     "stop_xy_mm": "mm",
     "status": "integer, see status_codes",
 }
+_CHECKED = 20_000  # rays that inverse maps are to find
 FRAME = (
     "Lens frame: z along the optical axis, front vertex at z = 0, film at z > 0, x right and y up seen from behind the "
     "camera; rays leave the film point towards the pupil point on the plane domain.pupil_z_mm; scene_ray is a point on "
@@ -90,8 +100,10 @@ def _check_gates(model: LensModel) -> None:
         raise InputError("export", "gates", codes, "one gate a surface and reason, and none on the rim of the stop")
 
 
-def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, Any] | None = None) -> tuple[Path, Path]:
-    """Write both inverse maps beside a model's file: NAME.stop.onnx and NAME.scene.onnx for NAME.onnx.
+def export_inverse(
+    inverse: InverseModel, path: str | Path, errors: dict[str, Any] | None = None
+) -> dict[str, dict[str, Any]]:
+    """Write both inverse maps beside a model's file, for other programs: NAME.stop.onnx and NAME.scene.onnx.
 
     Both give rays [5, N] (film x, y, pupil x, y, wavelength), scene_ray, transmittance, stop_xy_mm and status as the
     model does for those rays (NO_SOLUTION where they are not what was asked for), and density [N]. Inputs: see
@@ -99,6 +111,8 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
 
     Args:
         path: of the model's file. errors: for the card, as of `export_onnx`.
+
+    Returns for "stop" and "scene" the file, and how often the map finds fresh rays (see `convergence`).
 
     Raises:
         InputError: as `export_onnx`.
@@ -115,16 +129,12 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
         "index": front_index(model),
     }
     facts = {"steps": STEPS, "tolerance": TOLERANCE, "direction": model.direction, "front": shape}
-    written = []
-    (stored,) = as_stored([model])
+    found = convergence(inverse, *passing_rays(model, _CHECKED, seed=1))
     for name, guess, build in (("stop", inverse.stop, stop_graph), ("scene", inverse.scene, scene_graph)):
-        metadata = {
-            CARD_KEY: card_to_json({**card, "inverse": {"map": name, **facts, "fit": inverse.report}}),
-            MODEL_KEY: coefficients_text([model], guess=guess.packed()),
-        }
-        data = write_onnx(build(stored, Guess.unpacked(guess.packed()), ONNX), metadata)
-        written.append(write_file(base.with_name(f"{base.name}.{name}.onnx"), data))
-    return written[0], written[1]
+        text = card_to_json({**card, "inverse": {"map": name, **facts, "fit": found[name]}})
+        data = write_onnx(build(model, guess, ONNX), {CARD_KEY: text})
+        found[name]["file"] = str(write_file(base.with_name(f"{base.name}.{name}.onnx"), data))
+    return found
 
 
 def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:

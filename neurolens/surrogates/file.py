@@ -14,7 +14,7 @@ import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,7 @@ from neurolens.surrogates.card import (
     read_metadata,
 )  # fmt: skip
 from neurolens.surrogates.cores import CORES, Core
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Domain, Gate, LensModel, Scales, mixed, with_one_angle
+from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 
 SCHEMA = 2
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
@@ -70,7 +69,6 @@ class ModelFile:
     Attributes:
         path: the file.
         card: what `surrogates.card` wrote.
-        more: further entries of the coefficients, of inverse maps.
         nodes: a model for every node of the axes, in the order of `surrogates.axes.product`; one without axes. Their
             coefficients are rounded to float32, and their lens is that of the first node.
     """
@@ -78,7 +76,6 @@ class ModelFile:
     path: Path
     card: dict[str, Any]
     nodes: tuple[LensModel, ...]
-    more: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -109,7 +106,7 @@ def read_model(path: str | Path) -> ModelFile:
         check_tree(data, "coefficients")
         if data["schema"] != SCHEMA:
             raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}: {again}")
-        model = ModelFile(file, card, _nodes(file, card, data), data)
+        model = ModelFile(file, card, _nodes(file, card, data))
         _check_reference(model)
     return model
 
@@ -157,7 +154,7 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
 
 
 def check_size(core: Any) -> None:
-    """Refuse work beyond reason before a graph is made of a core, or of a tuple of arrays.
+    """Refuse work beyond reason before a graph is made of a core.
 
     Raises:
         ValueError: more terms and units, numbers or products than the limits above.
@@ -258,11 +255,8 @@ def onnx_of(
     return write_onnx(graphs, metadata or {}, Mixing(g, transform), shapes)
 
 
-def coefficients_text(nodes: Sequence[LensModel], **more: Any) -> str:
+def coefficients_text(nodes: Sequence[LensModel]) -> str:
     """The metadata entry of a model, or of the nodes of one of many states: deflated JSON in base64.
-
-    Args:
-        more: further entries, of inverse maps.
 
     Raises:
         InputError: a core that no file can hold.
@@ -277,7 +271,6 @@ def coefficients_text(nodes: Sequence[LensModel], **more: Any) -> str:
         "direction": first.direction,
         "angle": first.angle,
         "nodes": [{"encoding": asdict(node.encoding), "core": pack(node.core)} for node in nodes],
-        **more,
     }
     return deflated(data)
 

@@ -1,28 +1,29 @@
 """Inverse maps of a surrogate: the camera ray through a point of the stop, and the camera ray of a given scene ray.
 
-A direct fit of the inverse map gives the first guess. Newton's method with the model's Jacobian, limited so that it
-never diverges, takes it to the model's own ray to rounding. The model itself says whether that ray passes, so that both
-directions agree. Hanika and Dachsbacher 2014 introduced the iteration on the stop for polynomial lenses.
+A polynomial that is fitted to the model's own rays gives the first guess. Newton's method with the model's Jacobian,
+limited so that it never diverges, takes it to the model's own ray to rounding. The model itself says whether that ray
+passes, so that both directions agree. Hanika and Dachsbacher 2014 introduced the iteration on the stop for polynomial
+lenses.
 
-Each map is one graph: the guess, the steps written out, the model itself at the solution. It is evaluated on torch
-tensors, or exported: in onnxruntime one call takes 5 to 8 (stop) and 7 to 14 (scene) times that of the model.
+Each map is one graph: the guess, the steps written out, the model itself at the solution. It follows from the model
+alone, in a second, and is evaluated here by numpy or exported for other programs.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.graph.derive import derivative, with_derivatives
-from neurolens.graph.interpret import evaluate
+from neurolens.graph.derive import derivative, determinant, limited_newton, with_derivatives
+from neurolens.graph.interpret import evaluate, monomials
 from neurolens.graph.ir import Exponents, Graph, Value, pruned
 from neurolens.graph.program import RAY
 from neurolens.surrogates.assemble import (
@@ -36,25 +37,36 @@ from neurolens.surrogates.assemble import (
     wavelength_row,
     within_domain,
 )  # fmt: skip
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Refracted, Units
-from neurolens.surrogates.file import pack, unpack
-from neurolens.surrogates.lightfield import MIRROR, ROUND, Encoding
-from neurolens.surrogates.model import LensModel, Prediction, prediction_of
+from neurolens.surrogates.cores import (
+    DIRECTION,
+    MIRROR,
+    POSITION,
+    ROUND,
+    STOP,
+    Array,
+    CoreValues,
+    Field,
+    Refracted,
+    Units,
+)
+from neurolens.surrogates.model import Domain, Encoding, LensModel
 from neurolens.trace.surfaces import front_rays
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from neurolens.surrogates.domain import FilmRays
-    from neurolens.trace.surfaces import Rays
-
-Array = NDArray[np.float64]
 
 STEPS = 3
 # A solution counts where its residual is below this: of the stop's radius; of the front's radius and in radians.
 TOLERANCE = 1e-4
 # Longest Newton step: of the radius of the pupil (and of the film).
 LIMIT = 0.35
+_BATCH = 16384  # rays that numpy takes through a graph at once
+# Degree of the guesses of round lenses and of those with cylinders, and passing rays of their fit.
+_DEGREE, _MIRROR_DEGREE, _RAYS = 6, 3, 8000
+_ROUNDS = 40  # of drawing as many rays, until enough of them pass
+_MARGIN = 0.1  # of the half widths of the boxes that rays are drawn from
+_RIDGE = 1e-11  # relative
+# The guess of the stop is fitted where the stop's image has at least this share of its usual area.
+_FOLD = 0.1
+# A solution this far from the ray, in pupil radii, is another ray of the same point.
+_OTHER = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,18 +84,22 @@ class Guess:
     exponents: Exponents
     ab: Array
 
-    @property
-    def coefficients(self) -> int:
-        return int((self.ab != 0).sum())
-
-    def packed(self) -> dict[str, Any]:
-        """The guess as its file holds it, in float32."""
-        return {"exponents": pack(self.exponents), "ab": pack(self.ab)}
-
     @staticmethod
-    def unpacked(packed: Mapping[str, Any]) -> Guess:
-        """The inverse of `packed`. Raises ValueError, KeyError, TypeError: a damaged one."""
-        return Guess(unpack(packed["exponents"]), unpack(packed["ab"]))
+    def fitted(a: Array, b: Array, w: Array, z: Array, wanted: Array, *, mirror: bool) -> Guess:
+        """The guess of vectors `wanted` [K, 2, N] from a and b [2, N], by least squares over all terms."""
+        rows, forms = [*a, *b], MIRROR if mirror else ROUND
+        products = [sum(rows[i] * rows[j] for i, j in form) for form in forms]
+        exponents = _exponents(_MIRROR_DEGREE if mirror else _DEGREE, len(forms), bool(w.any()), bool(z.any()))
+        features = monomials(np.stack([*products, w, z]), exponents)
+        ab = []
+        for axes in ((0,), (1,)) if mirror else ((0, 1),):
+            columns = np.hstack([np.vstack([features * v[i] for v in (a, b)]) for i in axes])
+            norms = np.maximum(np.sqrt(np.einsum("ij,ij->i", columns, columns)), 1e-300)
+            columns /= norms[:, None]
+            gram = columns @ columns.T + _RIDGE * np.eye(len(columns))
+            found = np.linalg.solve(gram, columns @ np.hstack([wanted[:, i] for i in axes]).T)
+            ab.append((found.T / norms).reshape(len(wanted), 2, -1))
+        return Guess(exponents, np.stack(ab, 2))
 
     def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
         """The vectors, 2 rows each, of a and b, the p and u of `light`; z None: it is 0."""
@@ -98,12 +114,22 @@ class Guess:
         return [a * light.p + b * light.u for a, b in zip(parts[::2], parts[1::2], strict=True)]
 
 
+def _exponents(degree: int, invariants: int, dispersive: bool, moves: bool) -> Exponents:
+    """Exponents up to a total degree in the invariants; w and z multiply lower degrees only."""
+    powers = itertools.product(
+        *([range(degree + 1)] * invariants), range(3 if dispersive else 1), range(3 if moves else 1)
+    )
+    rows = [p for p in powers if sum(p[:-2]) + 2 * p[-2] + p[-1] + p[-2] * p[-1] <= degree]
+    return np.array(sorted(rows, key=sum), dtype=np.int64)
+
+
 class InverseRays(NamedTuple):
     """Camera rays that cross the stop in given points, or leave as given scene rays, [N].
 
     Attributes:
-        rays: with the pupil points found (of scene rays, the film points too).
-        prediction: of the model for those rays. Its status is that of `neurolens.base.status`, NO_SOLUTION among them.
+        rays: [5, N] film x, y, pupil x, y in mm, wavelength in nm.
+        scene_ray, transmittance, stop_xy_mm, status: of the model for those rays, [6, N], [N], [2, N], [N]; NO_SOLUTION
+            where they are not what was wanted.
         density: for stop points |d stop / d pupil|, area on the stop per area on the pupil plane, the film point held:
             a stop point drawn with density q per mm^2 is a pupil point drawn with density q times this. For scene rays
             |d (film, pupil) / d (position, direction)|, mm^2 on the film times mm^2 on the pupil plane, per mm^2 of
@@ -112,79 +138,191 @@ class InverseRays(NamedTuple):
             radians (root of the summed squares).
     """
 
-    rays: FilmRays
-    prediction: Prediction
-    density: Tensor
-    residual: Tensor
+    rays: Array
+    scene_ray: Array
+    transmittance: Array
+    stop_xy_mm: Array
+    status: NDArray[np.int32]
+    density: Array
+    residual: Array
 
 
 @dataclass(frozen=True, eq=False)
 class InverseModel:
-    """Both inverse maps of one model; see `inverse_fit.fit_inverse`.
+    """Both inverse maps of one model; make it with `inverse_of`.
 
     Attributes:
         stop: from the film point (in film radii) and the stop point (in stop radii) to the pupil point, centred and
             scaled as the model's.
         scene: from position and direction vector, scaled as the model's, to u and p.
-        report: JSON-able: how it was fitted.
     """
 
     model: LensModel
     stop: Guess
     scene: Guess
-    report: dict[str, Any] = field(default_factory=dict)
 
     def through_stop(
-        self,
-        film_x: Tensor,
-        film_y: Tensor,
-        film_z: Tensor,
-        stop_x: Tensor,
-        stop_y: Tensor,
-        wavelength_nm: Tensor,
-        steps: int = STEPS,
-        start: Tensor | None = None,
+        self, film_xy_mm: ArrayLike, stop_xy_mm: ArrayLike, wavelength_nm: ArrayLike, film_z_mm: ArrayLike,
+        stop_radius_mm: float | None = None, steps: int = STEPS,
+    ) -> InverseRays:  # fmt: skip
+        """The rays from film points [2, N] through stop points [2, N], in the precision of the film points.
+
+        Args:
+            wavelength_nm, film_z_mm: [N], or one for all. stop_radius_mm: None takes the widest.
+
+        Raises:
+            InputError: arrays of other shapes.
+        """
+        film, stop = _checked(2, film_xy_mm=film_xy_mm, stop_xy_mm=stop_xy_mm)
+        rays = np.concatenate([film, stop, np.broadcast_to(wavelength_nm, (1, film.shape[1]))]).astype(film.dtype)
+        return self._solved("stop", {"stop_rays": rays}, film_z_mm, stop_radius_mm, steps)
+
+    def from_scene(
+        self, origin_mm: ArrayLike, direction: ArrayLike, wavelength_nm: ArrayLike, film_z_mm: ArrayLike,
+        stop_radius_mm: float | None = None, steps: int = STEPS,
+    ) -> InverseRays:  # fmt: skip
+        """The camera rays of light that comes along scene rays; other arguments and errors as of `through_stop`.
+
+        Args:
+            origin_mm: [3, N], a point of each ray before or on the front surface, lens frame.
+            direction: [3, N] unit vectors of the camera rays, away from the lens, against the light: from a point X of
+                the front surface to a scene point S, (S - X) / |S - X|.
+        """
+        origin, away = _checked(3, origin_mm=origin_mm, direction=direction)
+        waves = np.broadcast_to(np.asarray(wavelength_nm, np.float64), (1, origin.shape[1]))
+        lines = (*origin.astype(np.float64), *away.astype(np.float64))
+        front, solid = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=waves[0])
+        given = np.concatenate([front, waves]).astype(origin.dtype)
+        out = self._solved("scene", {"front_rays": given}, film_z_mm, stop_radius_mm, steps)
+        with np.errstate(all="ignore"):  # area of direction vectors to solid angle
+            return out._replace(density=out.density / solid)
+
+    def _solved(
+        self, name: str, given: dict[str, Array], film_z_mm: ArrayLike, stop_radius_mm: float | None, steps: int
     ) -> InverseRays:
-        """The rays from film points through stop points; all [N], mm and nm, in the dtype of the inputs.
+        graph, ((key, rays),) = _exact_graph(self, name, steps), given.items()
+        radius = np.full((1, 1), self.model.checked_radius_mm(stop_radius_mm), rays.dtype)
+        film_z = np.broadcast_to(np.asarray(film_z_mm, rays.dtype), (1, rays.shape[1]))
+        parts = []
+        for start in range(0, max(rays.shape[1], 1), _BATCH):
+            part = slice(start, start + _BATCH)
+            call = {"film_z_mm": film_z[:, part], "stop_radius_mm": radius}
+            out = evaluate(graph, {key: rays[:, part], **call})
+            count = rays[:, part].shape[1]
+            wide = {k: np.broadcast_to(v, (len(v), count)) for k, v in out.items()}
+            parts.append([wide[k] if len(wide[k]) > 1 else wide[k][0] for k in InverseRays._fields])
+        found = InverseRays(*(np.concatenate(of_one, -1) for of_one in zip(*parts, strict=True)))
+        return found._replace(residual=np.where(np.isfinite(found.residual), found.residual, np.inf))
 
-        Args:
-            start: [2, N] in place of the first guess: pupil points, centred and scaled as the model's.
-        """
-        import torch
 
-        inputs = {"stop_rays": torch.stack([film_x, film_y, stop_x, stop_y, wavelength_nm])}
-        return self._solved("stop", inputs if start is None else inputs | {"start": start}, film_z, steps)
+def _checked(rows: int, **arrays: ArrayLike) -> list[Array]:
+    """The arrays as floats of one precision, [rows, N] each. Raises InputError: another shape."""
+    found = [np.asarray(a) for a in arrays.values()]
+    for name, array in zip(arrays, found, strict=True):
+        if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape != (rows, found[0].shape[-1]):
+            raise InputError("inverse", name, f"({array.dtype}, {array.shape})", f"numbers ({rows}, N), N for all")
+    kind = found[0].dtype if found[0].dtype.kind == "f" else np.float64
+    return [a.astype(kind) for a in found]
 
-    def from_scene(self, scene: Rays, film_z: Tensor, wavelength_nm: Tensor, steps: int = STEPS) -> InverseRays:
-        """The camera rays of light that comes along scene rays; all [N], in the dtype of the inputs.
 
-        Args:
-            scene: a point of the ray (mm, lens frame) before or on the front surface, and the unit direction of the
-                camera ray: away from the lens, against the light. Light from a scene point S through a point X of the
-                front surface has direction (S - X) / |S - X|.
-            film_z: the film planes, mm.
-        """
-        import torch
+def inverse_of(model: LensModel) -> InverseModel:
+    """The inverse maps of a model, their first guesses fitted to rays that it passes.
 
-        *lines, wavelength = (c.detach().double().numpy() for c in (*scene, wavelength_nm))
-        rays_at_front = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=wavelength)
-        front, solid = (torch.from_numpy(a).to(film_z.dtype) for a in rays_at_front)
-        out = self._solved("scene", {"front_rays": torch.cat([front, wavelength_nm[None]])}, film_z, steps)
-        return out._replace(density=out.density / solid)
+    Raises:
+        InputError: a model without rays that pass, or whose core gives no direction vector.
+    """
+    e, (rays, film_z) = model.encoding, passing_rays(model)
+    g = Graph()
+    light = light_field(g, e, g.input("rays", 5), g.input("film_z_mm", per_call=True))
+    values = model.core.build(g, light, Units())
+    if values.unit is not None:
+        raise InputError(model.method, "inverse", type(model.core).__name__, "a core of direction vectors")
+    g.outputs = dict(zip(("position", "direction", "stop"), values.vectors, strict=True)) | {"planes": light.planes}
+    g.outputs["w"] = light.colour() if light.dispersive else g.constant(0.0)
+    out = {k: np.broadcast_to(v, (len(v), len(film_z))) for k, v in evaluate(g, _inputs(model, rays, film_z)).items()}
+    (p, u), w = np.split(out["planes"][:4], 2), out["w"][0]
+    # Through a caustic two rays cross the stop at one point: the guess follows the sheet of the axis.
+    turned = np.linalg.det(_d_stop(model, rays, film_z))
+    sheet = turned > _FOLD * np.median(turned)
+    z = scaled_film_z(model, film_z)
+    z = np.zeros_like(w) if z is None else z
+    chief, scale = (np.array(v)[:, None] for v in (e.chiefs, e.pupil_scales_mm))
+    at_pupil = (rays[2:4] - chief * rays[:2]) / scale
+    at_sheet = (v[..., sheet] for v in (rays[:2] / e.film_scale_mm, out["stop"], w, z, at_pupil[None]))
+    stop = Guess.fitted(*at_sheet, mirror=e.mirror)
+    wanted = np.stack([u, p])
+    scene = Guess.fitted(out["position"], out["direction"], w, np.zeros_like(w), wanted, mirror=e.mirror)
+    return InverseModel(model, stop, scene)
 
-    def _solved(self, name: str, inputs: dict[str, Tensor], film_z: Tensor, steps: int) -> InverseRays:
-        import torch
 
-        from neurolens.surrogates.domain import FilmRays
+def _inputs(model: LensModel, rays: Array, film_z: Array) -> dict[str, Array]:
+    radius = np.full((1, 1), model.domain.stop_radius_mm)
+    return {"rays": rays, "film_z_mm": film_z[None], "stop_radius_mm": radius.astype(rays.dtype)}
 
-        radius = film_z.new_full((1, 1), self.model.domain.stop_radius_mm)
-        graph = _exact_graph(self, name, steps, "start" in inputs)
-        out = evaluate(graph, {**inputs, "film_z_mm": film_z[None], "stop_radius_mm": radius})
-        film_x, film_y, pupil_x, pupil_y, wavelength = out["rays"]
-        rays = FilmRays(film_x, film_y, film_z, pupil_x, pupil_y, wavelength)
-        density, residual = (out[n].expand(1, len(rays))[0] for n in ("density", "residual"))
-        residual = torch.where(torch.isfinite(residual), residual, torch.inf)
-        return InverseRays(rays, prediction_of(out, len(rays)), density, residual)
+
+def _d_stop(model: LensModel, rays: Array, film_z: Array) -> Array:
+    """[N, 2, 2] derivatives of the stop crossing by the pupil point."""
+    graph = with_derivatives(model.graph, ["stop_xy_mm"], [("rays", 2), ("rays", 3)])
+    out = evaluate(graph, _inputs(model, rays, film_z))
+    columns = [np.broadcast_to(out[derivative("stop_xy_mm", row)], (2, len(film_z))) for row in RAY[2:]]
+    return np.stack(columns).transpose(2, 1, 0)
+
+
+def passing_rays(model: LensModel, count: int = _RAYS, seed: int = 0) -> tuple[Array, Array]:
+    """At most so many rays [5, N] of the domain that the model passes, with their film planes [N].
+
+    Raises:
+        InputError: no ray passes.
+    """
+    rng, found, total = np.random.default_rng(seed), list[Array](), 0
+    for _ in range(_ROUNDS):
+        rays = _drawn(model.domain, count, rng)
+        out = evaluate(model.graph, _inputs(model, rays[:5], rays[5]))
+        found.append(rays[:, out["status"][0] == st.PASSED])
+        total += found[-1].shape[1]
+        if total >= count:
+            break
+    if not total:
+        raise InputError(model.method, "inverse", "(no ray passes)", "a model that passes light")
+    rays = np.concatenate(found, 1)[:, :count]
+    return rays[:5], rays[5]
+
+
+def _drawn(domain: Domain, count: int, rng: np.random.Generator) -> Array:
+    """[6, N] rays from the boxes of a domain about the rays that pass, and their film planes."""
+    b, (share, turn, across, along, colour, place) = domain.bounds, rng.random((6, count))
+    radius, turn = domain.film_radius_mm * np.sqrt(share), 2 * np.pi * turn
+    table = np.linspace(0, b.film_radius_mm, len(b.low_mm))
+    low, high, half = (np.interp(radius, table, v) for v in (b.low_mm, b.high_mm, b.half_mm))
+    u = (low + high) / 2 + (1 + _MARGIN) * (high - low) * (across - 0.5)
+    v = (1 + _MARGIN) * half * (2 * along - 1)
+    cos, sin = np.cos(turn), np.sin(turn)
+    (near, far), (shortest, longest) = domain.film_z_mm, domain.wavelength_nm
+    return np.stack(
+        [radius * cos, radius * sin, u * cos - v * sin, u * sin + v * cos,
+         shortest + (longest - shortest) * colour, near + (far - near) * place]
+    )  # fmt: skip
+
+
+def convergence(inverse: InverseModel, rays: Array, film_z: Array, steps: int = STEPS) -> dict[str, Any]:
+    """How often the inverse maps find the model's own passing rays, of these [5, N], in their precision.
+
+    Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that converged to
+    another ray of the same stop point, or scene ray, because the map is folded there).
+    """
+    model = inverse.model
+    forward = evaluate(model.graph, _inputs(model, rays, film_z))
+    passed = forward["status"][0] == st.PASSED
+    rays, film_z, scene = rays[:, passed], film_z[passed], forward["scene_ray"][:, passed]
+    stop = inverse.through_stop(rays[:2], forward["stop_xy_mm"][:, passed], rays[4], film_z, steps=steps)
+    back = inverse.from_scene(scene[:3], scene[3:], rays[4], film_z, steps=steps)
+    shares = {}
+    for name, out in (("stop", stop), ("scene", back)):
+        solved = out.residual < TOLERANCE
+        away = np.hypot(*(out.rays[2:4] - rays[2:4])) > _OTHER * model.domain.pupil_radius_mm
+        count = max(len(solved), 1)
+        shares[name] = {"converged": float(solved.sum()) / count, "other": float((solved & away).sum()) / count}
+    return shares
 
 
 def front_index(model: LensModel) -> list[float] | None:
@@ -197,10 +335,9 @@ def front_index(model: LensModel) -> list[float] | None:
 
 
 @lru_cache(maxsize=16)
-def _exact_graph(inverse: InverseModel, name: str, steps: int, start: bool) -> Graph:
-    if name == "stop":
-        return stop_graph(inverse.model, inverse.stop, EXACT, steps, start)
-    return scene_graph(inverse.model, inverse.scene, EXACT, steps)
+def _exact_graph(inverse: InverseModel, name: str, steps: int) -> Graph:
+    build = stop_graph if name == "stop" else scene_graph
+    return build(inverse.model, getattr(inverse, name), EXACT, steps)
 
 
 def stop_system(model: LensModel) -> Graph:
@@ -251,23 +388,19 @@ def _light(e: Encoding, vectors: list[Value], wavelength: Value) -> Field:
     return Field(g.concat(*vectors, wavelength_row(e, wavelength)), -e.w_middle / e.w_half)
 
 
-def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS, start: bool = False) -> Graph:
+def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -> Graph:
     """The map from stop points to camera rays.
 
-    Inputs stop_rays (film x, y, stop x, y in mm, wavelength in nm), film_z_mm, stop_radius_mm; `start`: another one of
-    that name in place of the guess. Outputs rays (film x, y, pupil x, y, wavelength), density, those of the model, and
-    where the form is exact `residual`. An exact graph gives the best point that was seen, any other that of the last
-    step, which saves one evaluation.
+    Inputs stop_rays (film x, y, stop x, y in mm, wavelength in nm), film_z_mm, stop_radius_mm. Outputs rays (film x, y,
+    pupil x, y, wavelength), density, those of the model, and where the form is exact `residual`. An exact graph gives
+    the best point that was seen, any other that of the last step, which saves one evaluation.
     """
     e, g = model.encoding, Graph()
     film, stop, wavelength = g.split(g.input("stop_rays", 5), [2, 2, 1])
     wanted = stop * (1 / model.scales.stop_mm)
     inputs = {"film": film, "wanted": wanted, "wavelength_nm": wavelength}
-    if start:
-        first = g.input("start", 2)
-    else:
-        z = scaled_film_z(model, g.input("film_z_mm", per_call=True))
-        (first,) = guess.build(g, _light(e, [film * (1 / e.film_scale_mm), wanted], wavelength), z)
+    z = scaled_film_z(model, g.input("film_z_mm", per_call=True))
+    (first,) = guess.build(g, _light(e, [film * (1 / e.film_scale_mm), wanted], wavelength), z)
     system = stop_system(model)
     u, size = _solve(system, inputs, first, steps, form)
     rays = _pupil_rays(e, film, u, wavelength)
@@ -332,7 +465,7 @@ def _core_graph(model: LensModel, light: Field, units: Units) -> Graph:
 
 
 def scaled_film_z(model: LensModel, film_z: Any) -> Any:
-    """The film plane, a value or a tensor, from -1 (nearest) to 1; None where there is one only."""
+    """The film plane, a value or an array, from -1 (nearest) to 1; None where there is one only."""
     near, far = model.domain.film_z_mm
     return (film_z - (near + far) / 2) * (2 / (far - near)) if far > near else None
 
@@ -357,138 +490,3 @@ def _finished(
     if form.exact:
         g.outputs["residual"] = size.sqrt()
     return pruned(g)
-
-
-# ---- limited Newton steps ----
-#
-# Plain Newton iterations of a fixed count, as published for lens polynomials, run away where a step leaves the data.
-# Here no step is longer than a limit, and a point that is worse than the best one so far is replaced by a shorter step
-# from the best one.
-
-# A step that did not help is repeated at this share of its length.
-SHORTER = 0.25
-# The unknowns stay within this, each: scaled so that passing rays fill the unit disc.
-REACH = 2.0
-_HUGE = 3e38
-
-# Rows a b / c d of a 2 x 2 matrix.
-Block = tuple[Value, Value, Value, Value]
-
-
-def with_jacobian(system: Graph) -> Graph:
-    """A system, of inputs `unknown` (and others) and output `residual`, with the columns of its Jacobian as outputs."""
-    unknowns = next(node.rows for node in system.nodes if node.name == "unknown")
-    return with_derivatives(system, ["residual"], [("unknown", k) for k in range(unknowns)])
-
-
-@dataclass(frozen=True)
-class Solved:
-    """The result of an iteration.
-
-    Attributes:
-        last: unknowns after the last step, whose residual is not known yet.
-        best: unknowns of the smallest residual before that. size: its squared length. None of zero steps.
-    """
-
-    last: Value
-    best: Value | None
-    size: Value | None
-
-    def judged(self, size: Value) -> tuple[Value, Value]:
-        """The best unknowns, and the squared length of their residual, from that of the last unknowns."""
-        if self.best is None or self.size is None:
-            return self.last, size
-        g, better = size.graph, size <= self.size
-        return g.select(better, self.last, self.best), g.select(better, size, self.size)
-
-
-def limited_newton(system: Graph, given: Mapping[str, Value], start: Value, steps: int, limit: float) -> Solved:
-    """Append so many steps from `start` (2 or 4 rows).
-
-    Args:
-        system: a graph from `unknown`, and the inputs `given`, to `residual`, of as many rows.
-        limit: the longest step, in units of the unknowns.
-    """
-    g, both = start.graph, with_jacobian(system)
-    x, best, size, step = start.clip(-REACH, REACH), None, None, None
-    for _ in range(steps):
-        found = g.inline(both, {**given, "unknown": x})
-        residual, *columns = (found[name] for name in both.outputs)
-        square, newton = g.square(residual), _limited(solve(columns, residual), limit)
-        if best is None or size is None or step is None:
-            best, size, step = x, square, newton
-        else:
-            better = square <= size
-            best = g.select(better, x, best)
-            step = g.select(better, newton, step * SHORTER)
-            size = g.select(better, square, size)
-        x = (best - step).clip(-REACH, REACH)
-    return Solved(x, best, size)
-
-
-def _limited(step: Value, limit: float) -> Value:
-    """A step no longer than the limit, and none where it is not finite: a singular Jacobian gives no direction."""
-    g, square = step.graph, step.graph.square(step)
-    shorter = step * (limit / square.sqrt().maximum(limit))
-    return g.select(square <= _HUGE, shorter, 0.0)
-
-
-def solve(columns: Sequence[Value], b: Value) -> Value:
-    """x of columns x = b, for 2 or 4 unknowns; not finite where the matrix is singular.
-
-    Four are solved in blocks of two, the last two first out: their own block must not be singular.
-    """
-    g = b.graph
-    if len(columns) == 2:
-        return g.concat(*_cramer(_block(columns, 0, 0), b[0], b[1]))
-    lower, corner = _block(columns, 2, 0), _block(columns, 2, 2)
-    schur, carry = _schur(columns)
-    right = _apply(carry, b[2], b[3])
-    first = _cramer(schur, b[0] - right[0], b[1] - right[1])
-    left = _apply(lower, *first)
-    return g.concat(*first, *_cramer(corner, b[2] - left[0], b[3] - left[1]))
-
-
-def determinant(columns: Sequence[Value]) -> Value:
-    """The determinant of the matrix with these columns, of 2 or 4 rows each."""
-    if len(columns) == 2:
-        return _determinant(_block(columns, 0, 0))
-    return _determinant(_schur(columns)[0]) * _determinant(_block(columns, 2, 2))
-
-
-def _block(columns: Sequence[Value], row: int, column: int) -> Block:
-    left, right = columns[column], columns[column + 1]
-    return left[row], right[row], left[row + 1], right[row + 1]
-
-
-def _schur(columns: Sequence[Value]) -> tuple[Block, Block]:
-    """upper - right corner^-1 lower, and right corner^-1, of the blocks upper, right / lower, corner."""
-    a, b, c, d = corner = _block(columns, 2, 2)
-    over = 1.0 / _determinant(corner)
-    minus = -over
-    carry = _times(_block(columns, 0, 2), (d * over, b * minus, c * minus, a * over))
-    taken = _times(carry, _block(columns, 2, 0))
-    p, q, r, s = (x - y for x, y in zip(_block(columns, 0, 0), taken, strict=True))
-    return (p, q, r, s), carry
-
-
-def _determinant(m: Block) -> Value:
-    return m[0] * m[3] - m[1] * m[2]
-
-
-def _times(m: Block, n: Block) -> Block:
-    return (*_row(m[0], m[1], n), *_row(m[2], m[3], n))
-
-
-def _row(a: Value, b: Value, n: Block) -> tuple[Value, Value]:
-    return a * n[0] + b * n[2], a * n[1] + b * n[3]
-
-
-def _apply(m: Block, x: Value, y: Value) -> tuple[Value, Value]:
-    return m[0] * x + m[1] * y, m[2] * x + m[3] * y
-
-
-def _cramer(m: Block, x: Value, y: Value) -> tuple[Value, Value]:
-    """Cramer's rule."""
-    over = 1.0 / _determinant(m)
-    return (m[3] * x - m[1] * y) * over, (m[0] * y - m[2] * x) * over

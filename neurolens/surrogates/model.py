@@ -7,7 +7,7 @@ onnxruntime, compiled C and numpy run without torch. Methods that take or give t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -16,25 +16,22 @@ import numpy as np
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.graph.program import RAY, WAVELENGTH
+from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.paraxial import PupilBounds
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
 from neurolens.surrogates.card import DOMAIN_SLACK, mix_domain
-from neurolens.surrogates.cores import Array, Core
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.cores import Array, Core, LightField
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from neurolens.surrogates.domain import FilmRays
+    from neurolens.surrogates.pairs import FilmRays
     from neurolens.trace.surfaces import Rays
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
-_DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
 # Positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
 
@@ -83,6 +80,86 @@ class Domain:
         pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
         values = {f.name: data[f.name] for f in fields(Domain) if f.name in data}
         return Domain(**{**values, **pairs, "bounds": PupilBounds(**bounds)})
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """From raw millimetres and nanometres to the light field.
+
+    Attributes:
+        film_plane_z_mm, pupil_plane_z_mm: the two planes (lens frame).
+        chief: k of the chief ray's u = k p, subtracted so that u is centred on the passing rays.
+        film_scale_mm, pupil_scale_mm: largest |p| and |u - k p| of the domain's passing rays.
+        w_middle, w_half: w = (1 / lambda^2 - middle) / half in 1/um^2; the index is linear in 1 / lambda^2 (Cauchy).
+            half is 0 for a lens without known dispersion, and then w = 0.
+        chief_y, pupil_scale_y_mm: of y where the lens has cylinders, and then the two above are of x; None: of both.
+    """
+
+    film_plane_z_mm: float
+    pupil_plane_z_mm: float
+    chief: float
+    film_scale_mm: float
+    pupil_scale_mm: float
+    w_middle: float
+    w_half: float
+    chief_y: float | None = None
+    pupil_scale_y_mm: float | None = None
+
+    @property
+    def mirror(self) -> bool:
+        """Whether the lens has two planes of symmetry instead of an axis."""
+        return self.chief_y is not None
+
+    @property
+    def dispersive(self) -> bool:
+        """Whether rays depend on the wavelength."""
+        return self.w_half != 0
+
+    @property
+    def chiefs(self) -> tuple[float, float]:
+        """k of x and of y."""
+        return self.chief, self.chief if self.chief_y is None else self.chief_y
+
+    @property
+    def pupil_scales_mm(self) -> tuple[float, float]:
+        """The pupil scales of x and of y, in mm."""
+        return self.pupil_scale_mm, self.pupil_scale_mm if self.pupil_scale_y_mm is None else self.pupil_scale_y_mm
+
+    def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:
+        """Crossings with the two planes in mm, [2, N] each."""
+        import torch
+
+        u = torch.stack([rays.pupil_x, rays.pupil_y])
+        film = torch.stack([rays.film_x, rays.film_y])
+        along = (self.film_plane_z_mm - self.pupil_plane_z_mm) / (rays.film_z - self.pupil_plane_z_mm)
+        return u + (film - u) * along, u
+
+    def __call__(self, rays: FilmRays) -> LightField:
+        import torch
+
+        p, u = self.planes(rays)
+        u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
+        w = torch.zeros_like(rays.wavelength_nm)
+        if self.dispersive:
+            w = (inverse_square_um(rays.wavelength_nm) - self.w_middle) / self.w_half
+        return LightField(p / self.film_scale_mm, u, w)
+
+    @staticmethod
+    def mixed(encodings: Sequence[Encoding], weights: Array) -> Encoding:
+        """The encoding of a state: planes are mixed as they are, scales by their reciprocals, as the graph has them."""
+
+        def mean(value: Callable[[Encoding], float]) -> float:
+            return float(weights @ np.array([value(e) for e in encodings]))
+
+        pupil_scale = 1 / mean(lambda e: 1 / e.pupil_scale_mm)
+        return replace(
+            encodings[0],
+            film_plane_z_mm=mean(lambda e: e.film_plane_z_mm),
+            pupil_plane_z_mm=mean(lambda e: e.pupil_plane_z_mm),
+            chief=pupil_scale * mean(lambda e: e.chief / e.pupil_scale_mm),
+            film_scale_mm=1 / mean(lambda e: 1 / e.film_scale_mm),
+            pupil_scale_mm=pupil_scale,
+        )
 
 
 @dataclass(frozen=True)
@@ -169,22 +246,6 @@ class LensModel:
         """
         return prediction_of(evaluate(self.graph, self._inputs(rays, stop_radius_mm)), len(rays))
 
-    def differentiate(self, rays: FilmRays, stop_radius_mm: float | None = None) -> tuple[Prediction, Tensor, Tensor]:
-        """Evaluate the model with its derivatives; arguments and errors as `predict`.
-
-        Returns the prediction, the derivatives [6, 5, N] of the scene ray (x, y, z in mm, unit direction) and [2, 5, N]
-        of the stop crossing: per mm of the film point's x, y and of the pupil point's x, y, and per nm, the other
-        arguments held. Where the status is not 0 they mean nothing.
-        """
-        import torch
-
-        out = evaluate(self._derivative_graph, self._inputs(rays, stop_radius_mm))
-        scene, stop = (
-            torch.stack([out[derivative(name, row)].expand(-1, len(rays)) for row in (*RAY, WAVELENGTH)], 1)
-            for name in _DIFFERENTIATED
-        )
-        return prediction_of(out, len(rays)), scene, stop
-
     def _inputs(self, rays: FilmRays, stop_radius_mm: float | None) -> dict[str, Tensor]:
         radius = rays.film_z.new_full((1, 1), self.checked_radius_mm(stop_radius_mm))
         return {"rays": rays.rows, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
@@ -200,10 +261,6 @@ class LensModel:
     def graph(self) -> Graph:
         """For evaluation in float64: inputs and outputs as `assemble` says."""
         return model_graph(self, EXACT)
-
-    @cached_property
-    def _derivative_graph(self) -> Graph:
-        return with_derivatives(self.graph, _DIFFERENTIATED, [("rays", k) for k in range(5)])
 
     @property
     def front(self) -> Surface | None:

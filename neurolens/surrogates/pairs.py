@@ -1,36 +1,262 @@
-"""Ray pairs: camera rays of a domain and their exact images, in five splits."""
+"""Domains, the camera rays (film, pupil, wavelengths, film positions) that a surrogate stands for; their exact images.
+
+Ray pairs are sampled from a domain and traced in float64, in five splits.
+"""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.quasirandom import SobolEngine
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.settings import WAVELENGTH_NM, said
+from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import camera_rays
-from neurolens.surrogates.cores import DIRECTION, STOP, Refracted
-from neurolens.surrogates.domain import SPARSE, FilmRays, draw, lit_share, sample_domain
-from neurolens.surrogates.model import Domain, LensModel
+from neurolens.setting.focusing import film_range_mm
+from neurolens.setting.pupils import camera_rays, image_radius_mm, pupil_bounds
+from neurolens.surrogates.model import Domain
 from neurolens.trace.rays import CHUNK, Rays, trace
 
-SCHEMA = 3
+_PUPIL_MARGIN = 1.05  # of the disc on the pupil plane beyond that of all passing rays
+# Film positions of sampled rays, both limits of focus among them: a picture has one film position, and so has a call of
+# an exported model.
+_FILM_PLANES = 17
+# Where the boxes around passing rays hold less than this share of the domain, rays are drawn from the boxes.
+SPARSE = 0.3
+# Boxes are enlarged by this share of their half width on every side, so that rays just beyond a rim are among them.
+_BOX_MARGIN = 0.15
+_EDGE = 0.03  # of the film radius
+# Another pupil plane is taken where so many times more of the disc passes; each plane tried is this factor further from
+# the film than the one before, out to so many focal lengths.
+_BETTER, _STEP, _REACH = 1.25, 1.02, 20
+
+
+@dataclass(frozen=True)
+class FilmRays:
+    """Camera rays as film point, pupil point and wavelength, each [N] float64; mm and nm, lens frame."""
+
+    film_x: Tensor
+    film_y: Tensor
+    film_z: Tensor
+    pupil_x: Tensor
+    pupil_y: Tensor
+    wavelength_nm: Tensor
+
+    def __len__(self) -> int:
+        return self.film_x.shape[0]
+
+    @property
+    def rows(self) -> Tensor:
+        """[5, N] as graphs take them: all but the film plane."""
+        return torch.stack([self.film_x, self.film_y, self.pupil_x, self.pupil_y, self.wavelength_nm])
+
+    def select(self, index: Tensor | slice) -> FilmRays:
+        return FilmRays(*(c[index] for c in self.columns()))
+
+    def to(self, dtype: torch.dtype) -> FilmRays:
+        return FilmRays(*(c.to(dtype) for c in self.columns()))
+
+    def columns(self) -> tuple[Tensor, ...]:
+        return (self.film_x, self.film_y, self.film_z, self.pupil_x, self.pupil_y, self.wavelength_nm)
+
+
+def domain_of(
+    lens: Lens,
+    *,
+    film_radius_mm: float | None = None,
+    focus_m: tuple[float, float] = (math.inf, math.inf),
+    wavelength_nm: tuple[float, float] | None = None,
+    nearest_m: float | None = None,
+    film_z_mm: tuple[float, float] | None = None,
+    pupil_z_mm: float | None = None,
+) -> Domain:
+    """The domain of a lens at its present stop.
+
+    Args:
+        film_radius_mm: None takes the lit film (see `pupils.image_radius_mm`).
+        focus_m: two object distances from the film; the domain holds every film plane between theirs, the paraxial
+            images and those of least spot.
+        wavelength_nm: None takes `Lens.light_nm`. Without any known dispersion `Lens.reference_nm` replaces it.
+        nearest_m: distance from the film of the nearest object in view; None takes the nearest focus.
+        film_z_mm: film planes, of a lens that was focused otherwise; None follows from `focus_m`.
+        pupil_z_mm: plane of the pupil points; None takes the one on which the pupil is tightest.
+
+    Raises:
+        InputError: a radius or `nearest_m` that is not positive and finite, wavelengths outside `WAVELENGTH_NM` or in
+            the wrong order.
+    """
+    if film_radius_mm is not None and not film_radius_mm > 0:
+        raise InputError("domain", "film_radius_mm", film_radius_mm, "a positive length in mm")
+    if nearest_m is not None and not 0 < nearest_m < math.inf:
+        raise InputError("domain", "nearest_m", nearest_m, "a positive distance in m, or none")
+    low, high = wavelength_nm or lens.light_nm
+    if not WAVELENGTH_NM[0] <= low <= high <= WAVELENGTH_NM[1]:
+        expected = f"shortest then longest, {said(WAVELENGTH_NM)} nm"
+        raise InputError("domain", "wavelength_nm", wavelength_nm, expected)
+    if not lens.dispersive:
+        low = high = lens.reference_nm
+    # At both distances the paraxial image and the best focus at every aperture.
+    planes = film_z_mm or [z for distance in focus_m for z in film_range_mm(lens, distance, (low, high))]
+    travel = (min(planes), max(planes))
+    radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
+    bounds = pupil_bounds(lens, radius, travel, (low, high), pupil_z_mm=pupil_z_mm)
+    plane = _best_plane_z_mm(lens, bounds, travel[0]) if pupil_z_mm is None else pupil_z_mm
+    if plane != bounds.pupil_z_mm:
+        bounds = pupil_bounds(lens, radius, travel, (low, high), pupil_z_mm=plane)
+    return Domain(
+        film_radius_mm=radius,
+        film_z_mm=travel,
+        focus_m=(max(focus_m), min(focus_m)),
+        pupil_z_mm=bounds.pupil_z_mm,
+        pupil_radius_mm=_PUPIL_MARGIN * bounds.disc_mm,
+        wavelength_nm=(low, high),
+        stop_radius_mm=lens.stop_radius_mm,
+        bounds=bounds,
+        nearest_m=nearest_m,
+    )
+
+
+def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float:
+    """The plane of `bounds`, or the one on which a disc holds the passing rays of all film points most tightly.
+
+    The pupil of a fisheye or of a condenser walks as the film point moves, and the pupil of a lens that is almost
+    telecentric on the film's side lies far away: on the plane of the paraxial exit pupil, or of the rear vertex in its
+    place, most of the disc is dark. Rays are straight behind the lens, so that boxes on one plane give those on all.
+    """
+    here = film_z_mm - bounds.pupil_z_mm
+    rows = zip(bounds.low_mm, bounds.high_mm, bounds.half_mm, strict=True)
+    step = bounds.film_radius_mm / (len(bounds.low_mm) - 1)
+    lit = [(i * step, low, high, half) for i, (low, high, half) in enumerate(rows) if low < high]
+
+    def spread(distance: float) -> float:
+        """Radius of the disc over the distance from the film: its square goes with the disc's share of solid angle."""
+        s = distance / here
+        boxes = ((r + (low - r) * s, r + (high - r) * s, half * s) for r, low, high, half in lit)
+        return max(max(abs(a), abs(b), math.hypot((a + b) / 2, h)) for a, b, h in boxes) / distance
+
+    f = abs(first_order(lens).efl_mm)
+    start = 0.25 * (film_z_mm - float(lens.vertices_mm[len(lens.surfaces) - 1]))
+    end = max(_REACH * f if math.isfinite(f) else 0.0, here)
+    count = math.ceil(math.log(max(end / start, 1.0)) / math.log(_STEP)) + 1
+    best = min((start * _STEP**k for k in range(count)), key=spread)
+    return film_z_mm - best if spread(here) > math.sqrt(_BETTER) * spread(best) else bounds.pupil_z_mm
+
+
+def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
+    """z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
+    data = first_order(lens)
+    front, rear = data.front_efl_mm, data.efl_mm
+    extension = film_z - data.rear_principal_z_mm - rear  # Newton: f f' / extension is how far beyond the front focus
+    far = extension <= 1e-9 * rear
+    distance = front + front * rear / torch.where(far, torch.ones_like(extension), extension)
+    return data.front_principal_z_mm - torch.where(far, torch.full_like(distance, math.inf), distance)
+
+
+def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmRays:
+    """Rays of a domain: uniform on the film and pupil discs and in wavelength, film positions in `_FILM_PLANES` steps.
+
+    Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
+    so that splits never share a ray.
+    """
+    s, film_z, wavelength = _drawn(domain, count, seed, skip)
+    film_x, film_y = _disc(s[0], s[1], domain.film_radius_mm)
+    pupil_x, pupil_y = _disc(s[2], s[3], domain.pupil_radius_mm)
+    return FilmRays(film_x, film_y, film_z, pupil_x, pupil_y, wavelength)
+
+
+def _drawn(domain: Domain, count: int, seed: int, skip: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Scrambled Sobol points: four numbers of every ray [4, N], its film plane and its wavelength."""
+    engine = SobolEngine(6, scramble=True, seed=seed)
+    if skip:
+        engine.fast_forward(skip)
+    s = engine.draw(count, dtype=torch.float64).T
+    (near, far), (low, high) = domain.film_z_mm, domain.wavelength_nm
+    step = torch.floor(s[5] * _FILM_PLANES).clamp_max(_FILM_PLANES - 1)
+    return s[:4], near + (far - near) * step / (_FILM_PLANES - 1), low + (high - low) * s[4]
+
+
+def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    r, phi = radius * torch.sqrt(a), 2 * math.pi * b
+    return r * torch.cos(phi), r * torch.sin(phi)
+
+
+def draw(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
+    """At most `count` rays of a domain, uniform where any passes, and the number of uniform rays they stand for."""
+    if lit_share(domain) < SPARSE:
+        return sample_lit(domain, count, seed, skip)
+    return sample_domain(domain, count, seed, skip), float(count)
+
+
+def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
+    """Rays that meet everything that blocks light.
+
+    They are uniform over the domain; where little of it passes, as many lie near the passing rays; and a tenth as many
+    start at the edge of the first and the last film plane, where a rim may just begin to block.
+    """
+    rays = [sample_domain(domain, count, seed)]
+    if lit_share(domain) < SPARSE:
+        rays.append(sample_lit(domain, count, seed + 1)[0])
+    x, y, z, *rest = rays[0].select(slice(0, count // 10)).columns()
+    radius = torch.hypot(x, y).clamp_min(1e-9 * domain.film_radius_mm)
+    stretch = domain.film_radius_mm * (1 - _EDGE * (1 - radius / domain.film_radius_mm)) / radius
+    ends = torch.tensor(domain.film_z_mm, dtype=torch.float64)[torch.arange(len(z)) % 2]
+    rays.append(FilmRays(x * stretch, y * stretch, ends, *rest))
+    return FilmRays(*(torch.cat(c) for c in zip(*(r.columns() for r in rays), strict=True)))
+
+
+def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
+    """Rays of the same distribution as `sample_domain`, but from the boxes of `Domain.bounds` alone.
+
+    Returns fewer than `count` rays, because the corners of a box may lie outside the disc; and the number of rays of
+    `sample_domain` that they stand for.
+    """
+    edges, low, high, half, area = _boxes(domain)
+    weight = (edges[1:] ** 2 - edges[:-1] ** 2) * area
+    s, film_z, wavelength = _drawn(domain, count, seed, skip)
+    total = torch.cumsum(weight, 0)
+    ring = torch.searchsorted(total, s[0] * total[-1], right=True).clamp_max(len(weight) - 1)
+    part = (s[0] * total[-1] - (total - weight)[ring]) / weight[ring]
+    r = torch.sqrt(edges[ring] ** 2 + part.clamp(0, 1) * (edges[1:] ** 2 - edges[:-1] ** 2)[ring])
+    u, v = low[ring] + (high - low)[ring] * s[2], half[ring] * (2 * s[3] - 1)
+    cos, sin = torch.cos(2 * math.pi * s[1]), torch.sin(2 * math.pi * s[1])
+    rays = FilmRays(r * cos, r * sin, film_z, u * cos - v * sin, u * sin + v * cos, wavelength)
+    kept = rays.pupil_x**2 + rays.pupil_y**2 <= domain.pupil_radius_mm**2
+    return rays.select(kept), count / lit_share(domain)
+
+
+def lit_share(domain: Domain) -> float:
+    """Share of the domain's rays within the boxes that `sample_lit` draws from (above 1: it gains nothing)."""
+    edges, *_, area = _boxes(domain)
+    held = ((edges[1:] ** 2 - edges[:-1] ** 2) * area).sum()
+    return float(held) / (domain.film_radius_mm**2 * math.pi * domain.pupil_radius_mm**2)
+
+
+def _boxes(domain: Domain) -> tuple[Tensor, ...]:
+    """Edges of rings of the film [K + 1]; the enlarged box of each ring's passing rays: low, high, half, area [K]."""
+    b = domain.bounds
+    low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (b.low_mm, b.high_mm, b.half_mm))
+    dark = low >= high
+    low, high, half = low.where(~dark, math.inf), high.where(~dark, -math.inf), half.where(~dark, 0.0)
+    low, high = torch.minimum(low[:-1], low[1:]), torch.maximum(high[:-1], high[1:])
+    half = torch.maximum(half[:-1], half[1:])
+    lit = low < high
+    low, high = low.where(lit, 0.0), high.where(lit, 0.0)
+    spare = _BOX_MARGIN * torch.maximum((high - low) / 2, half)
+    low, high, half = low - spare, high + spare, half + spare
+    edges = torch.linspace(0, domain.film_radius_mm, len(low) + 1, dtype=torch.float64)
+    return edges, low, high, half, (high - low) * 2 * half
+
+
 SPLITS = ("train", "held_out", "rim", "edge", "far")
 # Rays beyond this many rim radii are too far from any boundary to show where it lies.
 RIM_REACH = 1.25
 _BATCH = 65536
-# A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
-IDLE_SHARE, _IDLE_RAYS = 1e-5, 200_000
-_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300  # sampled for the largest angle of a lens; fewer passing rays do not show it
 
 
 @dataclass(frozen=True)
@@ -226,75 +452,3 @@ def _unreached_as_zero(lost: PairSet) -> PairSet:
 def join_pairs(sets: list[PairSet]) -> PairSet:
     """One set of all the rays, in order."""
     return PairSet.of_columns(torch.cat(c, -1) for c in zip(*(s.columns() for s in sets), strict=True))
-
-
-def save_pairs(pairs: RayPairs, path: str | Path) -> None:
-    """Write a .npz (plain arrays, no pickle) with what was traced as JSON; whole or not at all.
-
-    Arrays: `header`, the JSON's bytes; for each split `SPLIT_vectors` [13, N] (film x, y, z, pupil x, y, wavelength,
-    scene ray, transmittance), `SPLIT_status` [N] and `SPLIT_surfaces` [4, S, N] (crossings x and y, margins).
-    """
-    header = {
-        "schema": SCHEMA,
-        "lens_sha256": pairs.lens.sha256,
-        "domain": pairs.domain.to_dict(),
-        "settings": asdict(pairs.settings),
-        "tested": pairs.tested,
-    }
-    arrays: dict[str, Any] = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
-    for name in SPLITS:
-        c = getattr(pairs, name).columns()
-        arrays[f"{name}_vectors"] = torch.stack(c[:13]).numpy()
-        arrays[f"{name}_status"] = c[13].numpy()
-        arrays[f"{name}_surfaces"] = torch.stack(c[14:]).numpy()
-    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, **arrays)
-
-
-def with_angle(model: LensModel) -> LensModel:
-    """The model with the largest angle of its lens's rays, by a sample of the domain; see `LensModel.angle`."""
-    rays, _ = draw(model.domain, _ANGLE_RAYS, seed=5)
-    with torch.no_grad():
-        exact = trace_pairs(model.lens, rays, model.domain.pupil_z_mm)
-        if isinstance(model.core, Refracted):
-            angles = model.core(model.encoding(rays))[0][DIRECTION].norm(dim=0)
-        else:
-            angles = torch.atan2(torch.hypot(exact.scene.dx, exact.scene.dy), -exact.scene.dz)
-    angles = angles[exact.status == st.PASSED]
-    if len(angles) < _FEWEST_RAYS:
-        return replace(model, angle=math.pi)
-    angle = float(angles.max())
-    bound = next((b for b in (math.pi / 2, math.pi) if angle < b), math.pi)
-    return replace(model, angle=min(1.05 * angle, (angle + bound) / 2, bound))
-
-
-def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
-    """The models without the gates that block (next to) nothing that the others and the stop let through.
-
-    Which surface a status names may change with that: the first of those left. `share`: see `IDLE_SHARE`.
-    """
-    left = list(range(len(models[0].gates)))
-    sole = [_blocked(m) for m in models]  # [1 + G, N] of each, the stop first
-    while left:
-        others = [[b[[0, *(1 + k for k in left if k != g)]].any(0) for b in sole] for g in left]
-        counts = [
-            sum(int((b[1 + g] & ~rest).sum()) for b, rest in zip(sole, each, strict=True))
-            for g, each in zip(left, others, strict=True)
-        ]
-        least = min(range(len(left)), key=lambda i: counts[i])
-        if counts[least] > share * sum(b.shape[1] for b in sole):
-            break
-        del left[least]
-    if len(left) == len(models[0].gates):
-        return models
-    return tuple(
-        replace(m, gates=tuple(m.gates[k] for k in left), core=m.core.keep([0, *(1 + k for k in left)])) for m in models
-    )
-
-
-def _blocked(model: LensModel) -> Tensor:
-    """[1 + G, N] bool: which of the stop and the gates block each ray of the domain."""
-    with torch.no_grad():
-        vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
-    stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2
-    return torch.cat([stop[None], scalars[1:] > 0])

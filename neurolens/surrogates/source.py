@@ -45,26 +45,7 @@ OSL = "osl"  # of whole cameras: `shaders.osl`
 _WIDTH, _MOST_WAVELENGTHS = 110, 64
 # Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL, words of HLSL,
 # WGSL, CUDA and VEX, names of the code that is written.
-_WORDS = """
-    alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class co_await
-    co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype default delete do
-    double dynamic_cast else enum explicit export extern false float for friend goto if inline int long mutable
-    namespace new noexcept not not_eq nullptr operator or or_eq private protected public register reinterpret_cast
-    requires restrict return short signed sizeof static static_assert static_cast struct switch template this
-    thread_local throw true try typedef typeid typename typeof union unsigned using virtual void volatile wchar_t while
-    xor xor_eq active attribute buffer cast centroid coherent common discard external filter fixed flat half highp in
-    inout input interface invariant layout lowp mediump noinline noperspective out output partition patch precise
-    precision readonly resource sample sampler shared smooth subroutine superp uniform varying writeonly
-    abs all any clamp cross distance div dot equal fract inverse length main max min mix mod normalize outer reflect
-    refract round sign step texture transpose radians degrees isnan isinf
-    color point vector normal matrix string closure shader surface displacement volume light noise hash random emit
-    size_t ptrdiff_t max_align_t offsetof linux unix errno signal
-    cbuffer compile groupshared line linear mad module pass select snorm technique triangle unorm property extension
-    override fn let var alias loop continuing diagnostic enable ptr array await become crate def delegate final
-    finally from function impl implements import instanceof is it macro match meta move mut nil null of on package
-    ref self set trait type unless use where with yield device grid cvex foreach gather len push resize sop texel
-    ray rays i r c x y count band known band_first
-""".split()
+_WORDS = (Path(__file__).parent / "reserved_words.txt").read_text(encoding="utf-8").split()
 _PATTERNS = re.compile(
     r"t\d+|[fiu](16|32|64)|gl_.*|[biud]?vec[234]|d?mat[234](x[234])?|[iu]?(sampler|image|texture|subpassInput)\w*|texel\w*|atomic\w*|hvec\d"
     r"|dmat\w*|fvec\d|u?int(8|16|32|64)?_t|u?int|float_t|double_t"
@@ -107,7 +88,7 @@ def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
     Raises:
         InputError: a wavelength, film position or stop outside the model's domain; too many wavelengths, or one twice.
     """
-    from neurolens.surrogates.pairs import with_angle, without_idle_gates  # rays are traced, which needs torch
+    from neurolens.surrogates.targets import with_angle, without_idle_gates  # rays are traced, which needs torch
 
     wanted = fix.wavelengths_nm
     if len(wanted) > _MOST_WAVELENGTHS or len(set(wanted)) < len(wanted):
@@ -132,7 +113,7 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
     Raises:
         InputError: a wavelength outside the model's domain, or a model without a wavelength input.
     """
-    from neurolens.surrogates.pairs import with_angle
+    from neurolens.surrogates.targets import with_angle
 
     low, high = model.domain.wavelength_nm
     if model.encoding.w_half == 0:

@@ -1,4 +1,8 @@
-"""The input of a fit: settings, ray pairs with their exact vectors and scalars, scaled, and weights.
+"""The input of a fit: gates, settings, ray pairs with their exact vectors and scalars, scaled, and weights.
+
+Gates are the rims and discriminants that a model must test. A rim is tested at the ray's crossing with its surface. A
+ray that misses a surface or is totally reflected has no crossing; there the sign of the discriminant decides (of the
+intersection, or of Snell's law). It is smooth across the boundary, because it depends only on the ray that arrives.
 
 Of a lens whose rays leave the front surface at grazing angles, polynomials are fitted up to the front glass, and models
 refract there exactly (`cores.Refracted`): near grazing the direction outside turns as the square root of what is left
@@ -8,6 +12,7 @@ to the grazing ray. Networks follow that themselves, and measured worse when the
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -16,18 +21,161 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.base.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.settings import check_bounds, setting
 from neurolens.lens.glass import index_of, inverse_square_um
 from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import tilt_series
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Array
-from neurolens.surrogates.gates import boundary_rays, boundary_weights
-from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
-from neurolens.surrogates.model import Domain, Gate, Scales
-from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Array, LightField, Refracted, angle_vector
+from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales
+from neurolens.surrogates.pairs import (
+    RIM_REACH,
+    FilmRays,
+    PairSet,
+    RayPairs,
+    draw,
+    draw_everywhere,
+    join_pairs,
+    reached,
+    sample_domain,
+    trace_pairs,
+)
+from neurolens.surrogates.terms import pinned_threads
+from neurolens.trace.rays import CHUNK
+from neurolens.trace.shapes import is_deep, rim_sine
 from neurolens.trace.surfaces import entered
+
+# Rays of the boundary fits are mixed by this seed: networks use the first of them.
+_MIXING_SEED = 1
+# Gates of either kind; rims end when this share of the blocked rays, discriminants when this share of all rays is left.
+_MOST_GATES, _UNEXPLAINED = 10, 1e-4
+
+# Only the neighbourhood of a boundary decides who passes: weights fall off beyond this distance from it, in units of
+# the gate (half as much of a rim's radius).
+BOUNDARY_WIDTH = 0.03
+# The stop crossing is wanted to the same share of the opening down to this one, in stop radii: four stops.
+STOPPED_DOWN = 0.25
+
+
+def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
+    """[G, N] bool: rays of which the gate's value is known, because they get as far as its surface (and to its rim)."""
+    arrives = reached(pairs)
+    rows = [arrives[g.surface] & (pairs.meets[g.surface] > 0 if g.reason == st.RIM else True) for g in gates]
+    return torch.stack(rows) if rows else torch.empty((0, len(pairs)), dtype=torch.bool)
+
+
+def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
+    """[G, N] exact values of the gates, positive where the surface stops the ray; 0 where it never gets there."""
+    rows = []
+    for gate in gates:
+        k = gate.surface
+        if gate.reason == st.RIM:
+            rows.append(_beyond_rim(lens.surfaces[k], torch.hypot(pairs.cross_x[k], pairs.cross_y[k])))
+        else:
+            rows.append(-(pairs.meets[k] if gate.reason == st.MISSED else pairs.refracts[k]))
+    if not rows:
+        return torch.empty((0, len(pairs)), dtype=pairs.transmittance.dtype)
+    return torch.where(gate_reach(gates, pairs), torch.stack(rows), 0.0)
+
+
+def _beyond_rim(surface: Surface, height: Tensor) -> Tensor:
+    """[N] a rim's gate at crossings `height` [N] mm from the axis: the height's square over the rim's, less 1.
+
+    On a sphere whose equator lies within reach of the rays near the rim, the square turns back there and cannot be
+    fitted. The gate is then the depth over the rim's depth, less 1, which agrees to first order and never turns.
+    """
+    if not (is_deep(surface) and RIM_REACH * rim_sine(surface) > 1):
+        return height**2 / surface.semi_diameter_mm**2 - 1
+    sine = height * abs(surface.curvature)
+    near = sine <= 1
+    cosine = torch.sqrt((1 - torch.where(near, sine, 2 - sine) ** 2).clamp_min(0.0))
+    depth = 1 - torch.where(near, cosine, -cosine)
+    return depth / (1 - math.sqrt(1 - rim_sine(surface) ** 2)) - 1
+
+
+def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tuple[Tensor, Tensor]:
+    """Weights of the rays of `boundary_rays` in the fits of the gates [G, N] and of the stop crossing [N].
+
+    A gate decides where its value is near 0 and no other boundary stops the ray. The stop crossing counts wherever the
+    ray passes, because the stop may be closed, and more near the middle, where an error meets smaller openings. Rays
+    that are lost before a boundary weigh 0.
+    """
+    every = (*gates, Gate(lens.stop_index, st.RIM))
+    values, arrives = gate_values(lens, every, pairs), gate_reach(every, pairs)
+    beyond = values.where(arrives, 0.0).clamp_min(0.0)
+    rows = []
+    for i, value in enumerate(values):
+        others = torch.cat([beyond[:i], beyond[i + 1 :]])
+        stopped = others.amax(0) if len(others) else torch.zeros_like(value)
+        distance = value if i < len(gates) else beyond[i]
+        rows.append((_near(distance) * _near(stopped)).where(arrives[i], 0.0))
+    opening = torch.sqrt((values[-1] + 1).clamp_min(0.0)).where(arrives[-1], 1.0)
+    rows[-1] *= (1 + STOPPED_DOWN) / (opening + STOPPED_DOWN)
+    return torch.stack(rows[:-1]) if gates else values[:0], rows[-1]
+
+
+def _near(distance: Tensor) -> Tensor:
+    return 1 / torch.sqrt(1 + (distance / BOUNDARY_WIDTH) ** 2)
+
+
+def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
+    """The rays that the gates are fitted on: those near the rims, and lost rays where a gate is about those."""
+    if all(gate.reason == st.RIM for gate in gates) or not len(pairs.edge):
+        return pairs.rim
+    both = join_pairs([pairs.rim, pairs.edge])
+    return both.select(torch.randperm(len(both), generator=torch.Generator().manual_seed(_MIXING_SEED)))
+
+
+def choose_gates(lens: Lens, blocked: PairSet, drawn: int | None = None) -> tuple[Gate, ...]:
+    """The boundaries that block anything in the domain: the one that explains most blocked rays, then the next.
+
+    Rims come first, by the rays that refract all the way; then, for what the rims leave, discriminants. A gate of total
+    reflection covers the rays that miss the same surface, whose discriminant is lower still.
+
+    Args:
+        blocked: rays that did not pass, of uniform ones over the domain.
+        drawn: number of those uniform rays; None: of `blocked`.
+
+    Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
+    """
+    arrives = reached(blocked)
+    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    outside = ((blocked.cross_x**2 + blocked.cross_y**2) > radii**2) & arrives & (blocked.meets > 0)  # [S, N]
+    whole = ((blocked.meets > 0) & (blocked.refracts > 0)).all(0)
+    left = outside[:, whole & ~outside[lens.stop_index]]
+    rims = _greedy(left, math.floor(_UNEXPLAINED * int(whole.sum())))
+    stopped = outside[[*rims, lens.stop_index]].any(0)
+    # Rows: total reflection, then missed. The first of equals is taken.
+    lost = torch.cat([arrives & ~(blocked.refracts > 0), arrives & ~(blocked.meets > 0)])
+    edges = _greedy(lost[:, ~stopped], math.floor(_UNEXPLAINED * (drawn or len(blocked))))
+    count = len(lens.surfaces)
+    gates = [Gate(k, st.RIM) for k in rims]
+    gates += [Gate(k % count, st.TOTAL_REFLECTION if k < count else st.MISSED) for k in edges]
+    return tuple(sorted(gates, key=lambda g: (-g.surface, g.reason)))
+
+
+def _greedy(stops: Tensor, enough: int) -> list[int]:
+    """Rows of [K, N] bool: the one with most entries, then the one with most of the rest, until `enough` or fewer."""
+    chosen: list[int] = []
+    while stops.shape[1] and len(chosen) < _MOST_GATES:
+        counts = stops.sum(1)
+        best = int(counts.argmax())
+        if int(counts[best]) <= max(0, enough):
+            break
+        chosen.append(best)
+        stops = stops & ~stops[best]
+    return chosen
+
+
+def explained(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
+    """[N] bool: rays that a gate, exact, or the stop would stop."""
+    stop = Gate(lens.stop_index, st.RIM)
+    return (gate_values(lens, (*gates, stop), pairs) > 0).any(0)
+
+
+# ---- settings and targets ----
 
 Method = Literal["thin", "thick", "dense", "omp", "ols", "mlp", "ols+mlp"]
 POLYNOMIALS = ("dense", "omp", "ols")
@@ -244,3 +392,88 @@ def index_series(lens: Lens, encoding: Encoding) -> Array:
         if np.abs(series(w) - n).max() < _SERIES_ERROR:
             break
     return np.asarray(series.convert().coef)
+
+
+# Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
+_GATE_RAYS = 200_000
+
+
+def prepare(pairs: RayPairs) -> Prepared:
+    """Find the encoding, and the rims and discriminants that block anything in the domain.
+
+    Warns:
+        NeurolensWarning: more than one ray in 10,000 is lost in a way that no gate shows (beyond 90 degrees to a
+            plane, or on the far half of a sphere).
+    """
+    seed = pairs.settings.seed + 1_000_003
+    drawn, ended = draw_everywhere(pairs.domain, _GATE_RAYS, seed), []
+    with pinned_threads():
+        for start in range(0, len(drawn), CHUNK):  # crossings with many surfaces are large: of blocked rays alone
+            some = FilmRays(*(c[start : start + CHUNK] for c in drawn.columns()))
+            traced = trace_pairs(pairs.lens, some, pairs.domain.pupil_z_mm)
+            ended.append(traced.select(traced.status != st.PASSED))
+            del traced
+    blocked = join_pairs(ended)
+    del ended
+    gates = choose_gates(pairs.lens, blocked, len(drawn))
+    untold = (blocked.status % 4 != st.RIM) & ~explained(pairs.lens, gates, blocked)
+    lost = float(untold.double().sum()) / len(drawn)
+    if lost > 1e-4:
+        warnings.warn(
+            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total "
+            "reflection in a way that no gate shows; the rims near by stand in for that boundary",
+            NeurolensWarning,
+            stacklevel=2,
+        )
+    return Prepared(pairs, fit_encoding(pairs.domain, pairs.train, mirror=pairs.lens.anamorphic), gates)
+
+
+# ---- what a model is told of its lens once it is fitted ----
+
+# A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
+IDLE_SHARE, _IDLE_RAYS = 1e-5, 200_000
+_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300  # sampled for the largest angle of a lens; fewer passing rays do not show it
+
+
+def with_angle(model: LensModel) -> LensModel:
+    """The model with the largest angle of its lens's rays, by a sample of the domain; see `LensModel.angle`."""
+    rays, _ = draw(model.domain, _ANGLE_RAYS, seed=5)
+    with torch.no_grad():
+        exact = trace_pairs(model.lens, rays, model.domain.pupil_z_mm)
+        if isinstance(model.core, Refracted):
+            angles = model.core(model.encoding(rays))[0][DIRECTION].norm(dim=0)
+        else:
+            angles = torch.atan2(torch.hypot(exact.scene.dx, exact.scene.dy), -exact.scene.dz)
+    angles = angles[exact.status == st.PASSED]
+    if len(angles) < _FEWEST_RAYS:
+        return replace(model, angle=math.pi)
+    angle = float(angles.max())
+    bound = next((b for b in (math.pi / 2, math.pi) if angle < b), math.pi)
+    return replace(model, angle=min(1.05 * angle, (angle + bound) / 2, bound))
+
+
+def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
+    """The models without the gates that block (next to) nothing that the others and the stop let through.
+
+    Which surface a status names may change with that: the first of those left. `share`: see `IDLE_SHARE`.
+    """
+    left, blocked = list(range(len(models[0].gates))), torch.cat([_blocked(m) for m in models], 1)  # the stop first
+    while left:
+        others = (blocked[[0, *(1 + k for k in left if k != g)]].any(0) for g in left)
+        alone = [int((blocked[1 + g] & ~rest).sum()) for g, rest in zip(left, others, strict=True)]
+        if min(alone) > share * blocked.shape[1]:
+            break
+        del left[alone.index(min(alone))]
+    if len(left) == len(models[0].gates):
+        return models
+    return tuple(
+        replace(m, gates=tuple(m.gates[k] for k in left), core=m.core.keep([0, *(1 + k for k in left)])) for m in models
+    )
+
+
+def _blocked(model: LensModel) -> Tensor:
+    """[1 + G, N] bool: which of the stop and the gates block each ray of the domain."""
+    with torch.no_grad():
+        vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
+    stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2
+    return torch.cat([stop[None], scalars[1:] > 0])

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.graph.interpret import monomials as monomials
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.cores import LightField
 
 Exponents = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -53,11 +53,6 @@ def invariant_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
     return ordered([(*p, w) for w, most in enumerate(reach) for p in powers(3, most)])
 
 
-def raw_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
-    """[M, 5] exponents of p_x, p_y, u_x, u_y, w up to a total `degree`: the basis of the published lens polynomials."""
-    return ordered(powers(5, degree) if dispersive else [(*p, 0) for p in powers(4, degree)])
-
-
 def ordered(rows: Sequence[tuple[int, ...]]) -> Exponents:
     """[M, V] exponents, the lowest degree first."""
     return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
@@ -83,11 +78,6 @@ def kept(exponents: Exponents, chosen: Sequence[int]) -> tuple[Exponents, list[i
     rows = sorted({k % count for k in chosen})
     number = {k: i for i, k in enumerate(rows)}
     return exponents[rows], [number[k % count] + (k >= count) * len(rows) for k in chosen]
-
-
-def raw_variables(field: LightField) -> Tensor:
-    """[5, N]: p_x, p_y, u_x, u_y, w."""
-    return torch.cat([field.p, field.u, field.w[None]])
 
 
 def vector_columns(features: Tensor, field: LightField) -> Tensor:

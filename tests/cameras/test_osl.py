@@ -31,7 +31,7 @@ from neurolens.shaders.blender_shader import exact_lens
 from neurolens.shaders.pupil import Blades, PupilCircles
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
-from neurolens.surrogates import states
+from neurolens.surrogates import fit
 from neurolens.surrogates.axes import Axis, product, weights
 from neurolens.trace.tracegraph import exact_graph
 
@@ -178,7 +178,7 @@ def test_zoom_is_an_input() -> None:
 @pytest.mark.usefixtures("few_rays")
 def test_groups_of_a_lens_file_move_where_the_camera_is_focused(monkeypatch: pytest.MonkeyPatch) -> None:
     file = ROOT / "lenses" / "tajima_retrofocus_24.toml"
-    monkeypatch.setattr(states, "gap_axis", lambda axis, _: (replace(axis, knots=(2.4, axis.knots[-1]), degree=1), 0))
+    monkeypatch.setattr(fit, "gap_axis", lambda axis, _: (replace(axis, knots=(2.4, axis.knots[-1]), degree=1), 0))
     _, made, _ = exact_lens(file, None, lambda share: None)  # of the near part of its range
     assert made.near_m == pytest.approx((0.3, 0.3), rel=1e-6)
     program, focus_m = osl.osl_program(made), 0.34

@@ -33,8 +33,8 @@ from neurolens.shaders import lens_source
 from neurolens.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
 from neurolens.study.speed import CompiledSource
-from neurolens.surrogates.domain import domain_of, sample_domain
-from neurolens.surrogates.states import gap_axis, zoom_axis
+from neurolens.surrogates.fit import gap_axis, zoom_axis
+from neurolens.surrogates.pairs import domain_of, sample_domain
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 

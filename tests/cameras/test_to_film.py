@@ -1,8 +1,6 @@
 """From scene points to the film: there and back, and the same picture by light tracing as by path tracing."""
 
 import math
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import lens_models
@@ -11,29 +9,19 @@ import pytest
 from camera_helpers import FILM, FISHEYES, GAUSS, camera, film_rays, jittered, tabled
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.lens.shot import Shot
-from neurolens.surrogates.export import export_inverse, export_onnx
-from neurolens.surrogates.inverse_fit import fit_inverse
 
 IDEAL = ("pinhole", "thin", "thick", *FISHEYES)
 
 
-@cache
-def inverted(folder: Path) -> OnnxCamera:
-    """A model with its inverse beside it."""
-    model = lens_models.model("invariants")
-    export_inverse(fit_inverse(model, lens_models.prepared().pairs), folder / "m.onnx")
-    path = export_onnx(model, folder / "m.onnx")
-    return OnnxCamera(load_model(path), Shot(FILM, 2.0, 4.0, wavelength_nm=(400.0, 700.0)))
-
-
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> OnnxCamera:
-    return inverted(tmp_path_factory.mktemp("inverse"))
+def model() -> OnnxCamera:
+    return OnnxCamera(
+        load_model(lens_models.exported("invariants")), Shot(FILM, 2.0, 4.0, wavelength_nm=(400.0, 700.0))
+    )
 
 
 def points_on(rays: Any, seed: int = 0) -> np.ndarray:
@@ -161,11 +149,6 @@ def test_points_from_which_no_light_arrives(kind: str, model: OnnxCamera) -> Non
     assert np.linalg.norm(found.direction, axis=0) == pytest.approx(1, abs=1e-5)
     nothing = np.empty((3, 0), np.float32)
     assert lens.to_film(nothing, nothing[:2], nothing[0]).weight.shape == (0,)
-
-
-def test_a_model_without_inverse_says_so() -> None:
-    with pytest.raises(InputError, match="--inverse"):
-        camera("network").to_film(*(np.zeros((n, 1), np.float32) for n in (3, 2)), np.full(1, 550, np.float32))
 
 
 @pytest.mark.parametrize("kind", [*IDEAL, "exact", "model"])

@@ -19,8 +19,7 @@ from neurolens.base.errors import InputError
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
-from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.pairs import PairSettings
+from neurolens.surrogates.pairs import PairSettings, sample_domain
 from neurolens.trace.tracegraph import exact_graph
 
 

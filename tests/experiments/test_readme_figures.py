@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from experiments.make_models import errors_by_kind
-from neurolens.study.advice import recommended
+from neurolens.study.pages import recommended
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

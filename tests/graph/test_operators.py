@@ -14,14 +14,13 @@ import torch
 from neurolens.base.errors import InputError
 from neurolens.graph.c import write_blocks, write_c
 from neurolens.graph.compiler import compile_c
-from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.derive import derivative, determinant, limited_newton, solve, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_glsl
-from neurolens.surrogates.inverse import determinant, limited_newton, solve
 
 Array = np.ndarray
 RNG = np.random.default_rng(0)

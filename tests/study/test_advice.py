@@ -1,6 +1,6 @@
 """One decision for every command: when a model is worth its error, and when to trace exactly."""
 
-from neurolens.study.advice import SAVING, recommended, to_use
+from neurolens.study.pages import SAVING, recommended, to_use
 
 
 def test_the_rule_at_its_edge() -> None:

@@ -20,7 +20,7 @@ from neurolens.cli import lens as lens_list
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.any_format import lens_files, read_any
-from neurolens.study import character as char
+from neurolens.study import describe as char
 from neurolens.study.describe import library_row
 
 FOCAL_MM, RADIUS_MM, FIELD_DEG = 50.0, 8.0, 20.0

@@ -19,10 +19,9 @@ from neurolens.setting.states import set_lens
 from neurolens.study.check import check_model
 from neurolens.study.experiment import default_experiment, near_limit_m, wavelengths_nm
 from neurolens.study.measure import measure_on, shared_rays
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
 
 AIR: dict[str, float] = {}
 BK7, SK16, F2 = {"n_d": 1.5168, "V_d": 64.17}, {"n_d": 1.62041, "V_d": 60.32}, {"n_d": 1.62004, "V_d": 36.37}

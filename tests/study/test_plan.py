@@ -23,7 +23,8 @@ from neurolens.cli import main
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
 from neurolens.plan import candidates as tried
-from neurolens.plan import costs, plots
+from neurolens.plan import costs
+from neurolens.plan import plan as plans
 from neurolens.plan.candidates import Target, candidates
 from neurolens.plan.costs import Work, noise, shader_cost
 from neurolens.plan.footprints import (
@@ -47,8 +48,8 @@ from neurolens.shaders import pupil_fit
 from neurolens.shaders.blender_shader import lens_of
 from neurolens.shaders.osl import OslLens, osl_program
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.file import read_model
+from neurolens.surrogates.pairs import domain_of
 
 LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
 GAUSS = "lenses/laikin_double_gauss_50.toml"
@@ -311,7 +312,7 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
     drawn = list[object]()
-    monkeypatch.setattr(plots, "plot_effects", lambda made, path, title: drawn.append(path.name))
+    monkeypatch.setattr(plans, "plot_effects", lambda made, path, title: drawn.append(path.name))
     monkeypatch.setattr(tried, "TERMS", (6,))
     scene, folder = tmp_path / "scene.toml", tmp_path / "plan"
     film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "width": 64, "height": 36, "samples": 2}

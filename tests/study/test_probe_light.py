@@ -16,9 +16,8 @@ from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.lights import SceneLights
 from neurolens.lens.shot import Shot
 from neurolens.plan.footprints import Footprints, blur_mm, distance_mm, left_to
-from neurolens.plan.light import overview, stray_light
 from neurolens.plan.plan import plan
-from neurolens.plan.probe import effects_of, probe
+from neurolens.plan.probe import effects_of, overview, probe, stray_light
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
 from neurolens.render.settings import FlareSettings

@@ -26,9 +26,16 @@ from neurolens.study.rays import (
     ray_errors,
     relative_illumination,
 )
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
+from neurolens.surrogates.pairs import (
+    FilmRays,
+    PairSet,
+    PairSettings,
+    domain_of,
+    make_pairs,
+    sample_domain,
+    trace_pairs,
+)
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 

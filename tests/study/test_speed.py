@@ -11,9 +11,9 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.study.speed import Call, Candidate, Race, Unavailable, camera_candidate, exact_candidates, race
-from neurolens.surrogates.domain import FilmRays, domain_of
+from neurolens.study.speed import Call, Candidate, Race, Unavailable, camera_candidate, exact_candidate, race
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import FilmRays, domain_of
 from neurolens.surrogates.terms import pinned_threads
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -28,7 +28,7 @@ def domain() -> Domain:
 
 
 def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
-    eager = exact_candidates(LENS, domain, compiled=False)
+    eager = [exact_candidate(LENS, domain)]
     cameras = [camera_candidate(c, domain) for c in (Pinhole(50.0), ThinLens(50.0, 2.0, math.inf))]
     result = race([*eager, *cameras], domain, rounds=3)
     assert list(result.ns) == ["exact eager", "pinhole", "thin"]

@@ -11,7 +11,7 @@ from neurolens.base.errors import InputError
 from neurolens.plan import plan as traded
 from neurolens.plan.candidates import Choice
 from neurolens.plan.costs import Work
-from neurolens.plan.plan import Offer, best_within, front, offers, spread
+from neurolens.plan.plan import best_within, front, in_seconds, spread
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
 
@@ -28,8 +28,8 @@ def scene(**camera: object) -> dict:
     }
 
 
-def choice(name: str, error: float, cost: float, noise: float = 1.0, light: float = 0.0) -> Choice:
-    return Choice(name, "", error, light, cost, noise)
+def choice(name: str, error: float, cost: float, noise: float = 1.0, light: float = 0.0, s: float = math.inf) -> Choice:
+    return Choice(name, "", error, light, cost, noise, seconds=s)
 
 
 def test_seconds_are_those_of_the_picture_to_the_noise_of_the_exact_lens() -> None:
@@ -39,22 +39,22 @@ def test_seconds_are_those_of_the_picture_to_the_noise_of_the_exact_lens() -> No
     for denoised in (False, True):
         found = SimpleNamespace(
             asked=SimpleNamespace(denoised=denoised), seen=SimpleNamespace(weight=np.ones((2, 1, 8))),
-            places=SimpleNamespace(share=np.ones(1)), exact=SimpleNamespace(dispersive=True),
+            places=SimpleNamespace(share=np.ones(1)), exact=SimpleNamespace(dispersive=True), scene=made,
         )  # fmt: skip
         tried = [plain, coloured, choice("untimed", 0, math.inf)]
-        offered = {o.choice.name: o for o in offers(made, found, tried, work)}  # type: ignore[arg-type]
+        offered = {c.name: c for c in in_seconds(found, tried, work) if c.seconds < math.inf}  # type: ignore[arg-type]
         times = 1.0 if denoised else 1.5
         seconds = {"plain": 1050e-9 * rays / times, "coloured": (30 + 2000 * times) * 1e-9 * rays / times}
         assert {name: o.seconds for name, o in offered.items()} == pytest.approx(seconds)
-        assert offered["coloured"].camera == pytest.approx(30e-9 * rays / times)
+        assert offered["coloured"].camera_seconds == pytest.approx(30e-9 * rays / times)
 
 
 def test_the_front_holds_what_nothing_betters_and_time_buys_the_most_faithful() -> None:
     rows = [("a", 2, 1, 0), ("b", 1, 2, 0), ("dull", 1.5, 3, 0), ("dark", 0.1, 1.5, 0.5), ("c", 0, 9, 0)]
-    offered = [Offer(choice(n, e, 0.0, light=dim), s) for n, e, s, dim in rows]
-    assert [o.choice.name for o in front(offered)] == ["a", "b", "c"]
+    offered = [choice(n, e, 0.0, light=dim, s=s) for n, e, s, dim in rows]
+    assert [c.name for c in front(offered)] == ["a", "b", "c"]
     bought = {s: best_within(offered, s) for s in (0.5, 1.0, 5.0, 9.0)}
-    assert [o and o.choice.name for o in bought.values()] == [None, "a", "b", "c"]
+    assert [c and c.name for c in bought.values()] == [None, "a", "b", "c"]
 
 
 def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +64,7 @@ def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypat
     for budget in (0.0, 0.05, 1.0):
         seen[budget] = traded.plan_seen(shown, read_lens(LENS), budget).best
         assert seen[budget] is not None and seen[budget].flip <= budget
-    right = [c.cost for c in priced[0].choices if c.light_error <= 0.01]
+    right = [c.cost for c in priced.choices if c.light_error <= 0.01]
     assert seen[0.0].name == "exact" and seen[1.0].cost == min(right) <= seen[0.05].cost <= seen[0.0].cost
     for wrong in ({"flip_budget": 1.5}, {"flip_budget": 0.1, "afterwards": ("distortion",)}):
         with pytest.raises(InputError):
@@ -72,10 +72,10 @@ def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypat
 
 
 def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
-    many = [Offer(choice(str(k), 1 / (k + 1), 0.0), float(k)) for k in range(30)]
+    many = [choice(str(k), 1 / (k + 1), 0.0, s=float(k)) for k in range(30)]
     for chosen in (0, 7, 13, 29):
-        names = [o.choice.name for o in spread(many, many[chosen], 6)]
+        names = [c.name for c in spread(many, many[chosen], 6)]
         assert len(names) == 6 and {"0", "29", str(chosen)} <= set(names) and names == sorted(names, key=int)
     assert spread(many[:3], None, 6) == many[:3]
-    beside = Offer(choice("beside", 0.5, 0.0), 2.5)  # a choice that another camera betters is shown, too
+    beside = choice("beside", 0.5, 0.0, s=2.5)  # a choice that another camera betters is shown, too
     assert beside in spread(many, beside, 6) and spread(many[:2], beside) == [*many[:2], beside]

@@ -46,7 +46,6 @@ steps = 20
 [evaluation]
 vignetting_rays = 4000
 rounds = 0
-compile_exact = false
 [render]
 scenes = ["ROOT/experiments/scenes/grid.toml"]
 width = 32

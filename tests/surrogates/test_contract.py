@@ -23,10 +23,10 @@ from neurolens.lens.paraxial import first_order
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ALL
 from neurolens.surrogates.cores import Core
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.file import coefficients_text, read_model
 from neurolens.surrogates.model import LensModel, Prediction
+from neurolens.surrogates.pairs import FilmRays, sample_domain
 from neurolens.surrogates.source import Fix, at_wavelength, fixed_models, fused_program
 
 COUNT = 20_000

@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -15,9 +14,16 @@ from neurolens.lens.paraxial import PupilBounds, film_z_mm, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.domain import domain_of, focused_plane_z_mm, sample_domain
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import SPLITS, PairSettings, RayPairs, make_pairs, save_pairs, trace_pairs
+from neurolens.surrogates.pairs import (
+    PairSettings,
+    RayPairs,
+    domain_of,
+    focused_plane_z_mm,
+    make_pairs,
+    sample_domain,
+    trace_pairs,
+)
 from neurolens.surrogates.targets import film_equivalent_weights
 
 ROOT = Path(__file__).parents[2] / "lenses"
@@ -183,18 +189,6 @@ def test_the_seed_decides(pairs: RayPairs) -> None:
         assert all(torch.equal(a, b) for a, b in zip(*columns, strict=True))
     other = make_pairs(pairs.lens, pairs.domain, replace(small, seed=6))
     assert not torch.equal(one.train.scene.x, other.train.scene.x)
-
-
-def test_saved_pairs_are_plain_arrays(pairs: RayPairs, tmp_path: Path) -> None:
-    save_pairs(pairs, tmp_path / "pairs.npz")
-    with np.load(tmp_path / "pairs.npz", allow_pickle=False) as data:
-        header = json.loads(data["header"].tobytes())
-        assert Domain.from_dict(header["domain"]) == pairs.domain and header["lens_sha256"] == pairs.lens.sha256
-        for name in SPLITS:
-            columns = getattr(pairs, name).columns()
-            stored = [*data[f"{name}_vectors"], data[f"{name}_status"], *data[f"{name}_surfaces"]]
-            for a, b in zip(columns, stored, strict=True):
-                assert np.array_equal(a.numpy(), b)
 
 
 @pytest.mark.parametrize("wrong", [{"train": 0}, {"held_out": 0}, {"rim": 0}, {"train": -5}])

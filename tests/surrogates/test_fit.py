@@ -20,10 +20,9 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.surrogates import targets
 from neurolens.surrogates.assemble import refracted, tilt_series
 from neurolens.surrogates.cores import Refracted, Residual
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
 from neurolens.surrogates.targets import film_equivalent, targets_of
 from neurolens.trace.shapes import sag_and_derivatives
 from neurolens.trace.surfaces import entered

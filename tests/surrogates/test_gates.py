@@ -18,17 +18,23 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.cores import STOP, InvariantPolynomial
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain, sample_lit
+from neurolens.surrogates.boundaries import GateFit, invariant_core
+from neurolens.surrogates.cores import STOP, InvariantPolynomial, LightField
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.fits.boundaries import GateFit, invariant_core
-from neurolens.surrogates.fits.polynomial import fit_polynomial
-from neurolens.surrogates.gates import boundary_rays, gate_reach, gate_values
-from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Domain, Gate, LensModel
-from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
-from neurolens.surrogates.targets import targets_of
+from neurolens.surrogates.pairs import (
+    FilmRays,
+    PairSet,
+    PairSettings,
+    domain_of,
+    make_pairs,
+    sample_domain,
+    sample_lit,
+    trace_pairs,
+)
+from neurolens.surrogates.polynomial import fit_polynomial
+from neurolens.surrogates.targets import boundary_rays, gate_reach, gate_values, targets_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
 OLS = ModelSettings("ols", terms=40, planes=False)  # of `lens_models.model`

@@ -13,11 +13,11 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.readers.lensfile import read_lens
 from neurolens.surrogates.assemble import DirectionSeries
-from neurolens.surrogates.domain import FilmRays, domain_of
+from neurolens.surrogates.cores import angle_vector
 from neurolens.surrogates.fit import Prepared, prepare
-from neurolens.surrogates.fits.polynomial import fit_planes, shifted
-from neurolens.surrogates.lightfield import Encoding, angle_vector
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.model import Encoding
+from neurolens.surrogates.pairs import FilmRays, PairSettings, domain_of, make_pairs
+from neurolens.surrogates.polynomial import fit_planes, shifted
 from neurolens.surrogates.targets import targets_of
 from neurolens.surrogates.terms import invariant_exponents, monomials, solve, vector_columns
 

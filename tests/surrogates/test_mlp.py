@@ -12,12 +12,13 @@ from neurolens.base.status import OUTSIDE_DOMAIN
 from neurolens.cameras.model import load_model
 from neurolens.readers.lensfile import read_lens
 from neurolens.study.measure import onnx_predictor
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network, Residual
-from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.surrogates import network as networks
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, LightField, Network, Residual
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fits import network as networks
-from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
-from neurolens.surrogates.fits.projection import (
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.network import fit_network, with_boundary_terms
+from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs, sample_domain, trace_pairs
+from neurolens.surrogates.projection import (
     OptimiserState,
     Problem,
     activations,
@@ -25,17 +26,15 @@ from neurolens.surrogates.fits.projection import (
     normal_equations,
     project,
 )
-from neurolens.surrogates.gates import choose_gates
-from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs, with_angle
 from neurolens.surrogates.targets import (
     ModelSettings,
     Prepared,
+    choose_gates,
     film_equivalent_weights,
     fit_encoding,
     scales_of,
     targets_of,
+    with_angle,
 )
 
 LENSES = Path(__file__).parents[2] / "lenses"

@@ -19,16 +19,29 @@ from neurolens.lens.paraxial import stop_radius_mm
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.rays import ray_errors
+from neurolens.surrogates import polynomial
+from neurolens.surrogates.boundaries import stop_crossing
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import fit_model
-from neurolens.surrogates.fits import polynomial
-from neurolens.surrogates.fits.boundaries import stop_crossing
-from neurolens.surrogates.fits.polynomial import ParaxialMethod, fit_paraxial, fit_polynomial
-from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
-from neurolens.surrogates.targets import ModelSettings, Prepared, film_equivalent_weights, fit_encoding, scales_of
+from neurolens.surrogates.pairs import (
+    FilmRays,
+    PairSet,
+    PairSettings,
+    domain_of,
+    make_pairs,
+    sample_domain,
+    trace_pairs,
+)
+from neurolens.surrogates.polynomial import ParaxialMethod, fit_paraxial, fit_polynomial
+from neurolens.surrogates.targets import (
+    ModelSettings,
+    Prepared,
+    choose_gates,
+    film_equivalent_weights,
+    fit_encoding,
+    scales_of,
+)
 from neurolens.surrogates.terms import monomials, solve, vector_columns
 
 ROOT = Path(__file__).parents[2] / "lenses"

@@ -28,11 +28,10 @@ from neurolens.setting.states import set_lens
 from neurolens.study.check import check_states, space_of_card
 from neurolens.study.rays import ray_errors
 from neurolens.surrogates.axes import Axis, product, weights
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_states
+from neurolens.surrogates.fit import StateModel, StateSettings, StateSpace, fit_states, focus_axis, zoom_axis
 from neurolens.surrogates.model import LensModel, mix
-from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states import StateModel, StateSettings, StateSpace, fit_states, focus_axis, zoom_axis
+from neurolens.surrogates.pairs import FilmRays, PairSettings, make_pairs, sample_domain
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))
 FOCUS = Axis("focus", "1/m", (0.0, 1.0), 4)

@@ -8,15 +8,15 @@ import torch
 from numpy.typing import NDArray
 from sklearn import linear_model
 
+from experiments.published.data import raw_exponents
 from neurolens.graph.interpret import monomials
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.cores import LightField
 from neurolens.surrogates.terms import (
     SPANNED,
     Sweep,
     backward,
     forward,
     invariant_exponents,
-    raw_exponents,
     replace_terms,
     solve,
     vector_columns,

@@ -20,8 +20,8 @@ from neurolens.graph.compiler import find_compiler
 from neurolens.graph.program import SCENE_RAY, Program
 from neurolens.graph.shading import write_glsl
 from neurolens.study.speed import CompiledSource
-from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import FilmRays, sample_domain
 from neurolens.surrogates.source import fused_program
 
 COLUMNS = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")

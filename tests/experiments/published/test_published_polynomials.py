@@ -20,10 +20,9 @@ from neurolens.graph.interpret import evaluate, monomials
 from neurolens.graph.ir import Graph
 from neurolens.lens.glass import LINE_D_NM
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.fits.polynomial import ideal_map
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.model import Encoding
+from neurolens.surrogates.pairs import sample_domain, trace_pairs
+from neurolens.surrogates.polynomial import ideal_map
 from neurolens.surrogates.targets import fit_encoding, scales_of
 from neurolens.trace.rays import Rays, trace
 

@@ -19,10 +19,9 @@ from experiments.published.rtf import least_ellipse, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.study.rays import ray_errors
-from neurolens.surrogates.domain import FilmRays, sample_domain
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.cores import LightField
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.pairs import FilmRays, sample_domain, trace_pairs
 
 
 @cache

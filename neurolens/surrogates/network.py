@@ -24,19 +24,24 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import Kept, read_arrays
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network, Residual
-from neurolens.surrogates.fits.boundaries import (
+from neurolens.surrogates.boundaries import (
     MOST_NETWORK_TERMS,
     boundary_terms,
     features_of,
     fit_stop,
     solve_scalars,
 )
-from neurolens.surrogates.fits.projection import OptimiserState, Problem, Projection, activations, minimise, project
-from neurolens.surrogates.gates import boundary_weights, gate_values
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, LightField, Network, Residual
 from neurolens.surrogates.pairs import PairSet
-from neurolens.surrogates.targets import ModelSettings, Prepared, film_equivalent_weights, targets_of
+from neurolens.surrogates.projection import OptimiserState, Problem, Projection, activations, minimise, project
+from neurolens.surrogates.targets import (
+    ModelSettings,
+    Prepared,
+    boundary_weights,
+    film_equivalent_weights,
+    gate_values,
+    targets_of,
+)
 from neurolens.surrogates.terms import pinned_threads
 
 # What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop; and, for each mm of

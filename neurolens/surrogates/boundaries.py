@@ -15,10 +15,8 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.cores import STOP, InvariantPolynomial
-from neurolens.surrogates.gates import gate_reach, gate_values
-from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.targets import Prepared
+from neurolens.surrogates.cores import STOP, InvariantPolynomial, LightField
+from neurolens.surrogates.targets import Prepared, gate_reach, gate_values
 from neurolens.surrogates.terms import (
     Exponents,
     Sweep,

@@ -24,8 +24,7 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, MirrorPolynomial
-from neurolens.surrogates.fits.boundaries import (
+from neurolens.surrogates.boundaries import (
     boundary_terms,
     features_of,
     fit_stop,
@@ -35,7 +34,8 @@ from neurolens.surrogates.fits.boundaries import (
     stop_crossing,
     transmittance_terms,
 )
-from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, LightField, MirrorPolynomial
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import (
     POLYNOMIALS,

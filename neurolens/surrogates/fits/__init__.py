@@ -1,1 +1,0 @@
-"""Fits of surrogates: polynomials, networks, tests of what passes."""
