@@ -329,13 +329,13 @@ class Program:
         """Whether a core that works on one ray, or one vector, after the other waits for results most of the time.
 
         Counted for a core that does two operations a cycle, gives a result after 4 cycles and a quotient or root after
-        12; that it looks 128 operations ahead was chosen by measuring exact lenses and models.
+        12; that it looks 144 operations ahead was chosen by measuring exact lenses and models.
         """
         ready, live = dict[int, int](), self.live()
         for k in live:
             takes = 12 if self.steps[k].kind in ("div", "sqrt") else 4
             ready[k] = takes + max((ready[a] for a in self.steps[k].arguments if isinstance(a, int)), default=0)
-        return 2 * max(ready.values(), default=0) > len(live) + 128
+        return 2 * max(ready.values(), default=0) > len(live) + 144
 
     def in_parts(self, size: int) -> list[list[int]]:
         """The steps that differ between rays, in runs of about `size`; choices as soon as they can be made, because all
