@@ -40,8 +40,8 @@ def exact_candidates(
         return tracing(camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
 
     def arguments(rays: FilmRays) -> tuple[Any, ...]:
-        *points, wavelength = eager_arguments(rays)
-        return (*points, wavelength) if build_rays else (camera_rays(*points, domain.pupil_z_mm), wavelength)
+        fx, fy, fz, px, py, wavelength = values = eager_arguments(rays)
+        return values if build_rays else (camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
 
     run: Callable[..., Traced] = whole if build_rays else tracing
     fast = compile_tracing(run, fullgraph=True) if compiled else run

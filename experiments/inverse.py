@@ -80,7 +80,7 @@ def measure_lens(file: Path, rays: int, terms: int = 64) -> Row:
             "lens": file.stem,
             "focus_m": ["inf" if math.isinf(f) else f for f in domain.focus_m],
             "fit": {"seconds": seconds},
-            "ours": {t: convergence(inverse, *(c.astype(t) for c in every)) for t in ("float64", "float32")},
+            "ours": {t: convergence(inverse, every[0].astype(t), every[1].astype(t)) for t in ("float64", "float32")},
             "two_steps": convergence(inverse, *few, steps=2),
             "published": _published(inverse, *few),
             "rays": rays,
