@@ -27,6 +27,7 @@ import dataclasses
 import math
 import re
 import types
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -35,7 +36,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
 
 T = TypeVar("T")
@@ -352,6 +353,8 @@ def _override_value(dotted: str, text: str) -> Any:
 def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: str = "") -> T:
     """An instance of the dataclass `cls` from the tables of a TOML file.
 
+    Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning.
+
     Args:
         file: source of the data, for messages.
         prefix: dotted place of `data` in the file, "" for the top.
@@ -362,6 +365,9 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
     """
     known = {f.name: f for f in fields(cls) if f.init}  # type: ignore[arg-type]
     data = _with_new_names(known, data, file, prefix)
+    for name in set(data) & set(getattr(cls, "WITHOUT_EFFECT", ())):
+        data = {key: value for key, value in data.items() if key != name}
+        warnings.warn(f"{file}: {_join(prefix, name)} has no effect any more", NeurolensWarning, stacklevel=2)
     reject_unknown(file, prefix and f"{prefix}.", data, list(known))
     hints = get_type_hints(cls)
     values: dict[str, Any] = {}

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
@@ -172,6 +172,7 @@ class TargetChoice:
 class EvaluationChoice:
     """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread."""
 
+    WITHOUT_EFFECT: ClassVar = ("compile_exact",)
     vignetting_rays: int = 200_000
     rounds: int = 15
 
@@ -211,6 +212,7 @@ class Experiment:
     `export` take where this file is named (that of a plan): as `--camera`, a path in it relative to the file.
     """
 
+    WITHOUT_EFFECT: ClassVar = ("save_pairs",)
     title: str
     lens: LensChoice
     model: tuple[ModelSettings, ...]

@@ -9,7 +9,7 @@ import lens_models
 import pytest
 from shipped import whole
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.cli import main
@@ -89,6 +89,17 @@ def test_errors_are_in_the_order_that_physics_gives_and_hold_when_stopped_down(r
     for shares in stopped["ols-24"].values():
         assert shares["false_pass"] < 0.02 and shares["false_block"] < 0.02
     assert set(stopped["mlp-8x2"]) == {"2_stops", "4_stops"}
+
+
+def test_keys_of_before_that_changed_no_ray_are_skipped_with_a_word(tmp_path: Path) -> None:
+    text = SMALL.replace("ROOT", str(ROOT))
+    (tmp_path / "new.toml").write_text(text)
+    (tmp_path / "old.toml").write_text(
+        "save_pairs = true\n" + text.replace("rounds = 0", "rounds = 0\ncompile_exact = true")
+    )
+    with pytest.warns(NeurolensWarning, match="no effect") as said:
+        assert read_experiment(tmp_path / "old.toml") == read_experiment(tmp_path / "new.toml")
+    assert {str(w.message).split()[1] for w in said} == {"save_pairs", "evaluation.compile_exact"}
 
 
 def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
