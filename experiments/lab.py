@@ -445,7 +445,9 @@ def operations_of(program: Any) -> Row:
 
 def times_of(row: Row) -> str:
     """Least and median nanoseconds of a row of a race, or why there are none."""
-    return best_median(row["ns"]["min"], row["ns"]["median"]) if row["ns"] else f"not run: {row['reason']}"
+    if not (ns := row["ns"]):
+        return f"not run: {row['reason']}"
+    return best_median(ns["min"], ns["median"], form=".2f" if ns["min"] < 100 else ",.0f")
 
 
 def load_line(rows: Iterable[Row]) -> str:

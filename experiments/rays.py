@@ -317,10 +317,10 @@ def page(rows: Sequence[lab.Row], about: str) -> str:
 
 
 def draw(rows: Sequence[lab.Row], file: Path) -> None:
-    """Error on the film against time, a panel a lens, a number a program in the order of time."""
+    """Error on the film against time, a panel a lens, a number a program in the order of time, named beside it."""
     titles = {r["lens"]: r["title"] for r in rows}
-    with drawing(file, 5.6 * len(titles), 6.4) as figure:
-        for panel, name in zip(figure.subplots(1, len(titles), squeeze=False)[0], titles, strict=True):
+    with drawing(file, 9.0, 4.8 * len(titles)) as figure:
+        for panel, name in zip(figure.subplots(len(titles), 1, squeeze=False)[:, 0], titles, strict=True):
             timed = sorted((r for r in rows if r["lens"] == name and r["ns"]), key=lambda r: r["ns"]["min"])
             for k, row in enumerate(timed, 1):
                 # The trace that all are compared with has no error, and a logarithm none.
@@ -328,8 +328,9 @@ def draw(rows: Sequence[lab.Row], file: Path) -> None:
                 panel.plot(x, y, "s" if row["precision"] == "float64" else "o", color=colour, markersize=4)
                 panel.annotate(f"{k}", (x, y), (2, 4 if k % 2 else -9), textcoords="offset points", color=colour)
                 words = f"{k}  {row['name']}, {row['precision']}"
-                panel.text(0.03, 0.97 - 0.028 * k, words, transform=panel.transAxes, fontsize=7, color=colour)
-            panel.set(xscale="log", yscale="log", xlabel="ns a ray, one thread", title=titles[name])
+                panel.text(1.03, 1.02 - 0.05 * k, words, transform=panel.transAxes, fontsize=9, color=colour)
+            title = titles[name].replace("`", "")
+            panel.set(xscale="log", yscale="log", xlabel="ns a ray, one thread", title=title)
             plain_log_ticks(panel.xaxis, panel.yaxis)
             panel.margins(0.2)
             panel.set_ylabel("RMS error on the film, um (1e-11: the reference itself)")
