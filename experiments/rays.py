@@ -312,7 +312,8 @@ def page(rows: Sequence[lab.Row], about: str) -> str:
         mine = sorted((r for r in rows if r["lens"] == name), key=lambda r: r["ns"]["min"] if r["ns"] else math.inf)
         parts += [f"## {mine[0]['title']}", mine[0]["rays"], lab.table(_COLUMNS, mine)]
     rules = (__doc__ or "").partition("Rules. ")[2].partition("\n\nWrites")[0]
-    plot = "![Error against time, a point a program](rays.png)"
+    plot = "![Error against time, a point a program](rays.png)\n\nExact ones of ours are blue, models of ours green, "
+    plot += "others red; squares calculate in float64."
     return lab.page(TITLE, COMMAND, f"{lab.load_line(rows)} {about}", plot, *parts, _READING, "## Rules", rules)
 
 

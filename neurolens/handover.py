@@ -30,11 +30,9 @@ from neurolens.render.stmap import Plates, blocks
 
 FAR_M = 1e6  # stands for infinity where a program takes no other number
 LENSFUN_TYPES = {"equidistant": "fisheye"}  # other names are ours
-MOST_ENTRIES = 9  # of an animation that lensfun's profile has
-_SMALLER, _SMALLEST = (
-    (2, 4),
-    23.0,
-)  # stops from the shot's aperture to others in it, and its end; the widest is one, too
+MOST_ENTRIES = 9  # of lensfun's profile of an animation
+# Entries of the profile at other apertures: so many stops below the shot's, down to this f-number, and the widest.
+_SMALLER, _SMALLEST = (2, 4), 23.0
 _ROUNDS = 30  # of Lawson's weights
 MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"  # of OpenTrackIO
 _GOOD_PX = 0.1  # a polynomial that leaves more gives way to a ratio of two

@@ -49,9 +49,9 @@ class Results:
 
     Attributes:
         lens, domain: flat tables of figures with units in their keys.
-        models: name, family (of `plots.FAMILIES`), variables (raw or invariants), file relative to the run folder,
+        models: name, family (of `plots.FAMILIES`), file relative to the run folder,
             `measure.CARD_KEYS`, stopped_down and zones as of `measure.Findings`, poor (errors that are visible in a
-            picture), coefficients_per_vector (A and B terms both count; of a raw basis all scalars of the vector),
+            picture), coefficients_per_vector (A and B terms both count),
             parameters (of the whole model, rims included), bytes, fit_s, load_s, ns_per_ray (`Timing`) in onnxruntime,
             fused_ns_per_ray as C, fused_speedup and break_even_rays (of it, against the exact lens as C), note.
         target: of `target_record`, where an error was asked for.
@@ -60,8 +60,8 @@ class Results:
         cameras: renders of a scene through a camera: name, scene, render_s, camera_s (inside the camera) and its share,
             ns_per_ray of the camera alone, samples, width and height in pixels, threads.
         images: name, scene, camera, file_png and file_exr relative to the run folder, samples; except of the exact
-            lens, `image.ImageErrors`.
-        image_settings: `image.SETTINGS`.
+            lens, `scenes.ImageErrors`.
+        image_settings: `scenes.SETTINGS`.
         figures: file, relative to the run folder, title, caption; wide where it goes across the page.
         started: ISO 8601.
     """

@@ -1,4 +1,4 @@
-"""Executors that run tasks, in this process, in one for each, in forked ones, or on a cluster; and signals.
+"""Runs tasks: here, in a process for each, in forked processes, or on a cluster. Also handles signals.
 
 They have the interface of `concurrent.futures`: `submit` returns a `Future`, and `wait` and `as_completed` of the
 standard library take it. `run_each` hands out the answers of any number of tasks while only a few of them wait in
@@ -8,7 +8,7 @@ memory. An answer must depend on its task alone, because a cluster starts a task
         for task, answer in run_each(executor, work, tasks):
             print(task, answer.reason if isinstance(answer, Failed) else answer)
 
-Parts of a picture that are summed in a fixed order are `in_order`, by threads.
+`in_order` runs tasks in threads and yields answers in the order of the tasks, for sums that must not depend on timing.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from neurolens.base.errors import NeurolensError, one_line
 
 T = TypeVar("T")
 R = TypeVar("R")
-_LONGEST = 600  # characters of a reason
+_LONGEST = 3000  # characters of a reason
 _POLL_S, _POLL_PARENT_S, _PATIENCE_S = 0.05, 0.5, 5.0
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 # Another thread that starts a process asks all processes for their exit codes, which can be read only once.
@@ -179,7 +179,8 @@ class Forked(ThreadPoolExecutor):
             answer = pipe.recv()
         except (EOFError, OSError):
             raise NeurolensError(f"a worker {_end_of(process)}") from None
-        self._free.put((pipe, process))
+        finally:  # a worker that is gone fails at once from now on
+            self._free.put((pipe, process))
         return answer_of(answer)
 
 
@@ -285,7 +286,7 @@ def keep_memory() -> None:
     """Let the C library (glibc) keep the memory of arrays, once a process, up to the sizes that it comes to by itself.
 
     Else it gives that of every larger array back, and a trace spends half of its time on getting pages anew. Dask's
-    nannies ask for it (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth.
+    nannies ask for memory to be given back (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth.
     """
     with suppress(AttributeError, OSError):  # another C library
         library = ctypes.CDLL(None)

@@ -152,7 +152,7 @@ def _contents(to: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
         return _of_zip(to)
     file = to / FACTS
     if to.exists() and not to.is_dir():
-        raise InputError(to, "--to", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
+        raise InputError(to, "--extension", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
     if not file.exists():
         return {}, []
     data = read_bytes(file, _LARGEST, "a file of facts")

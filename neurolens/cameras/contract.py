@@ -169,7 +169,7 @@ class DifferentialCamera(Camera, Protocol):
         the sample for which `sample` returns the same ray.
 
         Raises:
-            InputError: an exported model without the inverse map of scene rays beside it.
+            InputError: a model whose core gives no direction vectors.
         """
         ...
 

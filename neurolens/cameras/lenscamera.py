@@ -201,8 +201,7 @@ class LensCamera:
         return self.film.natural(film_mm, pupil, wavelength_nm)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m, through points of the front surface that `pupil` chooses; a model
-        needs the inverse map of scene rays beside it (InputError)."""
+        """Film points of scene points [3, N] in m, through points of the front surface that `pupil` chooses."""
         shape, up = self.front, np.array([[0.0], [0.0], [self.film.film_z_mm]])
         with np.errstate(all="ignore"):
             point = 1e3 * point_m.astype(np.float64) + up

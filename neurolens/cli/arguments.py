@@ -6,6 +6,7 @@ import argparse
 import inspect
 import json
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -289,9 +290,9 @@ def exposure(default: float | None = 0.0, said: str = "0", title: str = "") -> A
     return setting(default, f"{about} (default: {said})", within=(-40, 40), unit="stops", metavar="STOPS", title=title)
 
 
-def threads() -> Any:
+def threads(about: str = "threads") -> Any:
     """--threads."""
-    return setting(2, "workers, each pinned to a core if there are as many as cores (default: 2)", within=(1, 256))
+    return setting(2, f"{about} (default: 2)", within=(1, 256))
 
 
 def more_glasses(files: Sequence[Path]) -> AbstractContextManager[None]:
@@ -395,8 +396,11 @@ def check_ids(files: Sequence[Path], command: str, option: str) -> None:
 def check_written(path: Path, option: str, metavar: str) -> None:
     """Refuse a path that does not fit the placeholder of its option, see `Command`; raises InputError."""
     if metavar in ("FOLDER", "DIR"):
-        if path.exists() and not path.is_dir():
-            raise InputError(path, option, str(path), "a folder, not a file")
+        there = next(p for p in (path, *path.absolute().parents) if p.exists())
+        if not there.is_dir():
+            raise InputError(path, option, str(there), "a folder, not a file")
+        if not os.access(there, os.W_OK):
+            raise InputError(path, option, str(there), "a folder that can be written")
         return
     kind = metavar.partition(".")[2]
     suffixes = _SUFFIXES.get(kind, (f".{kind}",))

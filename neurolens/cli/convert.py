@@ -182,18 +182,18 @@ examples:
         header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
         cells = [
             [r["glass"], f"{r['n_d']:.6f}", f"{r['V_d']:.2f}"]
-            + [cli.number(v) for v in (*r["range_nm"], *r["internal_transmittance_10mm"].values())]
+            + [cli.number(v) for v in r["range_nm"]]
+            + [cli.number(r["internal_transmittance_10mm"].get(f"{nm:.0f}")) for nm in _TRANSMITTED_NM]
             for r in rows
         ]
         return self.answer({"glasses": rows}, lambda: cli.table(header, cells))
 
 
 def _record(glass: Any) -> dict[str, Any]:
-    """Figures of one glass; internal transmittance by wavelength in nm, None where the source has none."""
+    """Figures of one glass; internal transmittance by wavelength in nm, empty where the source has none."""
     figures = {name: getattr(glass, name) for name in ("n_d", "V_d", "form", "coefficients")}
     through = {
-        f"{nm:.0f}": math.exp(-_PLATE_MM * glass.absorption_per_mm(nm)) if glass.absorption else None
-        for nm in _TRANSMITTED_NM
+        f"{nm:.0f}": math.exp(-_PLATE_MM * glass.absorption_per_mm(nm)) for nm in _TRANSMITTED_NM if glass.absorption
     }
     range_nm = [1000 * v for v in glass.range_um]
     return {"glass": str(glass), **figures, "range_nm": range_nm, "internal_transmittance_10mm": through}

@@ -96,6 +96,8 @@ examples:
     def run(self) -> int:
         """Check the options, then load, fix and write."""
         file, fixed = Path(self.model.removeprefix(FUSED)), _fixed(self.fix)
+        if file.is_dir():
+            raise InputError(file, "file", "(a folder)", "a model or a lens file, as FOLDER/models/NAME.onnx")
         whole = set(self.only) == set(_PARTS) and not fixed
         if self.to == "onnx" and (self.name is not None or set(self.only) != set(_PARTS)):
             self.refuse("--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")

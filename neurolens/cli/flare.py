@@ -198,7 +198,7 @@ examples:
 
     def run(self) -> int:
         """Trace the ghosts, print their table, and write the picture."""
-        progress, began = Progress(quiet=self.quiet or self.json), time.perf_counter()
+        progress, began = self.progress(), time.perf_counter()
         if self.quick:
             cells = f"{self.settings.bins} wavelengths, cells of {self.settings.cell_px:g}"
             progress.note(f"quick: {self.width} pixels wide, {cells}")

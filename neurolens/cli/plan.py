@@ -30,7 +30,7 @@ _BUDGETS = {"px": "pixels, as 0.25px", "flip": "FLIP, as 0.02flip", "s": "second
 
 def _budget(text: str) -> tuple[str, float]:
     """Type of --budget: its unit, pixels where it has none, and the number."""
-    return cli.amount(f"{text}px" if text[-1:].isdigit() else text, _BUDGETS)
+    return cli.amount(f"{text}px" if text[-1:] in set("0123456789.") else text, _BUDGETS)
 
 
 @dataclass(frozen=True, kw_only=True)

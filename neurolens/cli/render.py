@@ -109,7 +109,7 @@ examples:
         title=_LONG,
     )  # fmt: skip
     state: cli.LensState = cli.lens_state()
-    threads: int = cli.threads()
+    threads: int = cli.threads("workers, each pinned to a core if there are as many as cores")
 
     def run(self) -> int:
         """Render frames, or merge tiles; returns the exit code of the first frame that fails."""

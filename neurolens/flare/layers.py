@@ -66,7 +66,7 @@ class FlareJob:
         ghosts: traces the ghosts of the same lens and stop; left out, all of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".
         keep: picture beside which the photons of long work are kept until they are whole.
-        finer: wavelengths of a ghost at most, for one of a star or of photons.
+        finer: how many times as many wavelengths a ghost may take as stars and photons do.
     """
 
     lens: Lens
@@ -280,12 +280,8 @@ def photon_picture(job: FlareJob, part: str, photons: int, done: Done = lambda s
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
     sums = np.zeros((2, raster.height, raster.width), np.float32)
     same = lens, tracer.scatter, list(job.lights), raster, part, spectral.centres_nm, photons
-    kept, begun = (
-        Kept(
-            job.keep and kept_file(job.keep, part), digest((*same, settings.most_reflections, settings.seed)), _KEEP_S
-        ),
-        0,
-    )
+    known = digest((*same, settings.most_reflections, settings.seed))
+    kept, begun = Kept(job.keep and kept_file(job.keep, part), known, _KEEP_S), 0
     if (state := kept.load()) is not None:
         begun, (picture, sums) = state[0]["done"], state[1]
 
@@ -397,16 +393,17 @@ class Choice(NamedTuple):
     fade: bool
 
 
-def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: int) -> Choice:
+def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: int, *, fade: bool = False) -> Choice:
     """The ghosts that `brightest` names in some frames of a scene that has the table [flare].
 
     Args:
         frames: the scene, its camera in the frame's place, and the lens in its state.
+        fade: whether lights fade before they are left out, as those of an animation do.
 
     Raises:
         InputError: as of `coated`.
     """
-    sources, fade = SceneLights(frames[0][0]), len(frames) > 1
+    sources = SceneLights(frames[0][0])
     return Choice(brightest([_scene_job(sources, *frame, raster, threads, fade) for frame in frames]), fade)
 
 

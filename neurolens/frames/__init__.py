@@ -51,8 +51,11 @@ _CHOICE_FRAMES = 16  # of an animation, which decide the brightest ghosts
 
 
 def with_changes(settings: T, changes: object) -> T:
-    """Settings with the fields that `changes` has, too, and that are not None there."""
-    values = {f.name: getattr(changes, f.name, None) for f in fields(settings)}  # type: ignore[arg-type]
+    """Settings with the values of `changes`, a mapping or an object with such fields, that are not None."""
+    every = (
+        changes if isinstance(changes, Mapping) else {f.name: getattr(changes, f.name, None) for f in fields(settings)}
+    )  # type: ignore[arg-type]
+    values = {f.name: every.get(f.name) for f in fields(settings)}  # type: ignore[arg-type]
     return replace(settings, **{name: v for name, v in values.items() if v is not None})  # type: ignore[type-var]
 
 
@@ -95,7 +98,7 @@ class Frame(Picture):
             vignetting, dispersion: as in `lens.shot.Shot`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
-        colour: changes of the scene's [film] table, its fields of None none.
+        colour: changes of the scene's [film] table by their keys, as {"white_balance": "A"}.
         sensor: changes of the scene's [sensor] table; with any the picture has its channels.
         number: of the frame in an animation. tile: I and N, for the I-th of N bands of rows alone.
     """
@@ -116,7 +119,7 @@ class Frame(Picture):
     glass_files: tuple[Path, ...] = ()
     position_m: Vector | None = None
     look_at_m: Vector | None = None
-    colour: FilmSettings | None = None
+    colour: FilmSettings | Mapping[str, Any] | None = None
     sensor: SensorSettings | None = None
     number: int | None = None
     tile: tuple[int, int] | None = None
@@ -235,11 +238,11 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
     files = Files.of(tile_path(out, frame.tile))
     scene = seen_from(load_scene(frame.scene), frame.scene, frame.position_m, frame.look_at_m)
     files.spare(frame.scene.parent / name for name in files_named(scene.settings))
-    if frame.colour is not None and frame.colour.white_balance is not None:
-        check_name(frame.scene, "--white-balance", frame.colour.white_balance, scene.illuminants)
     settings = scene.settings.camera
     shot, (width, height) = frame.shot(settings, scene.aperture), frame.size(settings)
     film, sensor = with_changes(scene.settings.film, frame.colour), frame.reads(scene.settings.sensor)
+    if frame.colour is not None and film.white_balance is not None:
+        check_name(frame.scene, "--white-balance", film.white_balance, scene.illuminants)
     PixelGrid(width, height, shot.film_mm)  # checked before the slow make_camera
     rows = None if frame.tile is None else rows_of(height, frame.tile)
     camera = make_camera(str(frame.camera), shot, progress)
@@ -322,7 +325,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
             lenses[_state(frame)] = make_camera(str(frame.camera), shot).lens  # type: ignore[attr-defined]
         scenes.append((seen_from(scene, frame.scene, frame.position_m, frame.look_at_m), lenses[_state(frame)]))
     with _errors_of_table(prepared.frame.scene):
-        return scene_choice(scenes, _raster(prepared), threads)
+        return scene_choice(scenes, _raster(prepared), threads, fade=prepared.frame.number is not None)
 
 
 def _state(frame: Frame) -> tuple[Any, ...]:

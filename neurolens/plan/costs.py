@@ -105,7 +105,8 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
         plain, colours: cameras of the same lens, without and with its dispersion. weights: theirs at the places, as
             for `noise`.
     """
-    strips, samples = strips_of(scene, _STRIP_PATHS, 1, _STRIPS), min(scene.settings.camera.samples, _SAMPLES)
+    samples = min(scene.settings.camera.samples, _SAMPLES)
+    strips = strips_of(scene, _STRIP_PATHS, samples, 1, _STRIPS)
     rest, variance = [], []
     for camera, weight in zip((plain, colours), weights, strict=True):
         with shared_worlds():
@@ -123,10 +124,10 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
     return Work((rest[0], rest[1]), (1.0, ratio))
 
 
-def strips_of(scene: Scene, paths: int, least: int, count: int = 3) -> list[tuple[int, int]]:
+def strips_of(scene: Scene, paths: int, samples: int, least: int, count: int = 3) -> list[tuple[int, int]]:
     """The first row of each of some strips of a picture, and the one after its last: for so many paths in all."""
     shot = scene.settings.camera
-    rows = min(max(paths // (count * min(shot.samples, _SAMPLES) * shot.width), least), shot.height)
+    rows = min(max(paths // (count * samples * shot.width), least), shot.height)
     firsts = np.unique(np.linspace(0, shot.height - rows, count + 2).astype(int)[1:-1])
     return [(int(first), int(first) + rows) for first in firsts]
 

@@ -329,7 +329,7 @@ def plan_seen(scene: Scene, lens: Lens, flip_budget: float, **options: Any) -> P
 def _strips(scene: Scene, camera: Camera) -> list[FloatArray]:
     """Rows of a camera's picture at the scene's own size, in some places."""
     drawn = partial(render, scene, camera, samples=_SAMPLES, film=replace(scene.settings.film, wavelengths="one"))
-    return [drawn(rows=rows).rgb for rows in strips_of(scene, _STRIP_PATHS, _STRIP_ROWS)]
+    return [drawn(rows=rows).rgb for rows in strips_of(scene, _STRIP_PATHS, _SAMPLES, _STRIP_ROWS)]
 
 
 def front(choices: Sequence[Choice]) -> list[Choice]:

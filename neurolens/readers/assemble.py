@@ -134,6 +134,10 @@ def check_rows(lens: Lens) -> None:
         if not 1 <= s.n_d <= MAX_INDEX:
             mirror = " (an index of -1 describes a mirror, and the lens model has none)" if s.n_d == -1 else ""
             raise InputError(file, f"surface {k}, index", s.n_d, index + mirror)
+        if not abs(s.radius_mm) > 0:
+            raise InputError(file, f"surface {k}, radius", s.radius_mm, "a number other than 0, or a plane")
+        if not math.isfinite(s.thickness_mm):
+            raise InputError(file, f"surface {k}, thickness", s.thickness_mm, "a finite length")
         for power in (p for p, _ in s.asphere if not 2 <= p <= MAX_POWER):
             raise InputError(file, f"surface {k}, asphere, power", power, f"a power from 2 to {MAX_POWER}")
     if not 1 <= lens.object_medium.n_d <= MAX_INDEX:

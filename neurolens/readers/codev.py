@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens
 from neurolens.readers import draft
-from neurolens.readers.draft import INFINITE, Draft, Positions, lens_of, primary_first
+from neurolens.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, lens_of, primary_first
 from neurolens.readers.glasses import by_indices, named_glass
 from neurolens.readers.source import Line, ReadOptions, assume, by_word, read_lines, warn
 
@@ -473,6 +473,10 @@ def _special(block: Block) -> dict[str, Any]:
             first = "AR2, AR3, ..." if kind == "ODD" else f"{SPECIAL[kind]}4, {SPECIAL[kind]}6, ..."
             raise block.start.error(f"SCO of SPS {kind}", name, f"K, NRADIUS or {first}")
         found[power] = value
+    if not (radius == 0 or radius >= LEAST_RADIUS):
+        raise block.start.error(
+            f"NRADIUS of SPS {kind}", radius, f"a normalisation radius of at least {LEAST_RADIUS:g}"
+        )
     if kind == "ODD":
         return block.rotational((n, a / (radius or 1.0) ** n) for n, a in sorted(found.items()))
     if kind == "QBF" and block.conic:

@@ -34,6 +34,7 @@ from neurolens.setting.rims import check_states
 
 INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
 MAX_STATES = 200
+LEAST_RADIUS = 1e-3  # by which coefficients of aspheres are normalised, in the unit of the file
 
 
 @dataclass

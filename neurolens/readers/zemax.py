@@ -18,7 +18,7 @@ from neurolens.base.errors import InputError
 from neurolens.lens import glass as catalogue
 from neurolens.lens.prescription import Lens
 from neurolens.readers import draft
-from neurolens.readers.draft import INFINITE, Draft, Positions, lens_of, primary_first
+from neurolens.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, lens_of, primary_first
 from neurolens.readers.glasses import named_glass
 from neurolens.readers.source import MAX_POWER, Line, ReadOptions, assume, by_word, read_lines, warn
 
@@ -72,8 +72,9 @@ class Block(draft.Block):
         (count, line), (radius, _) = (self.extra.pop(first + k, (k, self.start)) for k in (0, 1))
         if not (0 <= count <= MAX_EXTRAS and count == int(count)):
             raise line.error(f"XDAT {first} of {self.kind}", count, f"how many terms there are, at most {MAX_EXTRAS}")
-        if not radius > 0:
-            raise line.error(f"XDAT {first + 1} of {self.kind}", radius, "a normalisation radius above 0")
+        if not radius >= LEAST_RADIUS:
+            expected = f"a normalisation radius of at least {LEAST_RADIUS:g}"
+            raise line.error(f"XDAT {first + 1} of {self.kind}", radius, expected)
         return radius, [self.extra.pop(first + 2 + k, (0.0, self.start))[0] for k in range(int(count))]
 
 

@@ -390,7 +390,8 @@ class Surroundings(LightGroup):
             turn = math.radians(around.rotate_y_deg)
             self._coefficients = _texels(picture, np.float32(around.scale), turn)
             bright = picture.reshape(-1, 3) @ (palette.means(self._rows) * np.float32(around.scale))
-            self._table = DirectionTable(bright.reshape(picture.shape[:2]), turn)
+            if bright.any():  # a faint picture can be 0 in float32
+                self._table = DirectionTable(bright.reshape(picture.shape[:2]), turn)
         else:
             self._rows = [palette.light(band or BLACK, around.illuminant) for band in bands]
             if around.colour is None:

@@ -260,8 +260,8 @@ def _header(text: str) -> tuple[str, list[Element]]:
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,12}", count):
                 elements.append(Element(name, int(count), []))
             case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys() and elements:
-                if _TYPES[length][0] == "f" or (name in _CORNERS and _TYPES[kind][0] == "f"):
-                    raise ValueError("lists whose length is a fraction, or faces that name vertices by fractions")
+                if _TYPES[length][0] == "f":
+                    raise ValueError("it has lists whose length is a fraction")
                 elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[length]))
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1].properties.append(Property(name, _TYPES[kind]))
@@ -316,7 +316,8 @@ class _Body:
             return {p.name: v.astype(np.float64) for p, v in zip(element.properties, values, strict=True)}
 
     def fans(self, element: Element) -> NDArray[np.int64]:
-        """The polygons of the next elements, in their order, as fans of triangles [T, 3]; none without corners."""
+        """The next elements; of faces the polygons, in their order, as fans of triangles [T, 3], else none."""
+        names = [p.name for p in element.properties if p.name in _CORNERS and p.length and element.name == "face"]
         big: Literal["big", "little"] = "big" if self._order == ">" else "little"
         starts, counts, form = array("q"), array("q"), ""  # where the corners of each begin, and how many there are
         at, end = self._at, self._values.size
@@ -327,7 +328,9 @@ class _Body:
                     first, at = at, at + self._size(length)
                     number = self._content[first:at] if self._order else self._values[first]
                     count = int.from_bytes(number, big) if isinstance(number, bytes) else int(number)
-                    if name in _CORNERS:
+                    if name in names[:1]:
+                        if kind[0] == "f":
+                            raise ValueError("its faces name vertices by fractions")
                         starts.append(at)
                         counts.append(count)
                         form = kind

@@ -211,7 +211,12 @@ class FlareSettings:
             if name not in LAYERS:
                 raise InputError("flare", "without", name, f"layers of flare: {', '.join(LAYERS)}")
         if self.photons and (self.brightest or set(self.gains) - set(LAYERS)):
-            raise InputError("flare", "photons", self.photons, "0 with layers or gains of single ghosts")
+            raise InputError(
+                "flare",
+                "photons",
+                self.photons,
+                "0 beside layers or gains of single ghosts, which photons do not tell apart",
+            )
         for name, factor in self.gains.items():
             if not all(0 <= v < math.inf for v in factor):
                 raise InputError("flare", f"gain {name}", factor, "finite numbers of at least 0")

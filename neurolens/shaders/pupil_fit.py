@@ -317,7 +317,8 @@ def _beside(lens: ShaderLens, image: StopImage) -> float:
 def _wide_discs(lenses: Sequence[ShaderLens], between: Sequence[tuple[Array, ShaderLens]] = ()) -> list[PupilCircles]:
     """One wide disc for each state; arguments of `fit_pupil`."""
     images = fit_stop_images(lenses, folded=True)
-    assert images is not None  # a finer image had enough rays
+    if images is None:
+        raise InputError("export", "pupil", "(hardly a ray passes)", "a lens that light can pass")
     nothing = np.zeros((0, 3), np.int64), np.zeros((0, 3, 0))
     pupils = [
         PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0, 1.0), *nothing)

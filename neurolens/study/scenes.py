@@ -184,7 +184,7 @@ def side_by_side(
     """Renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
 
     Args:
-        images: name to linear RGB [H, W, 3], shown through `image.to_srgb`; all of one shape.
+        images: name to linear RGB [H, W, 3], shown through `to_srgb`; all of one shape.
         error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
             All share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
         path: PNG, PDF or SVG to write.

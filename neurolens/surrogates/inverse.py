@@ -174,7 +174,7 @@ class InverseModel:
             InputError: arrays of other shapes.
         """
         film, stop = _checked(2, film_xy_mm=film_xy_mm, stop_xy_mm=stop_xy_mm)
-        rays = np.concatenate([film, stop, np.broadcast_to(wavelength_nm, (1, film.shape[1]))]).astype(film.dtype)
+        rays = np.concatenate([film, stop, _waves(wavelength_nm, film)]).astype(film.dtype)
         return self._solved("stop", {"stop_rays": rays}, film_z_mm, stop_radius_mm, steps)
 
     def from_scene(
@@ -189,7 +189,7 @@ class InverseModel:
                 the front surface to a scene point S, (S - X) / |S - X|.
         """
         origin, away = _checked(3, origin_mm=origin_mm, direction=direction)
-        waves = np.broadcast_to(np.asarray(wavelength_nm, np.float64), (1, origin.shape[1]))
+        waves = _waves(wavelength_nm, origin)
         lines = (*origin.astype(np.float64), *away.astype(np.float64))
         front, solid = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=waves[0])
         given = np.concatenate([front, waves]).astype(origin.dtype)
@@ -201,6 +201,8 @@ class InverseModel:
         self, name: str, given: dict[str, Array], film_z_mm: ArrayLike, stop_radius_mm: float | None, steps: int
     ) -> InverseRays:
         graph, ((key, rays),) = _exact_graph(self, name, steps), given.items()
+        if np.size(film_z_mm) not in (1, rays.shape[1]):
+            raise InputError("inverse", "film_z_mm", f"({np.shape(film_z_mm)})", "one number, or one a ray")
         radius = np.full((1, 1), self.model.checked_radius_mm(stop_radius_mm), rays.dtype)
         film_z = np.broadcast_to(np.asarray(film_z_mm, rays.dtype), (1, rays.shape[1]))
         parts = []
@@ -221,8 +223,15 @@ def _checked(rows: int, **arrays: ArrayLike) -> list[Array]:
     for name, array in zip(arrays, found, strict=True):
         if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape != (rows, found[0].shape[-1]):
             raise InputError("inverse", name, f"({array.dtype}, {array.shape})", f"numbers ({rows}, N), N for all")
-    kind = found[0].dtype if found[0].dtype.kind == "f" else np.float64
+    kind = np.float32 if found[0].dtype == np.float32 else np.float64
     return [a.astype(kind) for a in found]
+
+
+def _waves(wavelength_nm: ArrayLike, rays: Array) -> Array:
+    """[1, N] of as many rays. Raises InputError: neither one nor N wavelengths."""
+    if np.size(wavelength_nm) not in (1, rays.shape[1]):
+        raise InputError("inverse", "wavelength_nm", f"({np.shape(wavelength_nm)})", "one number, or one a ray")
+    return np.broadcast_to(np.asarray(wavelength_nm, np.float64), (1, rays.shape[1]))
 
 
 def inverse_of(model: LensModel) -> InverseModel:

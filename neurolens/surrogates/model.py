@@ -217,8 +217,8 @@ class LensModel:
         fit_s: seconds that the fit took.
         direction: what the core's direction vector is: the angle vector, or the slope for first-order models.
         angle: largest angle (rad) between the axis and the rays that the exact lens passes, enlarged by 5%; see
-            `pairs.with_angle`. A core's direction vector is no longer than that. Where it is, as a network's may be far
-            from the rays of its fit, the ray lies outside the domain. Where all rays point forwards the angle stays
+            `targets.with_angle`. A core's direction vector is no longer than that. Where it is, as a network's may be
+            far from the rays of its fit, the ray lies outside the domain. Where all rays point forwards the angle stays
             below a right one; of a `Refracted` core it is that inside the glass. pi refuses nothing.
     """
 

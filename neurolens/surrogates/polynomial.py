@@ -69,7 +69,7 @@ Shift = tuple[float, float]
 
 _CHOICE_RAYS = 10_000
 _SURPLUS = 1.5  # terms before elimination over terms kept
-_POSITION_SHARE = 2 / 3  # the position needs no less error than this share of the direction's, both weighed
+_POSITION_SHARE = 2 / 3  # the position may err by this share of the direction's error, both weighed
 # Growth goes on while directions err by more than this, a round taking away at least a share of the squared residual.
 FINE_DEG, _MORE_ROUNDS, _LEAST_FALL, _PASSES = 0.002, 4, 0.03, 3
 # The search for planes: rays of a trial fit, degree of its candidates; multiples of u in p and of p in u (scaled, see

@@ -121,7 +121,7 @@ class GraphPassage(Passage):
         return transmitted(depth)
 
     def coated(self, k: int, met: Hit, q: Value, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
-        """Return the shares that the coating of surface k transmits of light towards the scene; see `coatings`."""
+        """Return the shares that the coating of surface k transmits of light towards the scene; see `transmission`."""
         (one, two), coating, g = media, self.lens.surfaces[k].coating, self.wavelength_nm.graph
         assert sense < 0 and not reflected and coating is not None
         sides = self.lens.media[k : k + 2]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -551,6 +552,20 @@ def test_exposure_as_the_lens_falls_with_the_stop() -> None:
 def test_without_vignetting_the_corner_is_as_bright_as_the_middle() -> None:
     corner = shot((15.0, 9.0), shaded=0)["throughput"].mean()
     assert 0.93 < corner < 1.01
+
+
+def test_the_text_is_osl() -> None:
+    text, operations = osl.write_camera(lens(), "gauss", ["a comment */ that tries to end"])
+    assert operations < 1600
+    code = text.split("*/", 1)[1]
+    assert not re.search(r"\d\.?(e[+-]\d+)?f\b", code) and "#include" not in code and "struct" not in code
+    declared = re.findall(r"^    float (t\d+) = ", code, re.M)
+    assert len(declared) == len(set(declared)) > 300
+    for output in osl.OUTPUTS:
+        assert re.search(rf"^    {output} = (point|vector|color)\(", code, re.M)
+    known = {*declared, *re.findall(r"\b(\w+) = ", code)}
+    used = set(re.findall(r"\bt\d+\b", code))
+    assert used <= known
 
 
 @pytest.mark.whole  # the longest program

@@ -102,6 +102,15 @@ d2\t2.0\t3.0\tundefined
 """
 
 
+@pytest.mark.parametrize("row", ["4\t362.913\t{}\t", "13\t-1178.029\t{}\t"])
+@pytest.mark.parametrize("gap", ["nan", "inf"])
+def test_a_thickness_that_is_no_length_is_refused(row: str, gap: str, tmp_path: Path) -> None:
+    thickness = {"4": "2.032", "13": "35.509"}[row.partition("\t")[0]]
+    text = swapped(row.format(thickness), row.format(gap), optical_bench(GAUSS))
+    with pytest.raises(InputError, match=rf"surface {row.partition(chr(9))[0]} of the file, thickness: got {gap}"):
+        read_text(text, ".bench.txt", tmp_path)
+
+
 def test_optical_bench_states_field_and_aspheres(tmp_path: Path) -> None:
     lens, assumed = read_text(ZOOM, ".txt", tmp_path)
     assert assumed == [] and kind_of(tmp_path / "lens.txt") == "Optical Bench"

@@ -6,12 +6,14 @@ nearly closed. Each file takes what they show to where the pinhole has it, withi
 
 from __future__ import annotations
 
+import argparse
 import ast
 import json
 import math
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -27,7 +29,7 @@ from neurolens.cameras import field as fields
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of, spectrum_of
 from neurolens.cli import main
-from neurolens.cli.handover import _Writer
+from neurolens.cli.handover import _rate, _Writer
 from neurolens.handover import Handed, Pinhole, falloff
 from neurolens.lens.paraxial import chief_reach_mm
 from neurolens.lens.shot import Shot
@@ -588,3 +590,10 @@ def test_an_anamorphic_lens_has_its_squeeze_where_a_standard_knows_one() -> None
     values = hostile() | {"shot": shot, "entries": [], "notes": writer.notes}
     assert "lensfun knows no anamorphic lens" in html("handover.README.md.jinja", **values)
     assert '"60 48 0 0 60 48 2.0 neurolens_plate"' in html("handover.nk.jinja", **values)
+
+
+def test_rates_are_fractions() -> None:
+    assert (_rate("24"), _rate("24000/1001"), _rate("29.97")) == (24, Fraction(24000, 1001), Fraction(2997, 100))
+    for text in ("0", "-24", "1/0", "nan", "1e9", "x", "9" * 30):
+        with pytest.raises(argparse.ArgumentTypeError):
+            _rate(text)

@@ -338,12 +338,12 @@ def test_ply_files_hold_more_than_triangles(order: str, tmp_path: Path) -> None:
     header = f"ply\nformat {form} 1.0\nelement vertex 6\nproperty uchar red\n"
     header += "".join(f"property {kind} {n}\n" for kind, n in zip(["double"] * 3 + ["float"] * 5, AXES, strict=True))
     header += "element edge 2\nproperty int vertex1\nproperty int vertex2\nelement strip 1\n"
-    header += "property list ushort short of\nelement face 4\nproperty uchar flags\n"
+    header += "property list ushort short vertex_index\nelement face 4\nproperty uchar flags\n"
     header += "property list uint ushort vertex_index\nproperty list uchar float texcoord\nproperty int last\n"
     vertices = np.random.default_rng(5).random((6, 8)).astype(np.float32).astype(float)
     faces = [[0, 1, 2, 3], [3, 4, 5], [5, 4, 3, 2, 1], [0, 2, 5]]
     rows: list[tuple[str, list[Any]]] = [("B3d5f", [7, *v.tolist()]) for v in vertices]
-    rows += [("2i", [0, 1]), ("2i", [1, 2]), ("H3h", [3, -1, 0, 1])]
+    rows += [("2i", [0, 1]), ("2i", [1, 2]), ("H2h", [2, 0, 1])]
     rows += [(f"BI{len(f)}HB2fi", [1, len(f), *f, 2, 0.5, 0.25, -9]) for f in faces]
     words = "\n".join(" ".join(map(repr, values)) for _, values in rows).encode()
     body = b"".join(struct.pack(order + kind, *values) for kind, values in rows) if order else words

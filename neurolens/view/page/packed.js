@@ -1,4 +1,4 @@
-// What view/page.py wrote: characters to bytes, LZMA (raw, lc 3, lp 0, pb 0), texts as they were.
+// What view/__init__.py wrote: characters to bytes, LZMA (raw, lc 3, lp 0, pb 0), texts as they were.
 const HALF = 1024, LITERALS = 0x300; // odds of 2048; of literals after bytes of the same three high bits
 
 function bytesOf(text) {
@@ -130,7 +130,7 @@ class Unpacked {
   }
 }
 
-/** A text whose temporaries are counted: see _counted of view/page.py. */
+/** A text whose temporaries are counted: see _counted of view/__init__.py. */
 function written(text) {
   let before = 0;
   return text.split("\n").map((line) => {
