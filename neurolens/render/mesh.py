@@ -30,14 +30,13 @@ from neurolens.base.files import read_bytes
 from neurolens.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshSettings, Texture, Vector
 
 _LARGEST, _LARGEST_UV = 1e60, 1e6  # areas are finite; texture coordinates have pixels left in float32
-_LARGEST_HEADER = 100_000
+_LARGEST_HEADER, _LONGEST = 100_000, 60  # characters of PLY's header, and of a number or a corner
 _KINDS = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64".split()
 _TYPES = dict(zip(_KINDS, ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8") * 2, strict=True))
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_indices", "vertex_index")
 _COORDINATES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
 LARGEST_FILE = 500_000_000  # bytes
-_LONGEST = 60  # characters of a number or a corner
 _INDEX = r"-?[1-9][0-9]{0,9}"
 _CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
 # Of each kind of line: the fewest and most words after it, how many are used, what is expected.
@@ -259,10 +258,10 @@ def _header(text: str) -> tuple[str, list[Element]]:
                 order = _FORMATS[form]
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,12}", count):
                 elements.append(Element(name, int(count), []))
-            case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys() and elements:
-                if _TYPES[length][0] == "f":
-                    raise ValueError("it has lists whose length is a fraction")
-                elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[length]))
+            case ["property", "list", many, kind, name] if (
+                "f" not in _TYPES.get(many, "f") and kind in _TYPES and elements
+            ):
+                elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[many]))
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1].properties.append(Property(name, _TYPES[kind]))
             case [] | ["comment", *_] | ["obj_info", *_]:

@@ -174,7 +174,7 @@ class InverseModel:
             InputError: arrays of other shapes.
         """
         film, stop = _checked(2, film_xy_mm=film_xy_mm, stop_xy_mm=stop_xy_mm)
-        rays = np.concatenate([film, stop, _waves(wavelength_nm, film)]).astype(film.dtype)
+        rays = np.concatenate([film, stop, _each("wavelength_nm", wavelength_nm, film)]).astype(film.dtype)
         return self._solved("stop", {"stop_rays": rays}, film_z_mm, stop_radius_mm, steps)
 
     def from_scene(
@@ -189,7 +189,7 @@ class InverseModel:
                 the front surface to a scene point S, (S - X) / |S - X|.
         """
         origin, away = _checked(3, origin_mm=origin_mm, direction=direction)
-        waves = _waves(wavelength_nm, origin)
+        waves = _each("wavelength_nm", wavelength_nm, origin)
         lines = (*origin.astype(np.float64), *away.astype(np.float64))
         front, solid = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=waves[0])
         given = np.concatenate([front, waves]).astype(origin.dtype)
@@ -201,10 +201,8 @@ class InverseModel:
         self, name: str, given: dict[str, Array], film_z_mm: ArrayLike, stop_radius_mm: float | None, steps: int
     ) -> InverseRays:
         graph, ((key, rays),) = _exact_graph(self, name, steps), given.items()
-        if np.size(film_z_mm) not in (1, rays.shape[1]):
-            raise InputError("inverse", "film_z_mm", f"({np.shape(film_z_mm)})", "one number, or one a ray")
         radius = np.full((1, 1), self.model.checked_radius_mm(stop_radius_mm), rays.dtype)
-        film_z = np.broadcast_to(np.asarray(film_z_mm, rays.dtype), (1, rays.shape[1]))
+        film_z = _each("film_z_mm", film_z_mm, rays, rays.dtype)
         parts = []
         for start in range(0, max(rays.shape[1], 1), _BATCH):
             part = slice(start, start + _BATCH)
@@ -227,11 +225,11 @@ def _checked(rows: int, **arrays: ArrayLike) -> list[Array]:
     return [a.astype(kind) for a in found]
 
 
-def _waves(wavelength_nm: ArrayLike, rays: Array) -> Array:
-    """[1, N] of as many rays. Raises InputError: neither one nor N wavelengths."""
-    if np.size(wavelength_nm) not in (1, rays.shape[1]):
-        raise InputError("inverse", "wavelength_nm", f"({np.shape(wavelength_nm)})", "one number, or one a ray")
-    return np.broadcast_to(np.asarray(wavelength_nm, np.float64), (1, rays.shape[1]))
+def _each(name: str, value: ArrayLike, rays: Array, kind: Any = np.float64) -> Array:
+    """The value of every ray, [1, N]. Raises InputError: neither one number nor N."""
+    if np.size(value) not in (1, rays.shape[1]):
+        raise InputError("inverse", name, f"({np.shape(value)})", "one number, or one a ray")
+    return np.broadcast_to(np.asarray(value, kind), (1, rays.shape[1]))
 
 
 def inverse_of(model: LensModel) -> InverseModel:
@@ -316,8 +314,8 @@ def _drawn(domain: Domain, count: int, rng: np.random.Generator) -> Array:
 def convergence(inverse: InverseModel, rays: Array, film_z: Array, steps: int = STEPS) -> dict[str, Any]:
     """How often the inverse maps find the model's own passing rays, of these [5, N], in their precision.
 
-    Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that converged to
-    another ray of the same stop point, or scene ray, because the map is folded there).
+    Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that is another
+    ray of the same stop point, or scene ray, because the map is folded there).
     """
     model = inverse.model
     forward = evaluate(model.graph, _inputs(model, rays, film_z))

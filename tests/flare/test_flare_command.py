@@ -236,7 +236,7 @@ def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
         (["--light", "0,0,1,0.001"], "outside the lens"),
         (["--light", "3,2,inf"], "finite"),
         (["--light", "0,0", "--coating", "s00"], "s00"),
-        (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "0 with layers"),
+        (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "0 beside layers"),
         (["--light", "0,0", "--coating", "velvet"], "velvet"),
         (["--light", "1,2", "--reflections", "4"], "--photons or --glare"),
         ([], "--light, --lights or --image"),
