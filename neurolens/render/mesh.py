@@ -33,6 +33,7 @@ _LARGEST, _LARGEST_UV = 1e60, 1e6  # areas are finite; texture coordinates have 
 _LARGEST_HEADER, _LONGEST = 100_000, 60  # characters of PLY's header, and of a number or a corner
 _KINDS = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64".split()
 _TYPES = dict(zip(_KINDS, ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8") * 2, strict=True))
+_COUNTS = {name for name, kind in _TYPES.items() if kind[0] != "f"}  # what the length of a list may be
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_indices", "vertex_index")
 _COORDINATES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
@@ -258,9 +259,7 @@ def _header(text: str) -> tuple[str, list[Element]]:
                 order = _FORMATS[form]
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,12}", count):
                 elements.append(Element(name, int(count), []))
-            case ["property", "list", many, kind, name] if (
-                "f" not in _TYPES.get(many, "f") and kind in _TYPES and elements
-            ):
+            case ["property", "list", many, kind, name] if many in _COUNTS and kind in _TYPES and elements:
                 elements[-1].properties.append(Property(name, _TYPES[kind], _TYPES[many]))
             case ["property", kind, name] if kind in _TYPES and elements:
                 elements[-1].properties.append(Property(name, _TYPES[kind]))
@@ -327,9 +326,9 @@ class _Body:
                     first, at = at, at + self._size(length)
                     number = self._content[first:at] if self._order else self._values[first]
                     count = int.from_bytes(number, big) if isinstance(number, bytes) else int(number)
+                    if name in names[:1] and kind[0] == "f":
+                        raise ValueError("its faces name vertices by fractions")
                     if name in names[:1]:
-                        if kind[0] == "f":
-                            raise ValueError("its faces name vertices by fractions")
                         starts.append(at)
                         counts.append(count)
                         form = kind
