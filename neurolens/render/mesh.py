@@ -228,17 +228,16 @@ def read_polygons(content: bytes) -> TriangleSet:
     if not head.startswith(b"ply") or not end:
         raise ValueError("expected a PLY file, which begins with ply and a header")
     order, elements = _header(head.decode("ascii", "replace"))
-    for element in elements:
-        if element.count > len(content):
-            raise ValueError(f"{element.count} elements {element.name} in {len(content)} bytes")
+    if (most := max(elements, key=lambda e: e.count)).count > len(content):
+        raise ValueError(f"{most.count} elements {most.name} in {len(content)} bytes")
     columns, faces = dict[str, NDArray[np.float64]](), np.empty((0, 3), np.int64)
     try:
         body = _Body(content[content.index(b"\n", len(head)) + 1 :], order)
         for element in elements:
-            lists = any(p.length for p in element.properties)
-            found, fans = ({}, body.fans(element)) if lists else (body.columns(element), faces)
-            columns = found if element.name == "vertex" else columns
-            faces = fans if element.name == "face" else faces
+            if any(p.length for p in element.properties):
+                faces = np.concatenate([faces, body.fans(element)])
+            elif (found := body.columns(element)) and element.name == "vertex":
+                columns = found
     except (IndexError, OverflowError):
         raise ValueError("the file ends before its last element") from None
 
