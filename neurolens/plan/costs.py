@@ -36,10 +36,10 @@ from neurolens.shaders.source import camera_program
 UNIT = {"render": "ns", "c": "ns", "onnx": "ns", "osl": "ns", "glsl": "operations"}
 # Of a camera ray in Cycles under a white sky, experiments/results/osl_speed.md: Blender's own cameras; any shader, each
 # of its operations, and what each division and root takes besides. Fitted to the least times of the six cameras of
-# lenses there, on quiet cores: within 2.8%.
-CYCLES_NS: Mapping[str, float] = {"pinhole": 111.9, "thin": 139.5}
-SHADER_NS = 70.42
-_STEP_NS, _DEAR_NS, _DEAR = 0.2761, 2.324, ("div", "sqrt")
+# lenses there, on quiet cores: within 3.5%.
+CYCLES_NS: Mapping[str, float] = {"pinhole": 114.4, "thin": 140.9}
+SHADER_NS = 90.66
+_STEP_NS, _DEAR_NS, _DEAR = 0.2295, 2.772, ("div", "sqrt")
 # Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
