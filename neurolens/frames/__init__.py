@@ -52,10 +52,9 @@ _CHOICE_FRAMES = 16  # of an animation, which decide the brightest ghosts
 
 def with_changes(settings: T, changes: object) -> T:
     """Settings with the values of `changes`, a mapping or an object with such fields, that are not None."""
-    every = (
-        changes if isinstance(changes, Mapping) else {f.name: getattr(changes, f.name, None) for f in fields(settings)}
-    )  # type: ignore[arg-type]
-    values = {f.name: every.get(f.name) for f in fields(settings)}  # type: ignore[arg-type]
+    values = changes
+    if not isinstance(values, Mapping):
+        values = {f.name: getattr(changes, f.name, None) for f in fields(settings)}  # type: ignore[arg-type]
     return replace(settings, **{name: v for name, v in values.items() if v is not None})  # type: ignore[type-var]
 
 

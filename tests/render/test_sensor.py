@@ -1,6 +1,7 @@
 """A sensor's pixels: contrast of edges by lens and pixel, statistics of photons, wells, mosaics; the same in tiles."""
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cli import main
-from neurolens.frames import Frame, prepare, write_pictures
+from neurolens.frames import Frame, prepare, with_changes, write_pictures
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_channels, read_metadata
@@ -234,3 +235,11 @@ def test_a_pixel_that_is_not_whole_takes_no_companions(scene: Path) -> None:
     assert render(scene_from_tables(tables), camera, film=film, **sizes).stats["wavelengths"] == "one"  # type: ignore[arg-type]
     with pytest.raises(InputError, match="film.wavelengths"):
         render(scene_from_tables(tables), camera, film=FilmSettings(wavelengths="hero", fill_factor=0.5), **sizes)  # type: ignore[arg-type]
+
+
+def test_changes_by_name_leave_the_other_settings() -> None:
+    film = FilmSettings(colour_space="ACEScg", fill_factor=0.5)
+    assert with_changes(film, {"white_balance": "A"}) == replace(film, white_balance="A")
+    assert with_changes(film, None) == film
+    with pytest.raises(TypeError, match="whitebalance"):
+        with_changes(film, {"whitebalance": "A"})
