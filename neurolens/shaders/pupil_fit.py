@@ -99,7 +99,7 @@ def _fit_circles(
     lit = [r.at(np.flatnonzero(r.passed)[:_EDGES]) for r in rays]
     fits = [_fit_rims(edges, lit, pupils, exponents, int(code)) for code in rims]
     for k, (pupil, drawn) in enumerate(zip(pupils, rays, strict=True)):
-        numbers = np.array([fit[k] for fit in fits]).reshape(len(rims), -1)
+        numbers = np.array([fit[k] for fit in fits]).reshape(len(rims), len(exponents) + 1)
         pupils[k] = _with_circles(replace(pupil, wide=_disc(pupil, drawn, len(rims))), exponents, numbers)
         report((k + 1) / (len(pupils) + 1))
     pupils, lost = _widened(pupils, lenses, between)
