@@ -6,9 +6,9 @@ polynomials in film point and wavelength still move the picture of every other o
 
 `Vignetted`: the film value of white surroundings is V(f) at a film point f, 1 on the axis. It is the product of
 
-    natural N(f) = <T cos^4> / <T>    cos^4 of the film-side angle to the axis, mean over the light that passes: the
-                                      chief ray's, as the stop closes; of a fisheye projection its own law
-    optical O(f) = <T> A              effective aperture: the area through which light passes, times its transmittance
+- natural N(f) = <T cos^4> / <T>: cos^4 of the film-side angle to the axis, mean over the light that passes: the chief
+  ray's, as the stop closes; of a fisheye projection its own law;
+- optical O(f) = <T> A: effective aperture, the area through which light passes, times its transmittance,
 
 each over its value on the axis. For the four white cards of Steinert 2009, 5.2, every ray of a film point is weighed by
 the same factor, so that blur keeps its shape:

@@ -2,11 +2,12 @@
 
 Forbes's aspheres become even powers of the height, as lenses have them (G. W. Forbes, Opt. Express 15, 5218, 2007).
 With u the height over a normalisation radius and x = u^2,
-    Qcon: sag = conic + u^4 sum a_m Qcon_m(x), Jacobi's P_m^(0,4)(2 x - 1): exactly even powers;
-    Qbfs: sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x), whose slopes along the normal are
-    orthonormal (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic, Thorlabs's ASL5040-UV is sharp).
-    The cosine is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens
-    model's powers do not reach that are refused.
+
+- Qcon: sag = conic + u^4 sum a_m Qcon_m(x), Jacobi's P_m^(0,4)(2 x - 1): exactly even powers;
+- Qbfs: sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x), whose slopes along the normal are
+  orthonormal (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic, Thorlabs's ASL5040-UV is sharp).
+  The cosine is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens
+  model's powers do not reach that are refused.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ Their sizes are checked before they are decoded. Radiance (.hdr) has three manti
 text header, an empty line, a line with the size, then rows of pixels, each row in one of two forms (Greg Ward, "Real
 Pixels", Graphics Gems II, 1991; the Radiance reference manual, "Picture file format"):
 
-plain   4 bytes a pixel (runs of whole pixels, which programs wrote before 1991, are refused)
-runs    2, 2, width in two bytes, then the row of each of the four bytes by itself, as runs: n > 128 repeats the next
-        byte n - 128 times, any other n is followed by n bytes
+- plain: 4 bytes a pixel (runs of whole pixels, which programs wrote before 1991, are refused);
+- runs: 2, 2, width in two bytes, then the row of each of the four bytes by itself, as runs: n > 128 repeats the next
+  byte n - 128 times, any other n is followed by n bytes.
 
 A mantissa m with the exponent e is m * 2^(e - 136), as Blender, OpenImageIO and OpenCV read it; e = 0 is black.
 """
