@@ -37,8 +37,9 @@ _ALL = int(np.prod(_ZONES))
 _SQUEEZES = (1.0, 0.7, 0.5, 0.35, 1.4, 2.0)  # those that are tried
 _ROUNDS, _HEAVIER = 20, 20.0  # of least squares; by how much rays that a circle would lose weigh more
 _RIDGE, _CALM = 1e-9, 1e-3  # of the equations' diagonal; rays, by whose force numbers stay at those of all states
-_ALLOWED = (8e-4, 8e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
-LOST, _SURE = 1e-3, 6e-4  # of a zone's rays are lost in all; by the rays that tell
+# Shares of a zone's new rays that all circles may lose, in turn until at most so many are lost in all; by the rays that tell.
+_ALLOWED = (8e-4, 8e-4, 4e-4, 2e-4, 2e-4, 1e-4)
+LOST, _SURE = 1e-3, 6e-4
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
 _DRAWN, _DISC_LOST = 24, 6e-4  # draws of rays that tell how wide a disc has to be; what may be lost
 _INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
