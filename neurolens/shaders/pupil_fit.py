@@ -37,7 +37,8 @@ _ALL = int(np.prod(_ZONES))
 _SQUEEZES = (1.0, 0.7, 0.5, 0.35, 1.4, 2.0)  # those that are tried
 _ROUNDS, _HEAVIER = 20, 20.0  # of least squares; by how much rays that a circle would lose weigh more
 _RIDGE, _CALM = 1e-9, 1e-3  # of the equations' diagonal; rays, by whose force numbers stay at those of all states
-# Shares of a zone's new rays that all circles may lose, in turn until at most so many are lost in all; by the rays that tell.
+# Shares of a zone's new rays that all circles may lose, in turn, until they lose at most `_SURE`; with more than `LOST`
+# they give way to a wide disc.
 _ALLOWED = (8e-4, 8e-4, 4e-4, 2e-4, 2e-4, 1e-4)
 LOST, _SURE = 1e-3, 6e-4
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
