@@ -287,8 +287,8 @@ their paths are longer, and less is left to that chance. One colour is the camer
 def _page(blender: str, stages: Mapping[str, Stage], rows: Sequence[lab.Row], met: Sequence[lab.Goal]) -> str:
     parts = []
     for name, s in stages.items():
-        told = f"{s.size[0]} x {s.size[1]} pixels, {s.samples} samples, {s.rounds} rounds; the base: {s.base}."
-        parts += [f"## {_HEADINGS[name]}", told, lab.table(_COLUMNS, [r for r in rows if r["scene"] == name], "–")]
+        setting = f"{s.size[0]} x {s.size[1]} pixels, {s.samples} samples, {s.rounds} rounds; the base: {s.base}."
+        parts += [f"## {_HEADINGS[name]}", setting, lab.table(_COLUMNS, [r for r in rows if r["scene"] == name], "–")]
     head = f"Blender {blender}; {lab.machine_line()}"
     return lab.page("# Cameras in Cycles", __doc__ or "", head, *parts, _NOTE, lab.goal_table("Goal", met))
 

@@ -377,7 +377,7 @@ def needs(lens: LensFacts, setting: Setting, depths_m: Sequence[float], f_number
         worth = "what the lens itself adds is not known: pack it with its lens file"
     else:
         moved = lens.field.at(lens.field.distortion_um, corner, focus) / pixel_um
-        # Of all aberrations none shrinks less than the aperture does.
+        # No aberration shrinks less than the aperture does.
         blurred = lens.field.at(lens.field.blur_um, corner, focus) / pixel_um * lens.f_number / f_number
         dark = 1 - lens.field.at(lens.field.light, corner, focus)
         worth = f"distortion up to {_px(moved)} px, aberrations {_px(blurred)} px, corners {100 * dark:.0f}% darker"
@@ -393,8 +393,8 @@ def needs(lens: LensFacts, setting: Setting, depths_m: Sequence[float], f_number
             continue
         error = error_px(variant, setting) or 0.0
         if error <= tolerance_px:
-            told = "traces every surface" if kind == "exact" else f"is right to {error:.2g} px"
-            return Advice(kind, (f"Use this lens, form {kind}: it {told}, within {tolerance_px:g} px.", asked))
+            accuracy = "traces every surface" if kind == "exact" else f"is right to {error:.2g} px"
+            return Advice(kind, (f"Use this lens, form {kind}: it {accuracy}, within {tolerance_px:g} px.", asked))
         errors.append((error, kind))
     best = ": none takes this sensor and focus"
     if errors:
