@@ -33,7 +33,7 @@ class Panel:
         width, samples: of the picture.
         exposure: stops, or "auto": the exact picture's 99.5th percentile becomes nine tenths of white.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop; see `Aperture`.
-        vignetting: which parts of the fall of light towards the corners the camera keeps; see `neurolens.cameras.reduced`.
+        vignetting: the parts of the light fall-off that the camera keeps; see `neurolens.cameras.reduced`.
         fit: settings of the surrogate.
         options: numbers that the effect's measure asks for, by name.
     """
