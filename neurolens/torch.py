@@ -1,14 +1,19 @@
 """Lens cameras for torch: the rays of film points as tensors, with gradients.
 
-The forward pass runs the camera as compiled C, on the CPU in float32 where the machine has a compiler; elsewhere torch
-evaluates the camera's graph. The backward pass evaluates that graph once more, for the rays that passed, and lets
-torch differentiate it.
+The camera is a program of some hundred steps a ray (`graph.program`), and its gradients are another, its adjoint
+(`graph.adjoint`). In float32 each runs as one compiled function, which a tensor passes once: as C on the CPU, where the
+machine has a compiler, and as a CUDA kernel on a GPU, compiled by the NVRTC library that comes with torch. Elsewhere
+torch takes the steps one by one.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,14 +25,24 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.cameragraph import whole_camera
+from neurolens.cameras.lenscamera import CompiledProgram, padded
 from neurolens.cameras.lenscamera import LensCamera as _Camera
+from neurolens.graph.adjoint import OUTER, adjoint
+from neurolens.graph.c import Signature
 from neurolens.graph.compiler import has_compiler
-from neurolens.graph.interpret import evaluate
+from neurolens.graph.program import WAVELENGTH, Argument, Program, Step, row_names
+from neurolens.graph.scalars import lower
+from neurolens.graph.shading import Cuda
 from neurolens.lens.prescription import LINE_D_NM
 from neurolens.lens.shot import Shot
 
 _SHARE, _LEAST = 0.03, 3e-3  # steps of derivatives by settings: a share of the setting, and 1/m of focus at least
+_GIVEN = (*row_names("film_mm", 2), *row_names("square", 2), WAVELENGTH)
+_FOUND = (*row_names("ray", 6), "weight")
 _AWAY = 2.0  # steps from the shot's setting, beyond which rays are no longer taken as linear in it
+# Rows [R, N] of rays to results [R, N] in the order of a program's outputs.
+Run = Callable[[Tensor], Tensor]
+_THREADS = 128  # of a block of a kernel
 
 
 class LensRays(NamedTuple):
@@ -190,7 +205,7 @@ class LensCamera:
 
 
 class _Lens:
-    """The camera of one shot: its compiled form, or its graph with what that takes of a call."""
+    """The camera of one shot as a program, and how it runs here: forwards, and backwards by its adjoint."""
 
     def __init__(self, spec: str, shot: Shot, device: torch.device, dtype: torch.dtype) -> None:
         camera = make_camera(spec, shot)
@@ -200,14 +215,13 @@ class _Lens:
             )
         compiled = device.type == "cpu" and dtype == torch.float32 and has_compiler()
         self.camera: _Camera = camera.compiled() if compiled else camera
-        self.compiled = compiled
+        self.compiled, self.device, self.dtype = compiled, device, dtype
         lens = camera.lens_graph()
-        self.graph, numbers = whole_camera(camera.film, lens, mask_too=True)
-        self.call = {name: torch.full((1, 1), value, dtype=dtype, device=device) for name, value in numbers.items()}
-        tables = {"outline": camera.film.outline.table}
+        graph, self._numbers = whole_camera(camera.film, lens, mask_too=True)
+        self._tables = {"outline": camera.film.outline.table}
         if lens.aperture is not None and lens.aperture.mask is not None:
-            tables["mask"] = lens.aperture.table
-        self.call |= {name: _columns(table, device, dtype) for name, table in tables.items()}
+            self._tables["mask"] = lens.aperture.table
+        self.program = lower(graph)
 
     def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
         """Origins and directions [3, N], weights and status [N] for [N, 2], [N, 2] and [N]; without gradients."""
@@ -215,15 +229,45 @@ class _Lens:
             points, places = (np.ascontiguousarray(t.numpy().T) for t in (film, square))
             rays = self.camera.sample(points, places, np.ascontiguousarray(light.numpy()))
             return tuple(map(torch.from_numpy, (rays.origin_m, rays.direction, rays.weight, rays.status)))
-        origin, direction, weight, status = self.recorded(film, square, light)
+        found = self._forward(torch.stack([*film.T, *square.T, light]))
+        ray, weight, status = found[:6], found[6], found[7].int()
         passed, ahead = status == st.PASSED, film.new_tensor([[0], [0], [-1]])
-        return torch.where(passed, origin, 0.0), torch.where(passed, direction, ahead), weight, status
+        return torch.where(passed, ray[:3], 0.0), torch.where(passed, ray[3:], ahead), weight, status
 
-    def recorded(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
-        """The same by torch, which follows its gradients."""
-        rays = {"film_mm": film.T, "square": square.T, "wavelength_nm": light[None]}
-        found = evaluate(self.graph, rays | self.call)
-        return found["ray"][:3], found["ray"][3:], found["weight"][0], found["status"][0]
+    def gradients(self, film: Tensor, square: Tensor, light: Tensor, outer: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """The gradients [N, 2], [N, 2], [N] of a number by what `outputs` is given, from those by what it gives."""
+        by = self._backward(torch.stack([*film.T, *square.T, light, *outer[0], *outer[1], outer[2]]))
+        return by[0:2].T, by[2:4].T, by[4]
+
+    @cached_property
+    def _forward(self) -> Run:
+        return self._run(self.program, (*_GIVEN, *_FOUND))
+
+    @cached_property
+    def _backward(self) -> Run:
+        return self._run(adjoint(self.program, _FOUND, _GIVEN), (*_GIVEN, *(f"{OUTER}{name}" for name in _FOUND)))
+
+    def _run(self, program: Program, rows: Sequence[str]) -> Run:
+        """A program as a function of rows [R, N] of these names: one kernel on a GPU, C on the CPU, else by torch."""
+        if self.dtype == torch.float32 and "mask" not in self._tables and self.device.type == "cpu":
+            with suppress(InputError):
+                return self._as_c(program, rows)
+        if self.dtype == torch.float32 and has_kernels(self.device):
+            return on_gpu(program, rows, self._numbers, {k: self._tensor(t) for k, t in self._tables.items()})
+        return step_by_step(program, rows, self._numbers, {k: self._tensor(t) for k, t in self._tables.items()})
+
+    def _as_c(self, program: Program, names: Sequence[str]) -> Run:
+        table, single = self._tables["outline"], program.with_single_cells()
+        made = CompiledProgram(single, dict.fromkeys(program.outputs, 1), self._numbers, padded(table, table.shape[1]))
+
+        def run(rows: Tensor) -> Tensor:
+            found = made({name: row[None] for name, row in zip(names, rows.numpy(), strict=True)})
+            return torch.from_numpy(np.concatenate([found[name] for name in program.outputs], dtype=np.float32))
+
+        return run
+
+    def _tensor(self, table: Any) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(table), dtype=self.dtype, device=self.device)
 
 
 def _check_shape(name: str, tensor: Tensor, *shapes: tuple[int, ...]) -> None:
@@ -238,11 +282,6 @@ class _Sides(NamedTuple):
     low: _Lens
     high: _Lens
     ends: tuple[float, float]
-
-
-def _columns(table: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """A table [cells, columns] whose columns are contiguous."""
-    return torch.as_tensor(np.ascontiguousarray(table.T), dtype=dtype, device=device).T
 
 
 class _Rays(torch.autograd.Function):
@@ -278,18 +317,107 @@ class _Rays(torch.autograd.Function):
     def backward(ctx: Any, *outer: Tensor) -> tuple[Any, ...]:
         *given, status = ctx.saved_tensors[:4]
         slopes, outer = ctx.saved_tensors[4:], outer[:3]
-        wanted: list[Tensor | None] = [None, None, None]
-        needed = [k for k in range(3) if ctx.needs_input_grad[2 + k]]
-        passed = torch.nonzero(status == st.PASSED)[:, 0]
-        by_found = [o[..., passed] for o in outer]
-        if needed:
-            with torch.enable_grad():
-                some = [t[passed].requires_grad_(k in needed) for k, t in enumerate(given)]
-                *found, _ = ctx.lens.recorded(*some)
-            each = torch.autograd.grad(found, [some[k] for k in needed], by_found, allow_unused=True)
-            for k, part in zip(needed, each, strict=True):
-                whole = torch.zeros_like(given[k])
-                wanted[k] = whole if part is None else whole.index_copy(0, passed, part)
-        pairs = zip(slopes, by_found * (len(slopes) // 3), strict=True)
-        totals = [(by[..., passed] * o).sum().double().cpu() for by, o in pairs]
+        wanted: tuple[Tensor | None, ...] = (None, None, None)
+        if any(ctx.needs_input_grad[2:5]):
+            wanted = ctx.lens.gradients(*given, outer)
+        passed = status == st.PASSED
+        pairs = zip(slopes, outer * (len(slopes) // 3), strict=True)
+        totals = [torch.where(passed, by * o, 0.0).sum().double().cpu() for by, o in pairs]
         return None, None, *wanted, *(sum(totals[k : k + 3]) for k in range(0, len(totals), 3))
+
+
+# ---- A program on tensors. -------------------------------------------------------------------------------------------
+
+_RULES: dict[str, Callable[..., Any]] = {
+    "neg": lambda a: -a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "sqrt": torch.sqrt,
+    "floor": torch.floor,
+    "max": lambda a, b: torch.where(a > b, a, b),
+    "min": lambda a, b: torch.where(a < b, a, b),
+    "clamp": lambda x, limit: x.clamp(-limit, limit),
+    "fma": lambda a, b, c: a * b + c,
+    "select": lambda a, b, x, y: torch.where(a <= b, x, y),
+}
+
+
+def has_kernels(device: torch.device) -> bool:
+    """Test whether `on_gpu` can run on a device: an NVIDIA GPU, and a torch that compiles kernels (from 2.8 on)."""
+    return device.type == "cuda" and torch.version.cuda is not None and hasattr(torch.cuda, "_compile_kernel")
+
+
+def on_gpu(program: Program, rows: Sequence[str], numbers: Mapping[str, float], tables: Mapping[str, Tensor]) -> Run:
+    """The program as one CUDA kernel, in float32.
+
+    Args:
+        rows: names of the inputs of a ray, in the order of the rows that the function takes.
+        numbers: inputs of the call. tables: that lookups read, [cells, columns] on the GPU.
+    """
+    s = Signature.of(program, "lens")
+    kernel, device = _kernel(Cuda(program, "lens").kernel()), next(iter(tables.values())).device
+    call = torch.tensor([numbers[name] for name in s.per_call] or [0.0], dtype=torch.float32, device=device)
+    given = [part for name in s.tables for part in (tables[name], len(tables[name]))]
+    order = [rows.index(name) for name in s.per_ray]
+    kept, results = order == list(range(len(rows))), len(program.outputs)
+
+    def run(rays: Tensor) -> Tensor:
+        count, found = rays.shape[1], rays.new_empty((results, rays.shape[1]))
+        if count:
+            rays = rays if kept else rays[order]
+            with torch.cuda.device(device):
+                blocks = -(-count // _THREADS)
+                kernel((blocks, 1, 1), (_THREADS, 1, 1), [rays.contiguous(), call, *given, found, count])
+        return found
+
+    return run
+
+
+@cache
+def _kernel(text: str) -> Any:
+    return torch.cuda._compile_kernel(text, "lens_rays")
+
+
+def step_by_step(
+    program: Program, rows: Sequence[str], numbers: Mapping[str, float], tables: Mapping[str, Tensor]
+) -> Run:
+    """The program one step after the other, in the precision of the rays; arguments as of `on_gpu`."""
+    live = program.live()
+    uses = Counter(a for k in live for a in program.steps[k].arguments if isinstance(a, int))
+    uses.update(e.argument for e in program.outputs.values() if isinstance(e.argument, int))
+
+    def run(rays: Tensor) -> Tensor:
+        found: dict[int, Any] = {}
+        left = Counter(uses)
+
+        def value(argument: Argument) -> Any:
+            return rays.new_tensor(argument[0]) if isinstance(argument, tuple) else found[argument]
+
+        for k in live:
+            step = program.steps[k]
+            if step.kind == "input":
+                found[k] = rays.new_tensor(numbers[step.name]) if step.per_call else rays[rows.index(step.name)]
+                continue
+            given = [value(a) for a in step.arguments]
+            found[k] = (
+                _looked_up(tables[step.name], step, given) if step.kind == "lookup" else _RULES[step.kind](*given)
+            )
+            for a in step.arguments:
+                if isinstance(a, int):
+                    left[a] -= 1
+                    if not left[a]:  # its memory serves the next
+                        del found[a]
+        return torch.stack([value(e.argument).expand(rays.shape[1]) for e in program.outputs.values()])
+
+    return run
+
+
+def _looked_up(table: Tensor, step: Step, given: Sequence[Any]) -> Any:
+    total: Any = 0.0
+    for index, weights in step.at_indices(given):
+        cell = index.nan_to_num().long().clamp(0, len(table) - 1)
+        columns = range(step.column, table.shape[1], step.columns)
+        total = total + sum(w * table[cell, column] for w, column in zip(weights, columns, strict=True))
+    return total

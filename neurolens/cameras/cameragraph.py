@@ -80,8 +80,8 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     x, y = g.split(vertex + side * (along - edge), (1, 1))
     size = size * 2.0
     x, y = x * size, y * (size * sign)
-    # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
-    turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
+    # Turned to the azimuth of the film point; on the axis that is 0, and does not move with the film point.
+    turn = g.select(g.constant(_HAIR) <= radius, film * (1.0 / radius.maximum(_HAIR)), g.constant([1.0, 0.0]))
     pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
     g.outputs = {"pupil_mm": pupil, "area_mm2": area}
     return g

@@ -177,11 +177,11 @@ class ThickLens:
         Raises:
             InputError: no C compiler, or one that fails.
         """
-        from neurolens.cameras.lenscamera import CompiledGraph
+        from neurolens.cameras.lenscamera import CompiledProgram
 
         other = copy(self)
         if self.aperture is None or self.aperture.mask is None:
-            other._run = CompiledGraph(ideal_graph(self.aperture), self._numbers, np.zeros((1, 1, 8), np.float32))
+            other._run = CompiledProgram.of(ideal_graph(self.aperture), self._numbers, np.zeros((1, 1, 8), np.float32))
         return other
 
     def _evaluated(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import ctypes
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from functools import cached_property
 from pathlib import Path
@@ -44,7 +44,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.onnx import write_onnx
-from neurolens.graph.program import row_names
+from neurolens.graph.program import Program, row_names
 from neurolens.graph.scalars import lower
 from neurolens.lens.prescription import LINE_D_NM, Surface
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
@@ -389,9 +389,7 @@ class LensCamera:
 
 def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph) -> GraphRun:
     """A graph of the camera as a compiled function; a mask in the stop is tested on the rays that come back."""
-    table = film.outline.table
-    groups = table.reshape(len(table), -1, 5)
-    run = CompiledGraph(graph, numbers, np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5))))
+    run = CompiledProgram.of(graph, numbers, padded(film.outline.table, 5))
     mask = lens.aperture if lens.blades is None else None
     if mask is None:
         return run
@@ -411,14 +409,23 @@ def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: Len
     return masked
 
 
-class CompiledGraph:
-    """A camera's graph as a compiled function, with numbers of the call and the outline's table."""
+def padded(table: FloatArray, columns: int) -> FloatArray:
+    """A table as compiled code takes it: each group of so many columns in whole registers."""
+    groups = table.reshape(len(table), -1, columns)
+    return np.ascontiguousarray(np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(columns) - columns))))
 
-    def __init__(self, graph: Graph, numbers: dict[str, float], table: FloatArray) -> None:
-        program = lower(graph).in_order_of_need()
+
+class CompiledProgram:
+    """A camera's program as a compiled function.
+
+    Args:
+        rows: of each result, of which the program has them one by one. numbers: of the call. table: of the outline.
+    """
+
+    def __init__(self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray) -> None:
         if len(program.steps) > MAX_STEPS:
             raise InputError("compiled camera", "steps", len(program.steps), f"up to {MAX_STEPS} for a compiler")
-        self._rows = {name: (v.rows, np.int32 if name == "status" else np.float32) for name, v in graph.outputs.items()}
+        self._rows = {name: (count, np.int32 if name == "status" else np.float32) for name, count in rows.items()}
         self._signature = s = Signature.of(program, "camera")
         self._numbers, self._table = np.array([numbers[name] for name in s.per_call], np.float32), table
         self._call = load_compiled(write_blocks(program, "camera")).camera
@@ -426,9 +433,15 @@ class CompiledGraph:
         self._call.argtypes = [ctypes.c_size_t, pointer, pointer, pointer, ctypes.c_int, pointer, pointer]
         self._call.restype = None
 
+    @classmethod
+    def of(cls, graph: Graph, numbers: dict[str, float], table: FloatArray) -> CompiledProgram:
+        """That of a graph."""
+        rows = {name: value.rows for name, value in graph.outputs.items()}
+        return cls(lower(graph).in_order_of_need(), rows, numbers, table)
+
     def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
-        """The input of `camera_rays` for inputs [R, N]."""
-        count = rays["film_mm"].shape[1]
+        """The results [R, N] for inputs [R, N]; of a camera the input of `camera_rays`."""
+        count = next(iter(rays.values())).shape[1]
         found: dict[str, NDArray[Any]] = {
             name: np.empty((rows, count), kind) for name, (rows, kind) in self._rows.items() if name not in D_FILM
         }

@@ -325,6 +325,22 @@ class Program:
 
         return self._rewritten(shared)
 
+    def with_single_cells(self) -> Program:
+        """The same program but for rounding, with each lookup as a sum of lookups of one number each."""
+
+        def single(k: int, step: Step, given: Sequence[Expr]) -> Expr | None:
+            if step.kind != "lookup":
+                return None
+            total, found = None, given[0].program
+            for index, weights in step.at_indices(given):
+                for group, weight in enumerate(weights):
+                    width, column = step.columns * len(weights), step.column + group * step.columns
+                    number = found.lookup(step.name, width, column, [index], [found.literal(1.0)])
+                    total = weight * number if total is None else found.sum(total, weight * number)
+            return total
+
+        return self._rewritten(single)
+
     def waits(self) -> bool:
         """Whether a core that works on one ray, or one vector, after the other waits for results most of the time.
 

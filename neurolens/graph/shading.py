@@ -207,6 +207,24 @@ class Cuda(Glsl):
     band, to_whole = "{name}_cell(float(band), {})", "int({})"
     number, array, constant = "#define {} {}", "float {0}[{1}] = {{\n    {2}\n}};", "{macro}_TABLE "
 
+    def kernel(self) -> str:
+        """The text of `code` and a kernel of arrays, NAME_rays(in, call, tables ..., out, n).
+
+        `in` has the inputs of a ray as rows of n numbers, `call` those of the whole call, a table is its numbers and
+        its cells; `out` gets the results as rows, the status, a number there, last. On the host it is a loop.
+        """
+        s = Signature.of(self.program, self.name)
+        rows = [f"in[{k} * rows + i]" for k in range(len(s.per_ray))]
+        given = [*rows, *(f"call[{k}]" for k in range(len(s.per_call)))]
+        tables = [f"{table}, {table}_cells" for table in s.tables]
+        results = [*s.outputs, *["status"] * s.status]
+        return self.code(NOTHING) + part(
+            "parts.shading", "cuda_rays", **self.known, given=", ".join([*given, *tables]),
+            tables="".join(f"{self.table_of.format(table)}, " for table in s.tables),
+            results="\n".join(f"    out[{k} * rows + i] = float(ray.{o});" for k, o in enumerate(results)),
+            same=", ".join([*("in", "call"), *tables, "out", "rows", "i"]),
+        )  # fmt: skip
+
 
 class Vex(Glsl):
     """VEX of Houdini, which has no constants outside functions."""
