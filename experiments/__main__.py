@@ -27,6 +27,7 @@ NAMES = {
     "rays": ("rays", "an open benchmark of lens rays: error and time, ours beside other programs"),
     "tracer": ("tracer_race", "the exact lens as C beside a tracer written by hand"),
     "gpu": ("gpu", "lenses and models as GLSL compute shaders, on a GPU or by software OpenGL"),
+    "gpu-day": ("gpu_day", "exact lenses, models and cameras on a GPU: CUDA C++, torch, shaders, gradients"),
     "models": ("make_models", "make the models that ship"),
     "lens-index": ("lens_index", "the index of lenses/: their data and character for `neurolens lens list`"),
     "inverse": ("inverse", "inverse maps: how often they arrive"),

@@ -28,7 +28,17 @@ from numpy.typing import NDArray
 from experiments import gl_compute, lab
 from neurolens.base import status as st
 from neurolens.graph.c import Signature
-from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Program
+from neurolens.graph.program import (
+    FILM_Z,
+    RAY,
+    SCENE_RAY,
+    STATUS,
+    STOP,
+    STOP_RADIUS,
+    TRANSMITTANCE,
+    WAVELENGTH,
+    Program,
+)
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_glsl
 from neurolens.study.rays import ray_errors
@@ -55,7 +65,7 @@ OPTIONS = (
 )
 _CHECKED = 20_000
 _EACH = 4  # rays of a thread in place
-_RESULTS = 10  # numbers of a ray: position, direction, transmittance, crossing with the stop, status
+RESULTS = (*SCENE_RAY, TRANSMITTANCE, *STOP, STATUS)
 
 _HEAD = """\
 #version 430
@@ -115,6 +125,34 @@ def subject_of(name: str) -> Subject:
     return Subject(name, first, {EXACT: exact, **{kind: fused_program([model]) for kind, model in models.items()}})
 
 
+class Checked(NamedTuple):
+    """Rays of a domain, and their exact answers in float64."""
+
+    rays: FilmRays
+    exact: PairSet
+
+    @staticmethod
+    def of(subject: Subject, film_z_mm: float | None = None) -> Checked:
+        """Rays of a lens's domain, from a film plane there or from any one."""
+        domain = subject.model.domain
+        rays = on_one_plane(sample_domain(domain, _CHECKED, seed=5))
+        rays = rays if film_z_mm is None else replace(rays, film_z=torch.full_like(rays.film_z, film_z_mm))
+        return Checked(rays, trace_pairs(subject.model.lens, rays, domain.pupil_z_mm))
+
+    def errors(self, subject: Subject, found: torch.Tensor) -> tuple[float, float]:
+        """RMS in um over rays that pass here and in float64, and the share that passes or is blocked wrongly.
+
+        Args:
+            found: [10, N], the rows of `RESULTS`.
+        """
+        passed, truly = found[-1] == st.PASSED, self.exact.status == st.PASSED
+        rows = found[:, passed & truly]
+        told = Prediction(Rays(*rows[:6]), rows[6], rows[7], rows[8], rows[9].int())
+        pairs = self.exact.select(passed & truly)
+        known = ray_errors(subject.model.lens, subject.model.domain, pairs, lambda _: told)
+        return known.rms_um, float((passed != truly).double().mean())
+
+
 def shader(program: Program | None, work: str) -> str:
     """The text; no program: the work around a lens."""
     text, call = "", _NOWHERE
@@ -130,7 +168,7 @@ def on_one_plane(rays: FilmRays) -> FilmRays:
     return replace(rays, film_z=rays.film_z[:1].expand(len(rays)).clone())
 
 
-def _columns(rays: FilmRays) -> NDArray[np.float32]:
+def columns_of(rays: FilmRays) -> NDArray[np.float32]:
     """[5, N]: film and pupil points, wavelength."""
     columns = (rays.film_x, rays.film_y, rays.pupil_x, rays.pupil_y, rays.wavelength_nm)
     return np.stack([c.numpy() for c in columns]).astype(np.float32)
@@ -142,21 +180,21 @@ class ShaderRace:
     def __init__(self, folder: Path, rays: int) -> None:
         self.folder, self.count = folder, rays
         self.jobs: list[dict[str, Any]] = []
-        self.exact: dict[str, PairSet] = {}  # of the rays that are checked
+        self.checked: dict[str, Checked] = {}
 
     def add(self, subject: Subject) -> None:
         """The shaders of a lens in both kinds of work, and those whose results come back."""
         name, domain = subject.name, subject.model.domain
-        checked, timed = (on_one_plane(sample_domain(domain, n, seed=5)) for n in (_CHECKED, self.count))
-        self.exact[name] = trace_pairs(subject.model.lens, checked, domain.pupil_z_mm)
+        checked, timed = Checked.of(subject), on_one_plane(sample_domain(domain, self.count, seed=5))
+        self.checked[name] = checked
         film, pupil = (r * np.sqrt(2.0) for r in (domain.film_radius_mm, domain.pupil_radius_mm))
         low, high = domain.wavelength_nm
-        call = [float(checked.film_z[0]), domain.stop_radius_mm, film, pupil, low, high - low]
-        arrays = {"call": np.array(call, np.float32), "checked": _columns(checked), "timed": _columns(timed)}
+        call = [float(checked.rays.film_z[0]), domain.stop_radius_mm, film, pupil, low, high - low]
+        arrays = {"call": np.array(call, np.float32), "checked": columns_of(checked.rays), "timed": columns_of(timed)}
         for what, array in arrays.items():
             np.save(self.folder / f"{name}.{what}.npy", array)
         for k, (form, program) in enumerate({NOTHING: None, **subject.programs}.items()):
-            for work, each, size in ((WORKS[0], 1, _RESULTS * self.count), (WORKS[1], _EACH, self.count)):
+            for work, each, size in ((WORKS[0], 1, len(RESULTS) * self.count), (WORKS[1], _EACH, self.count)):
                 text = self.folder / f"{name}.{k}.{each}.comp"
                 text.write_text(shader(program, work))
                 job: dict[str, Any] = {"shader": text.name, "call": f"{name}.call.npy", "rays": f"{name}.timed.npy"}
@@ -164,7 +202,7 @@ class ShaderRace:
                 self.jobs.append(job | {"name": f"{name} {form} {work}", "groups": groups, "size": size})
                 if program is not None and each == 1:
                     groups = -(-_CHECKED // gl_compute.GROUP)
-                    job |= {"rays": f"{name}.checked.npy", "groups": groups, "size": _RESULTS * _CHECKED}
+                    job |= {"rays": f"{name}.checked.npy", "groups": groups, "size": len(RESULTS) * _CHECKED}
                     self.jobs.append(job | {"keep": f"{name}.{form}.npy"})
 
     def run(self, rounds: int) -> dict[str, Any]:
@@ -183,14 +221,9 @@ class ShaderRace:
         return found
 
     def errors(self, subject: Subject, form: str) -> tuple[float, float]:
-        """RMS in um over rays that pass here and in float64, and the share that passes or is blocked wrongly."""
-        found = torch.from_numpy(np.load(self.folder / f"{subject.name}.{form}.npy").reshape(_RESULTS, _CHECKED))
-        exact = self.exact[subject.name]
-        passed, truly = found[-1] == st.PASSED, exact.status == st.PASSED
-        rows = found[:, passed & truly]
-        told = Prediction(Rays(*rows[:6]), rows[6], rows[7], rows[8], rows[9].int())
-        known = ray_errors(subject.model.lens, subject.model.domain, exact.select(passed & truly), lambda _: told)
-        return known.rms_um, float((passed != truly).double().mean())
+        """The figures of `Checked` for a form."""
+        found = np.load(self.folder / f"{subject.name}.{form}.npy").reshape(len(RESULTS), _CHECKED)
+        return self.checked[subject.name].errors(subject, torch.from_numpy(found))
 
 
 def rows_of(subject: Subject, raced: ShaderRace, found: dict[str, Any]) -> list[lab.Row]:

@@ -180,8 +180,14 @@ def _hand(lens: Lens, pupil_z: float, vectors: int) -> Hand:
 # ---- Optiland (MIT licence). -----------------------------------------------------------------------------------------
 
 
-def optiland(task: Task, backend: str, precision: str) -> Prepared:
+# Optiland imports these to draw, which needs 150 MB.
+_DRAWING = ("vtk", "vtk.util", "vtk.util.numpy_support")
+
+
+def optiland(task: Task, backend: str, precision: str, device: str = "cpu") -> Prepared:
     """Optiland with constant indices and without records of each surface, which is its fastest way."""
+    if "vtk" not in sys.modules and importlib.util.find_spec("vtk") is None:
+        sys.modules.update((name, mock.MagicMock()) for name in _DRAWING)
     be, optics = package("optiland.backend"), package("optiland.optic")
     material, rays = package("optiland.materials").IdealMaterial, package("optiland.rays").RealRays
 
@@ -189,6 +195,7 @@ def optiland(task: Task, backend: str, precision: str) -> Prepared:
         be.set_backend(backend)
         be.set_precision(precision)
         if backend == "torch":
+            be.set_device(device)
             be.grad_mode.disable()
 
     settle()
@@ -204,7 +211,7 @@ def optiland(task: Task, backend: str, precision: str) -> Prepared:
         )
     numbers = [*start, *way, np.ones_like(start[0]), np.full_like(start[0], WAVELENGTH_NM / 1000)]
     columns: list[Any] = [np.ascontiguousarray(c, precision) for c in numbers]
-    columns = [torch.from_numpy(c) for c in columns] if backend == "torch" else columns
+    columns = [torch.from_numpy(c).to(device) for c in columns] if backend == "torch" else columns
 
     def call() -> Any:
         settle()
@@ -262,12 +269,12 @@ def ray_optics(task: Task) -> Prepared:
 _UNUSED = ("torchvision", "torchvision.utils", "torchvision.models", "torchvision.transforms", "lpips")
 
 
-def deeplens(task: Task, precision: str) -> Prepared:
+def deeplens(task: Task, precision: str, device: str = "cpu") -> Prepared:
     """DeepLens, from the film to the scene as in its renderer."""
     with mock.patch.dict(sys.modules, {name: mock.MagicMock() for name in _UNUSED if "deeplens" not in sys.modules}):
         whole, shapes = package("deeplens"), package("deeplens.geometric_surface")
     dtype: torch.dtype = getattr(torch, precision)
-    lens = whole.GeoLens(device=torch.device("cpu"), dtype=dtype)
+    lens = whole.GeoLens(device=torch.device(device), dtype=dtype)
     for f in task.faces:
         gap, c = torch.tensor(f.gap, dtype=dtype), 1 / f.radius
         behind = f"{f.index!r}/1e15"  # index at the d line, and an Abbe number that leaves it constant
@@ -280,13 +287,13 @@ def deeplens(task: Task, precision: str) -> Prepared:
             lens.surfaces.append(shapes.Spheric(c, f.rim, gap, behind))
     lens.aper_idx = [f.stop for f in task.faces].index(True)
     lens.astype(dtype)
-    start, way = (torch.from_numpy(np.ascontiguousarray(a.T)).to(dtype) for a in (task.start, task.way))
+    start, way = (torch.from_numpy(np.ascontiguousarray(a.T)).to(device, dtype) for a in (task.start, task.way))
 
     def call() -> Any:
         with torch.no_grad():
             return lens.trace(whole.Ray(start.clone(), way, WAVELENGTH_NM / 1000))[0]  # it writes into its rays
 
-    return call, lambda out: Found(out.o.numpy().T, out.d.numpy().T, out.is_valid.numpy() > 0)
+    return call, lambda out: Found(out.o.cpu().numpy().T, out.d.cpu().numpy().T, out.is_valid.cpu().numpy() > 0)
 
 
 # ---- The realistic camera of pbrt (BSD licence). ---------------------------------------------------------------------

@@ -93,18 +93,19 @@ def task_of(name: str, count: int = COUNT) -> Task:
 # ---- Ours. -----------------------------------------------------------------------------------------------------------
 
 
-def in_torch(run: Callable[..., Any], dtype: torch.dtype) -> Callable[[Task], Prepared]:
+def in_torch(run: Callable[..., Any], dtype: torch.dtype, device: str = "cpu") -> Callable[[Task], Prepared]:
     """The tracer in torch, eager or compiled."""
 
     def adapter(task: Task) -> Prepared:
-        fx, fy, px, py = (torch.from_numpy(np.ascontiguousarray(c)).to(dtype) for c in (*task.film, *task.pupil))
-        z, wavelength = torch.full_like(fx, task.film_z), torch.tensor(WAVELENGTH_NM, dtype=dtype)
+        columns = (torch.from_numpy(np.ascontiguousarray(c)) for c in (*task.film, *task.pupil))
+        fx, fy, px, py = (c.to(device, dtype) for c in columns)
+        z, wavelength = torch.full_like(fx, task.film_z), torch.tensor(WAVELENGTH_NM, dtype=dtype, device=device)
 
         def call() -> Any:
             with torch.no_grad():
                 return run(task.lens, fx, fy, z, px, py, task.pupil_z, wavelength)
 
-        return call, lambda out: Found(*split(torch.stack(out.rays).numpy()), out.status.numpy() == 0)
+        return call, lambda out: Found(*split(torch.stack(out.rays).cpu().numpy()), out.status.cpu().numpy() == 0)
 
     return adapter
 

@@ -241,20 +241,25 @@ class _Lens:
 
     @cached_property
     def _forward(self) -> Run:
-        return self._run(self.program, (*_GIVEN, *_FOUND))
+        return self._run(self.program, _GIVEN)
 
     @cached_property
     def _backward(self) -> Run:
-        return self._run(adjoint(self.program, _FOUND, _GIVEN), (*_GIVEN, *(f"{OUTER}{name}" for name in _FOUND)))
+        return self._run(self.adjoint, (*_GIVEN, *(f"{OUTER}{name}" for name in _FOUND)))
+
+    @cached_property
+    def adjoint(self) -> Program:
+        """The program of the gradients."""
+        return adjoint(self.program, _FOUND, _GIVEN)
 
     def _run(self, program: Program, rows: Sequence[str]) -> Run:
         """A program as a function of rows [R, N] of these names: one kernel on a GPU, C on the CPU, else by torch."""
         if self.dtype == torch.float32 and "mask" not in self._tables and self.device.type == "cpu":
             with suppress(InputError):
                 return self._as_c(program, rows)
-        if self.dtype == torch.float32 and has_kernels(self.device):
-            return on_gpu(program, rows, self._numbers, {k: self._tensor(t) for k, t in self._tables.items()})
-        return step_by_step(program, rows, self._numbers, {k: self._tensor(t) for k, t in self._tables.items()})
+        runner = on_gpu if self.dtype == torch.float32 and has_kernels(self.device) else step_by_step
+        numbers, tables = ({k: self._tensor(v) for k, v in given.items()} for given in (self._numbers, self._tables))
+        return runner(program, rows, numbers, tables)
 
     def _as_c(self, program: Program, names: Sequence[str]) -> Run:
         table, single = self._tables["outline"], program.with_single_cells()
@@ -266,8 +271,8 @@ class _Lens:
 
         return run
 
-    def _tensor(self, table: Any) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(table), dtype=self.dtype, device=self.device)
+    def _tensor(self, numbers: Any) -> Tensor:
+        return torch.tensor(numbers, dtype=self.dtype, device=self.device).contiguous()
 
 
 def _check_shape(name: str, tensor: Tensor, *shapes: tuple[int, ...]) -> None:
@@ -340,8 +345,14 @@ _RULES: dict[str, Callable[..., Any]] = {
     "min": lambda a, b: torch.where(a < b, a, b),
     "clamp": lambda x, limit: x.clamp(-limit, limit),
     "fma": lambda a, b, c: a * b + c,
-    "select": lambda a, b, x, y: torch.where(a <= b, x, y),
+    "select": lambda a, b, x, y: _chosen(a <= b, x, y, torch.result_type(a, b)),
 }
+
+
+def _chosen(first: Tensor, x: Any, y: Any, dtype: torch.dtype) -> Tensor:
+    if isinstance(x, Tensor) or isinstance(y, Tensor):
+        return torch.where(first, x, y)
+    return first.to(dtype) * (x - y) + y  # of two numbers `where` would make float32
 
 
 def has_kernels(device: torch.device) -> bool:
@@ -349,16 +360,15 @@ def has_kernels(device: torch.device) -> bool:
     return device.type == "cuda" and torch.version.cuda is not None and hasattr(torch.cuda, "_compile_kernel")
 
 
-def on_gpu(program: Program, rows: Sequence[str], numbers: Mapping[str, float], tables: Mapping[str, Tensor]) -> Run:
+def on_gpu(program: Program, rows: Sequence[str], numbers: Mapping[str, Tensor], tables: Mapping[str, Tensor]) -> Run:
     """The program as one CUDA kernel, in float32.
 
     Args:
         rows: names of the inputs of a ray, in the order of the rows that the function takes.
-        numbers: inputs of the call. tables: that lookups read, [cells, columns] on the GPU.
+        numbers: inputs of the call. tables: that lookups read, [cells, columns]. Both are on the GPU.
     """
-    s = Signature.of(program, "lens")
-    kernel, device = _kernel(Cuda(program, "lens").kernel()), next(iter(tables.values())).device
-    call = torch.tensor([numbers[name] for name in s.per_call] or [0.0], dtype=torch.float32, device=device)
+    s, kernel = Signature.of(program, "lens"), _kernel(Cuda(program, "lens").kernel())
+    call = torch.stack([numbers[name] for name in s.per_call]) if s.per_call else None
     given = [part for name in s.tables for part in (tables[name], len(tables[name]))]
     order = [rows.index(name) for name in s.per_ray]
     kept, results = order == list(range(len(rows))), len(program.outputs)
@@ -366,10 +376,10 @@ def on_gpu(program: Program, rows: Sequence[str], numbers: Mapping[str, float], 
     def run(rays: Tensor) -> Tensor:
         count, found = rays.shape[1], rays.new_empty((results, rays.shape[1]))
         if count:
-            rays = rays if kept else rays[order]
-            with torch.cuda.device(device):
+            rays = (rays if kept else rays[order]).contiguous()
+            with torch.cuda.device(rays.device):
                 blocks = -(-count // _THREADS)
-                kernel((blocks, 1, 1), (_THREADS, 1, 1), [rays.contiguous(), call, *given, found, count])
+                kernel((blocks, 1, 1), (_THREADS, 1, 1), [rays, rays if call is None else call, *given, found, count])
         return found
 
     return run
@@ -381,7 +391,7 @@ def _kernel(text: str) -> Any:
 
 
 def step_by_step(
-    program: Program, rows: Sequence[str], numbers: Mapping[str, float], tables: Mapping[str, Tensor]
+    program: Program, rows: Sequence[str], numbers: Mapping[str, Tensor], tables: Mapping[str, Tensor]
 ) -> Run:
     """The program one step after the other, in the precision of the rays; arguments as of `on_gpu`."""
     live = program.live()
@@ -393,12 +403,12 @@ def step_by_step(
         left = Counter(uses)
 
         def value(argument: Argument) -> Any:
-            return rays.new_tensor(argument[0]) if isinstance(argument, tuple) else found[argument]
+            return argument[0] if isinstance(argument, tuple) else found[argument]
 
         for k in live:
             step = program.steps[k]
             if step.kind == "input":
-                found[k] = rays.new_tensor(numbers[step.name]) if step.per_call else rays[rows.index(step.name)]
+                found[k] = numbers[step.name] if step.per_call else rays[rows.index(step.name)]
                 continue
             given = [value(a) for a in step.arguments]
             found[k] = (
@@ -409,7 +419,7 @@ def step_by_step(
                     left[a] -= 1
                     if not left[a]:  # its memory serves the next
                         del found[a]
-        return torch.stack([value(e.argument).expand(rays.shape[1]) for e in program.outputs.values()])
+        return torch.stack([value(e.argument) + torch.zeros_like(rays[0]) for e in program.outputs.values()])
 
     return run
 
