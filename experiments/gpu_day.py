@@ -130,24 +130,24 @@ class Subject(NamedTuple):
         return _ROWS if self.kind == LENS else _SQUARE
 
 
-def subjects_of(known: gpu.Subject) -> Iterator[Subject]:
-    """A lens and its models, as lenses and as cameras that are focused at infinity."""
-    domain, lens = known.model.domain, known.model.lens
+def lens_subject(known: gpu.Subject, form: str) -> Subject:
+    """A lens, exact or as a model."""
+    domain = known.model.domain
     film, pupil = (r / math.sqrt(2.0) for r in (domain.film_radius_mm, domain.pupil_radius_mm))
+    half, light = (film, film, pupil, pupil), domain.wavelength_nm
+    ends = (*(-h for h in half), light[0]), (*half, light[1])
     call = {FILM_Z: domain.film_z_mm[0], STOP_RADIUS: domain.stop_radius_mm}
-    half = (film, film, pupil, pupil)
-    ends = (*(-h for h in half), domain.wavelength_nm[0]), (*half, domain.wavelength_nm[1])
-    for form in (EXACT, *MODELS[known.name]):
-        yield Subject(known.name, LENS, form, known.programs[form], call, {}, *ends, lens.refractions)
-    for form in (EXACT, *MODELS[known.name]):
-        camera = camera_of(known, form)
-        graph, numbers = whole_camera(camera.film, camera.lens_graph(), mask_too=True)
-        table = torch.from_numpy(np.ascontiguousarray(camera.film.outline.table, np.float32))
-        (x, y), light = (side / 2 for side in camera.film_mm), domain.wavelength_nm
-        places = (-x, -y, 0.0, 0.0, light[0]), (x, y, 1.0, 1.0, light[1])
-        yield Subject(
-            known.name, CAMERA, form, lower(graph), numbers, {"outline": table}, *places, lens.refractions
-        )  # fmt: skip
+    return Subject(known.name, LENS, form, known.programs[form], call, {}, *ends, known.model.lens.refractions)
+
+
+def camera_subject(known: gpu.Subject, form: str) -> Subject:
+    """The camera of a lens, exact or of a model, focused at infinity."""
+    camera = camera_of(known, form)
+    graph, numbers = whole_camera(camera.film, camera.lens_graph(), mask_too=True)
+    tables = {"outline": torch.from_numpy(np.ascontiguousarray(camera.film.outline.table, np.float32))}
+    (x, y), light = (side / 2 for side in camera.film_mm), known.model.domain.wavelength_nm
+    ends = (-x, -y, 0.0, 0.0, light[0]), (x, y, 1.0, 1.0, light[1])
+    return Subject(known.name, CAMERA, form, lower(graph), numbers, tables, *ends, known.model.lens.refractions)
 
 
 def shot_of(known: gpu.Subject) -> Shot:
@@ -293,7 +293,7 @@ class Ceiling(NamedTuple):
     instructions_s: float
 
 
-def ceiling(device: torch.device, folder: Path) -> Ceiling | None:
+def ceiling(device: torch.device) -> Ceiling | None:
     """The ceilings of a GPU: a copy of 2 GB, and chains of fused multiply-adds."""
     if device.type != "cuda":
         return None
@@ -386,7 +386,7 @@ def alone(folder: Path) -> Iterator[None]:
 def torch_job(name: str, form: str, folder: Path, size: int, rounds: int) -> lab.Row:
     """A lens in torch: step by step, as a CUDA graph of these steps, compiled; the exact one by the tracer, too."""
     known = gpu.subject_of(name)
-    subject = next(s for s in subjects_of(known) if (s.kind, s.form) == (LENS, form))
+    subject = lens_subject(known, form)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     numbers = {name: torch.tensor(number, device=device) for name, number in subject.call.items()}
     run = step_by_step(subject.program, subject.rows, numbers, {})
@@ -434,7 +434,7 @@ def workers(
 ) -> dict[str, subprocess.Popen[str]]:
     """A process for each job; its row comes into the folder."""
     command = [sys.executable, "-m", "experiments", "gpu-day", "--rays", str(args.rays), "--rounds", str(args.rounds)]
-    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(folder / "inductor")}
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(folder / "inductor"), "OMP_NUM_THREADS": "1"}
     return {
         f"{name}:{form}": subprocess.Popen(
             [*command, "--torch", f"{name}:{form}", "-o", str(folder)], cwd=lab.ROOT, env=environment, text=True,
@@ -496,7 +496,7 @@ def gradient_row(known: gpu.Subject, form: str, device: torch.device, size: int,
         "forward": event_times(lambda: run(rows), rounds, device.type),
         "backward": event_times(lambda: turn(longer), rounds, device.type),
     }
-    some = min(size, _CHECKED)
+    some = min(size, _CHECKED // 5)
     double = LensCamera(spec, shot, dtype=torch.float64)
     again = [t.detach()[:some].cpu().double().requires_grad_() for t in given]
     exact = double(*again)
@@ -636,7 +636,7 @@ def _ns(seconds: Sequence[float]) -> str:
 
 def page_of(found: lab.Row) -> str:
     """The page of all that was measured."""
-    rows, best = found["rows"], found["ceiling"]
+    rows, best = found.get("rows", []), found.get("ceiling")
     copy, issue = (f"{best[0] / 1e12:.2f}", f"{best[1] / 1e9:,.0f}") if best else ("(not measured)", "(not measured)")
     notes = _NOTES.format(
         **found["about"], threads=THREADS, each=EACH, read=BYTES * 5, checked=_CHECKED, copy=copy, issue=issue
@@ -644,13 +644,17 @@ def page_of(found: lab.Row) -> str:
     parts = ["`python -m experiments gpu-day`", notes, lab.machine_line(f"; the whole in {found['seconds']:.0f} s")]
     if found["software"]:
         parts.append("**In software, without a GPU: these times say nothing about one.**")
-    parts += [lab.goal_table("goal", found["goals"])] if found["goals"] else []
+    parts += [lab.goal_table("goal", found["goals"])] if found.get("goals") else []
     parts += ["![Error against rays a second](gpu_day.png)", "## Lenses", lab.table(_LENSES, _of(rows, LENS))]
+    parts += ["Not measured: " + "; ".join(found["failed"])] if found.get("failed") else []
     parts += ["## Whole cameras", lab.table(_CAMERAS, _of(rows, CAMERA))]
-    parts += ["## Gradients (`neurolens.torch`)", lab.table(_GRADIENTS, found["gradients"])]
-    parts += ["## Lenses in torch", lab.table(_TORCH, found["torch"])]
-    parts += ["## Other people's tracers, on the same rays of one wavelength", lab.table(_PEERS, found["peers"])]
-    shaders = found["shaders"]
+    parts += ["## Gradients (`neurolens.torch`)", lab.table(_GRADIENTS, found.get("gradients", []))]
+    parts += ["## Lenses in torch", lab.table(_TORCH, found.get("torch", []))]
+    parts += [
+        "## Other people's tracers, on the same rays of one wavelength",
+        lab.table(_PEERS, found.get("peers", [])),
+    ]
+    shaders = found.get("shaders", "Not measured.")
     what = shaders if isinstance(shaders, str) else lab.table(_SHADERS, shaders)
     return lab.page("# Lenses on a GPU", *parts, "## As compute shaders of OpenGL", what)
 
@@ -668,17 +672,17 @@ def plot(found: lab.Row, file: Path) -> None:
 
     figure, axes = plt.subplots(figsize=(9, 5.5), layout="constrained")
     marks = dict(zip(MODELS, "os^D", strict=True))
-    rates = {(r["lens"], r["form"]): r for r in _of(found["rows"], LENS)}
+    rates = {(r["lens"], r["form"]): r for r in _of(found.get("rows", []), LENS)}
     for (lens, form), row in rates.items():
         colour = "tab:blue" if form.startswith(EXACT) else "tab:green" if form.startswith("ols") else "tab:orange"
         face = "none" if "fast" in form else colour
         axes.plot(1 / min(row["seconds"]["in place"]), row["rms_um"], marks[lens], mfc=face, color=colour, ms=9)
-    for row in found["torch"]:
+    for row in found.get("torch", []):
         base = rates.get((row["lens"], row["form"]))
         for way in ("eager", "compiled"):
             if base and row["seconds"].get(way):
                 axes.plot(1 / min(row["seconds"][way]), base["rms_um"], marks[row["lens"]], color="0.5", ms=6)
-    for row in found["peers"]:
+    for row in found.get("peers", []):
         if row.get("seconds") and row["program"][0] in "OD":
             axes.plot(1 / min(row["seconds"]), max(row["film_um"], 1e-3), marks[row["lens"]], color="tab:red", ms=7)
     key = {
@@ -689,7 +693,7 @@ def plot(found: lab.Row, file: Path) -> None:
         "Optiland, DeepLens": "tab:red",
     }
     lines = [plt.Line2D([], [], color=c, marker="s", ls="", label=name) for name, c in key.items()]
-    counts = {r["lens"]: r["refractions"] for r in found["rows"]}
+    counts = {r["lens"]: r["refractions"] for r in found.get("rows", [])}
     lines += [
         plt.Line2D([], [], color="k", marker=marks[name], ls="", mfc="none", label=f"{count} refractions")
         for name, count in counts.items()
@@ -719,71 +723,99 @@ def run(args: argparse.Namespace) -> None:
         row = torch_job(name, form, args.out, args.rays, args.rounds)
         (args.out / f"{name}.{form}.json").write_text(json.dumps(row), encoding="utf-8")
         return
-    begun = time.monotonic()
+    torch.set_num_threads(1)  # its threads would wait for those of the workers
     lenses = lab.chosen(list(MODELS), str, args.only, "gpu-day")
-    about = {
-        "device": torch.cuda.get_device_name() if cuda else "software (g++)",
-        "rays": args.rays,
-        "rounds": args.rounds,
-    }
-    found: lab.Row = {"about": about, "software": not cuda, "machine": lab.machine()}
-
-    def say(text: str) -> None:
-        if not args.quiet:
-            print(f"{time.monotonic() - begun:5.0f} s  {text}", file=sys.stderr, flush=True)
-
-    with tempfile.TemporaryDirectory(prefix="neurolens-gpu-day-") as place:
-        folder = Path(place)
-        running = workers([(n, f) for n in lenses for f in (EXACT, *MODELS[n])], folder, args)
-        known = {name: gpu.subject_of(name) for name in lenses}
-        subjects = [s for one in known.values() for s in subjects_of(one)]
-        say(f"{len(subjects)} programs written")
-        cpus = os.cpu_count() or 1
-        with ThreadPoolExecutor(max(1, cpus - 2)) as pool:
-            ways = [(s, fast) for s in subjects for fast in ((False, True) if cuda else (False,))]
-            compiled = list(pool.map(lambda way: Compiled(way[0], folder, device, way[1]), ways))
-        say("all compiled")
-        checked = {name: gpu.Checked.of(one, one.model.domain.film_z_mm[0]) for name, one in known.items()}
-        with alone(folder):
-            best = ceiling(device, folder)
-            found["ceiling"] = best
-            rows = []
-            for made in compiled:
-                rows.append(race(made, args.rays, args.rounds, best, FRAMES if cuda else SMALL))
-                rows[-1] |= errors_of(made, known[made.subject.lens], checked[made.subject.lens])
-            found["rows"] = rows
-            say("CUDA C++ measured")
-            by = {(m.subject.lens, m.subject.kind, m.form): m for m in compiled}
-            found["gradients"] = []
-            for name in lenses:
-                for form in (EXACT, *MODELS[name]):
-                    row = gradient_row(known[name], form, device, args.rays // 2, args.rounds)
-                    row["ratio"] = min(row["seconds"]["backward"]) / min(row["seconds"]["forward"])
-                    found["gradients"].append(row)
-            say("gradients measured")
-            found["peers"] = []
-            for name in (n for n in lenses if n in rays.CASES):
-                some = peer_rows(name, device, by[name, LENS, EXACT], min(args.rays, 2**20), args.rounds)
-                for row in (r for r in some if r.get("seconds")):
-                    row["gain"] = min(row["seconds"]) / min(some[0]["seconds"])
-                found["peers"] += some
-            say("other tracers measured")
-            found["shaders"] = shaders_of(known.values(), args)
-            say("shaders measured")
-        found["torch"] = collected(running, folder, begun + args.seconds)
-    mine = {(r["lens"], r["form"]): min(r["seconds"]["stored"]) for r in _of(rows, LENS)}
-    for row in (r for r in found["torch"] if r["seconds"]):
-        row["gain"] = min(min(t) for t in row["seconds"].values()) / mine[row["lens"], row["form"]]
-    cameras = {(r["lens"], r["form"]): r for r in _of(rows, CAMERA)}
-    found["goals"] = [
-        lab.Goal(text, wanted, value_of(cameras[key], at_least), at_least)
-        for text, key, wanted, at_least in (GOALS if cuda else ())
-        if key in cameras
-    ]
-    found["seconds"] = time.monotonic() - begun
     args.out.mkdir(parents=True, exist_ok=True)
-    plot(found, args.out / "gpu_day.png")
-    print(lab.write_results(args.out, "gpu_day", page_of(found), found))
+    with tempfile.TemporaryDirectory(prefix="neurolens-gpu-day-") as place:
+        Day(args, lenses, device, Path(place)).run()
+
+
+class Day:
+    """The measurements in their order; what is measured is written at once."""
+
+    def __init__(self, args: argparse.Namespace, lenses: list[str], device: torch.device, folder: Path) -> None:
+        self.args, self.lenses, self.device, self.folder = args, lenses, device, folder
+        self.begun, self.cuda = time.monotonic(), device.type == "cuda"
+        name = torch.cuda.get_device_name() if self.cuda else "software (g++)"
+        about = {"device": name, "rays": args.rays, "rounds": args.rounds}
+        self.found: lab.Row = {"about": about, "software": not self.cuda, "machine": lab.machine()}
+        self.forms = [(name, form) for name in lenses for form in (EXACT, *MODELS[name])]
+
+    def run(self) -> None:
+        """All of it."""
+        with alone(self.folder):  # workers compile meanwhile, and wait with their clocks
+            running = workers(self.forms, self.folder, self.args)
+            known = {name: gpu.subject_of(name) for name in self.lenses}
+            made = self._compiled(known)
+            self._race(known, made)
+            self._gradients(known)
+            self._peers({m.subject.lens: m for m in made if (m.subject.kind, m.form) == (LENS, EXACT)})
+            self.found["shaders"] = shaders_of(known.values(), self.args)
+            self._say("shaders")
+        self.found["torch"] = collected(running, self.folder, self.begun + self.args.seconds)
+        mine = {(r["lens"], r["form"]): min(r["seconds"]["stored"]) for r in _of(self.found["rows"], LENS)}
+        for row in (r for r in self.found["torch"] if r["seconds"]):
+            row["gain"] = min(min(t) for t in row["seconds"].values()) / mine[row["lens"], row["form"]]
+        self._say("torch")
+        print(page_of(self.found))
+
+    @contextmanager
+    def _unless_it_fails(self, what: str) -> Iterator[None]:
+        """The others are measured all the same."""
+        try:
+            yield
+        except Exception as error:  # of compilers and devices that nobody has tried
+            self.found.setdefault("failed", []).append(f"{what}: {type(error).__name__}: {error}"[:300])
+
+    def _say(self, what: str) -> None:
+        """Write what was measured so far."""
+        self.found["seconds"] = time.monotonic() - self.begun
+        plot(self.found, self.args.out / "gpu_day.png")
+        lab.write_results(self.args.out, "gpu_day", page_of(self.found), self.found)
+        if not self.args.quiet:
+            print(f"{self.found['seconds']:5.0f} s  {what}", file=sys.stderr, flush=True)
+
+    def _compiled(self, known: Mapping[str, gpu.Subject]) -> list[Compiled]:
+        subjects = [make(known[name], form) for make in (lens_subject, camera_subject) for name, form in self.forms]
+        ways = [(s, fast) for s in subjects for fast in ((False, True) if self.cuda else (False,))]
+        with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) - 2)) as pool:
+            made = list(pool.map(lambda way: Compiled(way[0], self.folder, self.device, way[1]), ways))
+        self._say(f"{len(made)} programs compiled")
+        return made
+
+    def _race(self, known: Mapping[str, gpu.Subject], compiled: Sequence[Compiled]) -> None:
+        best = self.found["ceiling"] = ceiling(self.device)
+        frames, rows = FRAMES if self.cuda else SMALL, self.found.setdefault("rows", [])
+        checked = {name: gpu.Checked.of(one, one.model.domain.film_z_mm[0]) for name, one in known.items()}
+        for made in compiled:
+            with self._unless_it_fails(f"{made.subject.name}, {made.form}"):
+                row = race(made, self.args.rays, self.args.rounds, best, frames)
+                rows.append(row | errors_of(made, known[made.subject.lens], checked[made.subject.lens]))
+        cameras = {(r["lens"], r["form"]): r for r in _of(rows, CAMERA)}
+        self.found["goals"] = [
+            lab.Goal(text, wanted, value_of(cameras[key], at_least), at_least)
+            for text, key, wanted, at_least in (GOALS if self.cuda else ())
+            if key in cameras
+        ]
+        self._say("CUDA C++")
+
+    def _gradients(self, known: Mapping[str, gpu.Subject]) -> None:
+        rows = self.found.setdefault("gradients", [])
+        for name, form in self.forms:
+            with self._unless_it_fails(f"gradients of {name}, {form}"):
+                row = gradient_row(known[name], form, self.device, self.args.rays // 2, self.args.rounds)
+                row["ratio"] = min(row["kernels"]["backward"]) / min(row["kernels"]["forward"])
+                rows.append(row)
+        self._say("gradients")
+
+    def _peers(self, exact: Mapping[str, Compiled]) -> None:
+        rows = self.found.setdefault("peers", [])
+        for name in (n for n in self.lenses if n in rays.CASES):
+            some = peer_rows(name, self.device, exact[name], min(self.args.rays, 2**20), self.args.rounds)
+            for row in (r for r in some if r.get("seconds")):
+                row["gain"] = min(row["seconds"]) / min(some[0]["seconds"])
+            rows += some
+        self._say("other tracers")
 
 
 def value_of(row: lab.Row, at_least: bool) -> float:
