@@ -41,6 +41,7 @@ from torch import Tensor
 from experiments import gpu, lab, ray_peers, rays
 from experiments.gpu import EXACT, LENSES
 from neurolens.base.errors import NeurolensError
+from neurolens.base.files import atomic_write_text
 from neurolens.cameras.cameragraph import whole_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.lenscamera import LensCamera as Camera
@@ -67,7 +68,7 @@ THREADS, EACH, BYTES = 128, 4, 4
 OPTIONS = (
     lab.count("rays", None, "of a timed call (default 8388608; in software 16384)"),
     lab.count("rounds", None, "repetitions of a timed call (default 15; in software 3)"),
-    lab.count("seconds", 420, "after which torch's compilers are waited for no longer (default 420)"),
+    lab.count("seconds", 420, "after which torch's compilers are waited for no longer (default 420; 0: no torch)", 0),
     lab.option("--torch", metavar="LENS:FORM", default="", help=argparse.SUPPRESS),  # one job of a worker
     lab.ONLY,
     lab.out(),
@@ -200,7 +201,7 @@ class Compiled:
         if device.type == "cuda":
             command = ["nvcc", "-O3", "-arch=native", *(FAST if fast else ()), "-Xcompiler", "-fPIC"]
         else:
-            command = ["g++", "-O2", "-march=native", "-fno-math-errno", "-fPIC", "-x", "c++"]
+            command = ["g++", "-O1", "-march=native", "-fno-math-errno", "-fPIC", "-x", "c++"]
         done = subprocess.run(
             [*command, "-shared", str(source), "-o", str(self.library)], capture_output=True, text=True, check=False
         )
@@ -383,8 +384,9 @@ def alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def torch_job(name: str, form: str, folder: Path, size: int, rounds: int) -> lab.Row:
-    """A lens in torch: step by step, as a CUDA graph of these steps, compiled; the exact one by the tracer, too."""
+def torch_job(name: str, form: str, folder: Path, size: int, rounds: int) -> None:
+    """A lens in torch: step by step, as a CUDA graph of these steps, compiled; the exact one by the tracer, too. Its
+    row, a file of the folder, grows."""
     known = gpu.subject_of(name)
     subject = lens_subject(known, form)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -397,7 +399,18 @@ def torch_job(name: str, form: str, folder: Path, size: int, rounds: int) -> lab
     def measure(way: str, call: Callable[[], Any], count: int = size) -> None:
         with alone(folder), torch.no_grad():
             ways[way] = [t / count for t in event_times(call, rounds, device.type)]
+        atomic_write_text(folder / f"{name}.{form}.json", json.dumps(row))
 
+    if device.type == "cuda" or lab.operations_of(subject.program)["operations"] < 200:
+        from torch.fx.experimental.proxy_tensor import make_fx
+
+        begun = time.perf_counter()
+        compiled = torch.compile(make_fx(run)(given), dynamic=False)
+        with torch.no_grad():
+            found = compiled(given)
+            row["compile_s"] = time.perf_counter() - begun
+            row["compiled_differs"] = float((found - run(given)).nan_to_num().abs().max())
+        measure("compiled", lambda: compiled(given))
     measure("eager", lambda: run(given))
     if form == EXACT:
         lens, domain = known.model.lens, known.model.domain
@@ -415,18 +428,6 @@ def torch_job(name: str, form: str, folder: Path, size: int, rounds: int) -> lab
             with torch.cuda.graph(recorded):
                 run(given)
         measure("CUDA graph", recorded.replay)
-    if device.type == "cuda" or lab.operations_of(subject.program)["operations"] < 200:
-        from torch.fx.experimental.proxy_tensor import make_fx
-
-        begun = time.perf_counter()
-        compiled = torch.compile(make_fx(run)(given), dynamic=False)
-        with torch.no_grad():
-            found = compiled(given)
-        row["compile_s"] = time.perf_counter() - begun
-        measure("compiled", lambda: compiled(given))
-        wanted = run(given)
-        row["compiled_differs"] = float((found - wanted).nan_to_num().abs().max())
-    return row
 
 
 def workers(
@@ -627,7 +628,10 @@ read, 32 or 40 written. "In place": rays made of their number, {each} for a thre
 quotients and square roots within 2 units in the last place (nvcc -prec-div=false -prec-sqrt=false). Errors of lenses
 are against the exact trace in float64, on {checked} rays; of cameras against their own program in float64. Bound by:
 the larger share of what the device did at best, a copy at {copy} TB/s and {issue} thousand million multiply-adds a
-second."""
+second; the instructions of a ray are counted in the machine code of the stored kernel, which makes that an estimate."""
+
+
+_MACHINE = "{processor}, {cores} cores; Python {python}, torch {torch}; the whole in {seconds:.0f} s."
 
 
 def _ns(seconds: Sequence[float]) -> str:
@@ -641,15 +645,19 @@ def page_of(found: lab.Row) -> str:
     notes = _NOTES.format(
         **found["about"], threads=THREADS, each=EACH, read=BYTES * 5, checked=_CHECKED, copy=copy, issue=issue
     )
-    parts = ["`python -m experiments gpu-day`", notes, lab.machine_line(f"; the whole in {found['seconds']:.0f} s")]
+    parts = ["`python -m experiments gpu-day`", notes, _MACHINE.format(**found["machine"], seconds=found["seconds"])]
     if found["software"]:
         parts.append("**In software, without a GPU: these times say nothing about one.**")
-    parts += [lab.goal_table("goal", found["goals"])] if found.get("goals") else []
+    goals = [lab.Goal(**{k: v for k, v in goal.items() if k != "verdict"}) for goal in found.get("goals", [])]
+    parts += [lab.goal_table("goal", goals)] if goals else []
     parts += ["![Error against rays a second](gpu_day.png)", "## Lenses", lab.table(_LENSES, _of(rows, LENS))]
     parts += ["Not measured: " + "; ".join(found["failed"])] if found.get("failed") else []
     parts += ["## Whole cameras", lab.table(_CAMERAS, _of(rows, CAMERA))]
     parts += ["## Gradients (`neurolens.torch`)", lab.table(_GRADIENTS, found.get("gradients", []))]
-    parts += ["## Lenses in torch", lab.table(_TORCH, found.get("torch", []))]
+    timed = [row for row in found.get("torch", []) if row["seconds"]]
+    left = ", ".join(f"{r['lens']} {r['form']}" for r in found.get("torch", []) if not r["seconds"])
+    parts += ["## Lenses in torch", lab.table(_TORCH, timed) if timed else ""]
+    parts += [f"Not measured, for the time was over before torch had compiled them: {left}." if left else ""]
     parts += [
         "## Other people's tracers, on the same rays of one wavelength",
         lab.table(_PEERS, found.get("peers", [])),
@@ -720,8 +728,7 @@ def run(args: argparse.Namespace) -> None:
     args.rounds = args.rounds or (15 if cuda else 3)
     if args.torch:
         name, form = args.torch.split(":")
-        row = torch_job(name, form, args.out, args.rays, args.rounds)
-        (args.out / f"{name}.{form}.json").write_text(json.dumps(row), encoding="utf-8")
+        torch_job(name, form, args.out, args.rays, args.rounds)
         return
     torch.set_num_threads(1)  # its threads would wait for those of the workers
     lenses = lab.chosen(list(MODELS), str, args.only, "gpu-day")
@@ -744,7 +751,7 @@ class Day:
     def run(self) -> None:
         """All of it."""
         with alone(self.folder):  # workers compile meanwhile, and wait with their clocks
-            running = workers(self.forms, self.folder, self.args)
+            running = workers(self.forms if self.args.seconds else (), self.folder, self.args)
             known = {name: gpu.subject_of(name) for name in self.lenses}
             made = self._compiled(known)
             self._race(known, made)
@@ -793,7 +800,7 @@ class Day:
                 rows.append(row | errors_of(made, known[made.subject.lens], checked[made.subject.lens]))
         cameras = {(r["lens"], r["form"]): r for r in _of(rows, CAMERA)}
         self.found["goals"] = [
-            lab.Goal(text, wanted, value_of(cameras[key], at_least), at_least)
+            lab.Goal(text, wanted, value_of(cameras[key], at_least), at_least).to_dict()
             for text, key, wanted, at_least in (GOALS if self.cuda else ())
             if key in cameras
         ]

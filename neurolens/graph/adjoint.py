@@ -75,7 +75,10 @@ def adjoint(program: Program, outputs: Collection[str], inputs: Collection[str])
         add(results[name].argument, found.input(f"{OUTER}{name}"))
     for k in reversed(forward):
         step = found.steps[k]
-        if k in gradients and step.kind in _RULES:
+        if k in gradients and k in found.tanhs:  # its steps would all have to wait for their gradients
+            slope = found.expr(1.0) - Expr(found, k) * Expr(found, k)
+            add(found.tanhs[k], gradients[k] * slope)
+        elif k in gradients and step.kind in _RULES:
             given = [Expr(found, a) for a in step.arguments]
             for argument, part in zip(
                 step.arguments, _RULES[step.kind](gradients[k], Expr(found, k), given), strict=True

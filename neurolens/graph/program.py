@@ -162,6 +162,7 @@ class Program:
         mixture: mixes the tables by a state; None: `band` chooses one. Of numbers that differ between tables that are
             mixed, only sums may have been folded.
         own_tables: numbers [cells, columns] that lookups read and that no caller gives, by name.
+        tanhs: the steps that are the tanh of another one, whose slope is known (`adjoint`), with that one.
     """
 
     tables: int = 1
@@ -169,6 +170,7 @@ class Program:
     outputs: dict[str, Expr] = field(default_factory=dict)
     mixture: Mixture | None = None
     own_tables: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    tanhs: dict[int, int] = field(default_factory=dict)
     _known: dict[Step, int] = field(default_factory=dict)
 
     def input(self, name: str, per_call: bool = False) -> Expr:
@@ -219,7 +221,10 @@ class Program:
         """tanh by additions, multiplications and one division, which every compiler vectorises."""
         x = self.op("clamp", value, TANH_LIMIT)
         t = x * x
-        return x * self.horner(t, TANH_NUMERATOR) / self.horner(t, TANH_DENOMINATOR)
+        found = x * self.horner(t, TANH_NUMERATOR) / self.horner(t, TANH_DENOMINATOR)
+        if isinstance(found.argument, int) and isinstance(value.argument, int):
+            self.tanhs[found.argument] = value.argument
+        return found
 
     def select(self, a: Number, b: Number, then: Number, otherwise: Number) -> Expr:
         """`then` where a <= b, else `otherwise`, which NaN chooses too."""
@@ -382,6 +387,8 @@ class Program:
             other = rule(k, step, given) if rule else None
             place[k] = other or found._append(replace(step, arguments=tuple(e.argument for e in given)))
         found.outputs = {name: moved(e.argument) for name, e in self.outputs.items()}
+        pairs = ((place[k].argument, place[a].argument) for k, a in self.tanhs.items() if k in place and a in place)
+        found.tanhs = {k: a for k, a in pairs if isinstance(k, int) and isinstance(a, int)}
         return found
 
     def _sums(self, least: int) -> dict[int, tuple[int, int]]:
