@@ -679,7 +679,7 @@ def plot(found: lab.Row, file: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(figsize=(9, 5.5), layout="constrained")
-    marks = dict(zip(MODELS, "os^D", strict=True))
+    marks = dict(zip(MODELS, "os^D", strict=False))
     rates = {(r["lens"], r["form"]): r for r in _of(found.get("rows", []), LENS)}
     for (lens, form), row in rates.items():
         colour = "tab:blue" if form.startswith(EXACT) else "tab:green" if form.startswith("ols") else "tab:orange"

@@ -42,7 +42,7 @@ _FOUND = (*row_names("ray", 6), "weight")
 _AWAY = 2.0  # steps from the shot's setting, beyond which rays are no longer taken as linear in it
 # Rows [R, N] of rays to results [R, N] in the order of a program's outputs.
 Run = Callable[[Tensor], Tensor]
-_THREADS = 128  # of a block of a kernel
+_THREADS, _MOST = 128, 2**30  # of a block of a kernel; rays of a call, whose number is an int of C
 
 
 class LensRays(NamedTuple):
@@ -367,17 +367,20 @@ def on_gpu(program: Program, rows: Sequence[str], numbers: Mapping[str, Tensor],
         rows: names of the inputs of a ray, in the order of the rows that the function takes.
         numbers: inputs of the call. tables: that lookups read, [cells, columns]. Both are on the GPU.
     """
-    s, kernel = Signature.of(program, "lens"), _kernel(Cuda(program, "lens").kernel())
+    s, device = Signature.of(program, "lens"), next(iter(tables.values())).device
+    kernel = _kernel(Cuda(program, "lens").kernel(), device)
     call = torch.stack([numbers[name] for name in s.per_call]) if s.per_call else None
     given = [part for name in s.tables for part in (tables[name], len(tables[name]))]
     order = [rows.index(name) for name in s.per_ray]
     kept, results = order == list(range(len(rows))), len(program.outputs)
 
     def run(rays: Tensor) -> Tensor:
+        if rays.shape[1] > _MOST:
+            return torch.cat([run(some) for some in rays.split(_MOST, 1)], 1)
         count, found = rays.shape[1], rays.new_empty((results, rays.shape[1]))
         if count:
             rays = (rays if kept else rays[order]).contiguous()
-            with torch.cuda.device(rays.device):
+            with torch.cuda.device(device):
                 blocks = -(-count // _THREADS)
                 kernel((blocks, 1, 1), (_THREADS, 1, 1), [rays, rays if call is None else call, *given, found, count])
         return found
@@ -386,8 +389,9 @@ def on_gpu(program: Program, rows: Sequence[str], numbers: Mapping[str, Tensor],
 
 
 @cache
-def _kernel(text: str) -> Any:
-    return torch.cuda._compile_kernel(text, "lens_rays")
+def _kernel(text: str, device: torch.device) -> Any:
+    with torch.cuda.device(device):
+        return torch.cuda._compile_kernel(text, "lens_rays")
 
 
 def step_by_step(

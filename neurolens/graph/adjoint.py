@@ -55,7 +55,8 @@ def adjoint(program: Program, outputs: Collection[str], inputs: Collection[str])
 
     Args:
         program: of one table of coefficients.
-        outputs: names of results that the number depends on. inputs: names of inputs.
+        outputs: names of results that the number depends on.
+        inputs: names of inputs, in the order of the gradients; of one that the program does not take that is 0.
 
     Raises:
         ValueError: a program whose coefficients follow a state or a band.
@@ -85,11 +86,12 @@ def adjoint(program: Program, outputs: Collection[str], inputs: Collection[str])
             ):
                 add(argument, part)
     found.outputs, zero = {}, found.literal(0.0)
-    for k in (k for k in forward if found.steps[k].kind == "input" and found.steps[k].name in inputs):
-        gradient = gradients.get(k, zero)
+    places = {found.steps[k].name: k for k in forward if found.steps[k].kind == "input"}
+    for name in inputs:
+        gradient = gradients.get(places.get(name, -1), zero)
         if STATUS in results:
             gradient = found.select(results[STATUS], float(PASSED), gradient, zero)
-        found.outputs[f"{INNER}{found.steps[k].name}"] = gradient
+        found.outputs[f"{INNER}{name}"] = gradient
     found.outputs |= {name: value for name, value in results.items() if name == STATUS}
     return found.in_order_of_need()
 

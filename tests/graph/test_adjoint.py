@@ -73,6 +73,14 @@ def test_the_middle_of_the_film_has_no_slope_of_its_radius() -> None:
     assert film.grad is not None and bool(torch.isfinite(film.grad).all()) and float(film.grad.abs().max()) < 1
 
 
+def test_gradients_come_in_the_order_asked_for() -> None:
+    """Inputs that a program does not take have none: a lens of unknown dispersion has no wavelength."""
+    back = adjoint(program_of(lambda p, x, y: x * y + y), ["value"], ["y", "wavelength_nm", "x"])
+    assert list(back.outputs) == ["by_y", "by_wavelength_nm", "by_x"]
+    given = torch.tensor([[2.0], [3.0], [1.0]])
+    assert step_by_step(back, ("x", "y", f"{OUTER}value"), {}, {})(given)[:, 0].tolist() == [3.0, 0.0, 3.0]
+
+
 def camera_program(
     name: str = "laikin_double_gauss_50.mlp-10x1",
 ) -> tuple[LensCamera, Program, dict[str, torch.Tensor]]:
