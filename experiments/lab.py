@@ -447,7 +447,7 @@ def times_of(row: Row) -> str:
     """Least and median nanoseconds of a row of a race, or why there are none."""
     if not (ns := row["ns"]):
         return f"not run: {row['reason']}"
-    return best_median(ns["min"], ns["median"], form=".2f" if ns["min"] < 100 else ",.0f")
+    return best_median(ns["min"], ns["median"], form=".2g" if ns["min"] < 1 else ".2f" if ns["min"] < 100 else ",.0f")
 
 
 def load_line(rows: Iterable[Row]) -> str:
