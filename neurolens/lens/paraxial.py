@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.lens.glass import index_of
+from neurolens.lens.glass import check_light, index_of
 from neurolens.lens.prescription import Lens
 
 Meridian = Literal["x", "y"]
@@ -105,6 +105,7 @@ class PathOfRay(NamedTuple):
 def system_of(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> System:
     """Return the lens in one meridian at one wavelength; None takes `Lens.reference_nm`."""
     light = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    check_light(lens, light)
     curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
     index = [index_of(medium, light) for medium in lens.media]
     ideal = [0.0 if s.focal_mm is None else 1 / s.focal_mm for s in lens.surfaces]
