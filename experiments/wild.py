@@ -149,8 +149,8 @@ def tracer(lens: Lens, pupil_z_mm: float) -> Runner:
         stop, nm = float(rays["stop_radius_mm"]), rays["wavelength_nm"]
         rows = [replace(s, diameter_mm=2 * stop) if s.stop else s for s in lens.surfaces]
         film = [torch.from_numpy(np.asarray(rays[name])) for name in RAY]
-        z = [torch.tensor(float(v), dtype=torch.float32) for v in (rays["film_z_mm"], pupil_z_mm)]
-        start = camera_rays(film[0], film[1], z[0], film[2], film[3], z[1])
+        film_z = torch.tensor(float(rays["film_z_mm"]), dtype=torch.float32)
+        start = camera_rays(film[0], film[1], film_z, film[2], film[3], pupil_z_mm)
         done = trace(replace(lens, surfaces=tuple(rows)), start, torch.from_numpy(nm), transmittance=True)
         inside = (light[0] <= nm) & (nm <= light[1]) & (0 <= stop < math.inf)
         found = {name: np.asarray(value) for name, value in zip(SCENE_RAY, done.rays, strict=True)}

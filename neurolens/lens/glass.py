@@ -148,6 +148,8 @@ ALIASES = {
     **{"BK7": "Schott:N-BK7", "silica": "generic:fused silica", "SiO2": "generic:fused silica"},
     **{"fluorite": "generic:CaF2", "acrylic": "generic:PMMA", "PC": "generic:polycarbonate"},
     **{"POLYCARB": "generic:polycarbonate", "PS": "generic:polystyrene", "POLYSTYR": "generic:polystyrene"},
+    **{"plexiglas": "generic:PMMA", "lucite": "generic:PMMA", "perspex": "generic:PMMA"},
+    **{"lexan": "generic:polycarbonate", "makrolon": "generic:polycarbonate", "styron": "generic:polystyrene"},
     **{"SAN": "generic:styrene acrylonitrile", "COP": "generic:Zeonex E48R", "E48R": "generic:Zeonex E48R"},
 }
 

@@ -20,6 +20,7 @@ from neurolens.lens.prescription import Lens
 
 Meridian = Literal["x", "y"]
 COLOURS = 7  # wavelengths that stand for a range
+_SAME_NM = 0.1  # files round spectral lines
 _LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light has a focus, too
 
 
@@ -163,6 +164,20 @@ def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridi
         f_number=abs(efl) / entrance_diameter if entrance_diameter else math.inf,
         front_efl_mm=front_efl,
     )
+
+
+def light_of(lens: Lens) -> dict[str, Any]:
+    """At which wavelength first-order data stand, and focal length and back focus at the source's primary one, as JSON.
+
+    `primary` is None where the source states none, or the same.
+    """
+    at, primary = lens.reference_nm, next(iter(lens.wavelengths_nm), lens.reference_nm)
+    found = None
+    if abs(primary - at) > _SAME_NM:
+        straight = lens.anamorphic and system_of(lens).march(1.0, 0.0).after[-1] == 0  # no power in the y-z plane
+        data = first_order(lens, primary, "x" if straight else "y")
+        found = {"wavelength_nm": primary, "efl_mm": float(data.efl_mm), "back_focus_mm": float(data.back_focus_mm)}
+    return {"wavelength_nm": at, "primary": found}
 
 
 def is_pinhole(lens: Lens) -> bool:
