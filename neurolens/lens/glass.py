@@ -363,9 +363,9 @@ def check_light(lens: Lens, wavelength_nm: float) -> None:
 
     Visible light passes: reading a lens says which of its glasses are not stated there.
     """
-    low, high = stated_nm(lens)
     if VISIBLE_NM[0] <= wavelength_nm <= VISIBLE_NM[1]:
         return
+    low, high = stated_nm(lens)
     if not low / DOMAIN_SLACK <= wavelength_nm <= high * DOMAIN_SLACK:
         expected = f"{low:g} to {high:g} nm, where the index of its glasses is stated"
         raise InputError(lens.path, "wavelength_nm", wavelength_nm, expected)

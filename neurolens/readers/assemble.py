@@ -102,13 +102,9 @@ def finish(
 
 
 def pupil_of(lens: Lens, object_na: float, distance: float) -> float:
-    """Diameter of the entrance pupil that gives light from an object at a distance this numerical aperture.
-
-    Raises:
-        InputError: an aperture that the medium of the object does not have, or an object at infinity.
-    """
-    sine, trial = object_na / float(lens.object_medium.n_d), lens.with_stop_radius(1.0)
-    reach = distance + first_order(trial).entrance_pupil_z_mm
+    """Diameter of the entrance pupil that gives light from a near object this numerical aperture, else InputError."""
+    sine = object_na / float(lens.object_medium.n_d)
+    reach = distance + first_order(lens.with_stop_radius(1.0)).entrance_pupil_z_mm
     if not (sine < 1 and 0 < reach < math.inf):
         expected = "an aperture below the index in front, of an object at a finite distance"
         raise InputError(lens.path, "numerical aperture of the object", object_na, expected)
@@ -245,14 +241,12 @@ def _as_beside(lens: Lens) -> Lens | None:
     """The lens with rims as wide as those on the other side of the same glass; None where some have no such rim."""
     rows = list(lens.surfaces)
     for k, s in enumerate(lens.surfaces):
-        # The glass before a surface ends at the one before, that behind it at the next.
-        ends = [(before, before) for before in rows[max(k - 1, 0) : k]] + [(s, t) for t in lens.surfaces[k + 1 : k + 2]]
-        known = [end.diameter_mm for glass, end in ends if glass.n_d != 1 and not math.isnan(end.diameter_mm)]
+        before, behind = rows[max(k - 1, 0) : k], lens.surfaces[k + 1 : k + 2] if s.n_d != 1 else ()
+        ends = [*(end for end in before if end.n_d != 1), *behind]
         if math.isnan(s.diameter_mm):
-            if not known:
-                return None
-            rows[k] = replace(s, diameter_mm=min(max(known), 2 * end_mm(s)))
-    return replace(lens, surfaces=tuple(rows))
+            widest = max((end.diameter_mm for end in ends if not math.isnan(end.diameter_mm)), default=math.nan)
+            rows[k] = replace(s, diameter_mm=min(widest, 2 * end_mm(s)))
+    return None if any(math.isnan(row.diameter_mm) for row in rows) else replace(lens, surfaces=tuple(rows))
 
 
 def narrowed(lens: Lens, draft: Draft) -> Lens:

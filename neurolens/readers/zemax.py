@@ -314,17 +314,17 @@ def _check_figures(file: File) -> None:
 
     Programs that exchange glasses leave the figures of glasses before.
     """
-    stale = ""
+    stale, unknown = "", None
     for name, given in file.figures.items():
         known = [(g.n_d, g.V_d) for g in (*catalogue.same_name(name), *catalogue.same_name(f"N-{name}"))]
-        for line, found in given:
-            others = known or [given[0][1]]
-            if not any(abs(n_d - found[0]) <= _SAME_N_D and abs(V_d - found[1]) <= _SAME_V_D for n_d, V_d in others):
-                stale = stale or f"line {line.number} gives {name} {found[0]:g} and {found[1]:g}, another glass's"
-    for name, ((line, found), *_) in file.figures.items():
-        if stale and not (catalogue.same_name(name) or catalogue.same_name(f"N-{name}")):
-            expected = f"a glass of the catalogue, or its own by --glass: the figures behind names are stale ({stale})"
-            raise line.error("GLAS", f"{name} with n_d {found[0]:g} and V_d {found[1]:g}", expected)
+        unknown = unknown or (None if known else (name, *given[0]))
+        for line, (n, V) in given:
+            if not any(abs(n_d - n) <= _SAME_N_D and abs(V_d - V) <= _SAME_V_D for n_d, V_d in known or [given[0][1]]):
+                stale = stale or f"line {line.number} gives {name} {n:g} and {V:g}, another glass's"
+    if stale and unknown:
+        name, line, (n, V) = unknown
+        expected = f"a glass of the catalogue, or its own by --glass: the figures behind names are stale ({stale})"
+        raise line.error("GLAS", f"{name} with n_d {n:g} and V_d {V:g}", expected)
 
 
 def _add_ends(file: File) -> None:
