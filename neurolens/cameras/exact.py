@@ -36,7 +36,7 @@ from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives
-from neurolens.lens.glass import LINE_D_NM, index_of
+from neurolens.lens.glass import LINE_D_NM, check_light, index_of
 from neurolens.lens.paraxial import PupilBounds, chief_reach_mm, first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
@@ -63,7 +63,7 @@ class ExactCamera(LensCamera):
         runtime: what runs the camera. Only "trace" can compute in float64.
 
     Raises:
-        InputError: a focus nearer than four focal lengths, or a lens that no ray passes.
+        InputError: a focus nearer than four focal lengths, a lens that no ray passes, light of no known index.
     """
 
     def __init__(
@@ -81,6 +81,8 @@ class ExactCamera(LensCamera):
         self.wavelength_nm = shot.wavelength_nm if self.dispersive else None
         self._range_nm = shot.wavelength_nm
         used = shot.wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
+        for nm in used:
+            check_light(lens, nm)
         self.lens = set_lens(lens, shot)
         film_z, tabled = self.lens.film_z_mm, at_infinity(self.lens)
         assert film_z is not None  # `set_lens` places the film

@@ -145,6 +145,12 @@ def test_light_that_is_none_has_one_status_in_every_form_of_a_lens(name: str) ->
     np.testing.assert_array_equal(back.status, np.where(good, st.PASSED, st.OUTSIDE_DOMAIN))
 
 
+@pytest.mark.parametrize("range_nm", [(150.0, 200.0), (2000.0, 3000.0)])
+def test_a_camera_for_light_that_no_glass_is_stated_for_is_refused(range_nm: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match="wavelength_nm: got (150|3000).0, expected 300 to 2500 nm"):
+        ExactCamera(read_lens(LENSES / "laikin_double_gauss_50.toml"), Shot(FILM, wavelength_nm=range_nm, focus_m=2.0))
+
+
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize("stop_mm", [-5.0, math.nan, math.inf, 1e20])
 def test_a_stop_without_a_radius_is_outside_the_domain(stop_mm: float, double: bool) -> None:
