@@ -98,6 +98,12 @@ class Handed:
         return str(self.attributes.get("lensModel") or self.attributes["cameraModel"])
 
     @property
+    def about(self) -> str:
+        """The lens by its name and the hash of its prescription; the path of its file says nothing elsewhere."""
+        sha256 = self.attributes.get("lensSerialNumber")
+        return f"{self.lens} (sha256 {sha256[:16]})" if sha256 else self.lens
+
+    @property
     def pixel_aspect(self) -> float:
         """The width of a pixel over its height in what it shows."""
         return float(f"{self.frames[0].squeeze * self.plates.pixel_mm[0] / self.plates.pixel_mm[1]:.6g}")

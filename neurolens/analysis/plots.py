@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurolens.base.errors import NeurolensError
+from neurolens.base.errors import NeurolensError, without_controls
 from neurolens.base.files import atomic_path
 
 if TYPE_CHECKING:
@@ -64,6 +64,8 @@ def drawing(path: str | Path, width_in: float, height_in: float, title: str = ""
             figure.suptitle(title + room, x=0.01, ha="left", fontsize=12, fontweight="bold")
             figure.text(0.01, 1 - 0.36 / height_in, subtitle, ha="left", va="top", fontsize=9, color="#555b63")
         yield figure
+        for text in figure.findobj(lambda artist: hasattr(artist, "set_text")):
+            text.set_text(without_controls(text.get_text()))  # a lens's name may hold anything, and SVG is XML
         with atomic_path(path) as temporary:
             figure.savefig(temporary, facecolor="white")
 

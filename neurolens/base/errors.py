@@ -9,12 +9,18 @@ from contextlib import contextmanager
 from pathlib import Path
 
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 _LONGEST = 400  # characters of a value or field in a message
 
 
 def printable(text: str) -> str:
     """Text for a terminal: what could command it, or turn the writing round, as \\u and four digits."""
     return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def without_controls(text: str) -> str:
+    """A text for files: without the characters that XML has not, nor USD an escape for."""
+    return _NOT_XML.sub("", text)
 
 
 def one_line(text: str, most: int) -> str:

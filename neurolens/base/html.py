@@ -19,7 +19,7 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_eval_context
 from jinja2.filters import do_mark_safe
 
-from neurolens.base.errors import one_line
+from neurolens.base.errors import one_line, without_controls
 
 _FOLDERS = [Path(__file__).parents[1] / name for name in ("templates", "view/page")]
 
@@ -41,7 +41,9 @@ def _templates() -> Environment:
         lstrip_blocks=True, keep_trailing_newline=True, finalize=_checked,
     )  # fmt: skip
     environment.filters["quoted"] = lambda svg: quote(svg, safe=" /:=(),;.")
-    environment.filters["literal"] = lambda value, ascii=True: do_mark_safe(json.dumps(value, ensure_ascii=ascii))
+    environment.filters["literal"] = lambda value, ascii=True: do_mark_safe(
+        json.dumps(without_controls(value) if isinstance(value, str) else value, ensure_ascii=ascii)
+    )
     environment.filters["line"] = lambda text: do_mark_safe(
         re.sub(r"([\\`*_|<\[])", r"\\\1", one_line(str(text), 1000))
     )
@@ -58,7 +60,7 @@ def _checked(context: Any, value: Any) -> Any:
     """The value of an expression, refused where it is a text that could be read as code."""
     if not context.autoescape and type(value) is str:  # `safe` makes another type of it
         raise TypeError(f"{value[:40]!r} needs a filter that quotes it")
-    return value
+    return without_controls(value) if type(value) is str else value
 
 
 def text_of(name: str) -> str:

@@ -3,7 +3,7 @@
 One integer per ray, the same codes for the exact tracer and for exported models:
 
     0                 passed
-    1                 outside the domain of a model (exact tracing never returns it)
+    1                 outside the domain of a model; of a lens, a wavelength at which no glass of it is stated
     2                 no solution found (inverse maps of models only)
     4 (k + 1) + r     ended at surface k (0-based, counted from the scene), for reason r:
                       1 missed the surface, 2 blocked by its rim (or by the stop), 3 total reflection
@@ -13,6 +13,8 @@ At each surface the reasons are tested in that order; the first failure along th
 
 from __future__ import annotations
 
+# Relative slack of a domain's bounds: the rounding of float32 inputs, and no more.
+DOMAIN_SLACK = 1.00001
 PASSED = 0
 OUTSIDE_DOMAIN = 1
 NO_SOLUTION = 2
@@ -44,7 +46,7 @@ def describe(status: int) -> str:
     if status == PASSED:
         return "passed"
     if status == OUTSIDE_DOMAIN:
-        return "outside the model's domain"
+        return "outside the domain of the model or lens"
     if status == NO_SOLUTION:
         return "no solution found"
     return f"{_REASONS[status % 4]} {status // 4 - 1}"

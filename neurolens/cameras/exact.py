@@ -36,7 +36,7 @@ from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives
-from neurolens.lens.glass import LINE_D_NM, index_of
+from neurolens.lens.glass import LINE_D_NM, check_light, index_of
 from neurolens.lens.paraxial import PupilBounds, chief_reach_mm, first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
@@ -47,7 +47,7 @@ from neurolens.surrogates.assemble import SCALARS, Form
 from neurolens.trace.aiming import without_rims
 from neurolens.trace.rays import Rays, trace
 from neurolens.trace.surfaces import media
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.trace.tracegraph import exact_graph, light_limits
 
 
 class ExactCamera(LensCamera):
@@ -63,7 +63,7 @@ class ExactCamera(LensCamera):
         runtime: what runs the camera. Only "trace" can compute in float64.
 
     Raises:
-        InputError: a focus nearer than four focal lengths, or a lens that no ray passes.
+        InputError: a focus nearer than four focal lengths, a lens that no ray passes, light of no known index.
     """
 
     def __init__(
@@ -81,6 +81,8 @@ class ExactCamera(LensCamera):
         self.wavelength_nm = shot.wavelength_nm if self.dispersive else None
         self._range_nm = shot.wavelength_nm
         used = shot.wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
+        for nm in used:
+            check_light(lens, nm)
         self.lens = set_lens(lens, shot)
         film_z, tabled = self.lens.film_z_mm, at_infinity(self.lens)
         assert film_z is not None  # `set_lens` places the film
@@ -165,7 +167,7 @@ class ExactCamera(LensCamera):
         assert done.transmittance is not None
         x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
         film = np.stack([x, y]) + (self.film.film_z_mm - z) / dz * np.stack([dx, dy])
-        return film, through, done.status.numpy()
+        return film, through, self._in_its_light(done.status, wavelength_nm)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """The graph of the lens with its stop; it has one form."""
@@ -210,7 +212,14 @@ class ExactCamera(LensCamera):
             done = trace(self.lens, rays, wavelength, transmittance=True)
         assert done.transmittance is not None
         scene = torch.stack(list(done.rays)).to(torch.float32).numpy()
-        return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), done.status.numpy())
+        status = self._in_its_light(done.status, wavelength_nm)
+        return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), status)
+
+    def _in_its_light(self, status: torch.Tensor, wavelength_nm: FloatArray) -> NDArray[np.int32]:
+        """The status of traced rays, as the lens's graph has it: of no other light than that of the camera."""
+        low, high = light_limits(self.lens, self._range_nm)
+        inside = (low <= wavelength_nm) & (wavelength_nm <= high)
+        return np.where(inside, status.numpy(), st.OUTSIDE_DOMAIN).astype(np.int32)
 
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Test whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.cameragraph import LensGraph, status_graph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
@@ -30,7 +31,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Surface
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
-from neurolens.surrogates.card import DOMAIN_SLACK, state_for
+from neurolens.surrogates.card import state_for
 from neurolens.surrogates.inverse import InverseModel, InverseRays, inverse_of
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]

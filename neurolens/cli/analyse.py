@@ -17,7 +17,6 @@ from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
     from neurolens.analysis.fields import Scene
-    from neurolens.lens.prescription import Lens
 
 
 WHATS = (
@@ -140,15 +139,18 @@ examples:
     def _scene(self) -> tuple[Scene, list[str]]:
         """The lens with its object in its state, and warnings."""
         from neurolens.analysis.fields import Scene
+        from neurolens.lens.glass import check_light
         from neurolens.readers.any_format import read_any
         from neurolens.study.describe import file_doubts, rim_doubts
 
         with warned(self.file) as notes:  # glasses that contradict the catalogue, constant indices
             tabled = read_any(self.file)
         lens = self.state.set_lens(tabled)
-        notes += rim_doubts(lens) + file_doubts(tabled, states=bool(self.state.zoom))
         scene = Scene(lens, self.state.focus_of(tabled, lens), self.axis)
-        return scene, notes + _wavelength_warnings(lens, self.waves_nm or scene.waves_nm)
+        with warned(self.file) as doubts:
+            for nm in self.waves_nm or scene.waves_nm:
+                check_light(lens, nm)
+        return scene, [*notes, *rim_doubts(lens), *file_doubts(tabled, states=bool(self.state.zoom)), *doubts]
 
     def _one(self, what: str, scene: Scene, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
         """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""
@@ -196,24 +198,6 @@ def analysis_of(what: str) -> Analysis:
         "seidel": Analysis(seidel, plots.plot_seidel, _seidel_text),
         "psf": Analysis(psf, plots.plot_psf, _psf_text),
     }[what]
-
-
-def _wavelength_warnings(lens: Lens, wavelength_nm: Iterable[float]) -> list[str]:
-    """Glasses of a lens that their source does not state at a wavelength in use."""
-    from neurolens.lens.glass import glass_of
-
-    waves, found = list(wavelength_nm), {}
-    for name in {s.glass: None for s in lens.surfaces if s.glass is not None}:
-        glass = glass_of(name)
-        outside = ", ".join(f"{nm:g}" for nm in waves if not glass.covers(nm))
-        if outside:
-            low, high = (round(1000 * v) for v in glass.range_um)
-            found[name] = f"the index of {glass} is stated for {low}-{high} nm: extrapolated at {outside} nm"
-    if any(s.n_d != 1 and s.glass is None for s in lens.surfaces):
-        far = ", ".join(f"{nm:g}" for nm in waves if not 365 <= nm <= 1014)
-        if far:
-            found[""] = f"glasses known by n_d and V_d alone are a guess at {far} nm, outside 365-1014 nm"
-    return list(found.values())
 
 
 _ROWS = 6  # of tables over the field

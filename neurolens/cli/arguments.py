@@ -432,6 +432,15 @@ def number(value: Any, digits: int = 4) -> str:
     return "infinity" if math.isinf(value) else f"{value + 0.0:.{digits}g}"  # no "-0"
 
 
+def first_order_light(data: dict[str, Any]) -> tuple[str, str]:
+    """The wavelength of first-order data (`paraxial.light_of`); a note of what they are at the file's primary one."""
+    note, primary = "of these figures", data["primary"]
+    if primary is not None:
+        efl, back = (f"{number(primary[key], 6)} mm" for key in ("efl_mm", "back_focus_mm"))
+        note += f"; at the file's primary {primary['wavelength_nm']:g} nm: focal length {efl}, back focus {back}"
+    return f"{data['wavelength_nm']:.2f} nm", note
+
+
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
     """Columns aligned by two spaces: the first `left` to the left, the others to the right."""
     lines = [list(header), *(list(row) for row in rows)]

@@ -114,7 +114,7 @@ class _Writer:
         exits, _ = read_channels(command.out / f"shot.exit{shot.frames[0].name}.exr", "RG")
         self._worse("exit_px", standards.exit_residual_px(self.frames[0].fields[""], shot.plates, exits))
         self._worse("maps_px", max(row["there_and_back_px"] for row in data["frames"]))
-        values = {"shot": shot, "about": f"{shot.lens} ({command.camera}), neurolens {__version__}", "entries": entries}
+        values = {"shot": shot, "about": f"{shot.about}, neurolens {__version__}", "entries": entries}
         values |= {"left": self.left, "fits": self.fits, "notes": self.notes, "projection": command.projection}
         values |= {"parallax": data["frames"][0]["parallax"], "types": standards.LENSFUN_TYPES}
         for name in ("shot.usda", "shot.nk", "shot.blender.py", "shot.lensfun.xml", "README.md"):
@@ -135,7 +135,7 @@ class _Writer:
         for kind in _KINDS:
             try:
                 fitted, left, data = standards.fitted_projection(
-                    kind, traced, command.picture, command.film, str(command.camera)
+                    kind, traced, command.picture, command.film, self.shot.about
                 )
             except InputError as error:
                 note = f"shot.{kind}: got {error.value}, expected {error.expected}"

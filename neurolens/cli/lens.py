@@ -227,8 +227,6 @@ def _lens_text(data: dict[str, Any]) -> str:
 
 
 def _first_order(data: dict[str, Any]) -> str:
-    from neurolens.lens.prescription import LINE_D_NM
-
     def mm(*keys: str) -> str:
         return ", ".join(f"{cli.number(data[key], 6)} mm" for key in keys)
 
@@ -252,9 +250,7 @@ def _first_order(data: dict[str, Any]) -> str:
         rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
     if data["front_efl_mm"] != data["efl_mm"]:
         rows.append(("front focal", mm("front_efl_mm"), "focal length of the object side, in its medium"))
-    if data["wavelength_nm"] != LINE_D_NM:
-        note = "of all this: the file's primary one, as its light does not hold the d line"
-        rows.append(("wavelength", f"{data['wavelength_nm']:g} nm", note))
+    rows.append(("wavelength", *cli.first_order_light(data)))
     return _columns(rows)
 
 

@@ -220,7 +220,7 @@ examples:
     def _facts(self, frame: TracedFrame, plates: Plates, kind: str, name: str) -> dict[str, Any]:
         """What the header of a map says of it."""
         field = frame.fields[name]
-        about: dict[str, Any] = {"version": __version__, "camera": str(self.camera), "name": frame.camera.name}
+        about: dict[str, Any] = {"version": __version__, "name": frame.camera.name}
         about |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
         about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
         about["settings"] = fingerprint_of(plain([frame.camera.settings, self.distance, self.state.stop]))

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.lens.glass import index_of
+from neurolens.lens.glass import check_light, index_of
 from neurolens.lens.prescription import Lens
 
 Meridian = Literal["x", "y"]
 COLOURS = 7  # wavelengths that stand for a range
+_SAME_NM = 0.1  # files round spectral lines
 _LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light has a focus, too
 
 
@@ -105,6 +106,7 @@ class PathOfRay(NamedTuple):
 def system_of(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> System:
     """Return the lens in one meridian at one wavelength; None takes `Lens.reference_nm`."""
     light = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    check_light(lens, light)
     curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
     index = [index_of(medium, light) for medium in lens.media]
     ideal = [0.0 if s.focal_mm is None else 1 / s.focal_mm for s in lens.surfaces]
@@ -162,6 +164,20 @@ def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridi
         f_number=abs(efl) / entrance_diameter if entrance_diameter else math.inf,
         front_efl_mm=front_efl,
     )
+
+
+def light_of(lens: Lens) -> dict[str, Any]:
+    """At which wavelength first-order data stand, and focal length and back focus at the source's primary one, as JSON.
+
+    `primary` is None where the source states none, or the same.
+    """
+    at, primary = lens.reference_nm, next(iter(lens.wavelengths_nm), lens.reference_nm)
+    found = None
+    if abs(primary - at) > _SAME_NM:
+        straight = lens.anamorphic and system_of(lens).march(1.0, 0.0).after[-1] == 0  # no power in the y-z plane
+        data = first_order(lens, primary, "x" if straight else "y")
+        found = {"wavelength_nm": primary, "efl_mm": float(data.efl_mm), "back_focus_mm": float(data.back_focus_mm)}
+    return {"wavelength_nm": at, "primary": found}
 
 
 def is_pinhole(lens: Lens) -> bool:

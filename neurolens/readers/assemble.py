@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
+_SHORTEST = 0.01  # focal length over the thickest glass: of 391 lenses none is below 0.19
 _SLIGHTLY = 0.1  # of a rim's diameter
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
 
@@ -71,6 +72,10 @@ def finish(
     # First-order data needs an opening, whatever it is.
     trial = lens.with_stop_radius(1.0 if math.isnan(stop.diameter_mm) else stop.semi_diameter_mm)
     data = first_order(trial)
+    thickest = max((s.thickness_mm for s in lens.surfaces[:-1] if s.n_d != 1), default=0.0)
+    if abs(data.efl_mm) < _SHORTEST * thickest:
+        expected = f"at least a hundredth of the thickest glass ({thickest:g}): are curvatures taken for radii or such?"
+        raise InputError(lens.path, "focal length", data.efl_mm, expected)
     if pupil_mm is not None:
         trial = trial.with_stop_radius(trial.stop_radius_mm * pupil_mm / data.entrance_pupil_diameter_mm)
         stated = abs(data.efl_mm) / pupil_mm if math.isnan(stated) else stated
@@ -94,6 +99,16 @@ def finish(
         if data.back_focus_mm <= 0:
             raise InputError(lens.path, "back focus", data.back_focus_mm, "a film behind the last surface")
     return replace(lens, surfaces=tuple(rows), f_number=float(stated))
+
+
+def pupil_of(lens: Lens, object_na: float, distance: float) -> float:
+    """Diameter of the entrance pupil that gives light from a near object this numerical aperture, else InputError."""
+    sine = object_na / float(lens.object_medium.n_d)
+    reach = distance + first_order(lens.with_stop_radius(1.0)).entrance_pupil_z_mm
+    if not (sine < 1 and 0 < reach < math.inf):
+        expected = "an aperture below the index in front, of an object at a finite distance"
+        raise InputError(lens.path, "numerical aperture of the object", object_na, expected)
+    return 2 * reach * sine / math.sqrt(1 - sine * sine)
 
 
 def smaller_stop(file: str, wanted: float, limit: float | None, state: str = "") -> float:
@@ -213,10 +228,25 @@ def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:
         return lens
-    derived = with_derived_rims(lens)
     surfaces = in_file(f"surface {', '.join(map(str, missing))}")
+    if not lens.half_field_deg and not lens.image_radius_mm and (filled := _as_beside(lens)) is not None:
+        warn(lens.path, f"no rim is given for {surfaces}, nor a field: as wide as the wider rim of the same glass")
+        return filled
+    derived = with_derived_rims(lens)
     warn(lens.path, f"no rim is given for {surfaces}: derived from f-number and field")
     return derived
+
+
+def _as_beside(lens: Lens) -> Lens | None:
+    """The lens with rims as wide as those on the other side of the same glass; None where some have no such rim."""
+    rows = list(lens.surfaces)
+    for k, s in enumerate(lens.surfaces):
+        before, behind = rows[max(k - 1, 0) : k], lens.surfaces[k + 1 : k + 2] if s.n_d != 1 else ()
+        ends = [*(end for end in before if end.n_d != 1), *behind]
+        if math.isnan(s.diameter_mm):
+            widest = max((end.diameter_mm for end in ends if not math.isnan(end.diameter_mm)), default=math.nan)
+            rows[k] = replace(s, diameter_mm=min(widest, 2 * end_mm(s)))
+    return None if any(math.isnan(row.diameter_mm) for row in rows) else replace(lens, surfaces=tuple(rows))
 
 
 def narrowed(lens: Lens, draft: Draft) -> Lens:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ HARMLESS = frozenset(
 )
 # What changes rays and is not read: what is expected in its place.
 REFUSED = by_word(
-    ("NAO NA", "EPD or FNO to size the stop"),
+    ("NA", "EPD, FNO or NAO to size the stop"),
     ("MOD", "a surface that is no ideal lens (a module)"),
     ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
     ("GRN", "a medium without a gradient index"),
@@ -48,6 +49,7 @@ ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
 NOT_ZOOMED = frozenset(
     """THC CCY GLC KC VUX VLX VUY VLY XAN YAN XIM YIM XRI YRI XOB YOB WTF WTW WTA WL REF DER""".split()
 )
+_THICKEST = 5.0  # of a glass, over the radius of its spheres; no lens of the library is above 1.1
 _MAX_COMMAND = 100_000  # characters of one command with all its continuation lines
 
 
@@ -109,6 +111,7 @@ class Block(draft.Block):
 
     kind: str = "SPH"
     curvature_x: float | None = None
+    unsaid: bool = False  # whether its first number may be a radius or a curvature, as which it stands
     terms: dict[str, float] = field(default_factory=dict)
     special: dict[str, float] | None = None  # coefficients of a special surface
 
@@ -180,9 +183,9 @@ def _system(file: File, command: Command) -> bool:
             if unit not in UNITS:
                 raise line.error("DIM", unit, "M (mm), C (cm) or I (inch)")
             file.unit = UNITS[unit]
-        case "EPD" | "FNO":
+        case "EPD" | "FNO" | "NAO":
             value = line.positive(name, words)
-            file.pupil, file.f_number = (value, None) if name == "EPD" else (None, value)
+            file.pupil, file.f_number, file.object_na = (value if name == n else None for n in ("EPD", "FNO", "NAO"))
         case "TEM":
             if abs(command.first() - ROOM) > 5:
                 warn(file.file, f"indices are those at {ROOM} degrees, not at {' '.join(words)}")
@@ -236,6 +239,7 @@ def _surface(file: File, command: Command) -> None:
             value = command.first(words)
             curvature = value if name.startswith("C") or value == 0 else 1 / value
             setattr(block, "curvature" if name.endswith("Y") else "curvature_x", curvature)
+            block.unsaid &= name.endswith("X")
         case "THI":
             block.thickness = command.first(words)
         case "K" | "KY":
@@ -278,18 +282,9 @@ def _new_surface(file: File, command: Command) -> None:
         raise line.error(name, "(here)", "one object SO, then surfaces S, then one image SI")
     far = name == "SO" and command.words[1:2] and command.words[1].lower() in ("inf", "infinity")
     numbers = command.numbers((command.words[0], str(INFINITE)) if far else command.words[:2], 2)
-    if file.radii is None and numbers[0] != 0:
-        file.radii = bool(file.pupil) and abs(numbers[0]) * (file.pupil or 0.0) > 2
-        why = (
-            "radii: a sphere of that curvature would be smaller than the pupil"
-            if file.radii
-            else "curvatures, not radii"
-        )
-        assume(file.file, f"line {line.number}: no RDM before it; the first numbers of surfaces are taken as {why}")
-    first = numbers[0]
-    block = Block(
-        line, str(len(file.blocks)), curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1]
-    )
+    first, thickness = numbers[:2]
+    curvature, unsaid = 1 / first if file.radii and first else first, file.radii is None and first != 0
+    block = Block(line, str(len(file.blocks)), curvature=curvature, thickness=thickness, unsaid=unsaid)
     if name == "SO" and block.thickness >= INFINITE:
         block.thickness = math.inf
     block.medium = medium(command, command.words[2:], file.private)
@@ -339,8 +334,24 @@ def _one_gap(file: File, command: Command) -> None:
     file.zoom.gaps[int(surface), int(place) - 1] = command.first(command.words[2:])
 
 
+def _settle_radii(file: File) -> None:
+    """Tell by pupil and glasses whether the first numbers of surfaces are radii, where no RDM says so."""
+    if not (unsaid := [block for block in file.blocks if block.unsaid]):
+        return
+    pupil = (file.pupil or 0.0) * max(abs(block.curvature) for block in unsaid) / 2
+    sides = ((a.thickness, b) for a, c in pairwise(file.blocks) if a.medium for b in (a, c) if b.unsaid)
+    glass = max((thickness * abs(b.curvature) for thickness, b in sides), default=0.0) / _THICKEST
+    what = "pupil" if pupil > 1 else "glass" if glass > 1 else ""
+    for block in unsaid if what else ():
+        block.curvature = 1 / block.curvature
+    why = f"radii: a sphere of that curvature would be smaller than the {what}" if what else "curvatures, not radii"
+    line = unsaid[0].start.number
+    assume(file.file, f"line {line}: no RDM before it; the first numbers of surfaces are taken as {why}")
+
+
 def _complete(file: File) -> None:
     """Set what follows from all surfaces."""
+    _settle_radii(file)
     first, *middle, image = file.blocks
     if not middle:
         raise InputError(file.file, "S", "(no surface)", "at least one surface between object and image")

@@ -21,6 +21,7 @@ from neurolens.readers.assemble import (
     finish,
     first_order,
     narrowed,
+    pupil_of,
     qbfs_terms,
     qcon_terms,
     smaller_stop,
@@ -192,7 +193,8 @@ class Draft:
     Attributes:
         kind: name of the format, for the source line.
         notes: lines of text.
-        pupil, f_number: if given, they size the stop; else its diameter does.
+        pupil, f_number, object_na: if given, they size the stop (by the numerical aperture n sin(theta) of the beam
+            from the axis of an object that is near); else its diameter does.
         unit: "mm", "cm", "in", "m", or None if unknown.
         stated_efl: focal length as the file states it, to be checked.
         drawn: rims are somebody's measures of a drawing, some of them radii where diameters are meant: halved where
@@ -212,6 +214,7 @@ class Draft:
     states: tuple[State, ...] = ()
     pupil: float | None = None
     f_number: float | None = None
+    object_na: float | None = None
     image_radius: float | None = None
     half_field_deg: float | None = None
     object_distance: float = math.inf
@@ -249,7 +252,7 @@ def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
         listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
         warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
     try:
-        draft = with_stop(draft, options.stop)
+        draft = with_stop(_without_negative_zeros(draft), options.stop)
         draft = _without_dummies(draft)
         return _lens_of(draft, options)
     except InputError as error:
@@ -289,7 +292,8 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
         # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
         lens = replace(lens, surfaces=tuple(rows))
-    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
+    pupil = draft.pupil if draft.object_na is None else pupil_of(lens, draft.object_na, draft.object_distance)
+    lens = finish(lens, pupil_mm=pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
     if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
         message = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
         warn(draft.file, f"{message}: the diameter is kept")
@@ -303,6 +307,7 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
     return lens
 
 
+_ROUNDED_MM = 1e-4  # by which programs round lengths
 _AGREES = 0.03  # relative: f-numbers are printed with two digits
 _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
 
@@ -349,6 +354,17 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
         stop_diameter_mm=opening,
         object_distance_mm=distance,
     )
+
+
+def _without_negative_zeros(draft: Draft) -> Draft:
+    """The draft with gaps of less than nothing, by no more than rounding, closed."""
+    least, rows = -_ROUNDED_MM / UNITS_MM.get(draft.unit or "mm", 1.0), list(draft.rows)
+    for k, row in enumerate(draft.rows):
+        if least <= row.surface.thickness_mm < 0:
+            rows[k] = replace(row, surface=replace(row.surface, thickness_mm=0.0))
+            found = f"surface {k}: a thickness of {row.surface.thickness_mm:.3g} is taken as 0"
+            warn(draft.file, draft.in_file(found))
+    return replace(draft, rows=tuple(rows))
 
 
 def _without_dummies(draft: Draft) -> Draft:

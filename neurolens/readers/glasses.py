@@ -25,8 +25,11 @@ _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
 _SAME_LINE_NM = 0.1
 _MOULDED = re.compile("([ _-]?MOLD(ED)?|M)$", re.IGNORECASE)
 _MOULDING = 0.01  # by how much moulding lowers an index at the most
-# Discontinued glasses of Schott, of which no dispersion formula is at hand: n_d (Elphel's optical-design-viewer), V_d.
-_DISCONTINUED: dict[str, tuple[float, float | None]] = {"LASF14A": (1.82223, None), "SF58": (1.917613, 21.5)}
+# Discontinued glasses of Schott, of which no dispersion formula is at hand: n_d and V_d (LASF14A and SF58 as in
+# Elphel's optical-design-viewer, SSK4 as Laikin's "Lens Design" prints it).
+_DISCONTINUED: dict[str, tuple[float, float | None]] = {
+    **{"LASF14A": (1.82223, None), "SF58": (1.917613, 21.5), "SSK4": (1.6177, 55.11)},
+}
 SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
 MAX_GLASSES, MAX_NAME, MAX_SAMPLES = 5000, 64, 200
 _FORMULAS = (

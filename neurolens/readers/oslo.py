@@ -24,7 +24,7 @@ TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
 # What changes rays and is not read, where a number other than 0 or a word follows: what is expected in its place.
 REFUSED = by_word(
-    ("NAO NA", "EBR or FNO to size the stop"),
+    ("NA", "EBR, FNO or NAO to size the stop"),
     ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: the lens model has none"),
     ("RFL RFH REFL", "no mirror: the lens model has none"),
     ("GRT GSP GOR DFR DOE HOE HOR", "no grating or hologram: the lens model has none"),
@@ -113,6 +113,8 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
             if angle < 0:
                 raise line.error(word, angle, "a number above 0")
             file.half_field_deg = angle if 1e-3 < angle < 90 else None
+        case "NAO":
+            file.object_na = line.positive(word, rest)
         case "FNO":
             file.f_number = line.positive(word, rest)
         case "WV":

@@ -10,6 +10,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from neurolens.readers.glasses import named_glass
 from neurolens.readers.source import MAX_POWER, Line, ReadOptions, assume, by_word, read_lines, warn
 
 UNITS = {"MM": "mm", "CM": "cm", "IN": "in", "INCH": "in", "METER": "m", "METERS": "m", "M": "m"}
-TYPES = tuple("STANDARD EVENASPH ODDASPHE XASPHERE XOSPHERE TOROIDAL BICONICX PARAXIAL COORDBRK".split())
+TYPES = tuple("STANDARD EVENASPH ODDASPHE XASPHERE XOSPHERE TOROIDAL BICONICX PARAXIAL COORDBRK JONESMAT".split())
 Q_TYPE = "Q"  # what the names of Q-type aspheres, and of no other type, begin with
 # Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.
 HARMLESS = frozenset(
@@ -43,6 +44,7 @@ UNMOVED = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT
 OPERANDS = ("THIC", "APER", "SDIA", "LTTL")
 MAX_EXTRAS = 240
 _DEEPEST = 1000  # sag of an asphere over its rim
+_SAME_N_D, _SAME_V_D = 0.005, 2.0  # by which the figures of one glass may differ: melts, moulding, other years
 _EVEN = 8  # terms of EVENASPH by its definition; other programs write more
 
 
@@ -95,6 +97,7 @@ class File(Draft):
     waves: int = 0  # how many wavelengths are used, where the file says so
     primary: int = 1
     behind: Counter[str] = field(default_factory=Counter)  # what follows a surface without indentation
+    figures: dict[str, list[tuple[Line, tuple[float, float]]]] = field(default_factory=dict)  # behind names of glasses
 
 
 def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
@@ -169,7 +172,7 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             file.f_number = line.positive(word, rest)
             file.working = line if rest[1:2] == ["1"] else None
         case "OBNA":
-            raise line.error(word, " ".join(rest), "a pupil diameter (ENPD), an f-number (FNUM) or the stop (FLOA)")
+            file.object_na = line.positive(word, rest[:1])
         case "ENVD":
             if line.numbers(word, rest, 2)[:2] != [20.0, 1.0]:
                 warn(file.file, f"indices are those at 20 degrees and 1 atmosphere, not at {' '.join(rest[:2])}")
@@ -209,7 +212,7 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
         case "DISZ":
             block.thickness = _thickness(line, word, rest[:1], is_object=len(file.blocks) == 1)
         case "GLAS":
-            block.medium, block.glass = _glass(line, rest, file.makers), line
+            block.medium, block.glass = _glass(file, line, rest), line
         case "DIAM":
             semi = line.first(word, rest)
             if semi < 0:
@@ -276,7 +279,7 @@ def _thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> fl
     return math.inf if is_object and value >= INFINITE else value
 
 
-def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
+def _glass(file: File, line: Line, rest: list[str]) -> dict[str, Any]:
     """GLAS name, type of solve, surface, n_d, V_d.
 
     Solve 1 is a model glass; others leave the glass that is named (2: a pickup, carried out; 3: one that the program
@@ -296,10 +299,32 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     if kind == "4":
         expected = "a glass of the catalogue, or n_d and V_d: no offset from it"
         raise line.error("GLAS", f"{name} with solve {kind}", expected)
-    figures = [] if catalogue.same_name(name) else [line.number_of("GLAS", word) for word in rest[3:5]]
+    known, figures = catalogue.same_name(name), list[float]()
+    with suppress(InputError) if known else nullcontext():
+        figures = [line.number_of("GLAS", word) for word in rest[3:5]]
     # 1.5 and 40 is what the program writes in the place of both.
     stated = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None
-    return named_glass(name, line.file, f"line {line.number}, GLAS", makers, figures=stated)
+    if stated:
+        file.figures.setdefault(name, []).append((line, stated))
+    return named_glass(name, line.file, f"line {line.number}, GLAS", file.makers, figures=None if known else stated)
+
+
+def _check_figures(file: File) -> None:
+    """Refuse figures behind unknown names where those behind known ones are another glass's, or a name has two.
+
+    Programs that exchange glasses leave the figures of glasses before.
+    """
+    stale, unknown = "", None
+    for name, given in file.figures.items():
+        known = [(g.n_d, g.V_d) for g in (*catalogue.same_name(name), *catalogue.same_name(f"N-{name}"))]
+        unknown = unknown or (None if known else (name, *given[0]))
+        for line, (n, V) in given:
+            if not any(abs(n_d - n) <= _SAME_N_D and abs(V_d - V) <= _SAME_V_D for n_d, V_d in known or [given[0][1]]):
+                stale = stale or f"line {line.number} gives {name} {n:g} and {V:g}, another glass's"
+    if stale and unknown:
+        name, line, (n, V) = unknown
+        expected = f"a glass of the catalogue, or its own by --glass: the figures behind names are stale ({stale})"
+        raise line.error("GLAS", f"{name} with n_d {n:g} and V_d {V:g}", expected)
 
 
 def _add_ends(file: File) -> None:
@@ -329,6 +354,7 @@ def _add_ends(file: File) -> None:
 def _complete(file: File) -> None:
     """Set what follows from all surfaces."""
     file.skipped["lines of the merit function"] += file.behind.total()
+    _check_figures(file)
     first, *middle, image = file.blocks
     for before, block in zip(file.blocks, file.blocks[1:], strict=False):
         block.semi_diameter = block.semi_diameter if block.clear is None else block.clear
@@ -437,6 +463,10 @@ def shape_of(block: Block) -> dict[str, Any]:
             block.parameters.pop(2, None)
             if not shape["focal_mm"] or block.bends:
                 raise block.start.error("PARAXIAL", shape["focal_mm"], "PARM 1, a focal length other than 0, no CURV")
+        case "JONESMAT":
+            shape = block.rotational()
+            block.parameters.clear()  # a Jones matrix turns polarisation, and no ray
+            warn(block.start.file, f"surface {block.name} of the file: a JONESMAT is left out of transmittance")
         case "COORDBRK":
             shape = block.rotational()  # harmless where every tilt and decentre is 0, which is checked below
     for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):

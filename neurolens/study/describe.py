@@ -28,7 +28,7 @@ from neurolens.base.lensname import maker_of, year_of
 from neurolens.flare.ghosts import GhostTracer, ghost_table
 from neurolens.flare.lights import Light
 from neurolens.lens.glass import glass_of
-from neurolens.lens.paraxial import first_order
+from neurolens.lens.paraxial import first_order, light_of
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.setting.check import Check, check_lens, doubts, verdict
@@ -75,7 +75,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         **{key: getattr(lens, key) for key in ("name", "designer", "source", "rims", "sha256", "refractions")},
         **{key: float(value) for key, value in asdict(data).items()},
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if squeezed else None,
-        "wavelength_nm": lens.reference_nm,
+        **light_of(lens),
         "object_medium": {**asdict(lens.object_medium), "n_d": float(lens.object_medium.n_d)},
         "working_f_number": None if math.isnan(working) else working,
         "film_z_mm": film_z,

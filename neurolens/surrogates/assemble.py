@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
+from neurolens.base.status import DOMAIN_SLACK
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.card import DOMAIN_SLACK
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Units
 
 if TYPE_CHECKING:

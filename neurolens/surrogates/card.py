@@ -28,8 +28,6 @@ CARD_KEY, MODEL_KEY = "neurolens", "neurolens.coefficients"
 CARD_KIND, CARD_SCHEMA = "neurolens.lens_model", 1
 MAX_CARD = 2**20
 
-# Relative slack of a domain's bounds: the rounding of float32 inputs, and no more.
-DOMAIN_SLACK = 1.00001
 # Transmittance of unpolarised light, with the polarisation that surfaces give to it.
 POLARISED = "polarised"
 

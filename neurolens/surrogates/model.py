@@ -16,13 +16,14 @@ import numpy as np
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.base.status import DOMAIN_SLACK
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.lens.glass import inverse_square_um
+from neurolens.lens.glass import ANY_WAVELENGTH_NM, inverse_square_um
 from neurolens.lens.paraxial import PupilBounds
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
-from neurolens.surrogates.card import DOMAIN_SLACK, mix_domain
+from neurolens.surrogates.card import mix_domain
 from neurolens.surrogates.cores import Array, Core, LightField
 
 if TYPE_CHECKING:
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from neurolens.trace.surfaces import Rays
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
-# Positive and finite, in float32 too.
-ANY_WAVELENGTH_NM = (1e-30, 3e38)
 
 
 @dataclass(frozen=True)

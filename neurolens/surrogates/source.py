@@ -17,6 +17,7 @@ from typing import Any
 import neurolens
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
+from neurolens.base.status import DOMAIN_SLACK
 from neurolens.graph.c import NOTHING, Extras, Signature, write_c, write_double
 from neurolens.graph.program import (
     FILM_Z,
@@ -34,7 +35,7 @@ from neurolens.graph.shading import LANGUAGES, write_shading
 from neurolens.lens.glass import inverse_square_um
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
 from neurolens.surrogates.axes import mixture_of, state_names
-from neurolens.surrogates.card import DOMAIN_SLACK, axes_of
+from neurolens.surrogates.card import axes_of
 from neurolens.surrogates.model import Domain, LensModel, with_one_angle
 
 DOUBLE = "c-double"

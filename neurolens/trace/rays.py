@@ -96,8 +96,8 @@ def trace(
     Args:
         lens: the prescription; its stop's diameter is the opening that clips.
         rays: points and unit directions [N], lens frame, mm. The dtype (float32 or float64) is that of the result.
-        wavelength_nm: one number, or a tensor [N], of which NaN and what is not positive pass no dispersive glass; None
-            takes `Lens.reference_nm`.
+        wavelength_nm: one number, or a tensor [N], of which those outside `glass.stated_nm`, and NaN, have the status
+            of what is outside the domain in a lens that disperses; None takes `Lens.reference_nm`.
         towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
         transmittance: whether to follow the power of unpolarised light, with the polarisation that surfaces give to it.
         record: surfaces whose crossings are wanted.
@@ -105,14 +105,13 @@ def trace(
 
     Raises:
         InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape or a
-            number that is not positive, an unknown `towards`, a surface to record that the lens
-            does not have.
+            number outside `glass.stated_nm`, an unknown `towards`, a surface to record that the lens does not have.
 
     A direction that is not a unit vector counts as a miss of the first surface.
     Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
     wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
-    check_rays(rays, wavelength_nm)
+    check_rays(lens, rays, wavelength_nm)
     if not torch.compiler.is_compiling():
         keep_memory()
     if towards not in ("scene", "film"):
@@ -153,7 +152,7 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = 
     Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
     Arguments and errors are those of `trace`, with one wavelength.
     """
-    check_rays(rays, wavelength_nm)
+    check_rays(lens, rays, wavelength_nm)
     keep_memory()
     chunks = zip(*(c.split(CHUNK) for c in rays), strict=True)
     with torch.no_grad():
@@ -233,19 +232,21 @@ class Tracing:
         self.medium = self.media[0 if sense > 0 else -1]
         self.vertex: Any = 0.0
         self._entering: int | None = entering
-        self.tests, self.rays = self._start(rays, lit, st.blocked(entering, st.MISSED))
+        self.tests, self.rays = self._start(rays, lit, entering)
 
-    def _start(self, rays: Rays, lit: Tensor | None, otherwise: int) -> tuple[Survival, Rays]:
+    def _start(self, rays: Rays, lit: Tensor | None, entering: int) -> tuple[Survival, Rays]:
         """Return rays with optical direction cosines, and the test that their directions are unit vectors."""
         o = self.o
         length2 = o.dot(rays[3:], rays[3:])
         sound = at_most((length2 - 1).abs(), UNIT_SLACK)
-        if lit is not None:
-            sound = sound * lit
         if self.freeze:
             # A NaN input must not reach the gradients of the other rays.
             sound = sound * torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
-        tests = Survival(sound, otherwise)
+        if lit is None:
+            tests = Survival(sound, st.blocked(entering, st.MISSED))
+        else:
+            tests = Survival(lit.to(sound.dtype), st.OUTSIDE_DOMAIN)
+            tests.require([(0.5, sound)], entering, st.MISSED)
         if self.freeze:
             rays = tests.along_axis(rays, self.sense, 0.0)
         if self.sense > 0:
@@ -338,8 +339,8 @@ def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
     return met.x * outwards, met.y * outwards
 
 
-def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
-    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not positive."""
+def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
+    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not stated."""
     shape, dtype = rays.x.shape, rays.x.dtype
     if dtype not in (torch.float32, torch.float64):
         raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
@@ -353,6 +354,8 @@ def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
             raise InputError("trace", "wavelength_nm", found, f"a number or a tensor {tuple(shape)}")
     elif not 0 < wavelength_nm < math.inf:
         raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
+    else:
+        glass.check_light(lens, wavelength_nm)
 
 
 def sound_wavelength(
@@ -365,7 +368,8 @@ def sound_wavelength(
     """
     if not isinstance(wavelength_nm, Tensor):
         return wavelength_nm, None
-    sound = (wavelength_nm > 0) & (wavelength_nm < math.inf)
+    low, high = glass.stated_nm(lens)
+    sound = (wavelength_nm >= low / st.DOMAIN_SLACK) & (wavelength_nm <= high * st.DOMAIN_SLACK)
     return torch.where(sound, wavelength_nm, glass.LINE_D_NM).to(dtype), sound if lens.dispersive else None
 
 
@@ -425,7 +429,7 @@ def follow(
             in the direction of travel.
     """
     wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
-    check_rays(rays, wavelength_nm)
+    check_rays(lens, rays, wavelength_nm)
     _check(len(lens.surfaces), steps, towards)
     tracing = Tracing(lens, rays, wavelength_nm, 1 if towards == "film" else -1, steps[0][0], guard=True)
     passage = Passage(tracing.o, lens, tracing.wavelength_nm, polarised)

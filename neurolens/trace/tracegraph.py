@@ -12,7 +12,7 @@ import numpy as np
 
 from neurolens.base import status as st
 from neurolens.graph.ir import Graph, Value
-from neurolens.lens.glass import absorption_of, cauchy, glass_of, index_at, index_of
+from neurolens.lens.glass import ANY_WAVELENGTH_NM, absorption_of, cauchy, glass_of, index_at, index_of, stated_nm
 from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Graphs, is_number, times
 from neurolens.trace.shapes import figure_of
@@ -23,6 +23,7 @@ TRANSMITTANCE = (
     "Transmittance: of unpolarised light, with the polarisation that surfaces give to it, coatings and absorption."
 )
 _DEGREE, _FIT = 8, 1e-9  # of the series of sine and cosine, and how close they are
+_WIDEST_MM = 1e15  # of a stop: its square is finite in float32
 _HALVINGS = 12  # of a phase, at most: films of 500 waves
 
 
@@ -34,8 +35,8 @@ def exact_graph(
 
     Args:
         pupil_z_mm: plane of the pupil points. wavelength_nm: range of the light, for coatings and absorption; a single
-            wavelength fixes the indices.
-        whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
+            wavelength fixes the indices. Outside `light_limits` the status says so, and where the stop has no radius.
+        whole: with stop, rims, domain and transmittance; else the ray alone, and whether it gets through.
         polarised: as in `Passage`. double: as in `Graphs`.
         path: an output more, `path` [2 K]: z and y of the crossing with each surface, that next to the film first.
     """
@@ -83,10 +84,28 @@ def exact_graph(
     if power is not None:
         g.outputs |= {"transmittance": power.arrived(r.x), "stop_xy_mm": at_stop}
     pairs, codes = zip(*tests, strict=True) if tests else ((), ())
-    g.outputs["status"] = g.first_failure([(g.value(a), g.value(b)) for a, b in pairs], codes).whole()
+    status = g.first_failure([(g.value(a), g.value(b)) for a, b in pairs], codes)
+    if stop_radius is not None:
+        low, high = light_limits(lens, wavelength_nm)
+        # The stop decides once for all rays of a call: no wavelength is at most -1.
+        high_or_none = g.select(stop_radius.between(0.0, _WIDEST_MM), high, -1.0)
+        inside = (g.constant(low) <= rays[4]) & (rays[4] <= high_or_none)
+        status = g.select(inside, status, float(st.OUTSIDE_DOMAIN))
+    g.outputs["status"] = status.whole()
     if path:
         g.outputs["path"] = g.concat(*crossings)
     return g
+
+
+def light_limits(lens: Lens, wavelength_nm: tuple[float, float]) -> tuple[float, float]:
+    """Wavelengths that a lens takes as a graph for a range: those of the range at which a glass of it is stated.
+
+    Any for a lens without dispersion.
+    """
+    if not lens.dispersive:
+        return ANY_WAVELENGTH_NM
+    low, high = stated_nm(lens)
+    return max(low, wavelength_nm[0]) / st.DOMAIN_SLACK, min(high, wavelength_nm[1]) * st.DOMAIN_SLACK
 
 
 class GraphPassage(Passage):

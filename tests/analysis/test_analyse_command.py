@@ -151,6 +151,10 @@ def test_far_wavelengths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     acrylic = tmp_path / "acrylic.toml"
     text = (LENSES / "thorlabs_lb1471_biconvex_50.toml").read_text(encoding="utf-8")
     acrylic.write_text(text.replace('n_d = 1.5168, V_d = 64.17, material = "N-BK7"', 'glass = "PMMA"'), "utf-8")
-    told = run_json(capsys, "analyse", acrylic, "spots", "--wavelengths", 2200)["warnings"]
-    assert any("PMMA" in w and "extrapolated at 2200 nm" in w for w in told)
-    assert any("guess" in w for w in run_json(capsys, "analyse", GAUSS, "spots", "--wavelengths", 2200)["warnings"])
+    assert "got 2200.0, expected 380 to 1620 nm" in failure(
+        capsys, "analyse", acrylic, "spots", "--wavelengths", 2200, "--quiet"
+    )
+    told = run_json(capsys, "analyse", acrylic, "spots", "--wavelengths", 390)["warnings"]
+    assert any("PMMA" in w and "420-1620 nm: extrapolated at 390 nm" in w for w in told)
+    told = run_json(capsys, "analyse", GAUSS, "spots", "--wavelengths", 2200)["warnings"]
+    assert any("alone is stated for 365-1014 nm: extrapolated at 2200 nm" in w for w in told)

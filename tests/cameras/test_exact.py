@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import lens_models
 import numpy as np
@@ -10,14 +11,21 @@ import pytest
 from camera_helpers import at, jittered
 from shipped import whole
 
+from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.graph.interpret import evaluate
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import pupil_plane_z_mm
+from neurolens.setting.states import set_lens
+from neurolens.trace.tracegraph import exact_graph
 
-FILM = (36.0, 24.0)
+FILM, LENSES = (36.0, 24.0), Path(__file__).parents[2] / "lenses"
 
 
 @cache
@@ -99,3 +107,57 @@ def test_anamorphic_outlines_lose_no_light_between_the_azimuths_they_are_sought_
             points, area = wide.sample(film, square, waves)
             light = area * (exact.film.scene(film, points, waves).status == 0)
             assert light[beyond].sum() <= 0.005 * light.sum()
+
+
+NMS = (
+    math.nan,
+    math.inf,
+    -math.inf,
+    0.0,
+    -550.0,
+    1e-30,
+    50.0,
+    200.0,
+    399.9,
+    400.0,
+    550.0,
+    700.0,
+    700.1,
+    1e3,
+    1e5,
+    3e38,
+)
+
+
+@pytest.mark.parametrize("name", ["laikin_double_gauss_50", *whole("canon_aspheric_50")])
+def test_light_that_is_none_has_one_status_in_every_form_of_a_lens(name: str) -> None:
+    """The tracer, its graph in C, and the backward trace: only wavelengths from 400 to 700 nm reach the scene."""
+    traced = make_camera(f"{LENSES}/{name}.toml", Shot(film_mm=(36.0, 24.0), focus_m=5.0))
+    nm = np.array(NMS, np.float32)
+    film, square = (np.tile(np.array(at, np.float32)[:, None], (1, nm.size)) for at in ((3.0, 2.0), (0.45, 0.52)))
+    good = (nm >= 400) & (nm <= 700)
+    for camera in (traced, traced.compiled()):
+        out = camera.sample(film, square, nm)
+        np.testing.assert_array_equal(out.status, np.where(good, st.PASSED, st.OUTSIDE_DOMAIN))
+        assert (out.weight[good] > 0).all() and not out.weight[~good].any()
+    point = np.tile(np.array([[-0.3], [-0.2], [-5.0]], np.float32), (1, nm.size))
+    back = traced.to_film(point, square, nm)
+    np.testing.assert_array_equal(back.status, np.where(good, st.PASSED, st.OUTSIDE_DOMAIN))
+
+
+@pytest.mark.parametrize("range_nm", [(150.0, 200.0), (2000.0, 3000.0)])
+def test_a_camera_for_light_that_no_glass_is_stated_for_is_refused(range_nm: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match="wavelength_nm: got (150|3000).0, expected 300 to 2500 nm"):
+        ExactCamera(read_lens(LENSES / "laikin_double_gauss_50.toml"), Shot(FILM, wavelength_nm=range_nm, focus_m=2.0))
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("stop_mm", [-5.0, math.nan, math.inf, 1e20])
+def test_a_stop_without_a_radius_is_outside_the_domain(stop_mm: float, double: bool) -> None:
+    """Its square is that of a radius, or infinite."""
+    lens = set_lens(read_lens(LENSES / "laikin_double_gauss_50.toml"))
+    graph = exact_graph(lens, pupil_plane_z_mm(lens), (400.0, 700.0), double=double)
+    rays = np.array([[0.0, 0.0, 0.0, 0.0, 550.0]]).T
+    for radius, status in ((float(lens.stop_radius_mm), st.PASSED), (stop_mm, st.OUTSIDE_DOMAIN)):
+        call = {"film_z_mm": np.array([[lens.film_z_mm]]), "stop_radius_mm": np.array([[radius]])}
+        assert evaluate(graph, {"rays": rays} | call)["status"] == status

@@ -3,6 +3,7 @@
 Focal lengths are those of ray-optics 0.9.8 and of the files' own heads, unless a line says otherwise.
 """
 
+import json
 import warnings
 from pathlib import Path
 
@@ -11,12 +12,14 @@ from test_tables_oslo import OSLO
 from test_zemax import BODY, DUMMY, HEAD, TAIL, read, swapped
 
 from neurolens.base.errors import InputError
+from neurolens.cli import main
 from neurolens.lens import glass as catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.readers.source import ReadOptions
 
+OTHERS = Path(__file__).parents[3] / "shared" / "data" / "cases" / "2026-11-28"
 CASES = Path(__file__).parents[3] / "shared" / "data" / "cases"
 needs_cases = pytest.mark.skipif(not CASES.exists(), reason="../shared/data/cases is not here")
 
@@ -182,3 +185,110 @@ def test_rims_that_overlap_slightly_are_narrowed(overlap_mm: float, reads: bool,
 def test_what_changes_rays_is_refused_with_the_reason(old: str, new: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         read(swapped(old, new), tmp_path)
+
+
+@needs_cases
+@pytest.mark.parametrize(
+    ("name", "efl_mm", "said"),
+    [
+        ("f3_no_rdm_fno.seq", 98.102, "taken as radii: a sphere of that curvature would be smaller than the glass"),
+        ("f4_primary_550.seq", 10.0340, "taken as curvatures"),
+        ("f5_thickness_minus_25nm.zmx", 50.0206, "surface 3 of the file: a thickness of -2.54e-05 is taken as 0"),
+        ("f6_no_cir.seq", 100.0308, "no rim is given for surface 2 of the file, nor a field"),
+    ],
+)
+def test_sound_files_of_other_programs_read(name: str, efl_mm: float, said: str) -> None:
+    """Focal lengths of f3 by Optiland, f6 by ray-optics; f5 is the Cooke triplet of 50 mm that came with Zemax."""
+    lens, told = heard(OTHERS / name)
+    assert first_order(lens).efl_mm == pytest.approx(efl_mm, rel=1e-5) and said in told
+
+
+@needs_cases
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("f1_sellmeier_beyond_range.zmx", "wavelength_nm: got 10600.0, expected 300 to 2500 nm"),
+        ("f2_stale_glass_figures.zmx", "BASF1 with n_d 1.60738.*--glass.*line 148 gives SF6HT 1.713 and 53.8316"),
+    ],
+)
+def test_glasses_that_are_not_known_are_not_guessed(name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_any(OTHERS / name)
+
+
+def test_first_order_data_say_their_wavelength_and_those_of_the_primary_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """f4 in small: focal length 10, back focus as the file's last thickness, at its primary wavelength of 550 nm."""
+    path = tmp_path / "landscape.seq"
+    path.write_text(
+        "dim m\nso 0. 1.0e+10\ns 0. 1.664\nsto\ns -0.2 0.22 NBK7_SCHOTT\ns -0.387040626 10.150245\nsi 0 0\n"
+        "epd 1.0\nwl 650 550 450\nref 2\nyim 0 3\n"
+    )
+    for command in (["convert", str(path), "-o", str(tmp_path / "lens.toml")], ["lens", str(path)]):
+        assert main([*command, "--json"]) == 0
+        data = json.loads(capsys.readouterr().out)
+        assert data["wavelength_nm"] == pytest.approx(587.5618) and data["efl_mm"] == pytest.approx(10.0340, abs=5e-5)
+        assert data["primary"] == pytest.approx({"wavelength_nm": 550.0, "efl_mm": 10.0, "back_focus_mm": 10.150245})
+    assert main(["lens", str(tmp_path / "lens.toml")]) == 0
+    assert "at the file's primary 550 nm: focal length 10 mm, back focus 10.1502 mm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("glasses", "reads"),
+    [
+        ("XY-9 0 0 1.62 36.4", True),  # nothing speaks against it
+        ("XY-9 0 0 1.62 36.4|N-BK7 0 0 1.5168 64.17", True),
+        ("XY-9 0 0 1.62 36.4|N-BK7 0 0 1.5 40", True),  # what the program writes in the place of both
+        ("XY-9 3 0 1.62 36.4|N-BK7 3 0 1.805 25.4", False),
+        ("XY-9 3 0 1.62 36.4|XY-9 3 0 1.5168 64.2", False),
+        ("N-BK7 3 0 1.805 25.4|XY-9 1 0 1.62 36.4", True),  # a model glass
+        ("N-BK7 3 0 1.805 25.4", True),  # by its name
+    ],
+)
+def test_figures_behind_unknown_names_are_believed_where_known_glasses_agree(
+    glasses: str, reads: bool, tmp_path: Path
+) -> None:
+    first, *more = glasses.split("|")
+    text = swapped("GLAS N-BK7 0 0 1.5 4.0E+1", f"GLAS {first}", HEAD + BODY)
+    names = [f"SURF {k}\n  CURV 0.01\n  DISZ 2\n  GLAS {g}\n  DIAM 9 1\n" for k, g in enumerate(more, start=3)]
+    end = f"SURF {len(names) + 3}\n  DISZ 45\n  DIAM 9 1\nSURF {len(names) + 4}\n  DISZ 0\n"
+    path = tmp_path / "lens.zmx"
+    path.write_text(text + "".join(names) + end)
+    if not reads:
+        with pytest.raises(InputError, match=r"GLAS: got 'XY-9 with n_d 1.62.*--glass: the figures behind names are"):
+            read_any(path)
+        return
+    lens, _ = heard(path)
+    assert {"XY-9": 1.62, "N-BK7": 1.5168}[first.split()[0]] == pytest.approx(lens.surfaces[0].n_d, abs=1e-4)
+
+
+def test_the_numerical_aperture_of_a_near_object_sizes_the_stop(tmp_path: Path) -> None:
+    """The stop is the first surface, 500 mm from the object: its radius is 500 tan(asin(0.01))."""
+    lens, _ = heard_text(swapped("DISZ INFINITY", "DISZ 500", swapped("ENPD 10", "OBNA 0.01 0")), tmp_path)
+    assert lens.stop_radius_mm == pytest.approx(500 * 0.01 / (1 - 0.01**2) ** 0.5, rel=1e-9)
+    (state,) = lens.configurations
+    assert state.object_distance_mm == 500 and (state.stop_diameter_mm or 2 * lens.stop_radius_mm) == pytest.approx(
+        2 * lens.stop_radius_mm, rel=1e-9
+    )
+
+
+def heard_text(text: str, tmp_path: Path) -> tuple[Lens, str]:
+    path = tmp_path / "lens.zmx"
+    path.write_text(text)
+    return heard(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "n_d"), [("SSK4", 1.6177), ("LEXAN", 1.5855), ("Plexiglas", 1.4918), ("STYRON", 1.591)]
+)
+def test_old_glasses_and_trade_names_are_known(name: str, n_d: float, tmp_path: Path) -> None:
+    lens, _ = heard_text(swapped("GLAS N-BK7", f"GLAS {name}"), tmp_path)
+    assert lens.surfaces[0].n_d == pytest.approx(n_d, abs=1e-3)
+
+
+def test_a_matrix_of_polarisation_moves_no_ray(tmp_path: Path) -> None:
+    text = swapped("TYPE STANDARD\n  CURV -2", "TYPE JONESMAT\n  PARM 1 1\n  PARM 8 0.5\n  CURV -2")
+    lens, told = heard_text(text, tmp_path)
+    assert lens.surfaces == heard_text(swapped("MODE SEQ", "MODE SEQ"), tmp_path)[0].surfaces
+    assert "JONESMAT is left out of transmittance" in told

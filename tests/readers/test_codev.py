@@ -180,7 +180,8 @@ def test_q_types_are_the_sums_of_forbes(kind: str, names: str, tmp_path: Path) -
     ("old", "new", "message"),
     [
         ("DIM   M", "DIM   F", r"line 4, DIM: got 'F', expected M \(mm\)"),
-        ("EPD   10.0", "NAO   0.1", r"line 3, NAO: got '0.1', expected EPD or FNO"),
+        ("EPD   10.0", "NA    0.1", r"line 3, NA: got '0.1', expected EPD, FNO or NAO"),
+        ("EPD   10.0", "NAO   0.1", r"numerical aperture of the object: got 0.1, expected.*a finite distance"),
         ("NBK7_SCHOTT", "NBK8_SCHOTT", r"line 12, glass: got 'NBK8'.*N-BK7"),
         ("NBK7_SCHOTT", "REFL", r"line 12, S: got 'REFL'.*no mirrors"),
         ("NBK7_SCHOTT", "0.5:60", r"index: got 0.5"),

@@ -131,7 +131,8 @@ def test_oslo_by_the_lensmakers_formula(tmp_path: Path) -> None:
     [
         ("UNI  1.0", "UNI  3.0", r"line 6, UNI: got 3.0"),
         ("EBR  5.0", "EBR  0", r"line 3, EBR"),
-        ("EBR  5.0", "NAO  0.1", r"line 3, NAO: got '0.1', expected EBR or FNO"),
+        ("EBR  5.0", "NA   0.1", r"line 3, NA: got '0.1', expected EBR, FNO or NAO"),
+        ("EBR  5.0", "NAO  0.1", r"numerical aperture of the object: got 0.1, expected.*a finite distance"),
         ("GLA  BK7", "GLA  BK99", r"line 12, GLA: got 'BK99'"),
         ("GLA  BK7", "PK GLA -2", r"line 12, PK: got 'GLA -2', expected a figure: solves and pickups"),
         ("GLA  BK7", "GLA  REFL", r"no mirrors"),

@@ -232,7 +232,8 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
     [
         ("MODE SEQ", "MODE NSC", r"line 2, MODE: got 'NSC'"),
         ("UNIT MM", "UNIT FURLONG", r"line 6, UNIT: got 'FURLONG', expected one of MM"),
-        ("ENPD 10", "OBNA 0.1 0", r"line 7, OBNA"),
+        ("ENPD 10", "OBNA 0.1 0", r"numerical aperture of the object: got 0.1, expected.*a finite distance"),
+        ("CURV 2.0E-2", "CURV 2.0E+4", r"focal length: got [-0-9.e]+, expected at least a hundredth of the thickest"),
         ("GLAS N-BK7", "GLAS N-BK8", r"GLAS: got 'N-BK8', expected a glass.*N-BK7"),
         ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  CURV -2", r"PARAXIAL: got 0.0, expected PARM 1, a focal length"),
         ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  XDAT 1 2\n  XDAT 2 1\n  XDAT 4 1\n  CURV -2", r"0 \(Qbfs\) or 1"),
@@ -338,8 +339,10 @@ def test_rims_that_are_not_given_are_derived_for_the_field(tmp_path: Path) -> No
     lens = read(text, tmp_path)
     assert lens.rims == "derived" and 9 < lens.surfaces[1].diameter_mm < 12
     without = swapped("YFLN 0 2.5 4 9", "YFLN 0 0 0 0", swapped("XFLN 0 0 3 9", "XFLN 0 0 0 0", text))
-    with pytest.raises(InputError, match=r"not given for surface 2 of the file.*--half-field"):
-        read(without, tmp_path)
+    assert read(without, tmp_path).surfaces[1].diameter_mm == lens.surfaces[0].diameter_mm  # the rim of the same glass
+    element = "SURF 3\n  CURV 0.001\n  DISZ 2\n  GLAS N-BK7\nSURF 4\n  CURV 0.0\n  DISZ 40\n"
+    with pytest.raises(InputError, match=r"not given for surface 2, 3, 4 of the file.*--half-field"):
+        read(swapped("SURF 3\n", element + "SURF 5\n", without), tmp_path)
     assert read(without, tmp_path, ReadOptions(half_field_deg=5.0)).surfaces == lens.surfaces
     assert math.isfinite(lens.surfaces[1].diameter_mm)
 

@@ -38,6 +38,7 @@ from neurolens.render.pictures import read_channels, read_metadata
 from neurolens.render.stmap import plates_of
 from neurolens.setting.focusing import best_focused
 from neurolens.setting.states import set_lens
+from neurolens.surrogates.card import read_card
 from tests.command_line import failure, run_json
 
 ROOT = Path(__file__).parents[2]
@@ -381,6 +382,13 @@ def test_headers_and_the_readme_tell_what_there_is(case: Case) -> None:
     for key in ("maps_px", "exit_px", "opentrackio_px", "lensfun_px", "colour_px"):
         assert f"{left[key]:.2g}" in told
     assert left["maps_px"] < 0.01 and left["lensfun_px"] < 0.1 and left["exit_px"] < 0.01
+    assert read_card(GAUSS)["lens"]["sha256"][:16] in told
+
+
+def test_no_file_tells_where_it_was_made(case: Case) -> None:
+    for path in case.folder.iterdir():
+        data = path.read_bytes()
+        assert str(GAUSS.parent).encode() not in data and str(case.folder).encode() not in data, path.name
 
 
 HOSTILE = '"; import os\n}} </lens>--> [exec rm] | {% raw %} \\'
@@ -437,6 +445,23 @@ def test_no_name_of_a_strangers_lens_is_read_as_code(animated: bool, tmp_path: P
     assert [str(p.GetPath()) for p in stage.Traverse()] == ["/Film", "/Film/Pinhole", "/Film/Lens"]
     if animated:
         assert stage.GetTimeCodesPerSecond() == pytest.approx(24000 / 1001)
+
+
+def test_characters_that_xml_has_not_are_left_out() -> None:
+    """In XML they are no text, and USD reads their escapes as letters; blanks of lines and other alphabets stay."""
+    odd = "a\x01b\x08\x1f\x0c\uffff\ud800c\u00e9\u5149\U0001f4f7"
+    known = {"lensModel": odd, "lensMake": odd, "lensSerialNumber": "0123456789abcdefgh"}
+    values = hostile()
+    shot = replace(values["shot"], attributes=known)
+    assert shot.about == f"{odd} (sha256 0123456789abcdef)"
+    values |= {"shot": shot, "about": shot.about}
+    plain = "abc\u00e9\u5149\U0001f4f7"
+    root = ElementTree.fromstring(html("handover.lensfun.xml.jinja", **values))
+    assert root.findtext("lens/model") == root.findtext("lens/maker") == plain
+    usd = html("handover.usda.jinja", **values)
+    assert f'doc = "{plain} (sha256 0123456789abcdef)"' in usd and "\\u" not in usd
+    for name in ("nk", "blender.py", "README.md"):
+        assert not re.search("[\x00-\x08\x0b-\x1f\ud800-\udfff]", html(f"handover.{name}.jinja", **values))
 
 
 def test_a_template_refuses_a_text_that_no_filter_has_quoted(monkeypatch: pytest.MonkeyPatch) -> None:

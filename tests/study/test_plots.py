@@ -4,11 +4,13 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from neurolens.analysis.layout import Layout, Line, Section
+from neurolens.analysis.plots import drawing
 from neurolens.base.errors import InputError
 from neurolens.study import plots, scenes
 from neurolens.study.rays import Illumination
@@ -46,3 +48,9 @@ def test_bad_images_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="illumination"):
             plots.illumination_plot(bad, path)
     assert not list(tmp_path.iterdir())
+
+
+def test_any_name_of_a_lens_makes_a_picture_that_is_xml(tmp_path: Path) -> None:
+    with drawing(tmp_path / "a.svg", 3, 2, "a\x01b", "c\x08d\ue000") as figure:
+        figure.subplots().set_xlabel("e\x0cf")
+    ElementTree.parse(tmp_path / "a.svg")

@@ -2,14 +2,18 @@
 
 import json
 import math
+import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning, warned
 from neurolens.cli import main
 from neurolens.lens import glass as catalogue
 from neurolens.lens.glass import (
@@ -18,13 +22,17 @@ from neurolens.lens.glass import (
     LINE_F_NM,
     P_GF,
     absorption_of,
+    all_glasses,
     check_against_table,
     index_at,
     index_of,
     table_notes,
 )
-from neurolens.lens.prescription import Surface
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
 
 ORACLE = Path(__file__).parents[3] / "shared" / "data" / "oracle" / "glass_indices.json"
 
@@ -314,3 +322,67 @@ def test_wavelengths_that_are_none_give_an_index_that_is_none() -> None:
         assert math.isnan(catalogue.find(name).index(math.nan))
     # Just beyond the pole at 264 nm, where the square of the index is negative.
     assert math.isnan(catalogue.find("N-SF66").index(262.0))
+
+
+def singlet(*glasses: str | tuple[float, float] | float) -> Lens:
+    """A singlet of each glass, which is a name, n_d with V_d, or n_d alone."""
+    rows = [Surface(math.inf, 1.0, 10.0, stop=True)]
+    for glass in glasses:
+        n_d, V_d = glass if isinstance(glass, tuple) else (1.0 if isinstance(glass, str) else glass, None)
+        named = glass if isinstance(glass, str) else None
+        rows += [Surface(50.0, 3.0, 20.0, n_d=n_d, V_d=V_d, glass=named), Surface(-80.0, 1.0, 20.0)]
+    return Lens("a lens", "", (*rows[:-1], replace(rows[-1], thickness_mm=40.0)), 4.0, path="a.toml")
+
+
+@pytest.mark.parametrize(
+    ("glasses", "wavelength_nm", "said"),
+    [
+        (("N-BK7", "F2"), 10600.0, "a.toml: wavelength_nm: got 10600.0, expected 300 to 2500 nm"),
+        (("N-BK7", (1.62, 36.4)), 200.0, "expected 300 to 2500 nm"),
+        (((1.62, 36.4),), 3000.0, "expected 300 to 2500 nm"),
+        (("PMMA",), 1700.0, "expected 380 to 1620 nm"),
+        (("N-BK7", "CaF2"), 5000.0, "the index of Schott:N-BK7 is stated for 300-2500 nm: extrapolated at 5000 nm"),
+        (
+            ("N-BK7", (1.62, 36.4)),
+            1550.0,
+            "known by n_d 1.62 and V_d 36.4 alone is stated for 365-1014 nm: extrapolated at 1550",
+        ),
+        (("N-BK7", "F2"), 1550.0, None),
+        (("PMMA",), 400.0, None),  # of which reading warns
+        ((1.5,), 10600.0, None),
+    ],
+)
+def test_no_index_is_taken_out_of_its_range_without_a_word(
+    glasses: tuple[Any, ...], wavelength_nm: float, said: str | None
+) -> None:
+    """Refused where no glass is stated, warned of where one is not: by first-order data and by traces; rays lose it."""
+    lens = singlet(*glasses)
+    nm, one, zero = torch.tensor([550.0, wavelength_nm], dtype=torch.float64), torch.ones(2), torch.zeros(2)
+    rays = Rays(*(v.double() for v in (zero, zero, -5 * one, zero, zero, one)))
+    works = [lambda: first_order(lens, wavelength_nm), lambda: trace(lens, rays, wavelength_nm, towards="film")]
+    for work in works:
+        with warned() as texts:
+            if said and "expected" in said:
+                with pytest.raises(InputError, match=re.escape(said)):
+                    work()
+            else:
+                work()
+        assert said is None or "expected" in said or any(said in text for text in texts)
+        assert said is not None or not texts
+    refused = said is not None and "expected" in said
+    assert trace(lens, rays, nm, towards="film").status.tolist() == [0, st.OUTSIDE_DOMAIN if refused else 0]
+
+
+@pytest.mark.parametrize(
+    ("range_nm", "share", "error"),
+    [((365.0, 1014.0), 0.95, 0.003), ((365.0, 1014.0), 1.0, 0.02), ((300.0, 2500.0), 0.95, 0.034)],
+)
+def test_figures_alone_hold_where_they_are_said_to(range_nm: tuple[float, float], share: float, error: float) -> None:
+    """The index by n_d and V_d against the formula of every glass that is stated there, of more than one term."""
+    off = [
+        abs(index_at(g.n_d, g.V_d, nm) - g.index(nm))
+        for nm in range_nm
+        for g in all_glasses()
+        if g.covers(nm) and g.n_d < 2.1 and len(g.coefficients) > 2
+    ]
+    assert len(off) > 300 and np.quantile(off, share) < error
