@@ -15,7 +15,7 @@ from neurolens.cameras.field import frame_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
 from neurolens.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
-from neurolens.defocus.picture import check_field, defocus
+from neurolens.defocus.picture import SAMPLES, check_field, defocus
 from neurolens.defocus.plate import DepthSettings, read_plate
 from neurolens.frames import Files
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
@@ -60,8 +60,9 @@ examples:
         "auto", "where depth begins (default: auto, the film in pictures of neurolens, else the pinhole)"
     )
     samples: int = setting(
-        64, "most samples of a pixel, where blur is wide, rounded up to a power of two (default: 64)", within=(8, 512)
-    )
+        SAMPLES, "of each pixel whose blur is uneven, rounded up to a power of two; others take fewer "
+        f"(default: {SAMPLES})", within=(8, 512),
+    )  # fmt: skip
     no_highlights: bool = setting(False, "do not spread very bright pixels as discs; their blur is then noisy")
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")

@@ -1,9 +1,9 @@
 """A plate as a lens would have photographed it: its pixels gathered, and its highlights spread as clean discs.
 
 The picture gets the camera's blur, distortion, vignetting and colour fringes. The rays of a pixel lie between those of
-the four nodes around it. What a ray meets is found in the plate's depth (`gather.c`). A pixel takes the more samples,
-the wider the lens blurs there, and weighs them so that even light stays even: the mean of radiance by weight, times the
-mean weight of the whole pupil.
+the four nodes around it. What a ray meets is found in the plate's depth (`gather.c`). A pixel takes the number
+of samples that is asked for where the light in its blur is uneven, and fewer where it is even or sharp. It weighs them
+so that even light stays even: the mean of radiance by weight, times the mean weight of the whole pupil.
 
 Highlights are pixels that are far brighter than their surroundings. Few of a pixel's samples would find them, which is
 noise. Their light above that of the surroundings is taken out of the plate and spread by the lens's own kernels, one
@@ -30,13 +30,16 @@ from neurolens.base.tasks import in_order
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
 from neurolens.defocus.kernels import LARGEST, kernel_at
-from neurolens.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable
+from neurolens.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable, reduced
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.render.sampler import sobol
 
 _SET = 512  # points of the pupil
 _FEW = 128  # of them, to measure blur
-_LEAST, _A_PIXEL = 8, 1  # samples of a pixel, and more for each pixel of the blur's radius: FLIP hardly gains by others
+SAMPLES, _LEAST = 128, 8  # of a pixel: as a rule, and at least
+# The contrast of the light in a pixel's blur, and the radius of that with the pixel itself, from which it takes all
+# samples: the error is in proportion to the contrast, and a small blur has few pixels to take samples of.
+_FULL, _FULL_PX = 0.25, 2.0
 _CLEAR = 0.01  # of its inverse depth, by which what hides a point is nearer
 _SAID = 0.002  # share of the light that was made up, from which it is said
 _EDGE = 9  # points of each side of the film that are tried
@@ -107,7 +110,7 @@ def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float6
 
 
 def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[np.uint8]:
-    """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel."""
+    """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel and what is in it."""
     width, height = plate.size
     places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
     nodes = [
@@ -133,8 +136,32 @@ def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[n
                 low = np.where(inside, np.maximum(least[np.ix_(rows, columns)], 0), low)
                 high = np.where(inside, np.maximum(most[np.ix_(rows, columns)], 0), high)
         widest = np.maximum(widest, np.maximum(radius_px(here, low), radius_px(here, high)))
-    wanted = np.ceil(np.log2(np.clip(_LEAST / 2 + _A_PIXEL * widest, _LEAST, samples))).astype(np.uint8)
+    share = np.minimum(_contrast(plate, places, widest) / _FULL, 1) * np.minimum((widest + 0.5) / _FULL_PX, 1) ** 2
+    wanted = np.ceil(np.log2(np.maximum(samples * share, _LEAST))).astype(np.uint8)
     return np.ascontiguousarray(wanted.repeat(FINEST, 0).repeat(FINEST, 1)[:height, :width])
+
+
+def _contrast(plate: Plate, places: list[NDArray[np.float64]], reach: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The standard deviation of the light of all layers over its mean, in squares [rows, columns] about places (rows,
+    columns of the film) that a blur of the radii `reach` fills: even light has no noise."""
+    sums: Any = 0.0
+    for layer in plate.layers:
+        solid = layer.texel[..., 3] >= 0
+        rgb = np.moveaxis(layer.texel[..., :3], 2, 0)
+        planes = (solid, *rgb, np.square(rgb, dtype=np.float64).sum(axis=0))
+        sums = sums + np.stack([reduced(np.where(solid, p, 0.0), FINEST, np.add) for p in planes], axis=2)
+    sums = np.pad(sums, [(1, 0), (1, 0), (0, 0)]).cumsum(axis=0).cumsum(axis=1)
+    middle = np.meshgrid(*places, indexing="ij")
+    (top, left), (stop, right) = (
+        [
+            np.clip(by((v + border + side * (reach + 1)) / FINEST), low, n - 2 + low).astype(int)
+            for v, border, n in zip(middle, plate.border_px[::-1], sums.shape, strict=False)
+        ]
+        for by, side, low in ((np.floor, -1, 0), (np.ceil, 1, 1))
+    )
+    count, *mean, square = np.moveaxis(sums[stop, right] - sums[top, right] - sums[stop, left] + sums[top, left], 2, 0)
+    bright = np.square(mean).sum(axis=0)
+    return np.sqrt(np.maximum(square * count / np.maximum(bright, 1e-30) - 1, 0))
 
 
 def _beside(values: FloatArray, by: np.ufunc) -> FloatArray:
@@ -145,10 +172,10 @@ def _beside(values: FloatArray, by: np.ufunc) -> FloatArray:
 
 
 def gather(
-    plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = 64, threads: int = 1,
+    plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = SAMPLES, threads: int = 1,
     report: Callable[[float], None] = lambda _: None,
 ) -> Gathered:  # fmt: skip
-    """The picture that a camera takes of a plate by at most `samples` a pixel; `spread`: `spread_over` of both."""
+    """The picture that a camera takes of a plate; `spread` is `spread_over` of both, `samples` a power of two."""
     width, height = plate.size
     points = _points(_SET, 5)
     jitter = np.ascontiguousarray(points[2:4].T)
@@ -281,13 +308,13 @@ def spread_highlights(
 
 
 def defocus(
-    plate: Plate, camera: Camera, samples: int = 64, threads: int = 1, highlights: bool = True,
+    plate: Plate, camera: Camera, samples: int = SAMPLES, threads: int = 1, highlights: bool = True,
     progress: Progress | None = None,
 ) -> Gathered:  # fmt: skip
     """The picture that a camera takes of a plate.
 
     Args:
-        samples: of a pixel, at most, 8 to 512; rounded up to a power of two.
+        samples: of each pixel whose blur is uneven, 8 to 512; rounded up to a power of two.
         highlights: spread pixels that are far brighter than their surroundings as discs, without noise.
 
     Warns:

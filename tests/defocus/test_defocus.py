@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.picture import gather, spread_highlights, spread_over, take_highlights
+from neurolens.defocus.picture import SAMPLES, _sizes, gather, spread_highlights, spread_over, take_highlights
 from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
@@ -57,6 +58,10 @@ def blurred(
     if taken is not None:
         spread_highlights(found, taken, plate, camera)
     return found
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
 
 
 def flat(value: float, inverse_depth: float, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
@@ -137,6 +142,24 @@ def test_a_blurred_edge_lets_the_light_behind_it_through_as_the_part_of_the_disc
     share = (math.pi - np.arccos(away) + away * np.sqrt(1 - away**2)) / math.pi
     near = slice(192 - 2 * int(radius), 192 + 2 * int(radius))
     np.testing.assert_allclose(row[near], share[near], atol=0.03)
+
+
+@pytest.mark.parametrize("post", [0.1, 1.0])
+def test_blurred_edges_are_as_clean_as_the_samples_that_are_asked_for(post: float) -> None:
+    """Posts nearer than what is in focus: every number of samples is taken, and the default has little noise."""
+    camera = thin()
+    rgb, w = flat(0.5, in_focus(camera))
+    posts = np.arange(SIZE[0]) % 128 < 32
+    rgb[:, posts], w[:, posts] = post, 2.0
+    clean = blurred(camera, rgb, w, samples=512)
+    noise = [rms(blurred(camera, rgb, w, samples=n) - clean) / rms(clean) for n in (16, 64, SAMPLES, 256)]
+    assert noise[2] < 0.007 and all(few > 1.3 * more for few, more in itertools.pairwise(noise))
+
+
+def test_even_light_takes_few_samples() -> None:
+    camera = thin()
+    plate = plate_of(camera, flat(0.5, 2.0))
+    assert _sizes(plate, spread_over(camera, plate), 512).max() == 3  # 8 samples
 
 
 def test_a_sharp_screen_hides_the_blur_behind_it() -> None:
