@@ -78,6 +78,8 @@ examples:
         """Read the plate, blur it, write the picture."""
         files = Files.of(self.out)
         files.spare((self.plate, *self.behind))
+        counted = {k: v for k, v in vars(self.sensor).items() if v is not None}
+        sensor = SensorSettings(**counted) if counted else None
         if self.depth_scale == 0:
             self.refuse("--depth-scale", 0, "metres of a unit")
         progress = self.progress()
@@ -94,8 +96,7 @@ examples:
         data |= {name: getattr(found, name) for name in ("highlights", "filled", "beyond")}
         metadata = {"version": __version__, "camera": camera.settings, "defocus": data}
         layers = {}
-        if counted := {k: v for k, v in vars(self.sensor).items() if v is not None}:
-            sensor = SensorSettings(**counted)
+        if sensor is not None:
             layers, metadata["sensor"] = expose(found.rgb, sensor, self.seed), about(sensor, self.seed)
         focus = None if math.isinf(shot.focus_m) else shot.focus_m
         attributes = standard_attributes(camera.settings, *plate.size)

@@ -420,6 +420,8 @@ def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
         (np.full(SIZE[::-1], 3.0), ["--film", "36x36"], "a picture of the film's shape"),
         (np.full(SIZE[::-1], 3.0), ["--lens", "fisheye-equidistant", "--focal-length", "8"], "a plate is a plane"),
         (np.full(SIZE[::-1], 3.0), ["--depth-scale", "0"], "metres of a unit"),
+        (None, ["--bits", "8", "--black-level", "255"], "black_level: got 255, expected at most 254"),
+        (None, ["--black-level", "16383"], "black_level: got 16383, expected at most 16382"),
     ],
 )
 def test_bad_input_gets_one_line(
