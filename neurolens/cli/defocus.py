@@ -93,7 +93,7 @@ examples:
         plate = read_plate(self.plate, self.film, frame_of(camera), depth, self.behind)
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
         data: dict[str, Any] = {"plate": self.plate.name, "layers": len(plate.layers), "file": str(files.out)}
-        data |= {name: getattr(found, name) for name in ("highlights", "filled", "beyond")}
+        data |= {name: getattr(found, name) for name in ("highlights", "filled", "lost", "beyond")}
         metadata = {"version": __version__, "camera": camera.settings, "defocus": data}
         layers = {}
         if sensor is not None:
@@ -109,10 +109,9 @@ examples:
 
 
 def _defocus_text(data: dict[str, Any]) -> str:
-    said = (
-        f"{data['file']}: {data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread, "
-    )
-    return said + f"{data['filled']:.2%} of the light filled in, {data['beyond']:.2%} from beyond the plate"
+    said = f"{data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread"
+    shares = f"{data['filled']:.2%} of the light filled in, {data['lost']:.2%} lost, {data['beyond']:.2%} from beyond"
+    return f"{data['file']}: {said}, {shares} the plate"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,12 +56,14 @@ _CELLS, _COLOURS = 24, 2
 @dataclass(frozen=True)
 class Gathered:
     """The picture [H, W, 3] that a camera takes of a plate, and the shares of its light that the plate did not have:
-    `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs."""
+    `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs; `lost`
+    is the share of the light of those that edges hide in the plate, if there are as many as beside them."""
 
     rgb: FloatArray
     filled: float
     beyond: float
     highlights: int = 0
+    lost: float = 0.0
 
 
 class _Table(ctypes.Structure):
@@ -79,7 +81,7 @@ def compiled() -> ctypes.CDLL:
     library = load_compiled(c_source("defocus/gather.c", **defined))
     whole, pointer = ctypes.c_int, ctypes.c_void_p
     library.splat.argtypes = [pointer, whole, pointer, whole, pointer, *[whole] * 2, pointer, *[whole] * 2, pointer]
-    library.splat.restype = None
+    library.splat.restype = ctypes.c_double
     library.gather.argtypes = [pointer, whole, _Table, whole, whole, whole, pointer, pointer]
     library.gather.restype = None
     return library
@@ -281,8 +283,8 @@ def spread_highlights(
     plate: Plate,
     camera: Camera,
     report: Callable[[float], None] = lambda _: None,
-) -> None:
-    """Add the light of highlights to a picture [H, W, 3]."""
+) -> float:
+    """Add the light of highlights to a picture [H, W, 3]; returns that which nearer things hide, summed likewise."""
     (width, height), border = plate.size, np.array(plate.border_px)
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
@@ -290,7 +292,7 @@ def spread_highlights(
     step = np.where(radius < near / 4, radius / _FINE_PX, near + np.log(radius) / _FINE).round().astype(int)
     for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), found.side.tolist(), strict=True)):
         groups[key].append(k)
-    structs = plate.structs()
+    structs, hidden = plate.structs(), 0.0
     for number, rows in enumerate(groups.values()):
         place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
         kernel = kernel_at(camera, plate, (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS)
@@ -300,11 +302,12 @@ def spread_highlights(
             points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.film_by_plate.T
             points[:, 5:] = found.light[rows]
             sweep, light = np.ascontiguousarray(kernel.sweep, np.float32), np.ascontiguousarray(kernel.light)
-            compiled().splat(
+            hidden += compiled().splat(
                 structs, len(structs), points.ctypes.data, len(rows), light.ctypes.data, *light.shape[1::-1],
                 sweep.ctypes.data, width, height, picture.ctypes.data,
             )  # fmt: skip
         report((number + 1) / len(groups))
+    return hidden
 
 
 def defocus(
@@ -329,19 +332,27 @@ def defocus(
     taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:
         found = gather(plate, camera, spread, 1 << (samples - 1).bit_length(), threads, report)
-    for some in taken:
+    hidden, light = 0.0, float(found.rgb.sum(dtype=np.float64))
+    for k, some in enumerate(taken):
+        behind = 0.0
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                spread_highlights(found.rgb, some, plate, camera, report)
-    _say(found, len(plate.layers))
-    return replace(found, highlights=sum(len(some.radius_px) for some in taken))
+                behind = spread_highlights(found.rgb, some, plate, camera, report)
+            before, light = light, float(found.rgb.sum(dtype=np.float64))
+            # Edges hide as much of highlights that a plate shows as they let through of those that it does not: of a
+            # point's pupil they cover, on the mean over points, what they leave open of a hidden one's.
+            hidden += before - light if k else behind
+    lost, number = max(hidden, 0) / max(light + hidden, 1e-30), sum(len(some.radius_px) for some in taken)
+    _say(found := replace(found, highlights=number, lost=lost), len(plate.layers))
+    return found
 
 
 def _say(found: Gathered, layers: int) -> None:
-    if found.filled > _SAID:
+    if max(found.filled, found.lost) > _SAID:
         more = "" if layers > 1 else "; layers behind (--behind, or a deep file) have it"
+        lost = f", without highlights: if as many are hidden as are seen, {100 * found.lost:.1f}% of the light is lost"
         warn(f"{100 * found.filled:.1f}% of the light comes from behind edges, which the plate does not show: what is "
-             f"beside them was put there{more}")  # fmt: skip
+             f"beside them was put there{lost * (found.lost > 0)}{more}")  # fmt: skip
     if found.beyond > _SAID:
         warn(f"{100 * found.beyond:.1f}% of the light comes from beyond the plate's borders, whose pixels were "
              "repeated: render it with overscan")  # fmt: skip

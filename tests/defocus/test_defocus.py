@@ -20,7 +20,7 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.picture import SAMPLES, _sizes, gather, spread_highlights, spread_over, take_highlights
+from neurolens.defocus.picture import SAMPLES, _sizes, defocus, gather, spread_highlights, spread_over, take_highlights
 from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
@@ -183,6 +183,19 @@ def test_what_lies_behind_an_edge_comes_from_the_layer_behind() -> None:
     assert alone.filled > 0.001 and both.filled < alone.filled / 20
     left = 192 - int(disc_px(camera, 2.0) / 2)
     assert alone.rgb[108, left, 1] > 0.15 and both.rgb[108, left, 1] < 0.02 < 0.15 < both.rgb[108, left, 0]
+
+
+def test_the_light_of_hidden_highlights_is_counted_as_lost(recwarn: pytest.WarningsRecorder) -> None:
+    """Posts before a far night full of lights: beside the same with the layer that the posts hide."""
+    camera = thin()
+    rgb, w = flat(0.05, 0.0)
+    rgb[5::11, 3::13] = 20.0
+    front, near = rgb.copy(), w.copy()
+    posts = np.arange(SIZE[0]) % 64 < 32
+    front[:, posts], near[:, posts] = 0.0, 2.0
+    one, two = (defocus(plate_of(camera, (front, near), *behind), camera, samples=32) for behind in ((), ((rgb, w),)))
+    assert one.lost == pytest.approx(1 - one.rgb.sum() / two.rgb.sum(), rel=0.15) and one.lost > 0.05
+    assert two.lost < 0.01 and f"{100 * one.lost:.1f}% of the light is lost" in str(recwarn[0].message)
 
 
 def test_planes_that_recede_have_no_edges() -> None:
