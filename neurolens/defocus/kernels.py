@@ -372,11 +372,12 @@ def kernels_over(
         ((i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1])
         for j, i in itertools.product(range(fields[1]), range(fields[0]))
     ]
+    least = plate.pinhole.before_film_mm / 1000
+    for distance in distances_m:
+        if not distance > least:
+            raise InputError("kernels", "distance_m", distance, f"above {least:g}, the entrance pupil")
     for number, distance in enumerate(distances_m):
-        ahead, cells = distance - plate.pinhole.before_film_mm / 1000, list[Cell]()
-        if not ahead > 0:
-            expected = f"above {plate.pinhole.before_film_mm / 1000:g}, the entrance pupil"
-            raise InputError("kernels", "distance_m", distance, expected)
+        ahead, cells = distance - least, list[Cell]()
         for place in places:
             kernel = kernel_at(camera, plate, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves)
             field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]

@@ -19,7 +19,7 @@ from neurolens.cameras.field import field_of, frame_of
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
-from neurolens.defocus.kernels import kernel_at
+from neurolens.defocus.kernels import kernel_at, kernels_over
 from neurolens.defocus.picture import SAMPLES, _sizes, defocus, gather, spread_highlights, spread_over, take_highlights
 from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.graph.compiler import has_compiler
@@ -462,6 +462,13 @@ def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
         np.testing.assert_allclose(cells[0], cells[2][:, ::-1], atol=0.02 * cells.max())  # the lens is round
     light = [k["light"][1] for k in data["kernels"][:3]]
     assert light[0] == pytest.approx(light[2], rel=1e-3) and light[0] < 0.95 * light[1]
+
+
+def test_distances_within_the_lens_are_refused_before_any_kernel() -> None:
+    done = list[float]()
+    with pytest.raises(InputError, match=r"distance_m: got 0\.01, expected above 0\.05"):
+        kernels_over(thin(), SIZE, (2.0, 0.01), (1, 1), report=done.append)
+    assert not done
 
 
 def test_a_kernel_has_the_area_of_rays_traced_from_the_point(exact: Camera) -> None:
