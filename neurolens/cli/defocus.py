@@ -15,7 +15,7 @@ from neurolens.cameras.field import frame_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
 from neurolens.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
-from neurolens.defocus.picture import check_field, defocus
+from neurolens.defocus.picture import SAMPLES, check_field, defocus
 from neurolens.defocus.plate import DepthSettings, read_plate
 from neurolens.frames import Files
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
@@ -60,8 +60,9 @@ examples:
         "auto", "where depth begins (default: auto, the film in pictures of neurolens, else the pinhole)"
     )
     samples: int = setting(
-        64, "most samples of a pixel, where blur is wide, rounded up to a power of two (default: 64)", within=(8, 512)
-    )
+        SAMPLES, "of each pixel whose blur is uneven, rounded up to a power of two; others take fewer "
+        f"(default: {SAMPLES})", within=(8, 512),
+    )  # fmt: skip
     no_highlights: bool = setting(False, "do not spread very bright pixels as discs; their blur is then noisy")
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
@@ -77,6 +78,8 @@ examples:
         """Read the plate, blur it, write the picture."""
         files = Files.of(self.out)
         files.spare((self.plate, *self.behind))
+        counted = {k: v for k, v in vars(self.sensor).items() if v is not None}
+        sensor = SensorSettings(**counted) if counted else None
         if self.depth_scale == 0:
             self.refuse("--depth-scale", 0, "metres of a unit")
         progress = self.progress()
@@ -90,11 +93,10 @@ examples:
         plate = read_plate(self.plate, self.film, frame_of(camera), depth, self.behind)
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
         data: dict[str, Any] = {"plate": self.plate.name, "layers": len(plate.layers), "file": str(files.out)}
-        data |= {name: getattr(found, name) for name in ("highlights", "filled", "beyond")}
+        data |= {name: getattr(found, name) for name in ("highlights", "filled", "lost", "beyond")}
         metadata = {"version": __version__, "camera": camera.settings, "defocus": data}
         layers = {}
-        if counted := {k: v for k, v in vars(self.sensor).items() if v is not None}:
-            sensor = SensorSettings(**counted)
+        if sensor is not None:
             layers, metadata["sensor"] = expose(found.rgb, sensor, self.seed), about(sensor, self.seed)
         focus = None if math.isinf(shot.focus_m) else shot.focus_m
         attributes = standard_attributes(camera.settings, *plate.size)
@@ -107,10 +109,9 @@ examples:
 
 
 def _defocus_text(data: dict[str, Any]) -> str:
-    said = (
-        f"{data['file']}: {data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread, "
-    )
-    return said + f"{data['filled']:.2%} of the light filled in, {data['beyond']:.2%} from beyond the plate"
+    said = f"{data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread"
+    shares = f"{data['filled']:.2%} of the light filled in, {data['lost']:.2%} lost, {data['beyond']:.2%} from beyond"
+    return f"{data['file']}: {said}, {shares} the plate"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -201,11 +201,13 @@ void gather(
 
 /* Add the light of points of a plate to a film. `points` [count, 8]: place in the plate, inverse depth, first column and
    row of the kernel in the film (not whole), and light of red, green and blue. `sweep`: see `kernels.Kernel`; columns and
-   rows of it are those of the kernel. A film pixel from which something nearer hides the point takes none. */
-void splat(
+   rows of it are those of the kernel. A film pixel from which something nearer hides the point takes none: the light that
+   is hidden so, the sum of all channels, is returned. */
+double splat(
     const struct layer *layers, int layer_count, const float *points, int count, const float *kernel, int wide, int high,
     const float *sweep, int width, int height, float *film)
 {
+    double lost = 0.0;
     for (int n = 0; n < count; n++) {
         const float *const p = points + 8 * n, w = p[2], left = floorf(p[3]), top = floorf(p[4]);
         const float fx = p[3] - left, fy = p[4] - top, near = w * (1.0f + CLEAR) + 1e-6f;
@@ -233,8 +235,11 @@ void splat(
                     int at_x, at_y;
                     hidden = layers[k].nearest > near && follow(layers + k, line, near, &found, &at_x, &at_y) == MET;
                 }
-                for (int c = 0; c < 3 && !hidden; c++) film[3 * ((size_t)y * width + x) + c] += light[c] * p[5 + c];
+                for (int c = 0; c < 3; c++)
+                    if (hidden) lost += light[c] * p[5 + c];
+                    else film[3 * ((size_t)y * width + x) + c] += light[c] * p[5 + c];
             }
         }
     }
+    return lost;
 }

@@ -41,6 +41,7 @@ LARGEST = 2048  # pixels a side of a kernel
 _RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
 _MARGIN = 2  # pixels around it
 _A_GROOVE, _FINEST = 8, 1536  # cells for each groove of an asphere, and the most along a side
+_FINER = 3  # pixels along a side of one, odd, that show grooves finer than it
 _LARGEST = 16384  # pixels a side of an atlas
 
 
@@ -174,11 +175,23 @@ def kernel_at(
     width, height = (np.ceil(most).astype(int) + _MARGIN - corner).tolist()
     if max(width, height) > LARGEST:
         raise InputError("kernel", "size", f"({width} x {height} pixels)", f"at most {LARGEST} a side: blur less")
-    light = np.zeros((height, width, 3), np.float32)
+    # Grooves finer than a pixel, in one box a pixel, would leave a checkerboard.
+    finer = _FINER if grooves is not None and _FINER * max(width, height) <= LARGEST else 1
+    light = np.zeros((finer * height, finer * width, 3), np.float32)
     colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
     for k in range(nm.size):
-        aimed.draw(light, k, corner, colour[[k // nm.shape[1]]] / nm.shape[1])
-    return Kernel(np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.film_by_plate, aimed.sweep(corner))
+        aimed.draw(light, k, corner, colour[[k // nm.shape[1]]] / nm.shape[1], finer)
+    light = np.maximum(_averaged(light, finer), 0)
+    return Kernel(light, (int(corner[0]), int(corner[1])), aimed.film_by_plate, aimed.sweep(corner))
+
+
+def _averaged(light: FloatArray, finer: int) -> FloatArray:
+    """The light of pixels that are so many times as wide, under a quadratic spline over three; the rim is dark."""
+    for axis in (0, 1) if finer > 1 else ():
+        for _ in range(2):
+            light = np.mean([np.roll(light, k - finer // 2, axis) for k in range(finer)], axis=0)
+        light = np.add.reduceat(light, np.arange(0, light.shape[axis], finer), axis)
+    return light
 
 
 def _disk(side: NDArray[Any]) -> Array:
@@ -226,11 +239,11 @@ class _Aimed:
         more = (1 / _RIM - 1) * far / np.where(far > 0, far - near, 1) * (place - within)
         return _Aimed(place + np.where(solid, more, 0), weight, slope, self.film_by_plate)
 
-    def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], colour: Array) -> None:
+    def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], colour: Array, finer: int) -> None:
         """Add the light of a wavelength to a kernel's picture, each quarter of the pupil with its cells cut along the
-        grid's diagonal."""
+        grid's diagonal; `finer`: the picture's pixels along the side of one of the film's."""
         height, width = light.shape[:2]
-        (x, y), weight = self.place[:, number] - corner[:, None, None], self.weight[number]
+        (x, y), weight = finer * (self.place[:, number] - corner[:, None, None]), self.weight[number]
         lit, cells = weight > 0, len(weight) - 1
         half, square = cells // 2, 1 - np.linspace(-1, 1, cells + 1) ** 2 / 2
         # The area of the disk that a cell has, over its whole.
@@ -359,11 +372,12 @@ def kernels_over(
         ((i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1])
         for j, i in itertools.product(range(fields[1]), range(fields[0]))
     ]
+    least = plate.pinhole.before_film_mm / 1000
+    for distance in distances_m:
+        if not distance > least:
+            raise InputError("kernels", "distance_m", distance, f"above {least:g}, the entrance pupil")
     for number, distance in enumerate(distances_m):
-        ahead, cells = distance - plate.pinhole.before_film_mm / 1000, list[Cell]()
-        if not ahead > 0:
-            expected = f"above {plate.pinhole.before_film_mm / 1000:g}, the entrance pupil"
-            raise InputError("kernels", "distance_m", distance, expected)
+        ahead, cells = distance - least, list[Cell]()
         for place in places:
             kernel = kernel_at(camera, plate, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves)
             field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]

@@ -1,9 +1,9 @@
 """A plate as a lens would have photographed it: its pixels gathered, and its highlights spread as clean discs.
 
 The picture gets the camera's blur, distortion, vignetting and colour fringes. The rays of a pixel lie between those of
-the four nodes around it. What a ray meets is found in the plate's depth (`gather.c`). A pixel takes the more samples,
-the wider the lens blurs there, and weighs them so that even light stays even: the mean of radiance by weight, times the
-mean weight of the whole pupil.
+the four nodes around it. What a ray meets is found in the plate's depth (`gather.c`). A pixel takes the number
+of samples that is asked for where the light in its blur is uneven, and fewer where it is even or sharp. It weighs them
+so that even light stays even: the mean of radiance by weight, times the mean weight of the whole pupil.
 
 Highlights are pixels that are far brighter than their surroundings. Few of a pixel's samples would find them, which is
 noise. Their light above that of the surroundings is taken out of the plate and spread by the lens's own kernels, one
@@ -30,13 +30,16 @@ from neurolens.base.tasks import in_order
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
 from neurolens.defocus.kernels import LARGEST, kernel_at
-from neurolens.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable
+from neurolens.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable, reduced
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.render.sampler import sobol
 
 _SET = 512  # points of the pupil
 _FEW = 128  # of them, to measure blur
-_LEAST, _A_PIXEL = 8, 1  # samples of a pixel, and more for each pixel of the blur's radius: FLIP hardly gains by others
+SAMPLES, _LEAST = 128, 8  # of a pixel: as a rule, and at least
+# The contrast of the light in a pixel's blur, and the radius of that with the pixel itself, from which it takes all
+# samples: the error is in proportion to the contrast, and a small blur has few pixels to take samples of.
+_FULL, _FULL_PX = 0.25, 2.0
 _CLEAR = 0.01  # of its inverse depth, by which what hides a point is nearer
 _SAID = 0.002  # share of the light that was made up, from which it is said
 _EDGE = 9  # points of each side of the film that are tried
@@ -53,12 +56,14 @@ _CELLS, _COLOURS = 24, 2
 @dataclass(frozen=True)
 class Gathered:
     """The picture [H, W, 3] that a camera takes of a plate, and the shares of its light that the plate did not have:
-    `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs."""
+    `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs; `lost`
+    is the share of the light of those that edges hide in the plate, if there are as many as beside them."""
 
     rgb: FloatArray
     filled: float
     beyond: float
     highlights: int = 0
+    lost: float = 0.0
 
 
 class _Table(ctypes.Structure):
@@ -76,7 +81,7 @@ def compiled() -> ctypes.CDLL:
     library = load_compiled(c_source("defocus/gather.c", **defined))
     whole, pointer = ctypes.c_int, ctypes.c_void_p
     library.splat.argtypes = [pointer, whole, pointer, whole, pointer, *[whole] * 2, pointer, *[whole] * 2, pointer]
-    library.splat.restype = None
+    library.splat.restype = ctypes.c_double
     library.gather.argtypes = [pointer, whole, _Table, whole, whole, whole, pointer, pointer]
     library.gather.restype = None
     return library
@@ -107,7 +112,7 @@ def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float6
 
 
 def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[np.uint8]:
-    """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel."""
+    """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel and what is in it."""
     width, height = plate.size
     places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
     nodes = [
@@ -133,8 +138,32 @@ def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[n
                 low = np.where(inside, np.maximum(least[np.ix_(rows, columns)], 0), low)
                 high = np.where(inside, np.maximum(most[np.ix_(rows, columns)], 0), high)
         widest = np.maximum(widest, np.maximum(radius_px(here, low), radius_px(here, high)))
-    wanted = np.ceil(np.log2(np.clip(_LEAST / 2 + _A_PIXEL * widest, _LEAST, samples))).astype(np.uint8)
+    share = np.minimum(_contrast(plate, places, widest) / _FULL, 1) * np.minimum((widest + 0.5) / _FULL_PX, 1) ** 2
+    wanted = np.ceil(np.log2(np.maximum(samples * share, _LEAST))).astype(np.uint8)
     return np.ascontiguousarray(wanted.repeat(FINEST, 0).repeat(FINEST, 1)[:height, :width])
+
+
+def _contrast(plate: Plate, places: list[NDArray[np.float64]], reach: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The standard deviation of the light of all layers over its mean, in squares [rows, columns] about places (rows,
+    columns of the film) that a blur of the radii `reach` fills: even light has no noise."""
+    sums: Any = 0.0
+    for layer in plate.layers:
+        solid = layer.texel[..., 3] >= 0
+        rgb = np.moveaxis(layer.texel[..., :3], 2, 0)
+        planes = (solid, *rgb, np.square(rgb, dtype=np.float64).sum(axis=0))
+        sums = sums + np.stack([reduced(np.where(solid, p, 0.0), FINEST, np.add) for p in planes], axis=2)
+    sums = np.pad(sums, [(1, 0), (1, 0), (0, 0)]).cumsum(axis=0).cumsum(axis=1)
+    middle = np.meshgrid(*places, indexing="ij")
+    (top, left), (stop, right) = (
+        [
+            np.clip(by((v + border + side * (reach + 1)) / FINEST), low, n - 2 + low).astype(int)
+            for v, border, n in zip(middle, plate.border_px[::-1], sums.shape, strict=False)
+        ]
+        for by, side, low in ((np.floor, -1, 0), (np.ceil, 1, 1))
+    )
+    count, *mean, square = np.moveaxis(sums[stop, right] - sums[top, right] - sums[stop, left] + sums[top, left], 2, 0)
+    bright = np.square(mean).sum(axis=0)
+    return np.sqrt(np.maximum(square * count / np.maximum(bright, 1e-30) - 1, 0))
 
 
 def _beside(values: FloatArray, by: np.ufunc) -> FloatArray:
@@ -145,10 +174,10 @@ def _beside(values: FloatArray, by: np.ufunc) -> FloatArray:
 
 
 def gather(
-    plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = 64, threads: int = 1,
+    plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = SAMPLES, threads: int = 1,
     report: Callable[[float], None] = lambda _: None,
 ) -> Gathered:  # fmt: skip
-    """The picture that a camera takes of a plate by at most `samples` a pixel; `spread`: `spread_over` of both."""
+    """The picture that a camera takes of a plate; `spread` is `spread_over` of both, `samples` a power of two."""
     width, height = plate.size
     points = _points(_SET, 5)
     jitter = np.ascontiguousarray(points[2:4].T)
@@ -254,8 +283,8 @@ def spread_highlights(
     plate: Plate,
     camera: Camera,
     report: Callable[[float], None] = lambda _: None,
-) -> None:
-    """Add the light of highlights to a picture [H, W, 3]."""
+) -> float:
+    """Add the light of highlights to a picture [H, W, 3]; returns that which nearer things hide, summed likewise."""
     (width, height), border = plate.size, np.array(plate.border_px)
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
@@ -263,7 +292,7 @@ def spread_highlights(
     step = np.where(radius < near / 4, radius / _FINE_PX, near + np.log(radius) / _FINE).round().astype(int)
     for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), found.side.tolist(), strict=True)):
         groups[key].append(k)
-    structs = plate.structs()
+    structs, hidden = plate.structs(), 0.0
     for number, rows in enumerate(groups.values()):
         place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
         kernel = kernel_at(camera, plate, (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS)
@@ -273,21 +302,22 @@ def spread_highlights(
             points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.film_by_plate.T
             points[:, 5:] = found.light[rows]
             sweep, light = np.ascontiguousarray(kernel.sweep, np.float32), np.ascontiguousarray(kernel.light)
-            compiled().splat(
+            hidden += compiled().splat(
                 structs, len(structs), points.ctypes.data, len(rows), light.ctypes.data, *light.shape[1::-1],
                 sweep.ctypes.data, width, height, picture.ctypes.data,
             )  # fmt: skip
         report((number + 1) / len(groups))
+    return hidden
 
 
 def defocus(
-    plate: Plate, camera: Camera, samples: int = 64, threads: int = 1, highlights: bool = True,
+    plate: Plate, camera: Camera, samples: int = SAMPLES, threads: int = 1, highlights: bool = True,
     progress: Progress | None = None,
 ) -> Gathered:  # fmt: skip
     """The picture that a camera takes of a plate.
 
     Args:
-        samples: of a pixel, at most, 8 to 512; rounded up to a power of two.
+        samples: of each pixel whose blur is uneven, 8 to 512; rounded up to a power of two.
         highlights: spread pixels that are far brighter than their surroundings as discs, without noise.
 
     Warns:
@@ -302,19 +332,27 @@ def defocus(
     taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:
         found = gather(plate, camera, spread, 1 << (samples - 1).bit_length(), threads, report)
-    for some in taken:
+    hidden, light = 0.0, float(found.rgb.sum(dtype=np.float64))
+    for k, some in enumerate(taken):
+        behind = 0.0
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                spread_highlights(found.rgb, some, plate, camera, report)
-    _say(found, len(plate.layers))
-    return replace(found, highlights=sum(len(some.radius_px) for some in taken))
+                behind = spread_highlights(found.rgb, some, plate, camera, report)
+            before, light = light, float(found.rgb.sum(dtype=np.float64))
+            # Edges hide as much of highlights that a plate shows as they let through of those that it does not: of a
+            # point's pupil they cover, on the mean over points, what they leave open of a hidden one's.
+            hidden += before - light if k else behind
+    lost, number = max(hidden, 0) / max(light + hidden, 1e-30), sum(len(some.radius_px) for some in taken)
+    _say(found := replace(found, highlights=number, lost=lost), len(plate.layers))
+    return found
 
 
 def _say(found: Gathered, layers: int) -> None:
-    if found.filled > _SAID:
+    if max(found.filled, found.lost) > _SAID:
         more = "" if layers > 1 else "; layers behind (--behind, or a deep file) have it"
+        lost = f", without highlights: if as many are hidden as are seen, {100 * found.lost:.1f}% of the light is lost"
         warn(f"{100 * found.filled:.1f}% of the light comes from behind edges, which the plate does not show: what is "
-             f"beside them was put there{more}")  # fmt: skip
+             f"beside them was put there{lost * (found.lost > 0)}{more}")  # fmt: skip
     if found.beyond > _SAID:
         warn(f"{100 * found.beyond:.1f}% of the light comes from beyond the plate's borders, whose pixels were "
              "repeated: render it with overscan")  # fmt: skip

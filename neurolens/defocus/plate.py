@@ -174,14 +174,15 @@ def _pyramid(w: FloatArray) -> list[FloatArray]:
     least = most = w
     levels, step = list[FloatArray](), FINEST
     while True:
-        least, most = _reduced(least, step, np.minimum), _reduced(most, step, np.maximum)
+        least, most = reduced(least, step, np.minimum), reduced(most, step, np.maximum)
         levels.append(np.ascontiguousarray(np.stack([least, most], axis=2)))
         if least.size == 1:
             return levels
         step = 2
 
 
-def _reduced(values: FloatArray, step: int, by: np.ufunc) -> FloatArray:
+def reduced(values: FloatArray, step: int, by: np.ufunc) -> FloatArray:
+    """Cells of `step` pixels a side [h, w], each one value of its pixels' by `np.add`, `np.minimum` or `np.maximum`."""
     for axis in (0, 1):
         values = by.reduceat(values, np.arange(0, values.shape[axis], step), axis=axis)
     return values

@@ -53,7 +53,7 @@ def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: 
             mean = mean.clip(0, full)
             counted = np.minimum(random.poisson(mean) if noisy else mean, settings.full_well)
             read = counted + (settings.read_noise * random.standard_normal(width) if noisy else 0.0)
-            numbers = np.rint(settings.black_level + read / stated["electrons_per_number"])
+            numbers = np.rint(settings.black + read / stated["electrons_per_number"])
             planes[name][k] = numbers.clip(0, stated["white_level"])
     return planes
 
@@ -61,5 +61,6 @@ def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: 
 def about(settings: SensorSettings, seed: int) -> dict[str, Any]:
     """The metadata of the channels: the settings, the largest number that is read, and the electrons of one."""
     most = 2**settings.bits - 1
-    electrons = settings.full_well / (most - settings.black_level)
-    return {**asdict(settings), "seed": seed, "white_level": most, "electrons_per_number": electrons}
+    electrons = settings.full_well / (most - settings.black)
+    known = {"black_level": settings.black, "seed": seed, "white_level": most, "electrons_per_number": electrons}
+    return asdict(settings) | known

@@ -12,6 +12,7 @@ from neurolens.base.settings import check_bounds, setting
 ColourSpaceName = Literal["sRGB", "ACEScg"]
 WavelengthMode = Literal["auto", "one", "hero"]
 WavelengthSampling = Literal["importance", "uniform"]
+_BLACK = 512  # number that is read without light, of 14 bits
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 
@@ -69,13 +70,21 @@ class SensorSettings:
     read_noise: float = setting(3.0, "in electrons, RMS, of reading (default: 3)", within=(0, 1e6), metavar="N")
     noise: Literal["all", "none"] = setting("all", "of photons and of reading, by --seed; or none (default: all)")
     bits: int = setting(14, "of the numbers that are read; the largest is a full well (default: 14)", within=(1, 16))
-    black_level: int = setting(512, "number that is read without light (default: 512)", within=(0, 65_534))
+    black_level: int | None = setting(
+        None, "number that is read without light (default: 512 of 14 bits and more, else a 32nd of the range)",
+        within=(0, 65_534), metavar="N",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_bounds(self, "sensor")
         most = 2 ** (self.bits or 16) - 2
         if (self.black_level or 0) > most:
             raise InputError("sensor", "black_level", self.black_level, f"at most {most}, below the largest number")
+
+    @property
+    def black(self) -> int:
+        """The number that is read without light."""
+        return min(_BLACK, 2**self.bits // 32) if self.black_level is None else self.black_level
 
 
 def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +19,8 @@ from neurolens.cameras.field import field_of, frame_of
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
-from neurolens.defocus.kernels import kernel_at
-from neurolens.defocus.picture import gather, spread_highlights, spread_over, take_highlights
+from neurolens.defocus.kernels import kernel_at, kernels_over
+from neurolens.defocus.picture import SAMPLES, _sizes, defocus, gather, spread_highlights, spread_over, take_highlights
 from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
@@ -57,6 +58,10 @@ def blurred(
     if taken is not None:
         spread_highlights(found, taken, plate, camera)
     return found
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
 
 
 def flat(value: float, inverse_depth: float, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
@@ -139,6 +144,24 @@ def test_a_blurred_edge_lets_the_light_behind_it_through_as_the_part_of_the_disc
     np.testing.assert_allclose(row[near], share[near], atol=0.03)
 
 
+@pytest.mark.parametrize("post", [0.1, 1.0])
+def test_blurred_edges_are_as_clean_as_the_samples_that_are_asked_for(post: float) -> None:
+    """Posts nearer than what is in focus: every number of samples is taken, and the default has little noise."""
+    camera = thin()
+    rgb, w = flat(0.5, in_focus(camera))
+    posts = np.arange(SIZE[0]) % 128 < 32
+    rgb[:, posts], w[:, posts] = post, 2.0
+    clean = blurred(camera, rgb, w, samples=512)
+    noise = [rms(blurred(camera, rgb, w, samples=n) - clean) / rms(clean) for n in (16, 64, SAMPLES, 256)]
+    assert noise[2] < 0.007 and all(few > 1.3 * more for few, more in itertools.pairwise(noise))
+
+
+def test_even_light_takes_few_samples() -> None:
+    camera = thin()
+    plate = plate_of(camera, flat(0.5, 2.0))
+    assert _sizes(plate, spread_over(camera, plate), 512).max() == 3  # 8 samples
+
+
 def test_a_sharp_screen_hides_the_blur_behind_it() -> None:
     camera = thin()
     rgb, w = flat(1.0, 0.0)
@@ -160,6 +183,19 @@ def test_what_lies_behind_an_edge_comes_from_the_layer_behind() -> None:
     assert alone.filled > 0.001 and both.filled < alone.filled / 20
     left = 192 - int(disc_px(camera, 2.0) / 2)
     assert alone.rgb[108, left, 1] > 0.15 and both.rgb[108, left, 1] < 0.02 < 0.15 < both.rgb[108, left, 0]
+
+
+def test_the_light_of_hidden_highlights_is_counted_as_lost(recwarn: pytest.WarningsRecorder) -> None:
+    """Posts before a far night full of lights: beside the same with the layer that the posts hide."""
+    camera = thin()
+    rgb, w = flat(0.05, 0.0)
+    rgb[5::11, 3::13] = 20.0
+    front, near = rgb.copy(), w.copy()
+    posts = np.arange(SIZE[0]) % 64 < 32
+    front[:, posts], near[:, posts] = 0.0, 2.0
+    one, two = (defocus(plate_of(camera, (front, near), *behind), camera, samples=32) for behind in ((), ((rgb, w),)))
+    assert one.lost == pytest.approx(1 - one.rgb.sum() / two.rgb.sum(), rel=0.15) and one.lost > 0.05
+    assert two.lost < 0.01 and f"{100 * one.lost:.1f}% of the light is lost" in str(recwarn[0].message)
 
 
 def test_planes_that_recede_have_no_edges() -> None:
@@ -397,6 +433,8 @@ def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
         (np.full(SIZE[::-1], 3.0), ["--film", "36x36"], "a picture of the film's shape"),
         (np.full(SIZE[::-1], 3.0), ["--lens", "fisheye-equidistant", "--focal-length", "8"], "a plate is a plane"),
         (np.full(SIZE[::-1], 3.0), ["--depth-scale", "0"], "metres of a unit"),
+        (None, ["--bits", "8", "--black-level", "255"], "black_level: got 255, expected at most 254"),
+        (None, ["--black-level", "16383"], "black_level: got 16383, expected at most 16382"),
     ],
 )
 def test_bad_input_gets_one_line(
@@ -424,6 +462,13 @@ def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
         np.testing.assert_allclose(cells[0], cells[2][:, ::-1], atol=0.02 * cells.max())  # the lens is round
     light = [k["light"][1] for k in data["kernels"][:3]]
     assert light[0] == pytest.approx(light[2], rel=1e-3) and light[0] < 0.95 * light[1]
+
+
+def test_distances_within_the_lens_are_refused_before_any_kernel() -> None:
+    done = list[float]()
+    with pytest.raises(InputError, match=r"distance_m: got 0\.01, expected above 0\.05"):
+        kernels_over(thin(), SIZE, (2.0, 0.01), (1, 1), report=done.append)
+    assert not done
 
 
 def test_a_kernel_has_the_area_of_rays_traced_from_the_point(exact: Camera) -> None:

@@ -141,3 +141,22 @@ def test_lenses_without_aspheres_and_grooves_too_fine_are_refused() -> None:
         aspheres(make_camera("thin", Shot((36.0, 24.0), 2.0)))
     with pytest.raises(InputError, match="lens with aspheres"):
         aspheres(ExactCamera(read_any(ROOT / "lenses" / "laikin_double_gauss_50.toml"), Shot((36.0, 24.0), 2.0)))
+
+
+@pytest.mark.parametrize("away", [0.0, 444.5])
+def test_grooves_finer_than_a_pixel_leave_no_checkerboard_but_rings_where_those_of_two_aspheres_beat(
+    away: float,
+) -> None:
+    camera = make_camera("fused:canon_aspheric_50", Shot((36.0, 24.0), 2.0, f_number=1.2))
+    plate = own_plate(camera, (2000, 1333))
+    place, w = (1000.0, 666.5 - away), 1 / (6 - plate.pinhole.before_film_mm / 1000)
+    kernel = kernel_at(camera, plate, place, w, place, colours=2, grooves=Grooves(60.0, 0.5))
+    assert kernel is not None
+    light = kernel.light[..., 1].astype(np.float64)
+    height, width = light.shape
+    cells = light[: height // 8 * 8, : width // 8 * 8].reshape(height // 8, 8, width // 8, 8).swapaxes(1, 2)
+    lit = cells.min(axis=(2, 3)) > 0.3 * light[light > 0].mean()  # without the rim
+    board = (cells * (-1.0) ** np.add.outer(np.arange(8), np.arange(8))).mean(axis=(2, 3))
+    assert np.abs(board[lit] / cells.mean(axis=(2, 3))[lit]).max() < 0.01
+    middle = light[height // 2 - 8 : height // 2 + 8, width // 2]
+    assert away or middle.std() > 0.3 * middle.mean()  # without grooves 0.11

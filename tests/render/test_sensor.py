@@ -205,7 +205,7 @@ def test_a_cover_glass_moves_the_image_back_and_stays_out_of_the_picture() -> No
         ("thin", ("--read-noise", "nan"), "from 0"),
         ("thin", ("--full-well", "0"), "from 1"),
         ("thin", ("--bits", "8", "--black-level", "255"), "black_level: got 255, expected at most 254"),
-        ("thin", ("--bits", "8"), "black_level: got 512, expected at most 254"),
+        ("thin", ("--black-level", "16383"), "black_level: got 16383, expected at most 16382"),
         ("thin", ("--fill-factor", "0"), "from 0.01 to 1"),
         ("thin", ("--cover-glass", "2"), "cover_glass_mm: got 2.0, expected left out"),
         ("thin", ("--cover-glass", "-1"), "from 0 to 100"),
@@ -218,6 +218,14 @@ def test_bad_input_is_one_line(
 ) -> None:
     line = failure(capsys, "render", scene, "--camera", camera, "-o", tmp_path / "o.exr", *options)
     assert said in line and not list(tmp_path.glob("o.*"))
+
+
+@pytest.mark.parametrize(("bits", "black"), [(1, 0), (8, 8), (12, 128), (14, 512), (16, 512)])
+def test_the_black_level_that_nobody_states_fits_the_bits(bits: int, black: int) -> None:
+    sensor = SensorSettings(bits=bits, noise="none", mosaic="none", electrons=100.0, full_well=100.0)
+    told = about(sensor, 0)
+    assert told["black_level"] == black and told["white_level"] == 2**bits - 1
+    assert [np.unique(expose(flat(v), sensor)["raw.G"]) for v in (0.0, 1.0)] == [black, told["white_level"]]
 
 
 def test_pictures_that_are_none_are_refused() -> None:
