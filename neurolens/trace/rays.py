@@ -245,7 +245,7 @@ class Tracing:
         if lit is None:
             tests = Survival(sound, st.blocked(entering, st.MISSED))
         else:
-            tests = Survival(lit.to(sound.dtype), st.OUTSIDE_DOMAIN)
+            tests = Survival(torch.ones_like(sound) * lit, st.OUTSIDE_DOMAIN)  # of one wavelength for all rays, too
             tests.require([(0.5, sound)], entering, st.MISSED)
         if self.freeze:
             rays = tests.along_axis(rays, self.sense, 0.0)

@@ -306,3 +306,11 @@ def test_float32_gives_the_same_to_rounding() -> None:
     assert ok.sum() > 20
     for a, b in zip(np.concatenate(exact[2]), np.concatenate(rounded[2]), strict=True):
         assert np.abs(a - b)[ok].max() < 2e-5 * (1 + np.abs(a[ok]).max())
+
+
+def test_one_wavelength_may_be_a_tensor_without_rows() -> None:
+    """It is the number that it holds; one that is none loses every ray."""
+    start = rays([good(DOUBLE_GAUSS, "scene")] * 2)
+    number, tensor = trace(DOUBLE_GAUSS, start, 550.0), trace(DOUBLE_GAUSS, start, torch.tensor(550.0))
+    assert torch.allclose(torch.stack(number.rays), torch.stack(tensor.rays)) and tensor.status.tolist() == [0, 0]
+    assert trace(DOUBLE_GAUSS, start, torch.tensor(-550.0)).status.tolist() == [st.OUTSIDE_DOMAIN] * 2
