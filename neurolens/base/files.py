@@ -52,7 +52,8 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | get
 
 CHUNK_BYTES = 16 << 20  # of saved arrays that are copied at a time
 _ABOUT, _LARGEST_ABOUT = "about.json", 8 << 20
-_UNREADABLE = (zipfile.BadZipFile, KeyError, TypeError, AttributeError, EOFError, RuntimeError)  # the last: deep JSON
+# RuntimeError: deep JSON; ArithmeticError: an integer beyond floats.
+_UNREADABLE = (zipfile.BadZipFile, KeyError, TypeError, AttributeError, EOFError, RuntimeError, ArithmeticError)
 _noted: ContextVar[set[Path] | None] = ContextVar("_noted", default=None)
 
 

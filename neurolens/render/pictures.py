@@ -120,7 +120,7 @@ def write_channels(
     with atomic_path(path) as temporary:
         try:
             OpenEXR.File([OpenEXR.Part(header | dict(attributes or {}), planes)]).write(os.fsencode(temporary))
-        except RuntimeError as error:  # the library's only kind; it names the temporary file
+        except (RuntimeError, UnicodeError) as error:  # the library's only kinds; it names the temporary file
             said = str(error).replace(str(temporary), path.name)
             raise InputError(path, "file", f"({said})", "a writable path") from None
 
@@ -398,6 +398,8 @@ def _film(settings: Mapping[str, Any], width: int, height: int) -> dict[str, Any
         return {}
     with np.errstate(over="raise"):
         size = np.array(settings["film_mm"], np.float32)
+    if size.shape != (2,):
+        raise ValueError(f"a film of {size.size} numbers")
     across, down = float(size[0]) / width, float(size[1]) / height
     squeeze = (settings.get("lens_state") or {}).get("squeeze") or 1.0
     aspect = across / down
