@@ -28,6 +28,7 @@ from PIL import Image
 from neurolens import __version__
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_path, open_regular
+from neurolens.base.records import plain
 from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.colour import (
@@ -107,7 +108,8 @@ def write_channels(
     The colour space of data that are no colours is None.
     """
     try:
-        text = json.dumps(metadata or {}, allow_nan=False)
+        json.dumps(metadata or {}, allow_nan=False)  # refuses what `plain` would make a text of
+        text = json.dumps(plain(metadata or {}))
     except (TypeError, ValueError) as error:
         raise InputError(path, "metadata", f"({error})", "values that JSON can hold") from None
     if not path.parent.is_dir():
@@ -374,7 +376,9 @@ def standard_attributes(
         if name.startswith(_TEXTS) and not isinstance(value, str | None):
             raise TypeError(f"{name}: {value!r} is no text")
         if value is not None and not (isinstance(value, str) and not value):  # the standard wants no empty text ...
-            typed[name] = float(value) if name in ("focus", *_STATE) else value
+            typed[name] = (
+                float(value) if name in ("focus", *_STATE) else plain(value) if isinstance(value, str) else value
+            )
     # ... nor a number that is none.
     return {name: value for name, value in typed.items() if not (isinstance(value, float) and math.isnan(value))}
 
