@@ -20,7 +20,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.files import read_bytes
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.pictures import COLOURS, PIXEL_TYPES, check_size, whole_file
@@ -71,7 +71,7 @@ def deep_layers(path: Path, header: Mapping[str, Any]) -> list[tuple[FloatArray,
 
 def _channels(data: bytes) -> tuple[dict[str, np.dtype[Any]], int]:
     """The channels of the first part with their types, and where the places of its chunks begin."""
-    found, at, several = dict[str, np.dtype[Any]](), 8, data[5] & _SEVERAL_PARTS
+    found, at, parts = dict[str, np.dtype[Any]](), 8, 0
     while True:
         while data[at]:  # an attribute: its name, its type, its length, its value
             name, end = data[at : at + 9], data.index(0, data.index(0, at) + 1) + 1
@@ -79,10 +79,12 @@ def _channels(data: bytes) -> tuple[dict[str, np.dtype[Any]], int]:
             if name == b"channels\0" and not found:
                 listed = _CHANNEL.findall(data[end + 4 : at])
                 found = {title.decode(): np.dtype(PIXEL_TYPES[kind[0]]) for title, kind in listed}
-        at += 1
-        if not several:
+        at, parts = at + 1, parts + 1
+        if not data[5] & _SEVERAL_PARTS:
             return found, at
         if not data[at]:
+            if parts > 1:
+                warn(f"of {parts} parts of a deep file the first alone is read")
             return found, at + 1
 
 
