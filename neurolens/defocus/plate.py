@@ -303,11 +303,9 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
 def _planes(path: Path) -> dict[str, FloatArray]:
     """The channels of all parts; of two with one name the later one has the name of its part before it."""
     planes, _ = decoded_channels(path, path, "file")
-    shape = next(iter(planes.values()), np.zeros(0)).shape
     for title, channels in decoded_later_parts(path):
         for name, pixels in channels.items():
-            if pixels.shape == shape:
-                planes[f"{title}.{name}" if name in planes else name] = np.asarray(pixels, np.float32)
+            planes[f"{title}.{name}" if name in planes else name] = np.asarray(pixels, np.float32)
     return planes
 
 

@@ -255,28 +255,36 @@ def check_size(file: str | Path, field: str, name: str, size: Sequence[int], mos
 
 
 def decoded_later_parts(path: Path) -> list[tuple[str, dict[str, NDArray[Any]]]]:
-    """Names and channels, as stored, of the parts of flat pixels after the first, which may have other sizes.
+    """Names and channels, as stored, of the parts after the first, whose pixels stand where those of the first do.
 
     The library reads all parts at once, and leaves out those that it cannot read.
+
+    Warns:
+        NeurolensWarning: parts that are left out, for their data windows differ.
     """
     if len(parts := _headers(path, "file", path)) < 2:
         return []
+    known, full, left_out, values = list[tuple[str, set[str]]](), dict[str, set[str]](), list[str](), 0
+    for name, header in parts:
+        if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+            raise InputError(path, "file", f"(part {name!r} is deep)", "flat parts, or a deep file by itself")
+        across, down = (int(b) - int(a) + 1 for a, b in zip(*header["dataWindow"], strict=True))
+        known.append((name, {c.name for c in header["channels"]}))
+        values += across * down * len(header["channels"])
+        if np.array_equal(header["dataWindow"], parts[0][1]["dataWindow"]):
+            full[name] = {c.name for c in header["channels"] if (c.xSampling, c.ySampling) == (1, 1)}
+        else:
+            left_out.append(name)
+    if values > _MOST_PARTS:
+        raise InputError(path, "file", f"({values} values in its parts)", f"at most {_MOST_PARTS}")
     with whole_file(path, "file", path), _silent():
-        known, values = list[tuple[str, dict[str, tuple[int, int]]]](), 0
-        for name, header in parts:
-            if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
-                raise InputError(path, "file", f"(part {name!r} is deep)", "flat parts, or a deep file by itself")
-            across, down = (int(b) - int(a) + 1 for a, b in zip(*header["dataWindow"], strict=True))
-            sizes = {c.name: (down // c.ySampling, across // c.xSampling) for c in header["channels"]}
-            known.append((name, sizes))
-            values += sum(math.prod(size) for size in sizes.values())
-        if values > _MOST_PARTS:
-            raise InputError(path, "file", f"({values} values in its parts)", f"at most {_MOST_PARTS}")
         with OpenEXR.File(os.fsencode(path), separate_channels=True) as file:
             found = [(part.name(), {name: c.pixels for name, c in part.channels.items()}) for part in file.parts]
-        if [(name, {n: p.shape for n, p in planes.items()}) for name, planes in found] != known:
+        if [(name, set(planes)) for name, planes in found] != known:
             raise ValueError(f"of {len(known)} parts {len(found)} can be read")
-    return found[1:]
+    if left_out:
+        warn(f"{path}: parts with other data windows are left out: {', '.join(left_out)}")
+    return [(name, {n: p for n, p in planes.items() if n in full[name]}) for name, planes in found[1:] if name in full]
 
 
 def header_of(path: str | Path) -> dict[str, Any]:

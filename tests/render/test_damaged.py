@@ -12,7 +12,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.field import frame_of
 from neurolens.cameras.ideal import ThinLens
 from neurolens.defocus import plate
@@ -186,6 +186,23 @@ def test_values_of_all_parts_are_bounded_before_they_are_read(tmp_path: Path, mo
     monkeypatch.setattr(OpenEXR, "File", Headers)
     with pytest.raises(InputError, match="values in its parts"):
         layers(tmp_path / "two.exr")
+
+
+def test_parts_that_stand_elsewhere_are_left_out_with_a_word(tmp_path: Path) -> None:
+    """A part of the first one's size, 9 pixels to the right, and one of another size."""
+    shifted = tuple(np.array(corner, np.int32) for corner in ((9, 0), (SIZE[0] + 8, SIZE[1] - 1)))
+    small = {name: plane[:8, :8].copy() for name, plane in planes(5.0).items()}
+    display = {"displayWindow": tuple(np.array(corner, np.int32) for corner in ((0, 0), (SIZE[0] - 1, SIZE[1] - 1)))}
+    parts = [
+        OpenEXR.Part(ZIP | display, planes(2.0), name="front"),
+        OpenEXR.Part(ZIP | display | {"dataWindow": shifted}, planes(3.0), name="aside"),
+        OpenEXR.Part(ZIP | display, small, name="small"),
+        OpenEXR.Part(ZIP | display, planes(8.0), name="behind"),
+    ]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    with pytest.warns(NeurolensWarning, match="other data windows are left out: aside, small"):
+        found = layers(tmp_path / "parts.exr")
+    assert [layer[5, 5, 3] for layer in found] == pytest.approx([1 / 2, 1 / 8])
 
 
 class Headers(OpenEXR.File):  # type: ignore[misc]
