@@ -3,7 +3,8 @@
 A case damages one file (a lens of any format, scene, mesh, picture, spectrum, model, experiment, tile, plate, archive,
 list of lights or keys, what an earlier run has kept) or the words of a command line, and runs the command. It passes
 when the exit code is 0, or 2 with one line on stderr (warnings aside; 1 where a command judges, as `evaluate`), no
-temporary file stays, a refused command has written nothing, and processor time, waiting and memory stay within bounds.
+temporary file stays, a refused command has written nothing, a file that was cut or lost bytes (kinds "cut ...") is
+refused or gives the pixels of the good one, and processor time, waiting and memory stay within bounds.
 
 Every case runs in a process that is forked for it, on a copy of good files; one that dies or hangs costs itself alone.
 Case K of seed S is always the same: `--seed S --first K --cases 1 --keep DIR` shows a fault again. A run that is
@@ -34,8 +35,11 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
 from experiments import lab
-from experiments.fuzz_kinds import KINDS, SEEDS, build, chosen, make_seeds, plate, shorten
+from experiments.fuzz_good import make_seeds
+from experiments.fuzz_kinds import KINDS, RIGHT, SEEDS, build, chosen, plate, shorten
 from experiments.lab import cpu_s, resident_kb
 from neurolens import __version__, cli
 from neurolens.base.files import atomic_write_text, write_json
@@ -151,7 +155,7 @@ def _child(case: int, kind: str, argv: list[str], place: Path, answer: Path) -> 
     after = _state(place)
     new = [path.name for path in after if after[path] != before.get(path)]
     said = answer.with_name("stderr").read_bytes().decode(errors="backslashreplace")
-    faults = list(_faults(argv, code, said, new, memory))
+    faults = [*_faults(argv, code, said, new, memory), *(_other_pixels(place) if code == 0 else ())]
     verdict = Verdict(case, kind, argv, code, said[-2000:], faults, cpu_s() - spent, memory)
     answer.write_text(json.dumps(asdict(verdict)))
 
@@ -183,6 +187,16 @@ def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memor
         yield f"{len(said)} characters on stderr"
     if memory > MEMORY or re.search(r"\bmemory\b", said):
         yield f"memory: {memory >> 20} MB"
+
+
+def _other_pixels(place: Path) -> Iterator[str]:
+    """The fault of a damaged file that was accepted: its pixels are not those of the good one (`fuzz_kinds.RIGHT`)."""
+    if (told := place / RIGHT).exists():
+        from neurolens.render.pictures import read_channels
+
+        (right, _), (found, _) = (read_channels(place / name) for name in told.read_text().split())
+        if right.keys() != found.keys() or any(not np.array_equal(right[n], found[n]) for n in right):
+            yield "accepted, with other pixels"
 
 
 def _single(folder: Path, argv: list[str]) -> tuple[int, str]:

@@ -46,6 +46,29 @@ def damage(chance: Chance, name: str, data: bytes) -> bytes:
     return (damage_text if text else damage_bytes)(chance, data)
 
 
+def spoil(chance: Chance, data: bytes, checked: bool) -> bytes:
+    """What a disk or a broken transfer leaves: a file that is cut, or a good one with bytes zeroed or a bit turned.
+
+    Only what checksums cover is changed: pixels of OpenEXR that are deflated, chunks of PNG, members of archives; of
+    files that are not `checked` nothing.
+    """
+    start = len(data)
+    if data[:4] in (b"\x89PNG", b"PK\x03\x04"):
+        start = 0
+    elif data[:4] == b"\x76\x2f\x31\x01":
+        start = 8
+        while True:
+            start = _attributes(data, start)[1]
+            if not data[5] & 0x10 or not data[start]:  # one part, or no more parts
+                break
+    if not checked or start == len(data) or chance.random() < 0.4:
+        return data[: chance.randrange(len(data))]
+    at, span = chance.randrange(start, len(data)), chance.choice((1, 4, 40, 400, 4000))
+    if chance.random() < 0.3:
+        return data[:at] + bytes([data[at] ^ 1 << chance.randrange(8)]) + data[at + 1 :]
+    return data[:at] + bytes(len(data[at : at + span])) + data[at + span :]
+
+
 def damage_text(chance: Chance, data: bytes) -> bytes:
     """A text with one to three mistakes: numbers, words, lines, bytes."""
     for _ in range(chance.choice((1, 1, 1, 2, 3))):
@@ -180,9 +203,9 @@ def damage_exr(chance: Chance, data: bytes) -> bytes:
     return damage_bytes(chance, data)
 
 
-def _attributes(data: bytes) -> tuple[list[tuple[bytes, bytes, bytes]], int]:
-    """Names, types and values of an OpenEXR header, and where it ends."""
-    found, at = [], 8
+def _attributes(data: bytes, at: int = 8) -> tuple[list[tuple[bytes, bytes, bytes]], int]:
+    """Names, types and values of an OpenEXR header that begins at a place, and where it ends."""
+    found = []
     while data[at]:
         name, _, rest = data[at : at + 600].partition(b"\0")
         kind = rest.partition(b"\0")[0]

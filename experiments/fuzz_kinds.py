@@ -1,7 +1,7 @@
 """Kinds of hostile cases: which file of a folder is damaged, and which command then reads it.
 
-A kind is a function of random numbers and a folder of good files (`make_seeds`); it damages files there and returns the
-words of a command, with small settings: a valid file goes all the way in a fraction of a second.
+A kind is a function of random numbers and a folder of good files (`fuzz_good.make_seeds`); it damages files there and
+returns the words of a command, with small settings: a valid file goes all the way in a fraction of a second.
 """
 
 from __future__ import annotations
@@ -16,19 +16,17 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from experiments import lab
-from experiments.fuzz_damage import WORDS, damage
+from experiments.fuzz_damage import WORDS, damage, spoil
 from neurolens import cli
 from neurolens.cli.arguments import Parser
 
+RIGHT = "right.txt"  # of a case: the picture of good files, and the one that is to be like it
 SEEDS = Path(__file__).with_name("fuzz_seeds")
 Chance = random.Random
 Words = list[str]
 _SMALL_FLARE = ("--width", "24", "--bins", "2", "--cell", "64", "--threads", "1", "--quiet")
 _FILM = ("--width", "8", "--height", "6", "--film", "24x18", "--quiet")
-_PLATE, _PLATE_FILM = (12, 8), "36x24"  # pixels; mm
+PLATE, PLATE_FILM = (12, 8), "36x24"  # pixels; mm
 
 
 def hurt(chance: Chance, folder: Path, name: str) -> None:
@@ -46,7 +44,7 @@ def _pick(chance: Chance, commands: Sequence[tuple[float, Sequence[str]]]) -> Wo
     return list(chance.choices([words for _, words in commands], [weight for weight, _ in commands])[0])
 
 
-def _render(camera: str = "thin", *more: str) -> Words:
+def rendered(camera: str = "thin", *more: str) -> Words:
     return ["render", "scene.toml", "--camera", camera, "-o", "out.exr", "--threads", "1", "--quiet", *more]
 
 
@@ -68,10 +66,10 @@ def _of_lens(chance: Chance, folder: Path) -> Words:
                 (0.3, ("analyse", "lens.toml", what))
                 for what in ("spots", "layout", "vignetting", "mtf", "psf", "fans")
             ),
-            (4, _render("thick:lens.toml")),
-            (4, _render("thin:lens.toml")),
-            (0.5, _render("lens.toml")),
-            (0.3, _render("fused:lens.toml")),
+            (4, rendered("thick:lens.toml")),
+            (4, rendered("thin:lens.toml")),
+            (0.5, rendered("lens.toml")),
+            (0.3, rendered("fused:lens.toml")),
             (0.1, ("stmap", "lens.toml", *_FILM, "-o", "shot")),
             (0.05, ("handover", "lens.toml", *_FILM, "-o", "shot")),
             (0.3, ("export", "lens.toml", "--to", "c", "-o", "out.h", "--json")),
@@ -94,7 +92,7 @@ def _of_zoom(chance: Chance, folder: Path) -> Words:
             (4, ("lens", "states.toml", "good.toml")),
             (2, ("lens", "states.toml", "--zoom", "100", "--focus", "2")),
             (1, ("lens", "states.toml", "--focus-mode", "internal", "--focus", "1.5")),
-            (2, _render("thick:states.toml", "--zoom", "100")),
+            (2, rendered("thick:states.toml", "--zoom", "100")),
         ),
     )
 
@@ -110,7 +108,7 @@ def _of_format(chance: Chance, folder: Path) -> Words:
     commands = [
         (8, ("convert", name, "-o", "out.toml")),
         (1, ("lens", name, "good.toml")),
-        (1, _render(f"thick:{name}")),
+        (1, rendered(f"thick:{name}")),
     ]
     return _pick(chance, commands)
 
@@ -124,12 +122,12 @@ def _of_glass(chance: Chance, folder: Path) -> Words:
 
 def _of_scene(chance: Chance, folder: Path) -> Words:
     hurt(chance, folder, "scene.toml")
-    return _pick(chance, ((9, _render()), (1, _flare("good.toml", "--lights", "scene.toml"))))
+    return _pick(chance, ((9, rendered()), (1, _flare("good.toml", "--lights", "scene.toml"))))
 
 
 def _of_mesh(chance: Chance, folder: Path) -> Words:
     hurt(chance, folder, chance.choice(("tetra.obj", "tetra.obj", "tetra.mtl", "tetra.ply", "mixed.ply")))
-    return _render()
+    return rendered()
 
 
 def _of_picture(chance: Chance, folder: Path) -> Words:
@@ -139,7 +137,7 @@ def _of_picture(chance: Chance, folder: Path) -> Words:
     hurt(chance, folder, name)
     if name == "sky.hdr":
         (folder / "scene.toml").write_text((folder / "scene.toml").read_text().replace("sky.exr", name))
-    return _render("thin", *(("--aperture-mask", name) if name == "mask.png" else ()))
+    return rendered("thin", *(("--aperture-mask", name) if name == "mask.png" else ()))
 
 
 def _of_model(chance: Chance, folder: Path) -> Words:
@@ -148,7 +146,7 @@ def _of_model(chance: Chance, folder: Path) -> Words:
     return _pick(
         chance,
         (
-            (3, _render(name)),
+            (3, rendered(name)),
             *((1, ("export", name, "--to", to, "-o", f"out.{to}", "--json")) for to in ("glsl", "vex", "wgsl", "onnx")),
             (0.3, ("export", name, "--to", "c", "-o", "out.h", "--json")),
             (0.1, ("stmap", name, *_FILM, "-o", "shot")),
@@ -186,17 +184,19 @@ def merging(*names: str) -> Words:
 
 
 def _of_plate(chance: Chance, folder: Path) -> Words:
-    name = chance.choice(("plate.exr", "half.exr"))
+    name = chance.choice(("plate.exr", "half.exr", *LAYERED))
     hurt(chance, folder, name)
+    if name in LAYERED:
+        return defocused(name)
     if chance.random() < 0.3:
         more = ("--depth", "R", "--samples", "8", "-o", "out.exr")
-        return ["defocus", name, "--lens", "thin", "--film", _PLATE_FILM, *more]
+        return ["defocus", name, "--lens", "thin", "--film", PLATE_FILM, *more]
     return plate(name)
 
 
 def plate(name: str) -> Words:
     """The flare of a plate's lights."""
-    return _flare("good.toml", "--image", name, "--film", _PLATE_FILM, "--most", "2")
+    return _flare("good.toml", "--image", name, "--film", PLATE_FILM, "--most", "2")
 
 
 def _of_lights(chance: Chance, folder: Path) -> Words:
@@ -204,7 +204,7 @@ def _of_lights(chance: Chance, folder: Path) -> Words:
     hurt(chance, folder, name)
     frames = ("--frames", "1:2", "--key", name)
     if name.startswith("keys"):
-        return _render("thin", *frames) if chance.random() < 0.8 else _flare("good.toml", "--light", "5,3", *frames)
+        return rendered("thin", *frames) if chance.random() < 0.8 else _flare("good.toml", "--light", "5,3", *frames)
     return _flare("good.toml", "--lights", name)
 
 
@@ -217,7 +217,7 @@ def _of_kept(chance: Chance, folder: Path) -> Words:
     """The files that an interrupted or an earlier run has left."""
     records = sorted(str(file.relative_to(folder)) for file in folder.glob("done/records/*.json"))
     commands = {
-        "out.exr.part": _render("thin", "--samples", "16"),
+        "out.exr.part": rendered("thin", "--samples", "16"),
         **{name: ["survey", "fold", "--no-fit", "-o", "done", "--quiet"] for name in records},
     }
     rare = [{"out.exr.part": 3}.get(name.partition("/")[0], 0.5) for name in commands]
@@ -229,7 +229,7 @@ def _of_kept(chance: Chance, folder: Path) -> Words:
 
 def _of_words(chance: Chance, folder: Path) -> Words:
     fine = (
-        _render(), _render("thick:lens.toml"), _render("model.onnx"), merging("tile.tile-1-of-2.exr"),
+        rendered(), rendered("thick:lens.toml"), rendered("model.onnx"), merging("tile.tile-1-of-2.exr"),
         ["lens", "lens.toml"], ["glass", "N-BK7"], ["convert", "lens.zmx", "-o", "out.toml"], ["models", "cooke"],
         ["export", "model.onnx", "--to", "c", "-o", "out.h", "--json"], ["analyse", "lens.toml", "seidel"],
         _flare("lens.toml", "--light", "5,3"), ["stmap", "thin", *_FILM, "-o", "shot"],
@@ -265,8 +265,8 @@ def parsers() -> dict[str, list[str]]:
 def _of_large(chance: Chance, folder: Path) -> Words:
     """A text file grown to 1 MB by one thing repeated."""
     commands = {
-        "lens.toml": _render("thick:lens.toml"),
-        **{name: _render() for name in ("scene.toml", "tetra.obj", "tetra.mtl", "lamp.csv")},
+        "lens.toml": rendered("thick:lens.toml"),
+        **{name: rendered() for name in ("scene.toml", "tetra.obj", "tetra.mtl", "lamp.csv")},
         "experiment.toml": ["read", "experiment.toml"],
         "lights.csv": _flare("good.toml", "--lights", "lights.csv"),
         **{name: ["convert", name, "-o", "out.toml"] for name in foreign()},
@@ -307,6 +307,54 @@ def _of_long_runs(chance: Chance, folder: Path) -> Words:
     return _pick(chance, by_file.get(name, (train,)))
 
 
+def _cut(chance: Chance, folder: Path, name: str, words: Words, out: str = "out.exr") -> Words:
+    """Spoil a file of a command whose picture is known (`fuzz_good.make_seeds`), and say where both are."""
+    file = folder / name
+    file.write_bytes(spoil(chance, file.read_bytes(), name != "sky.exr"))  # too small to be deflated
+    (folder / RIGHT).write_text(f"right/{name.replace('/', '-')}.exr {out}")
+    return words
+
+
+def _cut_picture(chance: Chance, folder: Path) -> Words:
+    name = chance.choice(SHOWN)
+    return _cut(chance, folder, name, with_picture(folder, name))
+
+
+def with_picture(folder: Path, name: str) -> Words:
+    """The picture of a scene that one file lights or clothes."""
+    if name == "sky.hdr":
+        (folder / "scene.toml").write_text((folder / "scene.toml").read_text().replace("sky.exr", name))
+    return rendered()
+
+
+def defocused(name: str) -> Words:
+    return ["defocus", name, "--lens", "thin", "--film", PLATE_FILM, "--samples", "8", "--quiet", "-o", "out.exr"]
+
+
+def _cut_plate(chance: Chance, folder: Path) -> Words:
+    name = chance.choice(LAYERED)
+    return _cut(chance, folder, name, defocused(name))
+
+
+def _cut_tile(chance: Chance, folder: Path) -> Words:
+    names = sorted(file.name for file in folder.glob("tile.tile-*.exr"))
+    return _cut(chance, folder, chance.choice(names), merging(*names))
+
+
+def _cut_checkpoint(chance: Chance, folder: Path) -> Words:
+    (folder / "kept.part").rename(folder / "out.exr.part")
+    return _cut(chance, folder, "out.exr.part", rendered("thin", "--samples", "16"))
+
+
+def _cut_map(chance: Chance, folder: Path) -> Words:
+    """A map that an earlier hand-over wrote: it is written again, or it is whole."""
+    name = chance.choice(sorted(str(file.relative_to(folder)) for file in folder.glob("maps/*.exr")))
+    return _cut(chance, folder, name, HANDOVER, name)
+
+
+LAYERED = ("parts.exr", "deep.exr")
+SHOWN = ("tile.png", "tile.jpg", "tile.tif", "tile.webp", "sky.exr", "sky.hdr")
+HANDOVER = ["handover", "thin", *_FILM, "-o", "maps"]
 KINDS: dict[str, tuple[float, Callable[[Chance, Path], Words]]] = {
     "lens": (12, _of_lens),
     "zoom": (3, _of_zoom),
@@ -324,6 +372,11 @@ KINDS: dict[str, tuple[float, Callable[[Chance, Path], Words]]] = {
     "archive": (4, _of_archive),
     "kept": (4, _of_kept),
     "words": (7, _of_words),
+    "cut picture": (3, _cut_picture),
+    "cut plate": (3, _cut_plate),
+    "cut tile": (3, _cut_tile),
+    "cut checkpoint": (3, _cut_checkpoint),
+    "cut map": (1, _cut_map),
     "large": (0.8, _of_large),
     "long runs": (0.1, _of_long_runs),
 }
@@ -385,67 +438,3 @@ def shorten() -> None:
     flare.Shots._field = field  # type: ignore[assignment,method-assign]
     train.Processes = lambda *_: Here()  # type: ignore[assignment,misc]
     blender.form_of = form_of
-
-
-# ---- Good files. -----------------------------------------------------------------------------------------------------
-
-
-def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple[int, str]]) -> None:
-    """Fill a new folder with one good file of each kind, those of some kinds by commands.
-
-    Raises:
-        RuntimeError: a command refuses good files; then every case would be refused.
-    """
-
-    def done(words: Words) -> None:
-        code, said = run(folder, words)
-        if code:
-            raise RuntimeError(f"{' '.join(words)}: {said}")
-
-    shutil.copytree(SEEDS, folder)
-    scene = folder / "scene.toml"
-    scene.write_text(
-        scene.read_text().replace('aperture_mask = "mask.png"\n', "")
-    )  # whose area takes a tenth of a second
-    lens, models = lab.LENSES / "cooke_triplet_50.toml", lab.MODELS / "cooke_triplet_50"
-    for place in ("lens.toml", "good.toml", "fold/lens.toml"):
-        (folder / place).parent.mkdir(exist_ok=True)
-        shutil.copy(lens, folder / place)
-    shutil.copy(lab.LENSES / "nikon_zoom_80_200.toml", folder / "states.toml")
-    shutil.copy(folder / "lens.zmx", folder / "fold" / "=lens.zmx")
-    shutil.copy(f"{models}.ols-64.onnx", folder / "model.onnx")
-    shutil.copy(f"{models}.mlp-16x2.onnx", folder / "network.onnx")
-    _plates(folder)
-    _pack(folder)
-    done(["read", "experiment.toml"])
-    done(_render("thin", "--keep-checkpoint", "--samples", "16"))
-    (folder / "out.exr.part").rename(folder / "kept.part")
-    for k in (1, 2):
-        done(_render("thin", "--tile", f"{k}/2", "-o", "tile.exr"))
-    done(["survey", "fold", "--no-fit", "-o", "done", "--quiet"])
-    if "long runs" in kinds:
-        done(["train", "experiment.toml", "-o", "run", "--rounds", "0", "--quiet"])
-    for made in (*folder.glob("out.*"), *folder.glob("tile*.png")):
-        if made.name != "tile.png":
-            made.unlink()
-    os.mkfifo(folder / "fifo")
-
-
-def _plates(folder: Path) -> None:
-    """Plates with two lights."""
-    from neurolens.render.pictures import write_exr
-
-    plate = np.full((*_PLATE[::-1], 3), 0.1)
-    plate[2, 3] = plate[5, 8:10] = 50.0
-    write_exr(folder / "plate.exr", plate, metadata={"film_mm": [36, 24]}, layers={"depth": plate[..., 0]})
-    write_exr(folder / "half.exr", plate, half=True)
-
-
-def _pack(folder: Path) -> None:
-    """The extension with one lens, as a zip and as a user folder."""
-    from neurolens.blender import Form, PackedLens, add_lens, write_pack
-
-    form = Form("polynomial", "ols-36", "shader", 1.0, 21.6, 1.8, 0.7)
-    lens = PackedLens("gauss", "Gauss", 50.0, 1.8, "US 2 1973", b"PNG", [form])
-    write_pack(folder / "pack.zip", [lens])
-    add_lens(folder / "user", lens)

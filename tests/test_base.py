@@ -13,18 +13,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import (
+    Kept,
     atomic_path,
     atomic_write_text,
     check_writable,
     place_inside,
     read_kept,
     safe_name,
+    write_arrays,
     write_kept,
 )
 from neurolens.base.progress import Progress
@@ -428,3 +431,10 @@ def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> N
         clock.now += 6
         report(0.25)
     assert stream.getvalue().splitlines()[0] == "trace:  25%, 6.0 s, 18 s left (in all 1 min 18 s left)"
+
+
+def test_a_kept_state_with_an_integer_beyond_floats_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "kept"
+    for spent, found in ((0, True), (10**400, False)):
+        write_arrays(path, {"key": "k", "state": {"done": 1}, "spent_s": spent, "arrays": 1}, {"a0": np.zeros(3)})
+        assert (Kept(path, "k", 0.0).load() is not None) == found

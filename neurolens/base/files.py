@@ -52,7 +52,8 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | get
 
 CHUNK_BYTES = 16 << 20  # of saved arrays that are copied at a time
 _ABOUT, _LARGEST_ABOUT = "about.json", 8 << 20
-_UNREADABLE = (zipfile.BadZipFile, KeyError, TypeError, AttributeError, EOFError, RuntimeError)  # the last: deep JSON
+# RuntimeError: deep JSON; ArithmeticError: an integer beyond floats.
+_UNREADABLE = (zipfile.BadZipFile, KeyError, TypeError, AttributeError, EOFError, RuntimeError, ArithmeticError)
 _noted: ContextVar[set[Path] | None] = ContextVar("_noted", default=None)
 
 
@@ -325,9 +326,9 @@ def fingerprint_of(values: Sequence[Any]) -> str:
 
 
 def atomic_write_text(path: str | Path, text: str) -> None:
-    """Write `text` (UTF-8) to `path` atomically."""
+    """Write `text` (UTF-8) to `path` atomically; bytes of names that are no UTF-8 are written as \\u and digits."""
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: str | Path, data: Any) -> None:

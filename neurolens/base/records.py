@@ -115,7 +115,8 @@ def write_results(path: str | Path, results: Results) -> None:
 def plain(value: Any, strict: bool = True) -> Any:
     """`value` with only what JSON knows: scalars and arrays of numpy and torch as numbers and lists, paths as text.
 
-    Infinity is the text "infinity" or "-infinity", NaN is null; unless `strict` both stay floats.
+    Infinity is the text "infinity" or "-infinity", NaN is null; unless `strict` both stay floats. Of a path that is no
+    UTF-8, the bytes that are no letters become \\u and four digits.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(item, strict) for key, item in value.items()}
@@ -125,7 +126,9 @@ def plain(value: Any, strict: bool = True) -> Any:
         return [plain(item, strict) for item in value]
     if strict and isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    return str(value).encode("utf-8", "backslashreplace").decode()
 
 
 def break_even_rays(

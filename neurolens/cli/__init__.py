@@ -6,6 +6,7 @@ Errors are one line and exit code 2, or 70 where neurolens itself is at fault.
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import signal
 import sys
@@ -103,6 +104,7 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None =
 
     `build` makes another parser; its errors and interrupts are reported like the command's.
     """
+    _open_streams()
     words = sys.argv[1:] if argv is None else argv
     args, received = argparse.Namespace(kept="nothing was done"), list[int]()
 
@@ -125,6 +127,21 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None =
             print(f"\nneurolens: interrupted; {printable(kept)}", file=sys.stderr)
             return 128 + (received[0] if received else signal.SIGINT)
         return _failed(error)
+
+
+def _open_streams() -> None:
+    """Let any text be written to stdout and stderr, and open those that the caller has closed, on the null device.
+
+    Else the next file that is opened, a picture to write, would be what programs print to.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:  # the lowest that is free
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        if (stream := getattr(sys, name)) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _check_words(words: Sequence[str]) -> None:

@@ -6,7 +6,6 @@ import argparse
 import inspect
 import json
 import math
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
 from neurolens.base.errors import InputError, one_line, printable, warn
+from neurolens.base.files import check_writable
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, program
@@ -394,13 +394,19 @@ def check_ids(files: Sequence[Path], command: str, option: str) -> None:
 
 
 def check_written(path: Path, option: str, metavar: str) -> None:
-    """Refuse a path that does not fit the placeholder of its option, see `Command`; raises InputError."""
+    """Refuse a path that does not fit the placeholder of its option (see `Command`), or where no file can be made.
+
+    Raises:
+        InputError: the path, or what it lacks. OSError: a file there cannot be replaced.
+    """
     if metavar in ("FOLDER", "DIR"):
         there = next(p for p in (path, *path.absolute().parents) if p.exists())
         if not there.is_dir():
             raise InputError(path, option, str(there), "a folder, not a file")
-        if not os.access(there, os.W_OK):
-            raise InputError(path, option, str(there), "a folder that can be written")
+        try:
+            check_writable(there / "file")
+        except OSError:
+            raise InputError(path, option, str(there), "a folder that can be written") from None
         return
     kind = metavar.partition(".")[2]
     suffixes = _SUFFIXES.get(kind, (f".{kind}",))
@@ -411,6 +417,7 @@ def check_written(path: Path, option: str, metavar: str) -> None:
         raise InputError(path, option, str(path.parent), "a folder that exists")
     if not path.name:
         raise InputError(path, option, str(path), "the start of the files' names")
+    check_writable(path if kind or metavar == "FILE" else path.with_name(f"{path.name}.file"))
 
 
 # Output
@@ -418,7 +425,8 @@ def check_written(path: Path, option: str, metavar: str) -> None:
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object on stdout."""
-    print(printable(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False)))
+    ascii_only = not str(sys.stdout.encoding).lower().startswith("utf")
+    print(printable(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=ascii_only)))
 
 
 def number(value: Any, digits: int = 4) -> str:

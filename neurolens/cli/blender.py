@@ -24,7 +24,7 @@ import numpy as np
 
 import neurolens
 from neurolens.base.errors import InputError, NeurolensError, warn
-from neurolens.base.files import check_writable, fingerprint_of, kept_in_cache, safe_name, sha256_of
+from neurolens.base.files import fingerprint_of, kept_in_cache, safe_name, sha256_of
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model, lens_id_of, maker_of
 from neurolens.base.settings import RANGE, setting
@@ -85,7 +85,6 @@ class Build(cli.Reporting):
 
     def run(self) -> int:
         """Pack the extension."""
-        check_writable(self.out)
         folder = self.models or shipped() / "models"  # of the installation as it is now
         if not folder.is_dir():
             self.refuse("--models", str(folder), "a folder of models that exists")

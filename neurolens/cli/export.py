@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, atomic_write_text, check_writable
+from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.lensname import FUSED, is_model
 from neurolens.base.settings import positive, setting
 from neurolens.cameras.build import make_camera
@@ -118,7 +118,6 @@ examples:
             write = self._write_camera if self.whole_camera else self._write_lens
         else:
             write = partial(self._write_model, fixed=fixed)
-        check_writable(self.out)
         about = write(file)
         data = {"file": str(self.out), "to": self.to, "bytes": self.out.stat().st_size, **about}
         maps = about.get("inverse", {}).values()

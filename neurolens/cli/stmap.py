@@ -24,7 +24,7 @@ from neurolens.cli import arguments as cli
 from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
 from neurolens.lens.shot import Shot
 from neurolens.render.film import PixelGrid
-from neurolens.render.pictures import read_metadata, standard_attributes, write_channels
+from neurolens.render.pictures import read_channels, standard_attributes, write_channels
 from neurolens.render.settings import size_by_shape
 from neurolens.render.stmap import Plates, illumination_map, plates_of, redistort_map, undistort_map, worst_px
 
@@ -256,7 +256,7 @@ examples:
 def _is_of(path: Path, facts: dict[str, Any]) -> bool:
     """Whether a map is there, whole, with this in its header."""
     with suppress(InputError):
-        return read_metadata(path) == plain(facts)
+        return read_channels(path)[1] == plain(facts)
     return False
 
 

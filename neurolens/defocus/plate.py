@@ -28,15 +28,16 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError, warn
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.field import Frame
+from neurolens.defocus.deep import OPAQUE, deep_layers
 from neurolens.render.colour import SRGB, ColourSpace, SpectralRange, conversion, converted
 from neurolens.render.pictures import (
     COLOURS,
     check_size,
     decoded_channels,
+    decoded_later_parts,
     header_of,
     metadata_of,
     read_colour_space,
-    whole_file,
 )
 
 FloatArray = NDArray[np.float32]
@@ -52,11 +53,7 @@ Along = Literal["axis", "ray"]
 _DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # after the name of a layer
 _COMBINED = ("Combined.", "combined.")
 _SKY_M = 1e9  # and beyond it
-_MOST_LAYERS = 8  # of a deep file
 _LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
-_MOST_VALUES = 1 << 29  # of the later parts of a file
-_MOST_DEEP = 1 << 25  # pixels of a deep file, which is read whole
-_OPAQUE = 0.5  # opacity from which a deep sample hides what is behind it
 _SAME = 1e-3  # relative: shapes of plate and film
 
 
@@ -272,8 +269,9 @@ def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[FloatArray, FloatArray]]:
     """Colours and depths of the layers of a file."""
-    if header_of(path)["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
-        return _deep(path)
+    header = header_of(path)
+    if header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
+        return deep_layers(path, header)
     planes = _planes(path)
     found = list[tuple[str, str]]()
     for name in planes:
@@ -296,7 +294,7 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
     for prefix, channel in found if several else found[:1]:
         rgb, metres = np.stack([planes[prefix + c] for c in COLOURS], axis=2), planes[channel]
         if (alpha := planes.get(prefix + "A")) is not None:  # colours are premultiplied
-            solid = alpha >= _OPAQUE
+            solid = alpha >= OPAQUE
             rgb = np.where(solid[..., None], rgb / np.where(solid, np.minimum(alpha, 1), 1)[..., None], 0)
             metres = np.where(solid, metres, np.float32(-np.inf))
         layers.append((rgb.astype(np.float32), metres))
@@ -306,51 +304,10 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
 def _planes(path: Path) -> dict[str, FloatArray]:
     """The channels of all parts; of two with one name the later one has the name of its part before it."""
     planes, _ = decoded_channels(path, path, "file")
-    with whole_file(path, "file", path), OpenEXR.File(str(path), header_only=True) as file:
-        kinds, count = {part.type() for part in file.parts}, sum(len(p.header["channels"]) for p in file.parts[1:])
-    if count and kinds <= {OpenEXR.scanlineimage, OpenEXR.tiledimage}:
-        shape = next(iter(planes.values())).shape
-        check_size(path, "file", f"{path}, {count} channels of later parts", (*shape, count), _LARGEST, _MOST_VALUES)
-        with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
-            for part in file.parts[1:]:
-                for name, channel in part.channels.items():
-                    if channel.pixels.shape == shape:
-                        known = f"{part.name()}.{name}" if name in planes else name
-                        planes[known] = np.asarray(channel.pixels, np.float32)
+    for title, channels in decoded_later_parts(path):
+        for name, pixels in channels.items():
+            planes[f"{title}.{name}" if name in planes else name] = np.asarray(pixels, np.float32)
     return planes
-
-
-def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
-    """The layers of a deep file: the opaque samples of each pixel, sorted by depth."""
-    size = [int(last) + 1 - int(first) for first, last in zip(*header_of(path)["dataWindow"], strict=True)]
-    check_size(path, "file", str(path), size, _LARGEST, _MOST_DEEP)
-    with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = {name: c.pixels for name, c in file.parts[0].channels.items()}
-    if not {*COLOURS, "Z"} <= channels.keys():
-        raise InputError(path, "channels", f"({', '.join(channels)[:200]})", "R, G, B and Z")
-    height, width = channels["Z"].shape
-    counts = np.array([[0 if v is None else len(v) for v in row] for row in channels["Z"]])
-    none = np.zeros(0, np.float32)
-    flat = {
-        name: np.concatenate([none, *(np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None)])
-        for name in channels.keys() & {*COLOURS, "Z", "A"}
-    }
-    alpha = flat.get("A", np.ones_like(flat["Z"]))
-    pixel = np.repeat(np.arange(height * width), counts.reshape(-1))
-    kept = np.flatnonzero((alpha >= _OPAQUE) & ~np.isnan(flat["Z"]) & ~np.isneginf(flat["Z"]))
-    kept = kept[np.lexsort((flat["Z"][kept], pixel[kept]))]
-    place = pixel[kept]
-    starts = np.flatnonzero(np.diff(place, prepend=-1))
-    rank = np.arange(len(place)) - np.repeat(starts, np.diff(starts, append=len(place)))
-    layers = []
-    for k in range(min(int(rank.max(initial=0)) + 1, _MOST_LAYERS)):
-        rows = kept[rank == k]
-        rgb = np.zeros((height * width, 3), np.float32)
-        metres = np.full(height * width, -np.inf if k else np.inf, np.float32)
-        rgb[place[rank == k]] = np.stack([flat[c][rows] for c in COLOURS], axis=1) / alpha[rows, None]
-        metres[place[rank == k]] = flat["Z"][rows]
-        layers.append((rgb.reshape(height, width, 3), metres.reshape(height, width)))
-    return layers
 
 
 def _finite(path: Path, rgb: FloatArray) -> FloatArray:

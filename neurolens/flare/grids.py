@@ -132,11 +132,12 @@ def ghost_moves(tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavel
         x, y, power, worst = tracer.follow_each(entering(rays), [wavelength_nm], pair)[0].astype(np.float64)
         weight = np.where(power > 0, power * np.clip((1 - worst) / _SOFT, 0, 1), 0)
         lit, whole = weight > 0, float(weight.sum())
-        if not lit.any():
+        energy = area * coarse.cell * whole
+        if not energy:  # nothing arrives, or from so far that floats do not hold it
             return None
         place, share = np.stack([x, y])[:, lit], weight[lit] / whole
         middle = place @ share
-        return middle, math.sqrt(((place.T - middle) ** 2).sum(1) @ share), area * coarse.cell * whole
+        return middle, math.sqrt(((place.T - middle) ** 2).sum(1) @ share), energy
 
     moves, changing, efl = np.zeros((2, 2)), np.zeros(2), abs(float(first_order(tracer.lens).efl_mm))
     for along, side in zip(moves, patch.sides, strict=True):

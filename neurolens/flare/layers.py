@@ -283,7 +283,9 @@ def photon_picture(job: FlareJob, part: str, photons: int, done: Done = lambda s
     known = digest((*same, settings.most_reflections, settings.seed))
     kept, begun = Kept(job.keep and kept_file(job.keep, part), known, _KEEP_S), 0
     if (state := kept.load()) is not None:
-        begun, (picture, sums) = state[0]["done"], state[1]
+        done_before, arrays = state[0].get("done", -1), state[1]
+        if done_before in range(len(whole) + 1) and [a.shape for a in arrays] == [picture.shape, sums.shape]:
+            begun, (picture, sums) = done_before, arrays
 
     def one(task: tuple[int, Light, int, int]) -> tuple[Floats, float]:
         """Sums of weights and of their squares, [2, H, W], and the area of the light."""

@@ -443,9 +443,10 @@ def highlights(
         r, c, of = (a[start : start + _AT_ONCE] for a in (row, column, region))
         energy, towards, solid = _pixels(picture[r, c], r, c, field, film_mm, (height, width))
         energy *= np.minimum(value[r, c] / threshold - 1, 1)[:, None]
-        colour += np.stack([np.bincount(of, e, count) for e in energy.T], 1)
         squares = (towards[:, None] * towards).reshape(9, -1)
-        moments += np.stack([np.bincount(of, energy.sum(1) * t, count) for t in (*towards, *squares, solid)])
+        each = (*energy.T, *(energy.sum(1) * t for t in (*towards, *squares, solid)))
+        for sums, some in zip((*colour.T, *moments), each, strict=True):
+            np.add.at(sums, of, some)  # in place: there may be as many regions as pixels
     middle, each = moments[:3], colour.sum(1)
     seen = np.flatnonzero((each > 0) & (middle[2] < -1e-6 * np.linalg.norm(middle, axis=0)))
     first = seen[np.argsort(-each[seen], kind="stable")][: most + 1]  # one more tells how they fade
@@ -472,11 +473,14 @@ def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
     from scipy import ndimage  # type: ignore[import-untyped]
 
     label, _ = ndimage.label(bright, np.ones((3, 3)))
-    number = label[bright] - 1
-    boxes = np.array([[(s.start, s.stop) for s in box] for box in ndimage.find_objects(label)]).reshape(-1, 2, 2)
-    large = np.ptp(boxes, axis=2).max(1) > 2 * cell
+    number, places = label[bright] - 1, np.nonzero(bright)
+    low, high = np.full((2, int(label.max()) + 1), label.size), np.zeros((2, int(label.max()) + 1), np.intp)
+    for least, most, place in zip(low, high, places, strict=True):
+        np.minimum.at(least, number, place)
+        np.maximum.at(most, number, place)
+    large = (high - low).max(0) >= 2 * cell
     # The cell of each pixel, counted from its region's corner; a row has fewer cells than the picture has columns.
-    row, column = (place - boxes[number, axis, 0] for axis, place in enumerate(np.nonzero(bright)))
+    row, column = (place - least[number] for place, least in zip(places, low, strict=True))
     part = np.where(large[number], row // cell * label.shape[1] + column // cell, 0)
     _, numbers = np.unique(number * np.int64(bright.size) + part, return_inverse=True)
     return np.asarray(numbers.reshape(-1), np.intp)

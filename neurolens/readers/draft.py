@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, printable
 from neurolens.base.settings import WAVELENGTH_NM, within
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import (
@@ -273,8 +273,8 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
         warn(draft.file, f"--f-number {options.f_number:g} is not used: the file sizes the stop itself")
     f_number = draft.f_number or options.f_number or math.nan
     lens = Lens(
-        name=options.name or draft.name or Path(draft.file).stem,
-        source=options.source or f"{draft.kind} file {Path(draft.file).name}",
+        name=options.name or draft.name or printable(Path(draft.file).stem),
+        source=options.source or f"{draft.kind} file {printable(Path(draft.file).name)}",
         surfaces=tuple(row.surface for row in draft.rows),
         f_number=f_number,
         image_radius_mm=draft.image_radius,

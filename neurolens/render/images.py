@@ -54,6 +54,9 @@ def _opened(file: str | Path, field: str, path: Path, most: int, pixels: int = M
     with _decoded(file, field, path) as data, warnings.catch_warnings(action="ignore"):  # Pillow's, of damaged files
         with Image.open(io.BytesIO(data), formats=_FORMATS) as picture:
             check_size(file, field, str(path), picture.size, most, pixels)
+            if picture.format == "PNG":  # decoding does not compare the checksums
+                with Image.open(io.BytesIO(data)) as copy:
+                    copy.verify()
             yield picture
 
 

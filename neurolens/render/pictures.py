@@ -28,6 +28,7 @@ from PIL import Image
 from neurolens import __version__
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_path, open_regular
+from neurolens.base.records import plain
 from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.colour import (
@@ -45,8 +46,9 @@ _BAND = 1 << 17  # pixels of a preview that are encoded at a time
 COLOURS = "RGB"
 LARGEST_FILM = 1 << 16  # pixels per side
 _MOST_VALUES = 1 << 27  # of an OpenEXR file, at 8 bytes each while it is read
+_MOST_PARTS = 1 << 28  # values of all parts of a file, at 4 bytes each
 _ROUNDED = 2e-4  # how far the chromaticities of one space may lie apart in files
-_TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files
+PIXEL_TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files
 _DEPTH = "Z"  # the name of depth in other programs
 
 
@@ -106,7 +108,8 @@ def write_channels(
     The colour space of data that are no colours is None.
     """
     try:
-        text = json.dumps(metadata or {}, allow_nan=False)
+        json.dumps(metadata or {}, allow_nan=False)  # refuses what `plain` would make a text of
+        text = json.dumps(plain(metadata or {}))
     except (TypeError, ValueError) as error:
         raise InputError(path, "metadata", f"({error})", "values that JSON can hold") from None
     if not path.parent.is_dir():
@@ -118,8 +121,8 @@ def write_channels(
     planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
     with atomic_path(path) as temporary:
         try:
-            OpenEXR.File([OpenEXR.Part(header | dict(attributes or {}), planes)]).write(str(temporary))
-        except RuntimeError as error:  # the library's only kind; it names the temporary file
+            OpenEXR.File([OpenEXR.Part(header | dict(attributes or {}), planes)]).write(os.fsencode(temporary))
+        except (RuntimeError, UnicodeError) as error:  # the library's only kinds; it names the temporary file
             said = str(error).replace(str(temporary), path.name)
             raise InputError(path, "file", f"({said})", "a writable path") from None
 
@@ -223,7 +226,7 @@ def decoded_channels(
         file, field: what names the picture, for messages: itself, or a scene and its key.
         most: pixels a side. pixels: the most in all.
     """
-    header = _header(file, field, path)
+    header = _headers(file, field, path)[0][1]
     with whole_file(file, field, path):
         size = [int(last) + 1 - int(first) for first, last in zip(*header["dataWindow"], strict=True)]
         check_size(file, field, str(path), size, most, pixels)
@@ -233,9 +236,9 @@ def decoded_channels(
         if (values := math.prod(size) * len(names)) > _MOST_VALUES:
             raise InputError(file, field, f"({values} values in its channels)", f"at most {_MOST_VALUES}")
         with _silent():
-            picture = OpenEXR.InputFile(str(path))  # `OpenEXR.File` would read all channels
+            picture = OpenEXR.InputFile(os.fsencode(path))  # `OpenEXR.File` would read all channels
             try:
-                types = [_TYPES[picture.header()["channels"][name].type.v] for name in names]
+                types = [PIXEL_TYPES[picture.header()["channels"][name].type.v] for name in names]
                 planes = picture.channels(names)
             finally:
                 picture.close()
@@ -251,17 +254,50 @@ def check_size(file: str | Path, field: str, name: str, size: Sequence[int], mos
         raise InputError(file, field, name, f"at most {pixels} pixels: all pictures of a scene share a limit")
 
 
+def decoded_later_parts(path: Path) -> list[tuple[str, dict[str, NDArray[Any]]]]:
+    """Names and channels, as stored, of the parts after the first, whose pixels stand where those of the first do.
+
+    The library reads all parts at once, and leaves out those that it cannot read.
+
+    Warns:
+        NeurolensWarning: parts that are left out, for their data windows differ.
+    """
+    if len(parts := _headers(path, "file", path)) < 2:
+        return []
+    known, full, left_out, values = list[tuple[str, set[str]]](), dict[str, set[str]](), list[str](), 0
+    for name, header in parts:
+        if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+            raise InputError(path, "file", f"(part {name!r} is deep)", "flat parts, or a deep file by itself")
+        across, down = (int(b) - int(a) + 1 for a, b in zip(*header["dataWindow"], strict=True))
+        known.append((name, {c.name for c in header["channels"]}))
+        values += across * down * len(header["channels"])
+        if np.array_equal(header["dataWindow"], parts[0][1]["dataWindow"]):
+            full[name] = {c.name for c in header["channels"] if (c.xSampling, c.ySampling) == (1, 1)}
+        else:
+            left_out.append(name)
+    if values > _MOST_PARTS:
+        raise InputError(path, "file", f"({values} values in its parts)", f"at most {_MOST_PARTS}")
+    with whole_file(path, "file", path), _silent():
+        with OpenEXR.File(os.fsencode(path), separate_channels=True) as file:
+            found = [(part.name(), {name: c.pixels for name, c in part.channels.items()}) for part in file.parts]
+        if [(name, set(planes)) for name, planes in found] != known:
+            raise ValueError(f"of {len(known)} parts {len(found)} can be read")
+    if left_out:
+        warn(f"{path}: parts with other data windows are left out: {', '.join(left_out)}")
+    return [(name, {n: p for n, p in planes.items() if n in full[name]}) for name, planes in found[1:] if name in full]
+
+
 def header_of(path: str | Path) -> dict[str, Any]:
     """The header of a file's first part; raises InputError as `read_channels`."""
-    return _header(path, "file", Path(path))
+    return _headers(path, "file", Path(path))[0][1]
 
 
-def _header(file: str | Path, field: str, path: Path) -> dict[str, Any]:
-    """The header of the first part; `file` and `field` name the picture."""
+def _headers(file: str | Path, field: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Names and headers of all parts; `file` and `field` name the picture."""
     with whole_file(file, field, path), _silent():
         open_regular(path).close()
-        with OpenEXR.File(str(path), header_only=True) as header:
-            return dict(header.parts[0].header)
+        with OpenEXR.File(os.fsencode(path), header_only=True) as opened:
+            return [(part.name(), dict(part.header)) for part in opened.parts]
 
 
 @contextmanager
@@ -348,7 +384,9 @@ def standard_attributes(
         if name.startswith(_TEXTS) and not isinstance(value, str | None):
             raise TypeError(f"{name}: {value!r} is no text")
         if value is not None and not (isinstance(value, str) and not value):  # the standard wants no empty text ...
-            typed[name] = float(value) if name in ("focus", *_STATE) else value
+            typed[name] = (
+                float(value) if name in ("focus", *_STATE) else plain(value) if isinstance(value, str) else value
+            )
     # ... nor a number that is none.
     return {name: value for name, value in typed.items() if not (isinstance(value, float) and math.isnan(value))}
 
@@ -372,6 +410,8 @@ def _film(settings: Mapping[str, Any], width: int, height: int) -> dict[str, Any
         return {}
     with np.errstate(over="raise"):
         size = np.array(settings["film_mm"], np.float32)
+    if size.shape != (2,):
+        raise ValueError(f"a film of {size.size} numbers")
     across, down = float(size[0]) / width, float(size[1]) / height
     squeeze = (settings.get("lens_state") or {}).get("squeeze") or 1.0
     aspect = across / down

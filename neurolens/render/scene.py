@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, printable
 from neurolens.base.settings import F_NUMBER, FILM_MM, from_dict, said, within
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
@@ -163,7 +163,7 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
     images = dict(zip(named, pictures.values(), strict=True))
     around, scale = settings.environment.file, settings.environment.scale
     return Scene(
-        path.stem,
+        printable(path.stem),
         settings,
         images,
         triangles,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import neurolens
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, printable
 from neurolens.base.files import atomic_write_text
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.graph.c import NOTHING, Extras, Signature, write_c, write_double
@@ -279,7 +279,7 @@ def comment_of(
 
 def lines_of(texts: Sequence[str]) -> list[str]:
     """Texts as lines of a comment."""
-    flat = [" ".join(str(text).split()) for text in texts]
+    flat = [" ".join(printable(str(text)).split()) for text in texts]
     return [part for line in flat for part in textwrap.wrap(line, _WIDTH, break_long_words=False)]
 
 

@@ -4,6 +4,7 @@ import math
 import os
 import signal
 import threading
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from neurolens.flare import layers, lights
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.layers import FlareJob, photon_picture
-from neurolens.flare.lights import Light, highlights
+from neurolens.flare.lights import Light, flat_shape, highlights, sides_across
 from neurolens.flare.photons import PhotonTracer
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
@@ -55,6 +56,32 @@ def test_no_light_is_a_black_picture_and_said(tmp_path: Path, capsys: pytest.Cap
         assert main([*COOKE[:-1], *words, "--layers", "2", "-o", str(out)]) == 0
         assert said in capsys.readouterr().err
         assert not read_exr(out)[0].any()
+
+
+def test_a_lamp_so_far_that_nothing_arrives_leaves_nothing() -> None:
+    """A disc of 0.2 m, 1,000 km away: each of its patches sends less than floats hold."""
+    lens, ahead = set_lens(read_lens("lenses/cooke_triplet_50.toml")), np.array([0.0, 0.0, -1.0])
+    for far_m in (1e6, 1e9):
+        lamp = replace(Light(0, 0, (6e-19, 6e-19, 2e-19), far_m), shape=flat_shape(ahead, 1e-12 * sides_across(ahead)))
+        job = FlareJob(lens, [lamp], Raster((36.0, 24.0), 24, 16), FlareSettings(bins=2, cell_px=64.0))
+        assert all(np.isfinite(v).all() and v.max() < 1e-12 for v in layers.flare_layers(job).values())
+
+
+def test_as_many_lights_as_pixels_take_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bright pixels, each a region of its own, took 550 bytes each; their sums alone take 128."""
+    monkeypatch.setattr(lights, "_AT_ONCE", 1 << 14)
+    n, film = 1600, (24.0, 24.0)
+    camera = make_camera("pinhole", Shot(film_mm=film, focus_m=math.inf, focal_length_mm=50.0))
+    field = field_of(camera, math.inf, "equidistant")
+    picture = np.zeros((n, n, 3), np.float32)
+    picture[::2, ::2] = 10.0
+    picture[100, 100] = 1000.0
+    tracemalloc.start()
+    found = highlights(picture, field, film, 2.0, 2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.of == n * n // 4 and max(found.lights[0].rgb) > 50 * max(found.lights[1].rgb)
+    assert peak < 300 * found.of
 
 
 def test_nested_rings_take_memory_and_time_by_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from shipped import whole
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
-from neurolens.render.film import digest
+from neurolens.render.film import SPENT, digest
 from neurolens.render.renderer import RenderResult, Watch, render
 from neurolens.render.settings import FilmSettings
 
@@ -208,6 +208,7 @@ WRONG: dict[str, Callable[[Path], Any]] = {
     "long settings": lambda p: rewritten(p, about(more="x" * (8 << 20))),
     "another format": lambda p: rewritten(p, about(format=2)),
     "huge number of samples": lambda p: rewritten(p, about(samples=10**30)),
+    "a time beyond floats": lambda p: rewritten(p, about(spent=dict.fromkeys(SPENT, 10**400))),
     "impossible time": lambda p: rewritten(p, about(spent={"seconds": float("inf")})),
 }
 

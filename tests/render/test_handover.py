@@ -536,9 +536,13 @@ def test_frames_have_their_own_files_and_an_interrupted_run_goes_on(
     assert len(kept) == 9 and not any(name.startswith(".") for name in kept) and "shot.exit.1002.exr" not in kept
     monkeypatch.setattr(files, "exit_map", real)
     (folder / "shot.enter.1001.exr").write_bytes(b"damaged")
+    cut = folder / "shot.undistort.1001.exr"
+    whole, planes = cut.read_bytes(), read_channels(cut)[0]
+    cut.write_bytes(whole[: len(whole) * 98 // 100])  # its header is whole
     told = run_json(capsys, *words)
     again = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-    assert all(again[name] == kept[name] for name in kept if name != "shot.enter.1001.exr")
+    assert all(again[name] == kept[name] for name in kept if name not in ("shot.enter.1001.exr", cut.name))
+    assert all(np.array_equal(plane, planes[name]) for name, plane in read_channels(cut)[0].items())
     assert read_metadata(folder / "shot.enter.1001.exr")["map"] == "enter"
     for kind in ("undistort", "redistort", "illumination", "enter", "exit"):
         assert {f"shot.{kind}.{n}.exr" for n in (1001, 1002)} <= set(again)

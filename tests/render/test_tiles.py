@@ -166,6 +166,8 @@ CHANGES: dict[str, Any] = {
     "name that is a table": ("camera", {"camera": {}}),
     "film beyond float32": ("camera", {"film_mm": [1e308, 24.0]}),
     "film of no height": ("camera", {"film_mm": [36.0, 0.0]}),
+    "film of three numbers": ("camera", {"film_mm": [24.0, 1, 5]}),
+    "film of one number": ("camera", {"film_mm": 24.0}),
     "space": ("colour", {"space": "mine"}),
     "layers that are numbers": ("layers", [1, "depth"]),
     "paths of 64 bits": ("render", {"paths": 2**63}),
