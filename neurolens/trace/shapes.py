@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from functools import lru_cache
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -35,6 +36,9 @@ TURN = 0.25
 FARTHEST = 1.5  # rim radii up to which figures are followed at most
 # Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
 DEEP = 0.25
+# Slopes at the rim of a polynomial's powers, all of one sign, from which on it is summed about the middle of its zone:
+# no glass is polished to 45 degrees by its polynomial alone, so that larger ones cancel, which float32 does not carry.
+CANCELS = 1.0
 _UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
 Quadric = tuple[Any, Any, Any]
@@ -48,6 +52,7 @@ class Figure(NamedTuple):
         plain: whether it is a sphere or a plane, of which only the curvature counts.
         bent: whether along x and y.
         terms: A_p of h^(p - 2), lowest first, in every second power where they are `even`; () without a polynomial.
+        centred: the same polynomial where its powers cancel; see `centred`.
         start: cx, cy, cz of the quadric cx x^2 + cy y^2 + cz z^2 = 2 z that the iteration starts from; None without an
             iteration. steps: of it. last_step: how long its last step may be.
         across: of a toroid or biconic, along the other axis: curvature and 1 + K; () of other surfaces.
@@ -61,6 +66,7 @@ class Figure(NamedTuple):
     bent: tuple[bool, bool] = (True, True)
     terms: Sequence[Any] = ()
     even: bool = True
+    centred: Centred | None = None
     start: Quadric | None = None
     steps: int = 0
     last_step: Any = 0.0
@@ -72,6 +78,19 @@ class Figure(NamedTuple):
     def flat(self) -> bool:
         """Whether it is a plane, known as such: a curvature that is no plain number may become another."""
         return self.plain and is_number(self.curvature) and self.curvature == 0
+
+
+class Centred(NamedTuple):
+    """A polynomial of an asphere by powers of t, which runs from -1 on the axis to 1 at the rim.
+
+    Attributes:
+        scale: t is `scale` h^2 - 1, or `scale` h - 1 where odd powers occur; float32 has it exactly.
+        sag, slope: coefficients of sum A_p h^(p - 2) and of sum p A_p h^(p - 2), lowest power of t first.
+    """
+
+    scale: float
+    sag: tuple[float, ...]
+    slope: tuple[float, ...]
 
 
 class Beyond(NamedTuple):
@@ -99,15 +118,46 @@ def curve_of(shape: Surface, number: Callable[[Any], Any] = float) -> Figure:
     if is_number(k) and k == 0 and not powers and not shape.cylinder:
         return Figure(c, plain=True)
     even = all(n % 2 == 0 for n in powers)
+    numbers = all(is_number(a) for a in powers.values())  # derivatives by coefficients are taken in powers
     return Figure(
         c,
         1 + k,
         bent=(shape.cylinder != "y", shape.cylinder != "x"),
         terms=[powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1)],
         even=even,
+        centred=centred(shape) if powers and numbers else None,
         across=(1 / shape.across[0], 1 + (shape.across[1] or 0.0)) if shape.across else (),
         turned=bool(shape.across and shape.across[1] is None),
     )
+
+
+def centred(surface: Surface) -> Centred | None:
+    """Return the polynomial of an asphere about the middle of its zone; None where float32 carries its powers.
+
+    High powers of one sign each reach far beyond their sum: of Forbes's polynomials of n terms by 6^n, of their powers
+    about the middle by 2.4^n. The coefficients are exact, but for one rounding each.
+    """
+    return _centred(tuple((int(p), _number(a)) for p, a in surface.asphere), float(_extent_mm(surface)))
+
+
+@lru_cache(maxsize=4096)
+def _centred(asphere: tuple[tuple[int, float], ...], rim_mm: float) -> Centred | None:
+    with np.errstate(over="ignore"):
+        reach = float(sum(p * abs(a) * np.float64(rim_mm) ** (p - 1) for p, a in asphere))
+    if not CANCELS < reach < math.inf:
+        return None
+    down = 1 if any(p % 2 for p, _ in asphere) else 2
+    scale = float(np.float32(2 / rim_mm**down))
+    if not 0 < scale < math.inf:
+        return None
+    half = 1 / Fraction(scale)
+    parts = [((p - 2) // down, Fraction(a) * half ** ((p - 2) // down), p) for p, a in asphere]
+    both = (
+        tuple(float(sum(a * w * math.comb(j, k) for j, a, w in rows if j >= k)) for k in range(parts[-1][0] + 1))
+        for rows in ([(j, a, 1) for j, a, _ in parts], parts)
+    )
+    found = Centred(scale, *both)
+    return found if 2 * rim_mm * sum(map(abs, found.slope)) < reach else None
 
 
 def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
@@ -254,13 +304,16 @@ def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int, steepest: floa
 
 
 def _polynomials(o: Arithmetic, figure: Figure, h2: Any, order: int) -> tuple[Any, Any]:
-    """sum A_p h^(p - 2) and sum p A_p h^(p - 2), in h^2 or, where odd powers occur, in h."""
+    """sum A_p h^(p - 2) and sum p A_p h^(p - 2), by powers of h^2 or, where odd ones occur, of h, or centred ones."""
     if not figure.terms:
         return 0.0, 0.0
     # The root is kept from 0, where its derivative is infinite.
     h, down = (h2, 2) if figure.even else (o.held_root(h2), 1)
-    slopes = [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
-    return 0.0 if order == 1 else o.horner(h, figure.terms), o.horner(h, slopes)
+    terms, slopes = figure.terms, [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
+    if figure.centred:
+        scale, terms, slopes = figure.centred
+        h = o.fma(h, scale, -1.0)
+    return 0.0 if order == 1 else o.horner(h, terms), o.horner(h, slopes)
 
 
 def toroid(c: Any, curve: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
