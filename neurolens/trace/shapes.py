@@ -88,9 +88,9 @@ class Centred(NamedTuple):
         sag, slope: coefficients of sum A_p h^(p - 2) and of sum p A_p h^(p - 2), lowest power of t first.
     """
 
-    scale: float
-    sag: tuple[float, ...]
-    slope: tuple[float, ...]
+    scale: Any
+    sag: Sequence[Any]
+    slope: Sequence[Any]
 
 
 class Beyond(NamedTuple):
@@ -309,8 +309,11 @@ def _polynomials(o: Arithmetic, figure: Figure, h2: Any, order: int) -> tuple[An
         return 0.0, 0.0
     # The root is kept from 0, where its derivative is infinite.
     h, down = (h2, 2) if figure.even else (o.held_root(h2), 1)
-    terms, slopes = figure.terms, [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
-    if figure.centred:
+    terms: Sequence[Any]
+    slopes: Sequence[Any]
+    if figure.centred is None:
+        terms, slopes = figure.terms, [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
+    else:
         scale, terms, slopes = figure.centred
         h = o.fma(h, scale, -1.0)
     return 0.0 if order == 1 else o.horner(h, terms), o.horner(h, slopes)
