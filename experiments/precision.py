@@ -100,7 +100,12 @@ def run(args: argparse.Namespace) -> int:
         if some
     ]
     middle = f"{len(rows)} lenses, {len(bent)} of them aspheric" + (f"; {_median(bent)}." if bent else ".")
-    parts = ["# float32 beside float64", "`python -m experiments precision`", middle + _FAR, lab.goal_table("goal", goals)]
+    parts = [
+        "# float32 beside float64",
+        "`python -m experiments precision`",
+        middle + _FAR,
+        lab.goal_table("goal", goals),
+    ]
     text = lab.page(*parts, "Errors on the film, largest 99th percentile first:", lab.table(_COLUMNS, rows, "-"))
     print(lab.write_results(args.out, "precision", text, rows))
     return int(any(row["p99_um"] > GOAL_UM for row in bent))

@@ -21,10 +21,7 @@ from neurolens.trace.shapes import cancelling, sag_mm
 TOUCH_MM = 1e-6  # edge contact is common in patents; only rounding is forgiven
 # Of slopes that cancel in an asphere: of Forbes's polynomials with 2,000, float32 loses 0.2 um on a film 50 mm behind.
 MOST_CANCELLING = 2000.0
-_OF_WHAT = {
-    "asphere": " mm of sag at the rim",
-    "asphere (cancelling)": " for the slopes of its terms at the rim over their sum, which float32 carries",
-}
+_UNITS = {"asphere": " mm of sag at the rim", "asphere (cancelling)": ": slopes of its terms at the rim over their sum"}
 _FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the ends
 _HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through
 _STEP_MM = 1e-3  # diameters are given to a micrometre
@@ -66,7 +63,7 @@ def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> No
         )
         for name, value, low, high in figures:
             if value < low or value > high:
-                expected = f"a size from {low:g} to {high:g}" + _OF_WHAT.get(name, "")
+                expected = f"a size from {low:g} to {high:g}" + _UNITS.get(name, "")
                 raise InputError(file, f"{state}surface {k}, {name}", float(value), expected)
 
 

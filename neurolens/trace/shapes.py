@@ -81,12 +81,8 @@ class Figure(NamedTuple):
 
 
 class Centred(NamedTuple):
-    """A polynomial of an asphere by powers of t, which runs from -1 on the axis to 1 at the rim.
-
-    Attributes:
-        scale: t is `scale` h^2 - 1, or `scale` h - 1 where odd powers occur; float32 has it exactly.
-        sag, slope: coefficients of sum A_p h^(p - 2) and of sum p A_p h^(p - 2), lowest power of t first.
-    """
+    """Sums of A_p h^(p - 2) and of p A_p h^(p - 2) by powers, lowest first, of t = scale h^2 - 1 (scale h - 1 where odd
+    ones occur), which runs from -1 on the axis to 1 at the rim; float32 has the scale exactly."""
 
     scale: Any
     sag: Sequence[Any]
@@ -134,17 +130,13 @@ def curve_of(shape: Surface, number: Callable[[Any], Any] = float) -> Figure:
 def centred(surface: Surface) -> Centred | None:
     """Return the polynomial of an asphere about the middle of its zone; None where float32 carries its powers.
 
-    High powers of one sign each reach far beyond their sum: of Forbes's polynomials of n terms by 6^n, of their powers
-    about the middle by 2.4^n. The coefficients are exact, but for one rounding each.
+    The powers of Forbes's polynomials of n terms exceed their sum by 6^n, those about the middle by 2.4^n.
     """
-    return _centred(tuple((int(p), _number(a)) for p, a in surface.asphere), float(_extent_mm(surface)))
+    return _centred(tuple((int(p), _number(a)) for p, a in surface.asphere if p >= 2), float(_extent_mm(surface)))
 
 
 def cancelling(surface: Surface) -> float:
-    """Slopes at the rim of an asphere's terms as they are summed, all of one sign, over their sum or over 1.
-
-    Float32 loses 6e-8 rad of slope for each 1 of it.
-    """
+    """Sizes of the slopes that an asphere sums at its rim, over their sum or 1; float32 loses 6e-8 rad for each 1."""
     found, rim = centred(surface), float(_extent_mm(surface))
     slopes = found.slope if found else [p * _number(a) * rim ** (p - 2) for p, a in surface.asphere]
     return sum(map(abs, slopes)) * rim / max(1.0, abs(sum(slopes)) * rim)
@@ -152,22 +144,20 @@ def cancelling(surface: Surface) -> float:
 
 @lru_cache(maxsize=4096)
 def _centred(asphere: tuple[tuple[int, float], ...], rim_mm: float) -> Centred | None:
-    with np.errstate(over="ignore", invalid="ignore"):
-        reach = float(sum(p * abs(a) * np.float64(rim_mm) ** (p - 1) for p, a in asphere))
-    if not CANCELS < reach < math.inf:
-        return None
     down = 1 if any(p % 2 for p, _ in asphere) else 2
-    scale = float(np.float32(2 / rim_mm**down))
-    if not 0 < scale < math.inf:
+    with np.errstate(all="ignore"):
+        reach = float(sum(p * abs(a) * np.float64(rim_mm) ** (p - 1) for p, a in asphere))
+        scale = float(np.float32(2 / np.float64(rim_mm) ** down))
+    if not (CANCELS < reach < 1e30 and 0 < scale < math.inf):
         return None
-    half = 1 / Fraction(scale)
-    parts = [((p - 2) // down, Fraction(a) * half ** ((p - 2) // down), p) for p, a in asphere]
-    both = (
-        tuple(float(sum(a * w * math.comb(j, k) for j, a, w in rows if j >= k)) for k in range(parts[-1][0] + 1))
-        for rows in ([(j, a, 1) for j, a, _ in parts], parts)
+    # Exact, but for one rounding of each coefficient.
+    terms = [((p - 2) // down, p, Fraction(a) / Fraction(scale) ** ((p - 2) // down)) for p, a in asphere]
+    powers = range(max(j for j, _, _ in terms) + 1)
+    sag, slope = (
+        tuple(float(sum(a * math.comb(j, k) * (p if sloping else 1) for j, p, a in terms if j >= k)) for k in powers)
+        for sloping in (False, True)
     )
-    found = Centred(scale, *both)
-    return found if 2 * rim_mm * sum(map(abs, found.slope)) < reach else None
+    return Centred(scale, sag, slope) if 2 * rim_mm * sum(map(abs, slope)) < reach else None
 
 
 def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
@@ -319,14 +309,11 @@ def _polynomials(o: Arithmetic, figure: Figure, h2: Any, order: int) -> tuple[An
         return 0.0, 0.0
     # The root is kept from 0, where its derivative is infinite.
     h, down = (h2, 2) if figure.even else (o.held_root(h2), 1)
-    terms: Sequence[Any]
-    slopes: Sequence[Any]
-    if figure.centred is None:
-        terms, slopes = figure.terms, [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
-    else:
-        scale, terms, slopes = figure.centred
-        h = o.fma(h, scale, -1.0)
-    return 0.0 if order == 1 else o.horner(h, terms), o.horner(h, slopes)
+    if figure.centred is not None:
+        h = o.fma(h, figure.centred.scale, -1.0)
+        return 0.0 if order == 1 else o.horner(h, figure.centred.sag), o.horner(h, figure.centred.slope)
+    slopes = [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
+    return 0.0 if order == 1 else o.horner(h, figure.terms), o.horner(h, slopes)
 
 
 def toroid(c: Any, curve: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:

@@ -145,6 +145,9 @@ def test_what_float32_does_not_carry_is_refused(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(assemble, "_ROUNDING_MM", 1.0)
     with pytest.raises(InputError, match=r"surface 0, asphere \(cancelling\)"):
         check_figures([surface_of([3e-4] * 20)], "a file")
+    for a in (1e20, 1e200, 1e308):  # no overflow on the way to the refusal
+        with pytest.raises(InputError, match="surface 0, asphere"):
+            check_figures([replace(sound, asphere=((4, a), (42, -a)))], "a file")
     endless = replace(sound, asphere=((4, 1e308), (6, -1e308)))
     with pytest.raises(InputError, match="surface 0, asphere"):
         check_figures([endless], "a file")
