@@ -16,6 +16,7 @@ from neurolens.cli.arguments import Parser
 
 NAMES = {
     "extremes": ("extremes", "errors and statuses at the ends of what optics allows"),
+    "precision": ("precision", "rays in float32 beside float64, through every lens file"),
     "pupils": ("pupils", "share of rays that pass a lens of those sent through its outlines"),
     "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),
     "vignetting": ("vignetting", "false passes and blocks, illumination"),

@@ -30,7 +30,7 @@ from neurolens.lens import glass
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, same_medium
 from neurolens.trace.arithmetic import TINY, Graphs
-from neurolens.trace.shapes import Figure, figure_of, is_plain
+from neurolens.trace.shapes import Centred, Figure, figure_of, is_plain
 from neurolens.trace.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
 from neurolens.trace.tracegraph import transmitted
 from neurolens.trace.transmission import Layers, path_mm, reflectance
@@ -55,6 +55,7 @@ class Shape(NamedTuple):
 
     terms: int = 0
     even: bool = True
+    centred: bool = False
     steps: int = 0
     bent: tuple[bool, bool] = (True, True)
     crossed: bool = False
@@ -84,7 +85,7 @@ def step_graph(kind: Kind) -> Graph:
     """The graph of one step: its input `state` [8] becomes the output `after` [8], in the frame of the next step.
 
     The input `call` holds `CALL`, then the coefficients of a coating's reflectance, lowest first, then `FIGURE` and the
-    terms of the polynomial, as many as the shape has.
+    terms of the polynomial (`_terms`), as many as the shape has.
     """
     g, shape = Graph(), kind.shape
     o = Graphs(g, finite=True)  # films average over rays, also over those that are lost and have no power
@@ -184,8 +185,10 @@ def _figure(shape: Shape, call: Value) -> Figure:
         return figure
     other: Any = rest[1] if shape.crossed else 0.0
     start = c if shape.bent[0] else other, c if shape.bent[1] else other, cz
+    terms = rest[more:]
+    centred = Centred(terms[0], terms[1::2], terms[2::2]) if shape.centred else None
     return figure._replace(
-        terms=rest[more:], even=shape.even, start=start, steps=shape.steps, last_step=last_step,
+        terms=terms, centred=centred, even=shape.even, start=start, steps=shape.steps, last_step=last_step,
         across=(rest[0], rest[2]) if shape.crossed else (), turned=shape.turned,
     )  # fmt: skip
 
@@ -195,7 +198,19 @@ def figure_numbers(figure: Figure, turn: float) -> list[Any]:
     cx, cy, cz = figure.start or (0.0, 0.0, 0.0)
     c, other = (cx, cy) if figure.bent[0] else (cy, cx)
     across = [turn * figure.across[0], turn * other, figure.across[1]] if figure.across else []
-    return [figure.stretch, turn * c, turn * cz, figure.last_step, *across, *(turn * v for v in figure.terms)]
+    return [figure.stretch, turn * c, turn * cz, figure.last_step, *across, *_terms(figure, turn)]
+
+
+def _terms(figure: Figure, turn: float) -> list[float]:
+    """The numbers of a polynomial: terms; of a centred one the scale, and in turn those of its sag and its slope."""
+    if figure.centred is None:
+        return [turn * v for v in figure.terms]
+    scale, *both = figure.centred
+    return [scale, *(turn * v for pair in zip(*both, strict=True) for v in pair)]
+
+
+def _sort(figure: Figure) -> tuple[bool, bool]:
+    return figure.even, figure.centred is not None
 
 
 class Stack:
@@ -220,9 +235,11 @@ class Stack:
         # All aspheres of a sort get the degree of the highest one, so that they share a function.
         self._figures = {k: figure_of(s, float) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
         figures = self._figures.values()
-        most = {even: max([0, *(len(f.terms) for f in figures if f.even == even)]) for even in (True, False)}
-        self._terms = {k: most[f.even] if f.terms else 0 for k, f in self._figures.items()}
-        self.width = PLAIN + len(FIGURE) + ACROSS + max(most.values())
+        most: dict[tuple[bool, bool], int] = {}
+        for f in figures:
+            most[_sort(f)] = max(most.get(_sort(f), 0), len(_terms(f, 1.0)))
+        self._terms = {k: most[_sort(f)] if f.terms else 0 for k, f in self._figures.items()}
+        self.width = PLAIN + len(FIGURE) + ACROSS + max(most.values(), default=0)
         kinds = {place: self.kind(*place) for place in sorted(places)}
         self._kinds = tuple(dict.fromkeys(kinds.values()))
         self.functions = np.full((len(lens.surfaces), len(ACTIONS)), -1, np.int32)
@@ -261,7 +278,7 @@ class Stack:
         lens, s, f = self.lens, self.lens.surfaces[k], self._figures.get(k)
         return Kind(
             ACTIONS[which][0],
-            None if f is None else Shape(self._terms[k], f.even, f.steps, f.bent, bool(f.across), f.turned),
+            None if f is None else Shape(self._terms[k], *_sort(f), f.steps, f.bent, bool(f.across), f.turned),
             reflects(lens, k),
             bool(s.coating and s.coating.layers),
             any(t.glass is not None or t.absorption_per_mm for t in lens.surfaces),

@@ -42,7 +42,7 @@ CLOSE_MM, WORST_MM = 1e-11, 1e-9  # of sag, in the unit of the heights: what is 
 MAX_TERMS = MAX_POWER // 2 - 1  # of either kind, m from 0
 _DIGITS = 80
 _SAMPLES = 101
-_ROUNDING = 1e-9  # sag that cancels in float64, where powers alternate
+_ROUNDING_MM = 2e-8  # of sag: what rounding the coefficients to float64 may change; float32 carries what passes this
 Terms = tuple[tuple[int, float], ...]
 
 
@@ -348,7 +348,7 @@ def _interpolated(function: Callable[[Decimal], Decimal], reach: Decimal, degree
 def _powers(in_x: Sequence[Decimal], radius: float, rim: float) -> Terms:
     """Return the powers of the height of a polynomial in x; ValueError where its terms cancel beyond float64."""
     terms = tuple((2 * k, float(c / Decimal(radius) ** (2 * k))) for k, c in enumerate(in_x) if c)
-    if sum(abs(a) * rim**p for p, a in terms) * 2.0**-52 > _ROUNDING:
+    if sum(abs(a) * rim**p for p, a in terms) * 2.0**-53 > _ROUNDING_MM:
         raise ValueError("fewer terms: powers of the height cancel in float64")
     return terms
 

@@ -22,7 +22,7 @@ MAX_WORD = 60  # characters of a number
 ENDLESS = 1e30  # more than any program writes for infinity
 LARGEST = 1e15  # of any figure of a table but a radius
 MAX_SURFACES = 500
-MAX_POWER = 40
+MAX_POWER = 42  # Forbes's aspheres of 20 terms reach it
 MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
 
 # Units of length in mm.

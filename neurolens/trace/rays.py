@@ -23,7 +23,7 @@ from neurolens.base.tasks import keep_memory
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.arithmetic import is_number, times
-from neurolens.trace.shapes import figure_of, is_deep, start_of
+from neurolens.trace.shapes import centred, figure_of, is_deep, start_of
 from neurolens.trace.surfaces import (
     Hit,
     Medium,
@@ -187,7 +187,8 @@ def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph
         glass.index_of(surface, glass.LINE_D_NM)
     if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache_folder("torch"))
-    torch.compiler.assume_constant_result(start_of)
+    for constant in (start_of, centred):
+        torch.compiler.assume_constant_result(constant)
     return torch.compile(run, dynamic=False, fullgraph=fullgraph)
 
 

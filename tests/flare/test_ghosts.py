@@ -70,6 +70,7 @@ CASES = {
     "mask": lambda: replace(set_lens(double_gauss(), f_number=4.0), aperture=Aperture(mask=LETTER, rotation_deg=30.0)),
     "coated": lambda: coated(double_gauss(), "broadband"),
     "aspheres": lambda: lens_of("phone_lens_6"),
+    "aspheres that cancel": lambda: lens_of("fujifilm_fujinon_xf_35mm_f1_4_r"),
     "cylinders": lambda: lens_of("schneider_anamorphic_31"),
     "toroids": toric,
     "absorbing": lambda: replace(

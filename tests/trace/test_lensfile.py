@@ -93,7 +93,7 @@ BAD_ROWS = [
     ('material = "F2"', "material = 2", ["surface 1, material", "got 2", "a text"]),
     # shapes, media, coatings
     ("n_d = 1.6,", "n_d = 1.6, asphere = {},", ["surface 4, asphere", "{ 4 = 1e-6"]),
-    ("n_d = 1.6,", "n_d = 1.6, asphere = { 1 = 1e-6 },", ["surface 4, asphere", "'1'", "from 2 to 40"]),
+    ("n_d = 1.6,", "n_d = 1.6, asphere = { 1 = 1e-6 },", ["surface 4, asphere", "'1'", "from 2 to 42"]),
     ("n_d = 1.6,", 'n_d = 1.6, cylinder = "z",', ["surface 4, cylinder", "'z'", '"x" or "y"']),
     ("n_d = 1.6,", "n_d = 1.6, absorption_per_mm = -1,", ["surface 4, absorption_per_mm", "got -1", "at least 0"]),
     (ROW_5, ROW_5 + ", absorption_per_mm = 0.1", ["surface 5, n_d", "(missing)", "absorption_per_mm is given"]),

@@ -1,0 +1,153 @@
+"""Float32 beside float64: shipped lenses whose polynomials cancel, Forbes's aspheres, all languages, ghosts."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from shipped import PATHS
+
+from experiments import precision
+from experiments.__main__ import main
+from neurolens.base.errors import InputError
+from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, WAVELENGTH
+from neurolens.graph.scalars import lower
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers import assemble
+from neurolens.readers.assemble import qcon_terms
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.rims import check_figures
+from neurolens.trace import shapes
+from neurolens.trace.arithmetic import NUMPY
+from neurolens.trace.rays import Rays, trace
+from neurolens.trace.tensors import Tensors
+from neurolens.trace.tracegraph import exact_graph
+
+LENSES = Path(__file__).parents[2] / "lenses"
+WORST = "fujifilm_fujinon_xf_35mm_f1_4_r"
+RIM, REACH = 8.0, 50.0
+
+
+def forbes(count: int, seed: int = 1) -> list[float]:
+    rng = np.random.default_rng(seed)
+    return (0.05 * 0.5 ** np.arange(count) * rng.choice([-1, 1], count)).tolist()
+
+
+def surface_of(a: list[float]) -> Surface:
+    return Surface(40.0, 3.0, 2 * RIM, 1.5, asphere=qcon_terms(a, RIM, RIM))
+
+
+@pytest.mark.parametrize("name", [WORST, "fujifilm_fujinon_xf_14mm_f2_8_r", "fujifilm_fujinon_xf_56mm_f1_2_r"])
+def test_lenses_of_eighteen_terms_keep_float32_on_the_film(name: str) -> None:
+    row = precision.measure(LENSES / f"{name}.toml", 4000)
+    assert row["rays"] > 800 and row["status_differs"] < 1e-3
+    assert row["p99_um"] < 0.05 and row["worst_um"] < 0.2
+    assert row["powers_um"] > 10 * row["p99_um"], "the powers of this lens cancel: what is tested here"
+
+
+def test_the_command_writes_its_table(tmp_path: Path) -> None:
+    command = ["precision", "--only", "canon_aspheric_50", "--rays", "500", "--output", str(tmp_path), "--quiet"]
+    assert main(command) == 0
+    (row,) = json.loads((tmp_path / "precision.json").read_text())
+    assert row["aspheres"] > 0 and row["centred"] == 0 and row["powers_um"] is None
+
+
+@pytest.mark.parametrize("count", [4, 8, 12, 16, 20])
+def test_rays_through_a_forbes_asphere(count: int) -> None:
+    for seed in range(3):
+        lens = Lens("", "", (surface_of(forbes(count, seed)), Surface(math.inf, REACH, 1e4, stop=True)), 2.0)
+        h = torch.linspace(-7.9, 7.9, 2001)
+        zero, film = torch.zeros_like(h), []
+        for dtype in (torch.float32, torch.float64):
+            rays = Rays(*(c.to(dtype) for c in (zero, h, zero - 5, zero, zero, zero + 1)))
+            out = trace(replace(lens, film_z_mm=60.0), rays, towards="film")
+            assert (out.status == 0).all()
+            film.append((out.rays.y + REACH * out.rays.dy / out.rays.dz).double().numpy())
+        error = 1e3 * np.abs(film[0] - film[1])
+        assert np.quantile(error, 0.99) < 0.05 and error.max() < 0.2
+
+
+@pytest.mark.parametrize("count", [8, 16, 20])
+def test_sag_and_slope_are_those_of_jacobis_polynomials(count: int) -> None:
+    """In 60 digits, from the definition: the coefficients once, what float32 and float64 make of them."""
+    mp = pytest.importorskip("mpmath").mp.clone()
+    mp.dps = 60
+    a = forbes(count)
+    figure, c = shapes.curve_of(surface_of(a)), mp.mpf(1) / 40
+    assert (figure.centred is not None) == (count > 4)
+
+    def sag(h):  # type: ignore[no-untyped-def]
+        x = (h / RIM) ** 2
+        form = sum(mp.mpf(v) * mp.jacobi(m, 0, 4, 2 * x - 1) for m, v in enumerate(a))
+        return c * h * h / (1 + mp.sqrt(1 - (c * h) ** 2)) + x**2 * form
+
+    heights = np.linspace(0.4, RIM, 20).astype(np.float32)
+    exact = np.array([[float(sag(mp.mpf(float(h)))), float(mp.diff(sag, mp.mpf(float(h))))] for h in heights]).T
+    for dtype, tolerance in ((np.float64, (2e-8, 1e-7)), (np.float32, (3e-7, 2e-6))):
+        h = heights.astype(dtype)
+        tensor = torch.from_numpy(h)
+        for o, h2, at in ((NUMPY, h * h, h), (Tensors(False, tensor.dtype), tensor * tensor, tensor)):
+            found = shapes.depth(o, figure, h2, order=0)  # type: ignore[arg-type]
+            assert np.abs(np.asarray(found.sag) - exact[0]).max() < tolerance[0]
+            assert np.abs(np.asarray(found.slope * at) - exact[1]).max() < tolerance[1]
+
+
+def test_odd_powers_that_cancel_are_centred_exactly() -> None:
+    """A centred polynomial is the same polynomial: in 60 digits its coefficients give back those of the powers."""
+    mp = pytest.importorskip("mpmath").mp.clone()
+    mp.dps = 60
+    for surface in (s for s in read_lens(LENSES / f"{WORST}.toml").surfaces if s.asphere):
+        found = shapes.centred(surface)
+        assert found is not None and any(p % 2 for p, _ in surface.asphere)
+        for share in (0.0, 0.3, 0.8, 1.0, 1.2):
+            h = mp.mpf(share * surface.semi_diameter_mm)
+            t = h * found.scale - 1
+            exact = [sum(mp.mpf(w) * a * h ** (p - 2) for p, a, w in rows) for rows in (
+                [(p, a, 1) for p, a in surface.asphere], [(p, a, p) for p, a in surface.asphere])]  # fmt: skip
+            for coefficients, wanted in zip(found[1:], exact, strict=True):
+                size = sum(abs(c) * abs(t) ** k for k, c in enumerate(coefficients))
+                assert abs(sum(mp.mpf(c) * t**k for k, c in enumerate(coefficients)) - wanted) < 2e-16 * size
+
+
+def test_the_graph_of_a_lens_in_float32() -> None:
+    """What C, shaders and ONNX are written from, run on float32, beside the tracer in float64."""
+    stop = Surface(math.inf, 30.0, 10.0, stop=True)
+    lens = Lens("", "", (surface_of(forbes(20)), Surface(math.inf, 3.0, 40.0), stop), 2.0)
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-10, 10, (2, 4000)), rng.uniform(-5, 5, (2, 4000))]).astype(np.float32)
+    given = dict(zip(RAY, points, strict=True)) | {WAVELENGTH: np.full(4000, 550, np.float32)}
+    given |= {FILM_Z: np.float32(60.0), STOP_RADIUS: np.float32(lens.stop_radius_mm)}
+    found = lower(exact_graph(lens, 12.0, (400.0, 700.0))).evaluate(given)
+    x, y, px, py = (torch.from_numpy(v).double() for v in points)
+    way = torch.stack([px - x, py - y, torch.full_like(x, 12.0 - 60.0)])
+    exact = trace(lens, Rays(x, y, torch.full_like(x, 60.0), *(way / way.norm(dim=0))), 550.0)
+    passed = (found[STATUS] == 0) & (exact.status.numpy() == 0)
+    assert passed.mean() > 0.3 and np.mean(found[STATUS] != exact.status.numpy()) < 1e-3
+    off = [np.abs(found[name] - c.numpy())[passed] for name, c in zip(SCENE_RAY, exact.rays, strict=True)]
+    assert np.quantile(np.hypot(off[3], off[4]), 0.99) < 1e-6
+
+
+def test_lenses_whose_powers_do_not_cancel_stay_as_they_are() -> None:
+    steep = Surface(40.0, 3.0, 2 * RIM, 1.5, asphere=((4, 1.0), (6, 1.0)))  # far beyond, but of one sign
+    assert shapes.centred(steep) is None
+    assert all(shapes.centred(s) is None for path in PATHS for s in read_lens(path).surfaces)
+
+
+def test_what_float32_does_not_carry_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twenty terms that do not fall are beyond what powers hold, and as powers of a lens file beyond float32."""
+    with pytest.raises(ValueError, match="fewer terms"):
+        qcon_terms([3e-4] * 20, RIM, RIM)
+    sound = surface_of(forbes(20))
+    check_figures([sound, replace(sound, diameter_mm=math.nan)], "a file")  # a rim that is not yet known is no fault
+    monkeypatch.setattr(assemble, "_ROUNDING_MM", 1.0)
+    with pytest.raises(InputError, match=r"surface 0, asphere \(cancelling\)"):
+        check_figures([surface_of([3e-4] * 20)], "a file")
+    for a in (1e20, 1e200, 1e308):  # no overflow on the way to the refusal
+        with pytest.raises(InputError, match="surface 0, asphere"):
+            check_figures([replace(sound, asphere=((4, a), (42, -a)))], "a file")
+    endless = replace(sound, asphere=((4, 1e308), (6, -1e308)))
+    with pytest.raises(InputError, match="surface 0, asphere"):
+        check_figures([endless], "a file")
