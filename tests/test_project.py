@@ -1,6 +1,7 @@
 """What the project says of itself in several files agrees; the Python examples of its pages run."""
 
 import ast
+import json
 import os
 import re
 import shutil
@@ -13,6 +14,8 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from pins import OLDEST, TABLE, pins, plain
 from test_imports import statements
 
 import neurolens
@@ -41,6 +44,18 @@ def test_the_tested_versions_lie_in_the_ranges_that_are_declared() -> None:
         )
 
 
+def test_every_pin_takes_every_python_that_is_promised() -> None:
+    """What the packages ask for, as tests/pins.py wrote it down of the index: from the very first Python on."""
+    asked = json.loads(TABLE.read_text(encoding="utf-8"))
+    pinned = {f"{plain(name)}=={version}" for name, version in pins().items()}
+    assert set(asked) == pinned, "constraints.txt has changed: run python tests/pins.py"
+    oldest = SpecifierSet(PROJECT["requires-python"])
+    assert OLDEST in oldest and "3.10.99" not in oldest
+    for pin, wanted in asked.items():
+        for python in (OLDEST, "3.11.2", "3.11.14", "3.12.0", "3.13.0"):
+            assert python in SpecifierSet(wanted or ""), f"{pin} wants Python {wanted}, not {python}"
+
+
 def imported(text: str, tree: ast.Module) -> Iterator[str]:
     """Top-level names that a module imports, also by `import_module` and `importorskip` of a literal."""
     yield from re.findall(r"\b(?:import_module|importorskip)\(\s*[\"'](\w+)", text)
@@ -61,9 +76,6 @@ def own_environment(file: Path, tree: ast.Module, name: str) -> bool:
 
 @pytest.mark.whole  # it reads all files
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
-    def plain(name: str) -> str:
-        return re.sub(r"[-_.]+", "-", name).lower()
-
     def declared(*extras: str) -> set[str]:
         lines = [line for extra in extras for line in PROJECT["optional-dependencies"][extra]]
         return {plain(Requirement(line).name) for line in [*PROJECT["dependencies"], *lines]}
@@ -90,7 +102,7 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
 
 
 # A command that would install the project which owns the name `neurolens` on PyPI.
-STRANGER = re.compile(r"pip3? install\b[^\n`]*?[\s'\"`]neurolens(?![\w*/.-])")
+STRANGER = re.compile(r"pip3? install\b[^\n`&;|]*?[\s'\"`]neurolens(?![\w*/.-])")
 
 
 def test_no_text_tells_anybody_to_install_the_other_neurolens() -> None:
@@ -141,7 +153,14 @@ def test_commands_refuse_to_run_under_the_other_neurolens(tmp_path: Path) -> Non
 
 def test_licence_citation_and_changes_are_there_and_name_this_version() -> None:
     assert PROJECT["license"] == "MIT" and (ROOT / "LICENSE").read_text(encoding="utf-8").startswith("MIT License")
-    assert "CC0" in (ROOT / "lenses" / "LICENSE").read_text(encoding="utf-8")
+    licence = (ROOT / "lenses" / "LICENSE").read_text(encoding="utf-8")
+    lenses = [tomllib.loads(file.read_text(encoding="utf-8")) for file in sorted((ROOT / "lenses").glob("*.toml"))]
+    fitted = sum(lens["rims"] == "photographs" for lens in lenses)
+    measured = sum("measured" in lens for lens in lenses)
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    assert "CC0" in licence and "Attribution-ShareAlike 3.0" in licence
+    assert f"In {fitted} files the diameters" in licence and f"{measured} files have a table" in licence
+    assert f"diameters of {fitted} lens files and the tables `[measured]` of {measured} come" in readme
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert f"\nversion: {neurolens.__version__}\n" in citation and "\nlicense: MIT\n" in citation
     assert f"\n## {neurolens.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
