@@ -20,7 +20,8 @@
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
 #
-# PYTHON=/path/to/python3 chooses the interpreter. PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu takes the small torch.
+# PYTHON=/path/to/python3 chooses the interpreter. Under Linux without an NVIDIA driver torch comes from its index of small CPU builds
+# (TORCH_CPU=) where that can be reached; PIP_EXTRA_INDEX_URL names another index, and TORCH_CPU= without a value takes pip's own.
 
 SHELL := /bin/sh
 PYTHON ?= python3
@@ -29,6 +30,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 CHROMIUM ?= $(shell command -v chromium || command -v chromium-browser || command -v google-chrome)
 ORT_WEB := 1.30.0
+TORCH_CPU ?= https://download.pytorch.org/whl/cpu
 BLENDER ?= 5.0.0
 BLENDER_VENV := .venv-blender$(if $(filter 5.0.0,$(BLENDER)),,-$(BLENDER))
 BLENDER_INSTALLED := $(BLENDER_VENV)/.installed
@@ -120,11 +122,21 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    echo "neurolens needs Python 3.11 or newer: '$(PYTHON)' is `$(PYTHON) --version 2>&1 || true`. Try make PYTHON=/path/to/python3.11" >&2; \
 	    exit 1; \
 	fi; \
-	echo "Setting up $(VENV) with $$found (once; torch is large)"; \
+	echo "Setting up $(VENV) with $$found (once)"; \
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
-	@set -e; (while sleep 15 >/dev/null && kill -0 $$$$ 2>/dev/null; do \
+	@set -e; index=; size="5.9 GB with its CUDA libraries: ten minutes at 10 MB/s"; \
+	if [ "`uname -s`" != Linux ]; then size="under 1 GB"; \
+	elif [ -n "$$PIP_EXTRA_INDEX_URL" ]; then size="what PIP_EXTRA_INDEX_URL has, at most 5.9 GB"; \
+	elif command -v nvidia-smi >/dev/null || [ -z "$(TORCH_CPU)" ]; then :; \
+	elif $(BIN)/python -c 'import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=10)' $(TORCH_CPU)/torch/ 2>/dev/null; then \
+	    index="--extra-index-url $(TORCH_CPU)"; size="the CPU build, as there is no NVIDIA driver: under 1 GB"; \
+	else echo "$(TORCH_CPU) cannot be reached, so torch comes without its small CPU build."; \
+	    echo "Ctrl-C stops it; without torch '$(BIN)/python -m pip install -e .' takes 265 MB, and renders with models."; \
+	fi; \
+	echo "torch and what it needs take $$size"; \
+	(while sleep 15 >/dev/null && kill -0 $$$$ 2>/dev/null; do \
 	    echo "  pip is at work: $(VENV) has $$(du -sm $(VENV) | cut -f1) MB"; done) & beat=$$!; \
-	$(PIP_INSTALL) torch; \
+	$(PIP_INSTALL) $$index torch; \
 	$(PIP_INSTALL) --no-build-isolation -e '.[train,dev]'; \
 	kill $$beat
 	@touch $@

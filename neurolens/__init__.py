@@ -3,6 +3,8 @@
 import os
 
 __version__ = "0.1.0"
+# What pip calls this project. `neurolens` on PyPI is another one, with the same folder and command.
+DISTRIBUTION = "neurolens-camera"
 
 # onnxruntime reads this when it is imported. Otherwise 1.31 writes a device id and events into the user's cache folder
 # and looks for a server to send them to; its own call to stop that comes too late.

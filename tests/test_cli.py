@@ -431,8 +431,47 @@ def test_without_torch_glass_is_found_lenses_are_converted_c_and_maps_are_writte
     ]
     done = python(WITHOUT_TORCH.replace("main(sys.argv[1:])", f"[main(c) for c in {commands!r}] != [0] * 5 + [2]"))
     assert done.returncode == 0, done.stderr
-    assert "'neurolens[train]'" in done.stderr and (tmp_path / "a.exr").exists()
+    assert "pip install '.[train]'" in done.stderr and (tmp_path / "a.exr").exists()
     assert "needs torch" in done.stdout and (tmp_path / "a.toml").exists() and (tmp_path / "a.h").exists()
+
+
+# As an import finds nothing where no extra is installed; the entries None of WITHOUT_TORCH make find_spec raise.
+BASE_INSTALL = """
+import importlib.machinery as machinery, sys
+from neurolens.base.errors import EXTRAS
+class Lean(machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] in EXTRAS else super().find_spec(name, path, target)
+sys.meta_path[:] = [Lean if finder is machinery.PathFinder else finder for finder in sys.meta_path]
+from neurolens.cli import main
+if __name__ == "__main__": sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "extra"),
+    [
+        ("blender build --lens laikin_double_gauss_50 -o a.zip", "train"),
+        ("blender build --no-exact --jobs 1 --lens laikin_double_gauss_50 -o a.zip", "train"),
+        ("lens laikin_double_gauss_50", "train"),
+        ("verify nikon_zoom_70_200", "train"),
+        ("mitsuba {root}/experiments/scenes/spheres.xml --camera petzval_portrait_100.ols-64 -o a.exr", "mitsuba"),
+        ("render {root}/experiments/scenes/room.toml --camera {model} --width 8 --dask local -o a.exr", "dask"),
+        ("train {root}/experiments/quickstart.toml -o runs", "train"),
+        ("plan {root}/experiments/scenes/room.toml --lens laikin_double_gauss_50 --budget 1px", "train"),
+    ],
+)
+def test_in_a_base_install_a_command_names_the_extra_that_it_needs(command: str, extra: str, tmp_path: Path) -> None:
+    """In one line, before work: no shader is made first, and no missing package is called a fault."""
+    words = command.format(root=ROOT, model=ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx").split()
+    (tmp_path / "base.py").write_text(BASE_INSTALL)
+    done = subprocess.run(
+        [sys.executable, "base.py", *words], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert done.returncode == 2 and f"pip install '.[{extra}" in done.stderr, done.stderr
+    assert len(done.stderr.splitlines()) == 1 and not (tmp_path / "a.zip").exists(), done.stderr
 
 
 def test_a_reader_that_leaves_is_no_error(scene: Path, tmp_path: Path) -> None:

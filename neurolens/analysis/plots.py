@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurolens.base.errors import NeurolensError, without_controls
+from neurolens.base.errors import NeurolensError, pip_install, without_controls
 from neurolens.base.files import atomic_path
 
 if TYPE_CHECKING:
@@ -35,9 +35,7 @@ def style() -> Any:
     try:
         import matplotlib
     except ImportError as error:
-        raise NeurolensError(
-            "plots need matplotlib: pip install 'neurolens[train]', or '.[train]' in a checkout"
-        ) from error
+        raise NeurolensError(f"plots need matplotlib: {pip_install('train')}") from error
     return matplotlib.rc_context(_STYLE)
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from neurolens import __version__
-from neurolens.base.errors import NeurolensError, one_line
+from neurolens.base.errors import NeurolensError, one_line, pip_install
 from neurolens.base.files import TemporaryFolder, atomic_path, cache_folder, place_inside
 from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure, keep_memory
 
@@ -170,7 +170,7 @@ def _distributed() -> Any:
     try:
         import distributed
     except ModuleNotFoundError:
-        raise NeurolensError("--dask needs Dask, which is not installed: pip install 'neurolens[dask]'") from None
+        raise NeurolensError(f"--dask needs Dask, which is not installed: {pip_install('dask')}") from None
     return distributed
 
 
@@ -192,7 +192,7 @@ class _Cluster:
         except BaseException as error:
             self.close()
             if isinstance(error, ImportError):
-                raise NeurolensError("--dask local needs cryptography: pip install 'neurolens[dask]'") from None
+                raise NeurolensError(f"--dask local needs cryptography: {pip_install('dask')}") from None
             if not isinstance(error, (OSError, ValueError)):
                 raise
             expected = "tcp://HOST:PORT of a scheduler that runs, local, or local:N"

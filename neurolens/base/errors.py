@@ -8,9 +8,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import neurolens
+
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 _LONGEST = 400  # characters of a value or field in a message
+# What brings a package that the base install lacks: an extra of pyproject.toml, by the name that is imported.
+EXTRAS = {
+    **dict.fromkeys(("torch", "scipy", "matplotlib", "contourpy", "flip_evaluator"), "train"),
+    **dict.fromkeys(("distributed", "dask", "cryptography"), "dask"),
+    **dict.fromkeys(("mitsuba", "drjit"), "mitsuba"),
+    **dict.fromkeys(("onnx", "mpmath"), "dev"),
+    "lensfunpy": "photographs",
+}
 
 
 def printable(text: str) -> str:
@@ -86,8 +96,24 @@ def warned(file: str | Path = "") -> Iterator[list[str]]:
             texts += dict.fromkeys(text.removeprefix(f"{file}: ") for text in own)
 
 
+def pip_install(extra: str) -> str:
+    """The command that installs an extra of this project: in a checkout from there, else by our name on PyPI."""
+    checkout = (Path(__file__).parents[2] / "pyproject.toml").is_file()
+    return f"pip install '{'.' if checkout else neurolens.DISTRIBUTION}[{extra}]'"
+
+
+def missing(error: BaseException) -> str:
+    """The package that an import did not find, and the command that brings it; empty for any other error."""
+    package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    if package not in EXTRAS:
+        return ""
+    return f"this needs {package}, which is not installed: {pip_install(EXTRAS[package])}"
+
+
 def reason(error: BaseException) -> str:
     """What an error says, of one of the system with its file; the error of a full disk names none."""
+    if text := missing(error):
+        return text
     if not isinstance(error, OSError):
         return str(error) or type(error).__name__
     return f"{'' if error.filename is None else f'{error.filename}: '}{error.strerror or error}"

@@ -33,7 +33,7 @@ from multiprocessing.connection import wait
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from neurolens.base.errors import NeurolensError, one_line
+from neurolens.base.errors import NeurolensError, missing, one_line, reason
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -253,8 +253,8 @@ def _result(future: Future[Any]) -> Any:
 
 def failure(error: Exception) -> Failed:
     """The reason that an error gives, in one line: errors travel between processes as text."""
-    if isinstance(error, NeurolensError):
-        return Failed(one_line(str(error), _LONGEST))
+    if isinstance(error, NeurolensError) or missing(error):
+        return Failed(one_line(reason(error), _LONGEST))
     if isinstance(error, MemoryError):
         return Failed(one_line(f"a worker ran out of memory ({error or 'no more is known'})", _LONGEST))
     frame = traceback.extract_tb(error.__traceback__)[-1]

@@ -17,13 +17,11 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
-from neurolens import __version__
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable, reason
+import neurolens
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, missing, one_line, printable, reason
 from neurolens.base.tasks import handled
 from neurolens.cli.arguments import Help, Parser, more_glasses
 
-# Packages of the extra that a base install lacks.
-_TRAIN_PACKAGES = {"torch", "scipy", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
 _RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--trade")}  # names that commands had still work
@@ -83,7 +81,7 @@ def build_parser(first: str | None = None) -> Parser:
         prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,
         formatter_class=partial(Help, indent_increment=4),
     )  # fmt: skip
-    parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
+    parser.add_argument("--version", action="version", version=f"neurolens {neurolens.__version__}")
     parser.renamed = _RENAMED
     subparsers: Any = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=Parser, prog="neurolens", help=argparse.SUPPRESS
@@ -105,6 +103,11 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None =
     `build` makes another parser; its errors and interrupts are reported like the command's.
     """
     _open_streams()
+    if not hasattr(neurolens, "DISTRIBUTION"):  # its files are written over ours where both are installed
+        return _fail(
+            f"another project called neurolens is installed over this one ({neurolens.__file__}): "
+            "pip uninstall neurolens, then install this one again"
+        )
     words = sys.argv[1:] if argv is None else argv
     args, received = argparse.Namespace(kept="nothing was done"), list[int]()
 
@@ -161,18 +164,13 @@ def _failed(error: Exception) -> int:
         # The reader (head, less) has exited; avoid a second error when the interpreter flushes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
-    if isinstance(error, OSError):
+    if isinstance(error, OSError) or missing(error):
         return _fail(reason(error))
     return _fault(error)
 
 
 def _fault(error: Exception) -> int:
-    """Report what no command expects: a package or memory that is missing, or a fault of neurolens itself."""
-    package = (getattr(error, "name", None) or "").partition(".")[0]
-    if isinstance(error, ModuleNotFoundError) and package in _TRAIN_PACKAGES:
-        return _fail(
-            f"this needs {package}, which is not installed: pip install 'neurolens[train]', or '.[train]' in a checkout"
-        )
+    """Report what no command expects: no memory, or a fault of neurolens itself."""
     if os.environ.get(_TRACEBACK):
         import traceback
 

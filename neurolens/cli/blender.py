@@ -90,6 +90,8 @@ class Build(cli.Reporting):
             self.refuse("--models", str(folder), "a folder of models that exists")
         began, packed = time.perf_counter(), []
         lens_folder = folder.parent / "lenses"
+        if lens_folder.is_dir():
+            import torch  # noqa: F401 - traces the lenses; where it is missing, that is said before shaders are made
         places = list(library(folder, lens_folder, self.lens))
         if not places:
             self.refuse("--models", str(folder), "a folder with models (.onnx)")

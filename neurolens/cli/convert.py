@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from neurolens.base.errors import InputError, warned
+from neurolens.base.errors import InputError, pip_install, warned
 from neurolens.base.files import atomic_path
 from neurolens.base.settings import group, setting
 from neurolens.cli import arguments as cli
@@ -61,7 +61,7 @@ examples:
 def _doubts(lens: Lens) -> list[str]:
     """Contradictions between the lens and statements of its file, as sentences."""
     if find_spec("torch") is None:
-        return ["the lens is not checked against its file's statements: that needs torch (pip install '.[train]')"]
+        return [f"the lens is not checked against its file's statements: that needs torch ({pip_install('train')})"]
     from neurolens.setting.check import check_lens, doubts
 
     try:

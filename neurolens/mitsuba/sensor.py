@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, pip_install
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.lens.shot import Shot, StopShape
@@ -64,9 +64,7 @@ def libraries() -> tuple[Any, Any]:
     try:
         return importlib.import_module("mitsuba"), importlib.import_module("drjit")
     except ImportError as error:
-        raise NeurolensError(
-            f"Mitsuba 3 cannot be imported ({error}): pip install 'neurolens[mitsuba]', or '.[mitsuba]' in a checkout"
-        ) from None
+        raise NeurolensError(f"Mitsuba 3 cannot be imported ({error}): {pip_install('mitsuba')}") from None
 
 
 def require_mitsuba(variant: str | None = None) -> Any:

@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, pip_install
 
 Array = NDArray[np.float64]
 
@@ -189,7 +189,7 @@ def database() -> tuple[Profile, ...]:
     """
     spec = find_spec("lensfunpy")
     if spec is None or not spec.submodule_search_locations:
-        expected = 'lensfunpy, which brings the profiles: pip install "neurolens[photographs]"'
+        expected = f"lensfunpy, which brings the profiles: {pip_install('photographs')}"
         raise InputError("verify", "photographs", "(not installed)", expected)
     folder = Path(next(iter(spec.submodule_search_locations))) / "db_files"
     found: list[Profile] = []

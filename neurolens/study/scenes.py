@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.analysis.plots import drawing, plain_log_ticks
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError, pip_install
 from neurolens.base.progress import Report
 from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera, FloatArray
@@ -105,9 +105,7 @@ def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise NeurolensError(
-            "FLIP needs flip-evaluator: pip install 'neurolens[train]', or '.[train]' in a checkout"
-        ) from error
+        raise NeurolensError(f"FLIP needs flip-evaluator: {pip_install('train')}") from error
     pictures = (np.ascontiguousarray(to_srgb(x), dtype=np.float32) for x in (b, a))
     options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
     errors, _, _ = flip_evaluator.evaluate(*pictures, "LDR", **options)
