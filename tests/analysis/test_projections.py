@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -14,6 +15,7 @@ from neurolens import handover as files
 from neurolens.analysis.projections import NAMES, Projection, fit, has_pole, inverse_polynomial, residual
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import Field, field_of
+from neurolens.cli import main
 from neurolens.cli import stmap as command
 from neurolens.lens.shot import Shot
 from tests.command_line import failure, run_json
@@ -119,6 +121,32 @@ def test_a_projection_that_turns_back_says_so() -> None:
     left = residual(found, beyond, found.project(beyond))
     assert not left.sound and left.fold_deg == pytest.approx(math.degrees(fold), abs=0.1)
     assert np.isnan(found.project(np.array([0.0, 0.1, -1.0]))).all()
+
+
+def test_parallax_is_the_walk_of_the_entrance_pupil(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """A fisheye's pupil moves by millimetres: one centre is off by tens of pixels of what is near, an ideal camera's
+    by none, and what is twice as far from the pupil is off by half."""
+    words = ("--width", "3840", "--film", "18x18", "--quiet", "--focus", "1", "--projection", "kannala-brandt")
+    near = {}
+    for metres in (0.5, 0.8):
+        told = run_json(capsys, "projection", FISHEYE, *words, "--near", metres, "-o", tmp_path / "a")
+        far, close = told["parallax"]
+        assert far["distance_m"] == "infinity" and close["distance_m"] == metres and told["rms_px"] < 0.1
+        near[metres] = close["worst_px"], 1 / (metres - told["before_film_mm"][0] / 1000)
+        one = 1 / (1 - told["before_film_mm"][0] / 1000)
+        # Proportional to the difference of reciprocal distances from the pupil, to a first approximation.
+        assert close["worst_px"] / far["worst_px"] == pytest.approx((near[metres][1] - one) / one, rel=0.2)
+        assert far["worst_px"] > 20
+    assert main(["projection", str(FISHEYE), *words]) == 0
+    assert re.search(r"parallax in pixels.*at infinity \S+ RMS, \S+ at most", capsys.readouterr().out)
+    ideal = run_json(capsys, "projection", "fisheye-equidistant", *words)
+    assert all(row["worst_px"] < 0.01 for row in ideal["parallax"])
+
+
+def test_the_rim_of_the_light_is_no_fold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fisheye's light ends at 18.8 mm of this film, and its mean steps back by 5 um in the last thousandth."""
+    field = field_of_camera(ROOT / "lenses" / "isshiki_fisheye_10.toml")
+    assert 18.5 < field.end_mm < 19 and (np.diff(np.abs(field.ideal(np.linspace(0, field.end_mm, 999) + 0j))) > 0).all()
 
 
 @pytest.mark.parametrize("camera", [GAUSS, ROOT / "models" / "nikon_zoom_14_24.ols-64.onnx"])
