@@ -1,4 +1,4 @@
-"""Lens tables broken on purpose: whether `neurolens verify --check` finds the fault, and names the right change.
+"""Lens tables broken on purpose: whether the check of `table_faults` finds the fault, and names the change.
 
 The tables are the primes of OpticsDatabase (github.com/amegahed/OpticsDatabase, MIT licence; its folder is to be named)
 whose match with a profile of lensfun is certain and whose distortion was measured. Each is broken once in every kind
@@ -23,12 +23,11 @@ import torch
 
 from experiments import lab
 from experiments.lab import Row
+from experiments.table_faults import ONE_OF, alarm, changed, check, glasses, opened_at, swapped, transposed
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.faults import alarm, changed, check, glasses, swapped, transposed
 from neurolens.photographs.figures import Measures, measure
 from neurolens.photographs.profiles import Profile
-from neurolens.photographs.rims import at_focal_length
 from neurolens.photographs.verify import found_for
 from neurolens.readers.any_format import read_any
 
@@ -100,7 +99,7 @@ def of_folder(folder: Path, only: str, quiet: bool) -> list[tuple[str, str, Lens
 def rows_of(lens: Lens, profile: Profile, seed: str, named: bool) -> list[Row]:
     """The sound table, and each of its broken ones."""
     focal = sorted(r.focal_mm for r in profile.distortion)[len(profile.distortion) // 2]
-    lens = at_focal_length(lens, focal)
+    lens = opened_at(lens, profile, focal)
     some = random.Random(seed)
 
     def figures(table: Lens) -> Measures:
@@ -126,8 +125,9 @@ def rows_of(lens: Lens, profile: Profile, seed: str, named: bool) -> list[Row]:
 def _line(kind: str, rows: Sequence[Row]) -> list[str]:
     found, asked = [r for r in rows if r["alarm"] > 1], [r for r in rows if "said" in r]
     sound = [r for r in asked if r["change"]]
-    right = [r for r in sound if r["right"] in f"{r['change']} "]
-    first = [r for r in right if r["right"] in f"{r['change'].split(' or at')[0]} "]
+    named = [(r["right"], [f"{one} " for one in r["change"].removeprefix(ONE_OF).split("; ")]) for r in sound]
+    right = [(own, each) for own, each in named if any(own in one for one in each)]
+    first = [own for own, each in right if own in each[0]]
     share = f"{100 * len(found) / max(len(rows), 1):.0f}%"
     return [
         kind,
@@ -162,10 +162,10 @@ def page(groups: dict[str, list[list[Row]]]) -> str:
             for name, column in zip(Measures._fields, figures.T, strict=True)]  # fmt: skip
     return lab.page(
         "# Lens tables broken on purpose",
-        f"`python -m experiments photographs-faults FOLDER`: what `verify --check` finds; {lab.machine_line()}",
+        f"`python -m experiments photographs-faults FOLDER`: what `table_faults` finds; {lab.machine_line()}",
         "## Faults", lab.table("kind|tables|found|asked for|told|the right one among them|it is first", lines),
-        "The right change of a dropped asphere is that at its surface (up to four are told); several are no single "
-        "change. Only tables that raise no alarm are broken.",
+        "Up to four changes that fit alike are told; the right one of a dropped asphere is at its surface; several "
+        "are no single change. Only tables that raise no alarm are broken.",
         "## Alarms of tables as they are", lab.table("tables|tables|alarms", alarms),
         "## Figures of tables as they are (certain matches)", lab.table("figure|50%|90%|95%|98%", told),
     )  # fmt: skip

@@ -41,6 +41,8 @@ SIDE = 2049  # of NVIDIA's exit picture
 _NEAR = 1.0  # pictures beyond the edge, so that what is read between pixels is right up to it
 _TRIED = 3  # each of so many is tried
 _FITTED, _HELD_OUT = (61, 41), (50, 34)  # points over the film
+_ALONG = 2049  # from its centre to its corner
+_BESIDE_PX = 2.0  # about where a ratio is sharpest
 AtStop = Callable[[float | None], Camera]
 Report = Callable[[float], None]
 
@@ -239,7 +241,9 @@ def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float
             k[: len(terms)] = np.linalg.lstsq((start * terms).T, goal - start, rcond=_LEAST)[0]
             missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) - ratio) * start
             by_mm = k.reshape(2, 3) / start[-1] ** np.array([2, 4, 6])
-            fits.append((float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
+            # The last place stands for 1, and is the widest.
+            pole = projections.has_pole(k[3:].tolist(), 1.0)
+            fits.append((math.inf if pole else float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
             if fits[-1][0] < _GOOD_PX:
                 break
         left, radial = min(fits, key=lambda fit: fit[0])
@@ -348,8 +352,12 @@ def fitted_projection(
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
         focal = focal[0], focal[0]
-    fitted = projections.fit(kind, *_shown(field, size, film_mm), size, focal, source)
-    left = projections.residual(fitted, *_shown(field, size, film_mm, _HELD_OUT))
+    fitted = projections.fit(kind, *_shown(field, size, film_mm, lit_points(field, film_mm)), size, focal, source)
+    ring = fitted.sharp_rad[:, None] + _BESIDE_PX / fitted.focal_px[0] * np.linspace(-1, 1, 33)
+    ring = ring[(ring > 0) & (ring < fitted.widest_rad)]
+    beside = field.point(np.stack([np.sin(ring), 0 * ring, np.cos(ring)]))
+    points = np.concatenate([lit_points(field, film_mm, _HELD_OUT), film_points(field, film_mm, _ALONG), beside])
+    left = projections.residual(fitted, *_shown(field, size, film_mm, points))
     rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
     data: dict[str, Any] = {
         "camera": source,
@@ -369,11 +377,8 @@ def fitted_projection(
     return fitted, left, data
 
 
-def _shown(
-    field: Field, size: tuple[int, int], film_mm: tuple[float, float], points: tuple[int, int] = _FITTED
-) -> tuple[Any, Any]:
-    """Unit directions [N, 3] and pixels [N, 2], in OpenCV's frame, of points spread over the lit picture."""
-    point = lit_points(field, film_mm, points)
+def _shown(field: Field, size: tuple[int, int], film_mm: tuple[float, float], point: Complex) -> tuple[Any, Any]:
+    """Unit directions [N, 3] and pixels [N, 2], in OpenCV's frame, of points of the picture."""
     pixel = np.stack([(point.real / film_mm[0] + 0.5) * size[0], (0.5 - point.imag / film_mm[1]) * size[1]], 1)
     return field.directions(point).T * [1, -1, 1], pixel - 0.5
 

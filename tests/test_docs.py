@@ -37,7 +37,7 @@ NODE = "onnxruntime-node@1.30"
 # What takes long in how-tos and is run by the first hour or by tests of the command: a block's commands
 # from the first of these on run with NEUROLENS_WHOLE=1.
 LONG = re.compile(
-    r"^neurolens (?:analyse|train|plan|handover|rims|verify [^\n]*--check|export [^\n]*--to osl)\b.*",
+    r"^neurolens (?:analyse|train|plan|handover|rims|export [^\n]*--to osl)\b.*",
     re.MULTILINE | re.DOTALL,
 )
 

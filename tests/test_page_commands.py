@@ -2,8 +2,11 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -12,7 +15,7 @@ from experiments.__main__ import build_parser as experiments_parser
 from neurolens.base import lensname
 from neurolens.base.errors import NeurolensError
 from neurolens.base.lensname import Named, split_kind
-from neurolens.cli import build_parser
+from neurolens.cli import build_parser, main
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "pages").rglob("*.md")), ROOT / "models" / "README.md"]
@@ -101,3 +104,42 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
                 with suppress(NeurolensError):  # packages that a measurement brings in an environment of its own
                     asked = experiments_parser(words).parse_args(words)
                     made |= {Path(asked.output)} if getattr(asked, "output", None) else set()
+
+
+# The README's lines run in a smaller size: what stands on the left is replaced.
+SMALLER = {"--width 3840": "--width 96"}
+# Lines that take minutes even so: tests of these commands run them on small input.
+LONG = re.compile(r"neurolens (train|survey|plan|demo|analyse|blender|view|export \S+ --to osl|render|defocus|flare)\b")
+
+
+def test_lines_of_the_readme_run_and_leave_nothing_that_lint_or_git_sees(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("lenses", "models", "experiments", "pyproject.toml", ".gitignore"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    before = set(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    printed = [
+        line.strip() for line in PAGES[0].read_text(encoding="utf-8").splitlines() if line.startswith("    neur")
+    ]
+    ran = []
+    for line in printed:
+        if LONG.match(line) or "verify" in line and find_spec("lensfunpy") is None:
+            continue
+        for printed_size, smaller in SMALLER.items():
+            line = line.replace(printed_size, smaller)
+        assert main([*shlex.split(line, comments=True)[1:], "--quiet"]) == 0, line
+        ran.append(line.split()[1])
+    assert {"stmap", "handover", "convert", "projection", "export"} <= set(ran)
+    made = sorted(set(tmp_path.iterdir()) - before)
+    assert made and list(tmp_path.glob("shot/*.blender.py"))
+    ignored = subprocess.run(
+        ["git", "-C", ROOT, "check-ignore", *(file.name for file in made)], capture_output=True, text=True
+    )
+    if ignored.returncode != 128:  # a checkout
+        assert ignored.stdout.split() == [file.name for file in made]
+    lint = [sys.executable, "-m", "ruff"]
+    if find_spec("ruff") is not None:
+        for words in (["check", "."], ["format", "--check", "."]):
+            found = subprocess.run([*lint, *words, "--no-cache"], capture_output=True, text=True)
+            assert found.returncode == 0, found.stdout

@@ -16,6 +16,7 @@ NVIDIA, documentation of NCore, sensor models.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -37,6 +38,11 @@ NAMES = {
 PLANAR = ("opencv", "opencv-rational")
 WIDEST_DEG = 85.0  # of what is divided by z
 _FIXED = ("p1", "p2")
+_RATIO = ("k4", "k5", "k6")  # of the denominator
+_REACH = (
+    1.25  # over the widest angle's radius: so far a ratio has no pole, for programs show a margin beyond the picture
+)
+_ROUNDING = 1e-6  # imaginary part of a real root over its size
 _TINY = 1e-24  # square of the sine below which the axis begins
 _NOT_FOLDED = 179.0, 89.9  # degrees to which a fold is looked for, about the lens and on the plane
 _ANGLES = 4097  # that are tried for it
@@ -104,6 +110,19 @@ class Projection:
         rising = (np.diff(radius, axis=0) > 0).all(axis=1)
         return end if rising.all() else float(angle[rising.argmin(), 0])
 
+    @property
+    def pole(self) -> bool:
+        """Whether a denominator is zero within the picture."""
+        bottom = [self.named.get(name, 0.0) for name in _RATIO]
+        return self.kind in PLANAR and has_pole(bottom, (_REACH * math.tan(self.widest_rad)) ** 2)
+
+    @property
+    def sharp_rad(self) -> Array:
+        """Angles of the picture at which a denominator is least: rings that points on a grid may miss."""
+        at = roots([self.named.get(name, 0.0) for name in _RATIO]).real if self.kind in PLANAR else np.zeros(0)
+        angle = np.arctan(np.sqrt(at[at > 0]))
+        return np.asarray(angle[angle <= self.widest_rad])
+
     def _distance(self, coefficients: NDArray[Any], angle: Array) -> Any:
         if self.kind == "f-theta":
             return angle * _series(coefficients, angle)
@@ -113,6 +132,19 @@ class Projection:
 def _series(coefficients: NDArray[Any], x: Array) -> Any:
     """A polynomial, lowest coefficient first."""
     return np.polynomial.polynomial.polyval(x, coefficients)
+
+
+def roots(bottom: Sequence[float]) -> NDArray[np.complex128]:
+    """The x at which 1 + k x + l x^2 + ... is zero."""
+    return np.asarray(np.roots([*reversed(bottom), 1.0]), np.complex128)
+
+
+def has_pole(bottom: Sequence[float], widest: float) -> bool:
+    """Whether 1 + k x + l x^2 + ... is zero for a real x from 0 to the widest."""
+    at = roots(bottom)
+    # Two real roots that are close come out of the rounding as a pair with small imaginary parts.
+    real = np.abs(at.imag) <= _ROUNDING * np.abs(at)
+    return bool((real & (at.real > 0) & (at.real <= widest)).any())
 
 
 def _bent(kind: str, c: NDArray[Any], x: Array, y: Array) -> tuple[Any, Any]:
@@ -174,7 +206,12 @@ def fit(
     if len(pixel) < 2 * len(NAMES[kind]) + 2:
         raise InputError(source, "picture", f"({len(pixel)} lit points)", "a picture that light reaches")
     start = Projection(kind, size, focal_px, (0.0,) * len(NAMES[kind]), widest)
-    return _adjusted(start, direction, pixel, focal_px[0] == focal_px[1])
+    # A ratio with a term too many spends it on a pole beside a zero: terms of the denominator go until none is there.
+    for dropped in range(4 if kind == "opencv-rational" else 1):
+        found = _adjusted(start, direction, pixel, focal_px[0] == focal_px[1], _RATIO[len(_RATIO) - dropped :])
+        if not found.pole:
+            break
+    return found
 
 
 def _angle(direction: Array) -> Array:
@@ -202,13 +239,15 @@ def _rms(values: Array) -> float:
     return math.sqrt(np.mean(values**2))
 
 
-def _adjusted(start: Projection, direction: Array, pixel: Array, round_: bool) -> Projection:
-    """The projection whose numbers, found from the paraxial ones, have the least squares of distances."""
+def _adjusted(
+    start: Projection, direction: Array, pixel: Array, round_: bool, dropped: Sequence[str] = ()
+) -> Projection:
+    """The projection whose numbers, found from the paraxial ones, have the least squares of distances; some stay 0."""
     theta = start.kind == "f-theta"
     first, tied = start.numbers, round_ and not theta
     if theta:
         first[:3] = start.focal_px[0] / start.focal_px[1], 1.0, start.focal_px[1]
-    free = [k + 2 for k, name in enumerate(NAMES[start.kind]) if name not in _FIXED]
+    free = [k + 2 for k, name in enumerate(NAMES[start.kind]) if name not in (*_FIXED, *dropped)]
     free += ([] if theta and round_ else [0]) + ([] if theta or tied else [1])
 
     def numbers(x: NDArray[Any]) -> NDArray[Any]:

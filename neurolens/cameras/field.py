@@ -15,7 +15,7 @@ entrance pupil's centre, for that moves with the field: `Field.parallax_mm` says
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -41,6 +41,7 @@ _FINER = 64, 4  # rings (and azimuths) of the map back over those of the map the
 _EDGE = 16  # points on each side of the film
 _TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
 _HALVINGS = 24
+_DIM = 2e-3  # of the light on the axis, nine stops below it: from there on places go straight on
 _STEPS = 6  # of Newton's method
 _SMALL = 0.004  # of the radius: where the size on the axis is measured, of cameras that do not know it
 
@@ -362,6 +363,8 @@ def field_of(
     widest = math.degrees(float(np.where(found.light > 0, found.angle, 0.0).max()))
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
+    # At the very rim few samples of the pupil are lit, and their mean steps to and fro: that is no fold.
+    place = np.where(found.light < _DIM * found.light[0], np.nan, place)
     place = _filled(place.reshape(rings, azimuths))
     rising = (np.diff(np.abs(place - place[:1]), axis=0) > 0).all(1)
     if not rising.all():
@@ -373,6 +376,16 @@ def field_of(
     parallax = {d: float(np.nanmax(m, initial=0.0)) for d, m in moved.items()}
     light = light / light[0].mean()
     return Field(ideal, _inverted(ideal), frame, target, end, widest, light, parallax, spectrum)
+
+
+def parallax_mm(camera: Any, field: Field, point: Complex, distances_m: Sequence[float]) -> dict[float, Complex]:
+    """By distance from the film (m), how far lit picture points [N] are from where the field puts what they show."""
+
+    def moved(distance_m: float) -> Complex:
+        seen = traced_light(camera, point, field.spectrum, field.frame, field.target, distance_m)
+        return (field.picture(seen.place) - point)[(seen.light > 0) & np.isfinite(seen.place)]
+
+    return {d: moved(d) for d in distances_m}
 
 
 def film_edge(film_mm: tuple[float, float]) -> Complex:

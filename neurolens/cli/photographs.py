@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neurolens.base.errors import InputError
 from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
 
@@ -30,12 +29,10 @@ class Verify(cli.Reporting):
 examples:
   neurolens verify lenses/sony_sonnar_55.toml -o sonnar.png
   neurolens verify "Nikon AF Nikkor 28mm f1.4D.zmx" --json
-  neurolens verify my_lens.toml --check
   neurolens verify my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --lens-file my_verified_lens.toml"""
     kept = "only a finished picture or lens file is written"
 
     file: Path = cli.lens(positional=True)
-    check: bool = setting(False, "look for wrong figures in the table, and try single changes that make it sound")
     profile: str | None = setting(None, "lensfun's name of the lens, where it is not found by itself", metavar="NAME")
     out: Path | None = cli.output_path("OUT.png", "draw measured points and computed curves (png, pdf, svg)", None)
     lens_file: Path | None = setting(
@@ -45,23 +42,11 @@ examples:
 
     def run(self) -> int:
         """Compare, draw, write."""
-        from neurolens.photographs.faults import check
-        from neurolens.photographs.verify import FREE, found_for, plot_verified, verify
+        from neurolens.photographs.verify import FREE, plot_verified, verify
         from neurolens.readers.any_format import read_any
 
         tabled = read_any(self.file)
-        checked = None
-        if self.check and not tabled.anamorphic:
-            checked = check(tabled, found_for(tabled, self.profile, any_focal=True)[1][0])
-        try:
-            found = verify(tabled, self.profile)
-        except InputError as error:
-            if checked is None or not checked.doubtful or self.out or self.lens_file:
-                raise
-            # A table so wrong that its focal length is another's: what the check says is the answer.
-            lines = [tabled.name, str(error), *(f"- {sentence}" for sentence in checked.said)]
-            data = {"file": str(self.file), "name": tabled.name, "reason": str(error), "check": checked.to_dict()}
-            return self.answer(data, lambda: "\n".join(lines))
+        found = verify(tabled, self.profile)
         if self.out is not None:
             plot_verified(found, self.out, tabled.believed_to_be or tabled.name)
         if self.lens_file is not None:
@@ -70,9 +55,7 @@ examples:
             write_lens(replace(tabled, measured=tuple(found.measured.items())), self.lens_file)
         files = [str(path) for path in (self.out, self.lens_file) if path is not None]
         data = {"file": str(self.file), "name": tabled.name, **found.to_dict(), "measured": found.measured}
-        data |= {"check": checked.to_dict()} if checked else {}
-        last = [*(f"- {sentence}" for sentence in (checked.said if checked else ())), FREE, *files]
-        return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, last))
+        return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, [FREE, *files]))
 
 
 def _text(found: Verified, name: str, last: list[str]) -> str:

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from neurolens import __version__
 from neurolens.base import lensname
 from neurolens.base.errors import InputError, warn
@@ -19,7 +21,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.settings import positive, setting
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.field import Field, field_of, frame_of, spectrum_of
+from neurolens.cameras.field import Complex, Field, field_of, frame_of, parallax_mm, spectrum_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
 from neurolens.lens.shot import Shot
@@ -31,6 +33,7 @@ from neurolens.render.stmap import Plates, illumination_map, plates_of, redistor
 Maker = Callable[[Field, Plates, Callable[[float], None]], dict[str, FloatArray]]
 _LARGEST = 16384  # pixels a side
 LIGHT_NM = (400.0, 700.0)
+_SEEN = 17, 11  # points of the film, whose parallax is told
 # Dominant wavelengths of the primaries of Rec. 709 (and sRGB), for light of D65.
 _CHANNELS_NM = (611.4, 549.1, 464.2)
 _NAMES = ("red", "green", "blue")
@@ -310,7 +313,8 @@ class Projection(PictureCommand):
       opencv            fx fy cx cy, k1 k2 p1 p2 k3      opencv-rational   and k4 k5 k6
       kannala-brandt    OpenCV's fisheye, k1 k2 k3 k4    f-theta           NVIDIA's polynomials, both ways
 
-    Directions are those of the light's centroid at this stop, from the lens's entrance pupil to what is in focus. With
+    Directions are those of the light's centroid at this stop, from the lens's entrance pupil to what is in focus; what
+    things at infinity and at --near are off by, since that pupil moves with the field, is told as parallax. With
     -o NAME: NAME.yaml for OpenCV's FileStorage, NAME.json for nerfstudio (its camera block; cx, cy from the corner of
     the first pixel, OpenCV's from its centre), NVIDIA's names for f-theta. A projection that turns back within the
     field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (scipy)."""
@@ -324,11 +328,15 @@ examples:
     projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta"] = setting(
         ..., "the projection to fit", old=("model",)
     )
+    near: float = setting(
+        0.3, "distance from the film to the nearest thing that is seen, whose parallax is told (default: 0.3)",
+        kind=positive("a distance in metres"), metavar="M",
+    )  # fmt: skip
     out: Path | None = cli.output_path("NAME", "write NAME.json and, for OpenCV's, NAME.yaml", None)
 
     def run(self) -> int:
         """Trace, fit, write."""
-        from neurolens.handover import fitted_projection, write_projection
+        from neurolens.handover import film_points, fitted_projection, lit_points, write_projection
 
         out, progress = self.out, self.progress()
         if out is not None and out.suffix in (".json", ".yaml"):  # the name of a file that will be written
@@ -338,11 +346,27 @@ examples:
             field = field_of(camera, shot.focus_m, "equidistant", spectrum=spectrum_of(camera, LIGHT_NM))
         with progress.stage(f"fit {self.projection}"):
             fitted, left, data = fitted_projection(self.projection, field, self.picture, self.film, str(self.camera))
+        distances = [d for d in (math.inf, self.near) if d > 1e-3 * max(field.frame.pupil_mm) and d != shot.focus_m]
+        points = np.concatenate([lit_points(field, self.film, _SEEN), film_points(field, self.film)])
+        pixel = self.film[0] / self.picture[0], self.film[1] / self.picture[1]
+        with progress.stage("trace other distances"):
+            moved = parallax_mm(camera, field, points[field.lit(points)], distances)
+        data["parallax"] = [{"distance_m": d, **_in_pixels(mm, pixel)} for d, mm in moved.items() if mm.size]
         data["files"] = write_projection(out, fitted, data) if out is not None else []
         if not left.sound:
             told = f"turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}"
             warn(f"{self.projection} {told}")
         return self.answer(data, lambda: _projection_text(data))
+
+
+def _where(distance_m: float) -> str:
+    return "at infinity" if math.isinf(distance_m) else f"{distance_m:g} m from the film"
+
+
+def _in_pixels(moved_mm: Complex, pixel_mm: tuple[float, float]) -> dict[str, float]:
+    """Root mean square and worst of displacements."""
+    px = np.hypot(moved_mm.real / pixel_mm[0], moved_mm.imag / pixel_mm[1])
+    return {"rms_px": float(np.sqrt(np.mean(px**2))), "worst_px": float(px.max())}
 
 
 def _projection_text(data: dict[str, Any]) -> str:
@@ -357,6 +381,16 @@ def _projection_text(data: dict[str, Any]) -> str:
         f"leaves {data['rms_px']:.3g} pixels RMS, {worst}",
         cli.table(("field, degrees", "RMS px", "worst px"), [(f"{a} to {b}", rms, most) for a, b, rms, most in spans]),
     ]
+    lines[2] += " of what is in focus"
+    if data["parallax"]:
+        told = [
+            f"{_where(p['distance_m'])} {p['rms_px']:.2g} RMS, {p['worst_px']:.2g} at most" for p in data["parallax"]
+        ]
+        before = " x ".join(dict.fromkeys(cli.number(v, 4) for v in data["before_film_mm"]))
+        lines.append(
+            f"parallax in pixels, for the entrance pupil moves with the field, but a projection has one centre, here "
+            f"{before} mm before the film: {'; '.join(told)}"
+        )
     if data["model"] == "kannala-brandt" and data["field_deg"] >= 90:
         lines.append("OpenCV's own functions end at 90 degrees, for they divide by z")
     return "\n".join([*lines, *data["files"]])

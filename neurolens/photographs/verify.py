@@ -56,6 +56,11 @@ class Curve(Result):
         off = off[np.isfinite(off)]
         return float(np.sqrt(np.mean(off**2))) if len(off) else math.nan
 
+    @property
+    def worst(self) -> float:
+        """The largest difference."""
+        return float(np.nanmax(np.abs(self.measured - self.computed)))
+
 
 @dataclass(frozen=True)
 class Comparison(Result):
@@ -159,6 +164,25 @@ class Verified(Result):
             f_number = min(c.light_stops) if widest else near_f8(c.light_stops)
             each.append(c.light_stops[f_number].rms)
         return _median(each)
+
+    def told(self, figure: str, unit: str) -> str:
+        """The residual of "distortion" or of "light" at the widest aperture: its median over focal lengths and its
+        worst, of distortion as a root mean square, of light at any height."""
+        known = self.curves(figure)
+        middle = f"median RMS {median(c.rms for _, c in known):.2g}"
+        if figure == "distortion":
+            focal, curve = max(known, key=lambda pair: pair[1].rms)
+            return f"{middle}, worst {curve.rms:.2g}{unit} at {focal:g} mm"
+        focal, curve = max(known, key=lambda pair: pair[1].worst)
+        return f"{middle}, worst {curve.worst:.2g}{unit} at {focal:g} mm"
+
+    def curves(self, figure: str) -> list[tuple[float, Curve]]:
+        """Focal lengths with their curves of that figure, as far as they are known."""
+        if figure == "distortion":
+            each = [(c.focal_mm, c.distortion_percent) for c in self.comparisons]
+        else:
+            each = [(c.focal_mm, c.light_stops[min(c.light_stops)]) for c in self.comparisons if c.light_stops]
+        return [(mm, curve) for mm, curve in each if curve is not None and math.isfinite(curve.rms)]
 
     @property
     def measured(self) -> dict[str, Any]:
@@ -280,8 +304,10 @@ def _said(found: Verified, fitted: bool) -> list[str]:
     else:
         word = "contradict each other" if slack > DOUBTFUL_PERCENT else "differ"
         own = f" (two cameras {word} by {slack:.2g}%)" if math.isfinite(slack) else ""
-        sound = "agree" if off <= SOUND_PERCENT else "roughly agree" if off <= DOUBTFUL_PERCENT else "disagree"
-        lines.append(f"the figures {sound} with the photographs: distortion within {off:.2g}% of the image height{own}")
+        most = max(curve.rms for _, curve in found.curves("distortion"))
+        sound = "agree" if most <= SOUND_PERCENT else "roughly agree" if off <= DOUBTFUL_PERCENT else "disagree"
+        told = found.told("distortion", "% of the image height")
+        lines.append(f"the figures {sound} with the photographs: distortion {told}{own}")
     lines.append(_said_of_light(found, fitted))
     if found.certainty != "certain":
         lines.append(f"the match of the names is only {found.certainty}")
@@ -293,13 +319,15 @@ def _said_of_light(found: Verified, fitted: bool) -> str:
     if math.isnan(wide):
         return "light was not measured"
     if wide <= SOUND_STOPS:
-        return f"the rims agree with the photographs: light wide open within {wide:.2g} stops"
+        sound = "agree" if all(c.rms <= SOUND_STOPS for _, c in found.curves("light")) else "roughly agree"
+        return f"the rims {sound} with the photographs: light wide open {found.told('light', ' stops')}"
     curves = [c.light_stops[min(c.light_stops)] for c in found.comparisons if c.light_stops]
     word = "darker" if _median(float(np.nanmean(c.measured - c.computed)) for c in curves) < 0 else "brighter"
     if closed > SOUND_STOPS:
-        return f"the real lens is {word} by {wide:.2g} stops, at f/8 by {closed:.2g}: rims alone cannot explain that"
+        off = f"{found.told('light', ' stops')}; at f/8 by median RMS {closed:.2g}"
+        return f"the real lens is {word} wide open, {off}: rims alone cannot explain that"
     cause = "more than rims can explain" if fitted else "its rims are others (see neurolens rims)"
-    return f"the real lens is {word} wide open by {wide:.2g} stops: {cause}"
+    return f"the real lens is {word} wide open, {found.told('light', ' stops')}: {cause}"
 
 
 _MOST = 6  # apertures, or focal lengths, that are drawn

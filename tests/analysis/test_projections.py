@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -11,9 +12,10 @@ import numpy as np
 import pytest
 
 from neurolens import handover as files
-from neurolens.analysis.projections import NAMES, Projection, fit, inverse_polynomial, residual
+from neurolens.analysis.projections import NAMES, Projection, fit, has_pole, inverse_polynomial, residual
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import Field, field_of
+from neurolens.cli import main
 from neurolens.cli import stmap as command
 from neurolens.lens.shot import Shot
 from tests.command_line import failure, run_json
@@ -100,9 +102,9 @@ def test_closed_forms_of_ideal_cameras() -> None:
         ("pinhole", "opencv", 50.0, {"k1": 0.0, "k2": 0.0}),
     ):
         field = field_of_camera(spec)
-        points = files._shown(field, SIZE, FILM)
+        points = files._shown(field, SIZE, FILM, files.lit_points(field, FILM))
         found = fit(kind, *points, SIZE, (focal / pixel, focal / pixel))
-        left = residual(found, *files._shown(field, SIZE, FILM, (40, 30)))
+        left = residual(found, *files._shown(field, SIZE, FILM, files.lit_points(field, FILM, (40, 30))))
         assert left.worst_px < 2e-3 and left.sound
         least = 0.01 if kind == "f-theta" else 2e-4  # pixels, or a share
         assert {k: found.named[k] for k in expected} == pytest.approx(expected, abs=least, rel=1e-4)
@@ -121,8 +123,71 @@ def test_a_projection_that_turns_back_says_so() -> None:
     assert np.isnan(found.project(np.array([0.0, 0.1, -1.0]))).all()
 
 
+def test_parallax_is_the_walk_of_the_entrance_pupil(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """A fisheye's pupil moves by millimetres: one centre is off by tens of pixels of what is near, an ideal camera's
+    by none, and what is twice as far from the pupil is off by half."""
+    words = ("--width", "3840", "--film", "18x18", "--quiet", "--focus", "1", "--projection", "kannala-brandt")
+    near = {}
+    for metres in (0.5, 0.8):
+        told = run_json(capsys, "projection", FISHEYE, *words, "--near", metres, "-o", tmp_path / "a")
+        far, close = told["parallax"]
+        assert far["distance_m"] == "infinity" and close["distance_m"] == metres and told["rms_px"] < 0.1
+        near[metres] = close["worst_px"], 1 / (metres - told["before_film_mm"][0] / 1000)
+        one = 1 / (1 - told["before_film_mm"][0] / 1000)
+        # Proportional to the difference of reciprocal distances from the pupil, to a first approximation.
+        assert close["worst_px"] / far["worst_px"] == pytest.approx((near[metres][1] - one) / one, rel=0.2)
+        assert far["worst_px"] > 20
+    assert main(["projection", str(FISHEYE), *words]) == 0
+    assert re.search(r"parallax in pixels.*at infinity \S+ RMS, \S+ at most", capsys.readouterr().out)
+    ideal = run_json(capsys, "projection", "fisheye-equidistant", *words)
+    assert all(row["worst_px"] < 0.01 for row in ideal["parallax"])
+
+
+def test_the_rim_of_the_light_is_no_fold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fisheye's light ends at 18.8 mm of this film, and its mean steps back by 5 um in the last thousandth."""
+    field = field_of_camera(ROOT / "lenses" / "isshiki_fisheye_10.toml")
+    assert 18.5 < field.end_mm < 19 and (np.diff(np.abs(field.ideal(np.linspace(0, field.end_mm, 999) + 0j))) > 0).all()
+
+
+@pytest.mark.parametrize("camera", [GAUSS, ROOT / "models" / "nikon_zoom_14_24.ols-64.onnx"])
+def test_a_ratio_has_no_pole_in_its_picture(camera: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two lenses to which six free terms put a pole beside a zero: at every thousandth of a pixel the place is near
+    that of the lens, and beyond the corner no denominator is zero for another tenth."""
+    monkeypatch.setattr("neurolens.cameras.field._ROUND", (129, 1))
+    field = field_of_camera(camera)
+    found, left, _ = files.fitted_projection("opencv-rational", field, SIZE, FILM, "here")
+    end = 1.1 * math.tan(found.widest_rad)
+    x = np.linspace(0, end, round(1000 * end * found.focal_px[0])) ** 2
+    k1, k2, _, _, k3, k4, k5, k6 = found.coefficients
+    assert (1 + x * (k4 + x * (k5 + x * k6))).min() > 0.05
+    assert (
+        np.abs(np.diff(np.sqrt(x) * (1 + x * (k1 + x * (k2 + x * k3))) / (1 + x * (k4 + x * (k5 + x * k6))))).max()
+        < 1e-5
+    )
+    assert left.worst_px < 0.1
+
+
+def test_poles_are_found_by_the_roots_of_the_denominator() -> None:
+    """(1 - x) (1 - x / 9), a double root, a pair of roots that are not real, and a root beyond the picture."""
+    assert has_pole([-10 / 9, 1 / 9, 0.0], 1.5) and not has_pole([-10 / 9, 1 / 9, 0.0], 0.99)
+    assert has_pole([-2.0, 1.0, 0.0], 1.5) and not has_pole([-2.0, 1.01, 0.0], 1.5)
+    assert not has_pole([0.0, 0.0, 0.0], 10.0) and not has_pole([145.73, 2.0, 1.0], 10.0)
+
+
+def test_the_ring_where_a_ratio_is_sharpest_is_known() -> None:
+    """A ratio whose denominator all but reaches zero 43 pixels from the centre."""
+    x = 0.0017  # r^2 there
+    sharp = Projection(
+        "opencv-rational", SIZE, (1044.5, 1044.5), (-2 / x, 1 / x**2, 0, 0, 0, -2 / x, 1.0000001 / x**2, 0), 0.7
+    )
+    (angle, _) = sharp.sharp_rad
+    assert not sharp.pole and 1044.5 * math.tan(angle) == pytest.approx(43.07, abs=0.01)
+
+
 def test_f_theta_goes_both_ways() -> None:
-    found = fit("f-theta", *files._shown(field_of_camera("fisheye-stereographic"), SIZE, FILM), SIZE, (746.7, 746.7))
+    field = field_of_camera("fisheye-stereographic")
+    points = files._shown(field, SIZE, FILM, files.lit_points(field, FILM))
+    found = fit("f-theta", *points, SIZE, (746.7, 746.7))
     angle = np.linspace(0, found.widest_rad, 50)
     radius = sum(a * angle ** (k + 1) for k, a in enumerate(found.coefficients))
     back = sum(b * radius ** (k + 1) for k, b in enumerate(inverse_polynomial(found)))

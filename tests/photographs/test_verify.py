@@ -116,6 +116,15 @@ def test_the_sonnar_against_photographs() -> None:
     assert all(curve.rms < 0.2 for curve in c.light_stops.values())
 
 
+def test_the_verdict_states_the_worst_beside_the_median() -> None:
+    """The table of this zoom has 0.41 stops in the corner at 135 mm, and 0.11% RMS of distortion at 104 mm."""
+    pytest.importorskip("lensfunpy")
+    distortion, light = verify(lens_of("nikon_zoom_70_200")).verdict[:2]
+    assert "roughly agree" in distortion and "median RMS 0.052, worst 0.11% of the image height at 104 mm" in distortion
+    assert "roughly agree" in light and "median RMS 0.077, worst 0.41 stops at 135 mm" in light
+    assert "within" not in distortion + light
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.analysis.fields import Result
+from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.figures import Measures, measure
 from neurolens.photographs.profiles import Profile
@@ -26,7 +28,9 @@ _UNITS = {10.0: "centimetres", 25.4: "inches"}
 _OF_TERMS = (-1.0, "the sign"), (10.0, "the exponent (10 times)"), (0.1, "the exponent (a tenth)")
 _POWERS, _ROUNDS = (4, 6, 8, 10), 6  # of an asphere that may be missing; rounds of the search for its terms
 _NEAR_MM, _DAMPED = 1e-5, (1e-9, 1e-7, 1e-5, 1e-3, 1e-1)  # of sags at the rim, for slopes; shares of their squares
-_LIKELY, _ALIKE = 7, 4  # surfaces that are searched to the end, and named at most, for an asphere that is missing
+_LIKELY, _ALIKE = 7, 4  # surfaces that are searched to the end for a missing asphere; changes that are named at most
+ONE_OF = "one of these: "
+_VARIES = re.compile(r"(?i)f/?[\d.]+-[\d.]+")
 _CLEARLY = 3.0  # times by which the score is less after a change that is told
 _WORDS = {
     "distortion": ("distortion", "%"), "blur": ("blur of the axis times the f-number", " µm"),
@@ -127,10 +131,15 @@ class Tried(NamedTuple):
         return bool(alarm(self.figures)[0] <= 1)
 
 
-def _best(tried: Sequence[Change], profile: Profile, focal_mm: float) -> Tried:
+def _ranked(tried: Sequence[Change], profile: Profile, focal_mm: float) -> list[Tried]:
+    """Changes with their figures, the best first."""
     figures = measure([change.lens for change in tried], profile, focal_mm).figures
-    n = int(np.argmin(score(figures)))
-    return Tried(tried[n], Measures(*(v[n : n + 1] for v in figures)))
+    each = [Tried(change, Measures(*(v[n : n + 1] for v in figures))) for n, change in enumerate(tried)]
+    return sorted(each, key=lambda one: one.score)
+
+
+def _best(tried: Sequence[Change], profile: Profile, focal_mm: float) -> Tried:
+    return _ranked(tried, profile, focal_mm)[0]
 
 
 def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float, rounds: int = _ROUNDS) -> Tried:
@@ -182,6 +191,22 @@ class Checked(Result):
     said: tuple[str, ...]
 
 
+def opened_at(lens: Lens, profile: Profile, focal_mm: float) -> Lens:
+    """The lens at a focal length of a profile, at the widest f-number of the product there.
+
+    The table of a zoom often states that of its widest end alone. The product's is the widest at which light was
+    measured; where none was, and its name has two f-numbers, that of a stop which opens no farther than at that end.
+    """
+    placed = at_focal_length(lens, focal_mm)
+    if lights := profile.light_at(focal_mm):
+        own = min(light.f_number for light in lights)
+    elif _VARIES.search(profile.model):
+        own = float(first_order(placed.with_stop_radius(lens.stop_radius_mm)).f_number)
+    else:
+        own = placed.f_number
+    return replace(placed, f_number=max(placed.f_number, own))
+
+
 def check(lens: Lens, profile: Profile) -> Checked:
     """Look for figures of a lens that no sound table has, and for one change after which they are gone.
 
@@ -193,7 +218,7 @@ def check(lens: Lens, profile: Profile) -> Checked:
     lens.require_glass("check")
     known = sorted({r.focal_mm for r in profile.distortion} or set(profile.focal_mm))
     focal = known[len(known) // 2]
-    placed = at_focal_length(lens, focal)
+    placed = opened_at(lens, profile, focal)
     now = _best([Change("", placed)], profile, focal)
     before = _named(now)
     if now.sound:
@@ -201,22 +226,22 @@ def check(lens: Lens, profile: Profile) -> Checked:
         return Checked(False, None, before, None, (sound,))
     beyond = {name: v for name, v in before.items() if not v <= getattr(ALARM, name)}
     said = f"the table is doubtful: {_told(beyond, limits=True)}"
-    best = _best(list(changes(placed)), profile, focal)
-    others = ""
-    if not _helps(best, now):  # terms of an asphere can imitate other changes, so that they come last
+    tried = _ranked(list(changes(placed)), profile, focal)
+    if not _helps(tried[0], now):  # terms of an asphere can imitate other changes, so that they come last
         bent = [k for k, s in enumerate(placed.surfaces) if not s.stop and 0 < s.semi_diameter_mm < math.inf]
         first = {k: missing_asphere(placed, k, profile, focal, rounds=1).score for k in bent}
         likely = sorted(bent, key=first.__getitem__)[:_LIKELY]
-        aspheres = sorted((missing_asphere(placed, k, profile, focal) for k in likely), key=lambda tried: tried.score)
-        best = min([best, *aspheres[:1]], key=lambda tried: tried.score)
-        alike = [t for t in aspheres[1:_ALIKE] if _helps(t, now) and t.score <= 2 * best.score]
-        others = "".join(f" or at surface {t.change.said.split()[-1]}" for t in alike)
+        aspheres = [missing_asphere(placed, k, profile, focal) for k in likely]
+        tried = sorted([*tried, *aspheres], key=lambda one: one.score)
+    best = tried[0]
     if not _helps(best, now):
         nearest = f"no single change makes it sound; the nearest is: {best.change.said}"
         return Checked(True, None, before, None, (said, nearest))
     after = _named(best)
     moved = _told({name: after[name] for name in beyond})
-    change = best.change.said + others
+    # What fits about as well cannot be told apart by these figures.
+    alike = [t.change.said for t in tried[:_ALIKE] if _helps(t, now) and t.score <= 2 * best.score]
+    change = alike[0] if len(alike) == 1 else f"{ONE_OF}{'; '.join(alike)}"
     told = f"one change makes it sound, {change}: {moved}"
     return Checked(True, change, before, after, (said, told))
 
