@@ -353,7 +353,8 @@ def _override_value(dotted: str, text: str) -> Any:
 def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: str = "") -> T:
     """An instance of the dataclass `cls` from the tables of a TOML file.
 
-    Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning.
+    Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning. `cls.keys_read`,
+    where there is one, takes other spellings of values.
 
     Args:
         file: source of the data, for messages.
@@ -364,7 +365,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
             `__post_init__` refuses.
     """
     known = {f.name: f for f in fields(cls) if f.init}  # type: ignore[arg-type]
-    data = _with_new_names(known, data, file, prefix)
+    data = _with_new_names(known, getattr(cls, "keys_read", dict)(data), file, prefix)
     for name in set(data) & set(getattr(cls, "WITHOUT_EFFECT", ())):
         data = {key: value for key, value in data.items() if key != name}
         warnings.warn(f"{file}: {_join(prefix, name)} has no effect any more", NeurolensWarning, stacklevel=2)
