@@ -110,6 +110,21 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink()
 
 
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """A block that one process or thread at a time runs for a folder; others wait. Systems without such locks let all
+    of them through."""
+    handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
+    try:
+        if handle is not None:
+            with suppress(OSError):
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)  # which ends the lock
+
+
 def check_writable(path: str | Path) -> None:
     """Test whether `atomic_path` can write here, by creating and removing an empty file.
 
@@ -203,7 +218,7 @@ def cache_folder(name: str = "") -> Path:
     """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "neurolens"
     own = _is_own_folder(folder) and _is_own_folder(folder / name)
-    return folder / name if own else Path(_folder_of_process().name)
+    return folder / name if own else Path(folder_of_process().name)
 
 
 def _is_own_folder(folder: Path) -> bool:
@@ -234,7 +249,7 @@ class TemporaryFolder(tempfile.TemporaryDirectory[str]):
         super().cleanup()
 
 
-_folder_of_process = cache(TemporaryFolder)
+folder_of_process = cache(TemporaryFolder)
 
 
 @cache

@@ -23,7 +23,7 @@ from types import ModuleType
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, place_inside, read_bytes, safe_name
+from neurolens.base.files import atomic_path, locked, place_inside, read_bytes, safe_name
 from neurolens.base.lensname import year_of
 from neurolens.base.tomlfile import parse_json
 
@@ -135,15 +135,18 @@ def add_lens(to: Path, lens: PackedLens) -> None:
         InputError: no packed extension, facts that are not those of neurolens, no folder. OSError: it cannot be
             written.
     """
-    files, known = _contents(to)
-    new = lens.files() | {FACTS: _facts(_merged(known, lens))}  # the facts last: they name files
-    if to.suffix == ".zip":
-        _write_zip(to, files | new)
-        return
-    for name, data in new.items():
-        (to / name).parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(to / name) as temporary:
-            temporary.write_bytes(data)
+    if to.suffix != ".zip" and not to.exists():
+        to.mkdir(parents=True, exist_ok=True)
+    with locked(to if to.is_dir() else to.parent):  # another process may add a lens meanwhile
+        files, known = _contents(to)
+        new = lens.files() | {FACTS: _facts(_merged(known, lens))}  # the facts last: they name files
+        if to.suffix == ".zip":
+            _write_zip(to, files | new)
+            return
+        for name, data in new.items():
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(to / name) as temporary:
+                temporary.write_bytes(data)
 
 
 def _contents(to: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
