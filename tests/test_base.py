@@ -35,12 +35,12 @@ from neurolens.base.settings import (
     check_bounds,
     from_dict,
     from_options,
-    in_unit,
     read_config,
     setting,
     to_dict,
     to_toml,
 )
+from neurolens.base.units import in_unit
 
 
 def test_what_a_run_keeps_counts_only_while_it_is_whole(tmp_path: Path) -> None:

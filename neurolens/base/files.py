@@ -110,21 +110,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink()
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """A block that one process or thread at a time runs for a folder; others wait. Systems without such locks let all
-    of them through."""
-    handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
-    try:
-        if handle is not None:
-            with suppress(OSError):
-                fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        if handle is not None:
-            os.close(handle)  # which ends the lock
-
-
 def check_writable(path: str | Path) -> None:
     """Test whether `atomic_path` can write here, by creating and removing an empty file.
 

@@ -29,7 +29,6 @@ import re
 import types
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass
 from numbers import Real
@@ -39,6 +38,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
+from neurolens.base.units import WORTH, in_unit
 
 T = TypeVar("T")
 # Bounds that every input keeps: beyond them searches take minutes or find no light.
@@ -48,15 +48,6 @@ FILM_MM = 1e-3, 1e4  # a side
 WAVELENGTH_NM = 100.0, 20_000.0  # from lithography to thermal cameras
 RANGE = "range"  # a zoom position that stands for all of them
 _UNIT = re.compile(r"(.+?)_(per_mm|px|mm|um|nm|m|deg|s)")
-# What units are worth, by dimension: a value may be typed with any unit of its option's dimension.
-_WORTH: tuple[dict[str, float], ...] = (
-    {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3, "ft": 0.3048, "in": 0.0254, '"': 0.0254},
-    {"deg": 1, "\N{DEGREE SIGN}": 1, "rad": 180 / math.pi},
-    {"s": 1, "ms": 1e-3, "min": 60, "h": 3600},
-    {"px": 1, "pixels": 1},
-    {"stops": 1},
-)
-_QUANTITY = re.compile(r"([-+]?[\d.]+(?:e[-+]?\d+)?) ?([^\d\s.,]+)", re.IGNORECASE)
 _PLACEHOLDERS = {int: "N", float: "X", str: "NAME", Path: "FILE"}
 _NAMES = {
     bool: "true or false",
@@ -156,27 +147,6 @@ def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -
     return convert
 
 
-def in_unit(unit: str, convert: Callable[[str], T]) -> Callable[[str], T]:
-    """Type of an argument whose numbers may have a unit: in_unit("m", float)("6ft") is 1.8288; `unit` "f" takes f/2."""
-    worth = next((worth for worth in _WORTH if unit in worth), {})
-
-    def plain(word: str) -> str:
-        if unit == "f":
-            return re.sub(r"^f/? ?(?=[\d.])", "", word, flags=re.IGNORECASE)
-        found = _QUANTITY.fullmatch(word.strip())
-        if found is None or (factor := worth.get(found[2].lower())) is None:
-            return word
-        with suppress(ValueError):  # 1.2.3
-            return f"{float(found[1]) * factor / worth[unit]:.12g}"
-        return word
-
-    def read(text: str) -> T:
-        return convert(",".join(map(plain, text.split(","))))
-
-    read.__name__ = getattr(convert, "__name__", "value")  # for messages of argparse
-    return read
-
-
 def between(low: float, high: float, unit: str, kind: Callable[[str], Any] = float) -> Callable[[str], Any]:
     """Type of an argument that is a number from `low` to `high`."""
     return number(kind, lambda value: low <= value <= high, _expected(kind, (low, high), unit))
@@ -265,7 +235,7 @@ def _details(
         bounds = None if option.kind else option.within
         details["type"] = between(*bounds, option.unit, kind) if bounds else option.kind or kind
         typed = "f" if f.name == "f_number" else unit[2] if unit else str(option.metavar).lower()
-        if typed == "f" or any(typed in worth for worth in _WORTH):
+        if typed == "f" or any(typed in worth for worth in WORTH):
             details["type"] = in_unit(typed, details["type"])
     if option.nargs is not None:
         details["nargs"] = option.nargs

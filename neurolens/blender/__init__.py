@@ -14,7 +14,8 @@ import os
 import re
 import sys
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
@@ -23,7 +24,7 @@ from types import ModuleType
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, locked, place_inside, read_bytes, safe_name
+from neurolens.base.files import atomic_path, fcntl, place_inside, read_bytes, safe_name
 from neurolens.base.lensname import year_of
 from neurolens.base.tomlfile import parse_json
 
@@ -120,6 +121,21 @@ def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
     for lens in packed:
         files |= lens.files()
     _write_zip(out, files | {FACTS: _facts(lens.facts() for lens in packed)})
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """A block that one process or thread at a time runs for a folder; others wait. Systems without such locks let all
+    of them through."""
+    handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
+    try:
+        if handle is not None:
+            with suppress(OSError):
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)  # which ends the lock
 
 
 def check_takes(to: Path) -> None:

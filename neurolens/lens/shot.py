@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from neurolens.base.errors import InputError
-from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, between, check_bounds, in_unit, said, setting, within
+from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, between, check_bounds, said, setting, within
+from neurolens.base.units import in_unit
 
 FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
