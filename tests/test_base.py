@@ -43,6 +43,7 @@ from neurolens.base.settings import (
     to_dict,
     to_toml,
 )
+from neurolens.base.units import in_unit
 
 
 def test_what_a_run_keeps_counts_only_while_it_is_whole(tmp_path: Path) -> None:
@@ -415,6 +416,21 @@ def test_settings_are_options(capsys: pytest.CaptureFixture[str]) -> None:
         ["--cell", "--rays", "--fast", "--kind"]
     )
     assert "(default" not in over.format_help()
+
+
+@pytest.mark.parametrize(
+    ("unit", "typed", "value"),
+    [
+        ("m", "2m", "2"), ("m", "200cm", "2"), ("m", "6ft", "1.8288"), ("m", "6 FT", "1.8288"), ("m", "inf", "inf"),
+        ("m", "1.5e3mm", "1.5"), ("m", "2", "2"), ("mm", "2in", "50.8"), ("mm", "-0.1mm", "-0.1"),
+        ("deg", "30deg", "30"), ("nm", "0.55um,600nm,700", "550,600,700"), ("s", "2min", "120"),
+        ("pixels", "3840px", "3840"), ("f", "f/2", "2"), ("f", "F2.8", "2.8"), ("f", "2.8", "2.8"),
+        ("m", "2kg", "2kg"), ("m", "2deg", "2deg"), ("m", "1.2.3m", "1.2.3m"), ("deg", "2m", "2m"), ("f", "2m", "2m"),
+    ],
+)  # fmt: skip
+def test_numbers_take_the_units_of_their_dimension(unit: str, typed: str, value: str) -> None:
+    """What is no quantity of the option's dimension is left for the option to refuse."""
+    assert in_unit(unit, str)(typed) == value
 
 
 class Clock:

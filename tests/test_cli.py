@@ -18,6 +18,7 @@ from lens_models import edited
 from shipped import whole
 
 from neurolens.cli import build_parser, main
+from neurolens.cli.train import Train
 from neurolens.render.pictures import read_exr
 from neurolens.surrogates.card import read_card
 
@@ -533,3 +534,27 @@ def test_render_through_a_model_needs_no_torch_and_keeps_its_card(
     ):
         line = failure(capsys, "render", scene, "--camera", MODEL, "-o", out, "--quiet", *args)
         assert all(word in line for word in words), line
+
+
+def test_values_take_the_units_that_people_type(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every option with a unit: what a shell passes, in the unit of the setting."""
+    parse = build_parser().parse_args
+    found = parse("render a.toml --camera thin -o a.exr --focus 6ft --focal-length 2in --f-number f/2".split())
+    assert (found.focus_m, found.focal_length_mm, found.f_number) == (1.8288, 50.8, 2.0)
+    assert parse("render a.toml --camera thin -o a.exr --width 3840x2160".split()).height == 2160
+    for film, mm in (("super35", (24.89, 18.66)), ("Super-35", (24.89, 18.66)), ("36mm x 2.4cm", (36.0, 24.0))):
+        assert parse(["flare", str(GAUSS), "--film", film]).film == mm
+    assert parse(f"lens {GAUSS} --focus 200cm".split()).focus_m == 2.0
+    assert "metres" in failure(capsys, "lens", GAUSS, "--focus", "2kg")
+    assert "36x24" in failure(capsys, "flare", GAUSS, "--light", "1,1", "--film", "superb")
+    assert "the film sets the height" in failure(capsys, "flare", GAUSS, "--light", "1,1", "--width", "384x216")
+
+
+def test_train_takes_the_name_of_a_lens(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """As --lens; a name that is neither is told with the nearest lens."""
+    seen: list[tuple[object, Path | None]] = []
+    monkeypatch.setattr(Train, "_train", lambda self, file, out, _: seen.append((self.experiment, file)) or (file, {}))
+    monkeypatch.setattr(Train, "answer", lambda *args: 0)
+    assert main(["train", "cooke_triplet_50"]) == 0
+    assert [(experiment, file.stem) for experiment, file in seen] == [(None, "cooke_triplet_50")]
+    assert "cooke_triplet_50" in failure(capsys, "train", "cook_triplet_50")

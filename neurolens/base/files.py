@@ -204,7 +204,7 @@ def cache_folder(name: str = "") -> Path:
     """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "neurolens"
     own = _is_own_folder(folder) and _is_own_folder(folder / name)
-    return folder / name if own else Path(_folder_of_process().name)
+    return folder / name if own else Path(folder_of_process().name)
 
 
 def _is_own_folder(folder: Path) -> bool:
@@ -235,7 +235,7 @@ class TemporaryFolder(tempfile.TemporaryDirectory[str]):
         super().cleanup()
 
 
-_folder_of_process = cache(TemporaryFolder)
+folder_of_process = cache(TemporaryFolder)
 
 
 @cache

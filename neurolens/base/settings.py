@@ -38,6 +38,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
+from neurolens.base.units import WORTH, in_unit
 
 T = TypeVar("T")
 # Bounds that every input keeps: beyond them searches take minutes or find no light.
@@ -233,6 +234,9 @@ def _details(
         details["metavar"] = option.metavar or (unit[2].upper() if unit else _PLACEHOLDERS[kind])
         bounds = None if option.kind else option.within
         details["type"] = between(*bounds, option.unit, kind) if bounds else option.kind or kind
+        typed = "f" if f.name == "f_number" else unit[2] if unit else str(option.metavar).lower()
+        if typed == "f" or any(typed in worth for worth in WORTH):
+            details["type"] = in_unit(typed, details["type"])
     if option.nargs is not None:
         details["nargs"] = option.nargs
     elif many:
@@ -353,7 +357,8 @@ def _override_value(dotted: str, text: str) -> Any:
 def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: str = "") -> T:
     """An instance of the dataclass `cls` from the tables of a TOML file.
 
-    Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning.
+    Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning. `cls.keys_read`,
+    where there is one, takes other spellings of values.
 
     Args:
         file: source of the data, for messages.
@@ -364,7 +369,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
             `__post_init__` refuses.
     """
     known = {f.name: f for f in fields(cls) if f.init}  # type: ignore[arg-type]
-    data = _with_new_names(known, data, file, prefix)
+    data = _with_new_names(known, getattr(cls, "keys_read", dict)(data), file, prefix)
     for name in set(data) & set(getattr(cls, "WITHOUT_EFFECT", ())):
         data = {key: value for key, value in data.items() if key != name}
         warnings.warn(f"{file}: {_join(prefix, name)} has no effect any more", NeurolensWarning, stacklevel=2)

@@ -14,7 +14,8 @@ import os
 import re
 import sys
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
@@ -23,7 +24,7 @@ from types import ModuleType
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, place_inside, read_bytes, safe_name
+from neurolens.base.files import atomic_path, fcntl, place_inside, read_bytes, safe_name
 from neurolens.base.lensname import year_of
 from neurolens.base.tomlfile import parse_json
 
@@ -122,6 +123,21 @@ def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
     _write_zip(out, files | {FACTS: _facts(lens.facts() for lens in packed)})
 
 
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """A block that one process or thread at a time runs for a folder; others wait. Systems without such locks let all
+    of them through."""
+    handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
+    try:
+        if handle is not None:
+            with suppress(OSError):
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)  # which ends the lock
+
+
 def check_takes(to: Path) -> None:
     """Refuse a zip or a user folder that takes no lens, before a lens is made; raises InputError as `add_lens`."""
     _contents(to)
@@ -135,15 +151,18 @@ def add_lens(to: Path, lens: PackedLens) -> None:
         InputError: no packed extension, facts that are not those of neurolens, no folder. OSError: it cannot be
             written.
     """
-    files, known = _contents(to)
-    new = lens.files() | {FACTS: _facts(_merged(known, lens))}  # the facts last: they name files
-    if to.suffix == ".zip":
-        _write_zip(to, files | new)
-        return
-    for name, data in new.items():
-        (to / name).parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(to / name) as temporary:
-            temporary.write_bytes(data)
+    if to.suffix != ".zip" and not to.exists():
+        to.mkdir(parents=True, exist_ok=True)
+    with locked(to if to.is_dir() else to.parent):  # another process may add a lens meanwhile
+        files, known = _contents(to)
+        new = lens.files() | {FACTS: _facts(_merged(known, lens))}  # the facts last: they name files
+        if to.suffix == ".zip":
+            _write_zip(to, files | new)
+            return
+        for name, data in new.items():
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(to / name) as temporary:
+                temporary.write_bytes(data)
 
 
 def _contents(to: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:

@@ -78,6 +78,7 @@ class Parser(argparse.ArgumentParser):
         """Parse as argparse does; old names of commands work; an intermixed one reports unknown arguments itself."""
         args = sys.argv[1:] if args is None else list(args)
         args = [*self.renamed.get(args[0], args[:1]), *args[1:]] if args else args
+        args = self._sizes(args)
         if self.intermixed:
             self.intermixed = False  # argparse comes back here for its two passes
             try:
@@ -88,6 +89,18 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"unrecognized arguments: {' '.join(rest)}")
             return found, rest
         return super().parse_known_args(args, namespace)
+
+    def _sizes(self, args: list[str]) -> list[str]:
+        """The words of a command line, with "--width 3840x2160" as width and height."""
+        for at, word in enumerate(args):
+            words = word if word.startswith("--width=") else " ".join(args[at : at + 2])
+            found = re.fullmatch(r"--width[= ](\d+) ?x ?(\d+)", words, re.IGNORECASE)
+            if found is None or "--width" not in self._option_string_actions:  # or of a command within
+                continue
+            if "--height" not in self._option_string_actions:
+                self.error(f"argument --width: got '{found[1]}x{found[2]}', expected a width: the film sets the height")
+            args = [*args[:at], f"--width={found[1]}", f"--height={found[2]}", *args[at + 1 + (word != words) :]]
+        return args
 
     def error(self, message: str) -> NoReturn:
         self.exit(

@@ -33,18 +33,18 @@ from neurolens.flare.lights import SUN, KeptLights, Light, SceneLights, highligh
 from neurolens.frames import Files, flare_channels
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
+from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted, in_gamut
 from neurolens.render.lights import SUN_RADIUS_RAD
 from neurolens.render.pictures import (
     read_colour_space,
     read_exr,
     read_metadata,
     standard_attributes,
-    write_exr,
+    write_channels,
     write_png,
 )  # fmt: skip
 from neurolens.render.scene import files_named, load_scene, seen_from
-from neurolens.render.settings import OF_LAYERS, OF_LIGHTS, OF_PICTURE, ColourSpaceName, FlareSettings
+from neurolens.render.settings import LAYERS, OF_LAYERS, OF_LIGHTS, OF_PICTURE, ColourSpaceName, FlareSettings
 
 _COMMAND = "neurolens flare"
 _QUICK_WIDTH = 480  # pixels at most
@@ -121,8 +121,9 @@ examples:
         None, "99% of the lit pixels become no brighter than 0.8; frames share one value", title=OF_PICTURE
     )
     colour_space: ColourSpaceName | None = setting(
-        None, "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES); default: that of --image, else of a "
-        "scene's [film] table, else sRGB", title=OF_PICTURE,
+        None, "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES), which holds more of saturated "
+        "lights: what is beyond becomes paler, never negative; default: that of --image, else of a scene, else sRGB",
+        title=OF_PICTURE,
     )  # fmt: skip
     quick: bool = setting(
         False, "at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
@@ -381,7 +382,7 @@ def _write(
     files.spare(shots.reads(args))
     job = replace(shot.job, single=single, keep=args.out)
     layers = flare_layers(job, progress)
-    total = sum_of(layers, job.raster)
+    total = in_gamut(sum_of(layers, job.raster))
     if args.frames.frames is None:  # frames have the same layers, dark ones too
         layers = {name: picture for name, picture in layers.items() if picture.any()}
     exposure = _exposure(total) if exposure is None else exposure
@@ -392,7 +393,8 @@ def _write(
     header = standard_attributes(camera, job.raster.width, job.raster.height, args.frame)
     write_png(files.preview, total, exposure or 0.0)  # first: a frame whose EXR exists is kept
     channels = flare_channels(layers, space)
-    write_exr(args.picture, total, metadata=metadata, space=space, layers=channels, attributes=header)
+    rgb = {c: sum((channels[f"{name}.{c}"] for name in LAYERS if name in layers), 0 * total[..., 0]) for c in "RGB"}
+    write_channels(args.picture, rgb | channels, space, metadata, header)
     for path in kept_beside(args.picture):
         path.unlink()
     return exposure

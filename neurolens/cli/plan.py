@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import time
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from neurolens.render.scene import Scene
 
 
+_SHARE = 0.1  # of the time of its picture, which a plan may take without a word
 _BUDGETS = {"px": "pixels, as 0.25px", "flip": "FLIP, as 0.02flip", "s": "seconds, as 20s"}
 
 
@@ -124,6 +126,7 @@ trade.png and trade.json (default: runs/trade-SCENE-LENS)."""
         """Plan, write and print."""
         from neurolens.plan.plan import plan, plan_seen, plan_within, plot_effects
 
+        began = time.process_time()
         with self.progress({"plan": 10}).stage("plan") as report:
             more = {**look, "zoom": self.zoom, "report": report}
             unit, most = self.budget
@@ -131,12 +134,13 @@ trade.png and trade.json (default: runs/trade-SCENE-LENS)."""
                 result = plan(scene, lens, most, explain=self.explain, **more)
             else:
                 result = (plan_within if unit == "s" else plan_seen)(scene, lens, most, **more)
+        took = time.process_time() - began
         data: dict[str, Any] = plain({"scene": str(self.scene), "lens": str(self.lens), **result.to_dict()})
         write_json(folder / "plan.json", data)
         if result.best:
             atomic_write_text(folder / "plan.toml", result.to_toml(lens, folder))
         plot_effects(result, folder / "effects.png", f"{scene.name} through {lens.name}")
-        return self.answer(data, lambda: _text(self, result, folder), 0 if result.best else 1)
+        return self.answer(data, lambda: _text(self, result, folder, took), 0 if result.best else 1)
 
     def _trade(self, result: Trade, folder: Path, title: str) -> int:
         """Draw, write, print; 1 where no camera keeps the budget."""
@@ -176,7 +180,7 @@ def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
     return [file for file in files if read_card(file)["lens"]["sha256"] == figures]
 
 
-def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
+def _text(command: Plan, result: plans.Plan, folder: Path, took: float) -> str:
     from neurolens.plan.probe import STRAY
 
     rows = [
@@ -199,7 +203,9 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
             f"{result.unit} of the camera on a path times noise, the paths it takes for equal error; ~ noisy: the "
             f"median of its calls took more than {NOISY:g} times the least, which is shown"
         )
-    parts.append("\n".join([_use(result), *(_commands(command, result, result.best, folder) if result.best else ())]))
+    parts.append(
+        "\n".join([_use(result, took), *(_commands(command, result, result.best, folder) if result.best else ())])
+    )
     written = ["plan.json", "effects.png", *["plan.toml"] * bool(result.best)]
     return "\n\n".join([*parts, f"Written: {folder}/{', '.join(written)}"])
 
@@ -220,8 +226,8 @@ def _needs(asked: SceneNeeds) -> str:
     )
 
 
-def _use(result: plans.Plan) -> str:
-    """The camera to use, or that there is none."""
+def _use(result: plans.Plan, took: float) -> str:
+    """The camera to use and its price, or that there is none; `took`: CPU seconds of the plan."""
     best, seconds, flip = result.best, result.budget_s, result.budget_flip
     if best is None:
         nearest = min(result.choices, key=lambda c: c.error_px, default=None)
@@ -230,15 +236,20 @@ def _use(result: plans.Plan) -> str:
         return f"No camera for --for {result.target} {keeps if seconds is None else f'takes {seconds:g} s'}."
     allowed = f"of {result.budget_px:g}" if flip is None else f"FLIP {cli.number(best.flip, 2)} of {flip:g}"
     allowed = allowed if seconds is None else f"within {seconds:g} s"
-    lines = [
-        f"Use {best.name}: {cli.number(best.error_px, 3)} px {allowed}, {cli.number(best.cost, 3)} {result.unit} "
-        "a path times noise"
-    ]
+    lines = [f"Use {best.name}: {cli.number(best.error_px, 3)} px {allowed}"]
     if result.work.rest[best.disperses]:
+        price, took = (float(f"{value:.2g}") for value in (best.seconds, took))
         lines.append(
-            f"The picture takes {cli.number(best.seconds, 3)} s of one thread to the noise that the scene's samples "
+            f"The picture takes about {cli.number(price)} s of one thread to the noise that the scene's samples "
             f"have with the exact lens, the camera {cli.number(best.camera_seconds, 2)} s of that"
         )
+        if took > _SHARE * price:
+            lines.append(
+                f"This plan took {cli.number(took)} CPU seconds, {cli.number(took / price, 2)} times as long: it is "
+                "worth them for many frames or more samples"
+            )
+    else:
+        lines[0] += f", {cli.number(best.cost, 3)} {result.unit} a path times noise"
     if len(result.alike) > 1:
         lines.append(f"Any of these takes about as long: {', '.join(result.alike)}")
     if (times := result.work.noise[best.disperses]) > 1 and not result.asked.denoised:

@@ -6,14 +6,14 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from neurolens.base.cluster import Dask
 from neurolens.base.errors import NeurolensError, one_line, printable
 from neurolens.base.files import read_bytes
-from neurolens.base.lensname import lens_id_of
+from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import NOISY, noisy
 from neurolens.base.settings import setting, whole
@@ -46,7 +46,9 @@ The folder holds report.html, results.json, config.toml (all settings, defaults 
 lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     kept = "fitted models are kept in the run folder; the same command resumes"
 
-    experiment: Path | None = setting(None, "experiment file", positional=True, metavar="EXPERIMENT.toml", nargs="?")
+    experiment: Path | None = setting(
+        None, "experiment file, or the name of a lens, as --lens", positional=True, metavar="EXPERIMENT.toml", nargs="?"
+    )
     lens: tuple[Path, ...] | None = cli.lens(
         None, ", instead of an experiment; of several, each has a run folder in DIR (runs)", nargs="+"
     )
@@ -78,6 +80,10 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     def run(self) -> int:
         """Run the experiment, or one a lens, and print a summary."""
         lenses = self.lens or ()
+        if not lenses and self.experiment and self.experiment.suffix.lower() != ".toml":
+            named = resolve(self.experiment, models=False, cameras=False).file
+            assert named is not None  # which only cameras without a lens lack
+            return replace(self, experiment=None, lens=(named,)).run()
         if (self.experiment is None) == (not lenses):
             self.refuse("EXPERIMENT.toml or --lens", "(both)" if lenses else "(neither)", "one of them")
         if not lenses and (self.within or self.zoom_range or self.internal_focus):

@@ -18,6 +18,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import numpy as np
+
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, reason, warn
 from neurolens.base.files import check_writable
@@ -29,7 +31,16 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.shot import Dispersion, FocusMode, Shot, Vignetting, film_size
 from neurolens.readers.glasses import more_glasses
-from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, check_name, conversion, converted
+from neurolens.render.colour import (
+    ACESCG,
+    COLOUR_SPACES,
+    SRGB,
+    ColourSpace,
+    check_name,
+    conversion,
+    converted,
+    in_gamut,
+)
 from neurolens.render.film import PixelGrid
 from neurolens.render.job import MEANING
 from neurolens.render.pictures import standard_attributes
@@ -48,6 +59,7 @@ T = TypeVar("T")
 Vector = tuple[float, float, float]
 Layers = dict[str, FloatArray]
 _CHOICE_FRAMES = 16  # of an animation, which decide the brightest ghosts
+_PALER = 1e-3  # share of the light that may lie below zero without a word
 
 
 def with_changes(settings: T, changes: object) -> T:
@@ -390,12 +402,28 @@ def write_pictures(
 
 
 def flare_channels(flare: Mapping[str, FloatArray], space: ColourSpace) -> Layers:
-    """The channels of layers of flare in a colour space, of pictures [H, W, 3] linear sRGB by name."""
-    channels: Layers = {}
+    """The channels of layers of flare in a colour space, of pictures [H, W, 3] linear sRGB by name.
+
+    None is negative: colours beyond the space are mixed with grey, see `in_gamut`. Single ghosts sum to all.
+
+    Warns:
+        NeurolensWarning: colours that become noticeably paler.
+    """
+    inside, below, above = dict[str, FloatArray](), 0.0, 0.0
     for name, picture in flare.items():
         colour = picture if space is SRGB else converted(picture, conversion(SRGB, space)).astype(picture.dtype)
-        channels |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
-    return channels
+        inside[name] = in_gamut(colour, space)
+        below, above = below - float(colour.clip(max=0).sum()), above + float(colour.clip(0).sum())
+    if below > _PALER * above:
+        wider = "" if space is ACESCG else f"; the colour space {ACESCG.name} keeps more of them"
+        warn(
+            f"flare: colours beyond {space.name} are mixed with grey of their luminance, so that none is negative "
+            f"({below / above:.1%} of the light){wider}"
+        )
+    if parts := [name for name in inside if name not in LAYERS]:
+        whole = np.maximum(np.sum([inside[name] for name in parts], 0), np.finfo(np.float32).tiny)
+        inside |= {name: inside[name] * (inside["ghosts"] / whole) for name in parts}
+    return {f"{name}.{c}": colour[..., k] for name, colour in inside.items() for k, c in enumerate("RGB")}
 
 
 def _rescued(files: Files, result: RenderResult) -> str:

@@ -11,12 +11,13 @@ import shlex
 import shutil
 import signal
 import subprocess
+import tempfile
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, cache_folder, keep_newest, seal, sealed_bytes
+from neurolens.base.files import atomic_path, cache_folder, folder_of_process, keep_newest, seal, sealed_bytes
 
 # -march=native uses all of the machine; the next two let square roots and divisions become vectors, also where only one
 # side of a choice needs them. NaN and infinity stay what they are. -fno-inline keeps the knowledge that the arrays of a
@@ -70,19 +71,30 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
         InputError: there is no compiler, or it fails; the message says how.
         OSError: the disk is full, where the library goes or where compilers have their temporary files.
     """
-    compiler = find_compiler()
-    done = _run([*_words(compiler), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"], source)
+    compiler, places = find_compiler(), (Path(tempfile.gettempdir()), library.parent)
+    words = [*_words(compiler), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"]
+    done = _run(words, source, TMPDIR=str(_with_room(*places)))
     if done.returncode or not library.is_file() or not library.stat().st_size:
         # Linkers that write to mapped memory say nothing, but end by a signal.
-        if "No space left" in done.stderr or shutil.disk_usage(library.parent).free < _ROOM:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
+        full = [str(place) for place in places if not _has_room(place)]
+        if full or "No space left" in done.stderr:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), " and ".join(full or map(str, places)))
         said = " ".join(next((line for line in done.stderr.splitlines() if "error" in line), done.stderr).split())
         raise InputError(compiler, "compile", f"({said[:200] or 'no word'})", "a C compiler that knows C99")
     return done.stderr
 
 
-def _run(command: list[str], text: str = "") -> subprocess.CompletedProcess[str]:
-    pipe, english = subprocess.PIPE, {**os.environ, "LC_ALL": "C"}
+def _has_room(folder: Path) -> bool:
+    return shutil.disk_usage(folder).free >= _ROOM
+
+
+def _with_room(*folders: Path) -> Path:
+    """The first folder whose disk has room, or else the first."""
+    return next(filter(_has_room, folders), folders[0])
+
+
+def _run(command: list[str], text: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
+    pipe, english = subprocess.PIPE, {**os.environ, "LC_ALL": "C", **environment}
     try:
         # In a group of its own, the driver's children, which do the work, end with it, also at Ctrl-C.
         with subprocess.Popen(
@@ -115,7 +127,8 @@ def c_source(file: str, **constants: object) -> str:
 def load_compiled(source: str) -> ctypes.CDLL:
     """The library of a source, which is compiled once for this machine and kept in `cache_folder`.
 
-    A library of another user, or a damaged one, is compiled again.
+    A library of another user, or a damaged one, is compiled again. Where the disk of the cache is full, it goes to the
+    folder of temporary files, for this process; a compiler itself works in whichever of the two has room.
 
     Raises:
         InputError: as `compile_c`; a library that cannot be loaded.
@@ -124,6 +137,8 @@ def load_compiled(source: str) -> ctypes.CDLL:
     if sealed_bytes(library) is not None:
         with suppress(OSError):  # another run has just removed it
             return ctypes.CDLL(str(library))
+    if _with_room(library.parent, Path(tempfile.gettempdir())) != library.parent:
+        library = Path(folder_of_process().name) / library.name
     with atomic_path(library) as temporary:
         compile_c(source, temporary, FLAGS)
         seal(temporary, 0o700)

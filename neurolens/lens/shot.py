@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from argparse import ArgumentTypeError
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,12 @@ from typing import Any, Literal, get_args
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, between, check_bounds, said, setting, within
+from neurolens.base.units import in_unit
 
 FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
 Dispersion = Literal["full", "lateral", "off"]
+FILMS = {"super35": "24.89x18.66", "fullframe": "36x24", "apsc": "23.6x15.7", "mft": "17.3x13", "super16": "12.52x7.41"}
 
 
 @dataclass(frozen=True)
@@ -107,11 +110,13 @@ class Shot:
 
 
 def film_size(text: str) -> tuple[float, float]:
-    """Type of an option: a film's width x height in mm, as in 36x24."""
-    width, _, height = text.lower().partition("x")
-    side = between(*FILM_MM, "the film's width x height in mm, as in 36x24, each")
+    """Type of an option: a film's width x height in mm, as in 36x24, also with units, or its name in `FILMS`."""
+    named = FILMS.get(re.sub(r"[-_ ]", "", text.lower()), text.lower())
+    width, _, height = named.partition("x")
+    expected = f"the film's width x height in mm, as in 36x24, or one of {', '.join(FILMS)}, each"
+    side = in_unit("mm", between(*FILM_MM, expected))
     try:
-        return side(width), side(height)
+        return side(width.strip()), side(height.strip())
     except ArgumentTypeError as error:
         raise ArgumentTypeError(f"{text!r}: {error}") from None
 

@@ -132,10 +132,10 @@ def balance(white_rgb: ArrayLike) -> Matrix:
     return _solve(SRGB.to_xyz, adaptation(white, xyz_of(SRGB.white)) @ SRGB.to_xyz)
 
 
-def in_gamut(colours: NDArray[np.floating]) -> FloatArray:
-    """Linear sRGB [..., 3] without negative values: colours beyond the gamut, as of one wavelength, are mixed with grey
-    of their luminance until they lie on its border; the others stay as they are."""
-    grey = (colours @ SRGB.to_xyz[1].astype(np.float32)).clip(0)[..., None]
+def in_gamut(colours: NDArray[np.floating], space: ColourSpace = SRGB) -> FloatArray:
+    """Linear colours [..., 3] of a space without negative values: colours beyond its gamut, as of one wavelength, are
+    mixed with grey of their luminance until they lie on its border; the others stay as they are."""
+    grey = converted(colours, space.to_xyz[1:2].astype(np.float32)).clip(0)
     least = np.minimum(colours.min(-1, keepdims=True), 0)
     share = grey / np.maximum(grey - least, np.finfo(np.float32).tiny)
     return np.where(least < 0, np.maximum(grey + share * (colours - grey), 0), colours).astype(np.float32)

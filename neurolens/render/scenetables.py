@@ -11,7 +11,7 @@ irradiance intensity / d^2, as much as from a small sphere of radius r and emiss
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from inspect import get_annotations
@@ -37,10 +37,12 @@ def require(ok: bool, field: str, value: object, expected: str) -> None:
 
 @dataclass(frozen=True)
 class Rule:
-    """What the values of a field have in common: a test, and what is expected, for messages."""
+    """What the values of a field have in common: a test, what is expected, for messages, and whether they are colours,
+    of which one number is a grey."""
 
     good: Callable[[Any], bool]
     expected: str
+    colour: bool = False
 
 
 def between(low: float, high: float, unit: str = "a number") -> Rule:
@@ -50,7 +52,7 @@ def between(low: float, high: float, unit: str = "a number") -> Rule:
 
 def each_between(low: float, high: float) -> Rule:
     """The rule that each of three numbers lies from `low` to `high`."""
-    return Rule(lambda v: all(low <= x <= high for x in v), f"three numbers from {low:g} to {high:g}")
+    return Rule(lambda v: all(low <= x <= high for x in v), f"three numbers from {low:g} to {high:g}", colour=True)
 
 
 def _is_regular(rows: tuple[Row, ...]) -> bool:
@@ -78,7 +80,7 @@ Direction = Annotated[Vector, Rule(_is_direction, f"a direction, between {SMALLE
 Light = Annotated[Vector, each_between(0, BRIGHTEST)]
 Share = Annotated[Vector, each_between(0, 1)]
 Reflectance = Annotated[  # linear sRGB, or the name of a measured spectrum
-    Vector | str, Rule(lambda v: isinstance(v, str) or all(0 <= x <= 1 for x in v), "three numbers from 0 to 1")
+    Vector | str, Rule(lambda v: isinstance(v, str) or all(0 <= x <= 1 for x in v), "three numbers from 0 to 1", True)
 ]
 _SCALE = Rule(lambda v: all(0 < x < math.inf for x in (v if isinstance(v, tuple) else (v,))), "finite numbers above 0")
 _BRIGHTNESS = Rule(lambda v: 0 < v <= BRIGHTEST, f"a number above 0, at most {BRIGHTEST:g}")
@@ -102,6 +104,12 @@ def _rules(table: type) -> dict[str, Rule]:
 
 class Checked:
     """A table whose values obey the rules of their types; None is a missing field."""
+
+    @classmethod
+    def keys_read(cls, data: Mapping[str, Any]) -> dict[str, Any]:
+        """The keys of a file's table; a colour that is one number becomes three."""
+        greys = {name for name, rule in _rules(cls).items() if rule.colour}  # type: ignore[arg-type]
+        return {k: [v] * 3 if k in greys and type(v) in (int, float) else v for k, v in data.items()}
 
     def __post_init__(self) -> None:
         for field, rule in _rules(type(self)).items():  # type: ignore[arg-type]

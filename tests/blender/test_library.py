@@ -7,12 +7,15 @@ import json
 import math
 import os
 import sys
+import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from neurolens import blender
 from neurolens.base.errors import InputError
 from neurolens.blender import (
     Form,
@@ -58,6 +61,24 @@ def test_zip_is_read_as_it_was_written_and_takes_more(tmp_path: Path) -> None:
     assert len({f.number for f in found.values()}) == 2
     with pytest.raises(InputError, match="each id once"):
         write_pack(out, [lens(), lens()])
+
+
+@pytest.mark.parametrize("suffix", ["", ".zip"])
+def test_lenses_added_at_once_are_all_there(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight threads that all read before any writes, were there no lock."""
+    to, entries = tmp_path / f"own{suffix}", blender._merged
+    if suffix:
+        write_pack(to, [lens("first")])
+
+    def slowly(*args: Any) -> Any:
+        time.sleep(0.05)
+        return entries(*args)
+
+    monkeypatch.setattr(blender, "_merged", slowly)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda k: add_lens(to, lens(f"lens_{k}")), range(8)))
+    ids = {entry["id"] for entry in blender._contents(to)[1]}
+    assert ids == {f"lens_{k}" for k in range(8)} | ({"first"} if suffix else set())
 
 
 def test_user_folder_adds_to_the_lenses_that_ship(tmp_path: Path) -> None:

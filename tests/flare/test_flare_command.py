@@ -11,6 +11,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from neurolens import frames
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
 from neurolens.cli import flare as command
@@ -18,7 +19,7 @@ from neurolens.cli import main
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, coated
-from neurolens.flare.layers import FlareJob
+from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.lights import Light, light_rays, with_disc
 from neurolens.lens.apertures import Aperture
 from neurolens.readers.lensfile import read_lens
@@ -36,6 +37,13 @@ def layers_of(file: Path) -> dict[str, np.ndarray]:
     return {
         name[:-2]: np.stack([planes[f"{name[:-1]}{c}"] for c in "RGB"], -1) for name in planes if name.endswith("R")
     }
+
+
+def held(layers: dict[str, np.ndarray]) -> np.ndarray:
+    """Pixels where the space holds the colours of all layers: what it does not hold was mixed until a colour is 0."""
+    found = np.logical_and.reduce([(v.min(-1) > 1e-4 * v.max()) | (v.max(-1) <= 0) for v in layers.values()])
+    assert found.sum() > 150
+    return found
 
 
 def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -109,8 +117,10 @@ def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
     assert files[1].stat().st_mtime_ns == kept and files[2].read_bytes() == before
 
 
-def test_gains_and_tints(tmp_path: Path) -> None:
-    """The gains of a ghost and of the layer multiply, and the layer stays the sum of its parts."""
+def test_gains_and_tints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gains of a ghost and of the layer multiply, and the layer stays the sum of its parts; of the light itself,
+    before what lies beyond the colour space is mixed."""
+    monkeypatch.setattr(frames, "in_gamut", lambda colours, space: colours)
     found = []
     gains = ["--gain", "g05-03=0.5", "--tint", "g05-03=1/0/2", "--gain", "ghosts=3"]
     for words in ([], gains):
@@ -195,8 +205,9 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
     found = read_layers(out)
     assert len(found) == 12 and not read_exr(out)[0].any()
     words = ["--lights", str(scene), "--coating", "single-layer", "--focus", "2", "--bins", "3"]
-    assert main(["flare", "cooke_triplet_50", *words, "--width", "36", "-o", str(out), "--quiet"]) == 0
-    ghosts = np.stack([found[f"ghosts.{c}"] for c in "RGB"], -1) @ conversion(COLOUR_SPACES["ACEScg"], SRGB).T
+    words += ["--width", "36", "--colour-space", "ACEScg", "-o", str(out), "--quiet"]  # which holds these colours
+    assert main(["flare", "cooke_triplet_50", *words]) == 0
+    ghosts = np.stack([found[f"ghosts.{c}"] for c in "RGB"], -1)
     plain = read_exr(out)[0]
     assert plain.any()
     # One matrix, the white balance's, takes all pixels.
@@ -279,10 +290,14 @@ def test_layers_are_the_ghosts_with_the_greatest_peaks_on_the_film(tmp_path: Pat
     order = np.argsort(-each.max((1, 2, 3)))
     found = layers_of(out)
     assert set(found) == {"ghosts", "rest", *(tracer.pairs[k].name for k in order[:12])}
+    same = held(found)
     for k in order[:12]:
-        np.testing.assert_allclose(found[tracer.pairs[k].name], each[k], rtol=1e-4, atol=1e-6 * each[k].max())
+        layer = found[tracer.pairs[k].name]
+        np.testing.assert_allclose(layer[same], each[k][same], rtol=1e-4, atol=1e-6 * each[k].max())
+        assert layer.sum() == pytest.approx(each[k].sum(), rel=0.02)
     assert found["rest"].max() < found["ghosts"].max() / 20
-    np.testing.assert_allclose(found["rest"], each[order[12:]].sum(0), rtol=1e-3, atol=1e-4 * each.max())
+    rest = each[order[12:]].sum(0)
+    np.testing.assert_allclose(found["rest"][same], rest[same], rtol=1e-3, atol=1e-4 * each.max())
 
 
 def test_no_layer_is_black(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -358,7 +373,8 @@ def test_colours_are_those_of_the_space_that_is_asked_for(tmp_path: Path) -> Non
     assert expected.keys() == found.keys() and len(found) == 4
     pairs = [(read_exr(plain)[0], read_exr(other)[0]), *((expected[n], found[n]) for n in found)]
     for picture, aces in pairs:
-        np.testing.assert_allclose(aces, picture @ np.transpose(matrix), atol=3e-5 * picture.max())
+        same = held(expected)
+        np.testing.assert_allclose(aces[same], picture[same] @ np.transpose(matrix), atol=3e-5 * picture.max())
     header = OpenEXR.File(str(other), header_only=True).header()
     assert header["chromaticities"] == pytest.approx(ACESCG.chromaticities, abs=1e-6)
     assert header["colorInteropID"] == ACESCG.interop_id
@@ -401,3 +417,28 @@ def test_no_picture_replaces_what_it_is_made_from(tmp_path: Path, capsys: pytest
         assert main([*COOKE, *words]) == 2
         assert "another name" in capsys.readouterr().err
         assert (mask.read_bytes(), plate.read_bytes()) == before
+
+
+@pytest.mark.parametrize("space", COLOUR_SPACES)
+@pytest.mark.parametrize("colour", ["0/0/1", "0/1/0", "1/0/0.2"])
+def test_no_picture_is_negative(tmp_path: Path, space: str, colour: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Flare of saturated lights: nothing below zero, the luminance of the light kept, the layers still its sums."""
+    out = tmp_path / "led.exr"
+    words = ["flare", "laikin_double_gauss_50", "--light", f"15,8,{colour}", "--width", "48", "--cell", "16"]
+    assert main([*words, "--bins", "4", "--layers", "2", "--colour-space", space, "-o", str(out)]) == 0
+    said = capsys.readouterr().err
+    rgb, layers = read_exr(out)[0], layers_of(out)
+    assert min(picture.min() for picture in (rgb, *layers.values())) >= 0
+    np.testing.assert_array_equal(layers["ghosts"], rgb)
+    np.testing.assert_allclose(sum(v for name, v in layers.items() if name != "ghosts"), rgb, rtol=1e-5, atol=1e-7)
+    lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=math.inf, focus_mode="best")
+    light = Light(15.0, 8.0, tuple(map(float, colour.split("/"))))
+    job = FlareJob(lens, [light], Raster((36, 24), 48, 32), FlareSettings(bins=4, cell_px=16.0))
+    raw = flare_layers(job)["ghosts"]
+    assert raw.min() < 0
+    to_y = COLOUR_SPACES[space].to_xyz[1]
+    light_of = raw @ conversion(SRGB, COLOUR_SPACES[space]).T @ to_y
+    bright = light_of > 0.01 * light_of.max()
+    assert bright.mean() > 0.5
+    np.testing.assert_allclose((rgb @ to_y)[bright], light_of[bright], rtol=1e-4)
+    assert space == "ACEScg" or colour[0] == "1" or ("mixed with grey" in said and "ACEScg" in said)

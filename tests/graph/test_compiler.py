@@ -1,10 +1,15 @@
 """Compiled libraries: kept for the next time, never taken from a folder that others can write to."""
 
+import functools
+import shutil
+import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from neurolens.base import files
 from neurolens.base.errors import InputError
 from neurolens.graph import compiler
 
@@ -93,7 +98,38 @@ def test_a_full_disk_is_no_missing_compiler(monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.setenv("CC", str(odd))
     with pytest.raises(OSError, match="No space left") as error:
         compiler.load_compiled(SOURCE)
-    assert error.value.filename == str(tmp_path / "neurolens")
+    assert str(tmp_path / "neurolens") in error.value.filename
+
+
+@pytest.mark.parametrize("full", ["cache", "temporary", "both"])
+def test_a_full_disk_is_left_for_another_or_named(full: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The compiler writes where there is room: its own temporary files, too."""
+    temporary, cache = tmp_path / "temporary", compiler.cache_folder()
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.setattr(files, "folder_of_process", functools.cache(files.TemporaryFolder))
+    monkeypatch.setattr(compiler, "folder_of_process", files.folder_of_process)
+    seen = tmp_path / "seen"
+    odd = tmp_path / "odd"
+    odd.write_text(f'#!/bin/sh\necho "$TMPDIR" >> {seen}\nexec {compiler.find_compiler()} "$@"\n')
+    odd.chmod(0o700)
+    monkeypatch.setenv("CC", str(odd))
+    usage = shutil.disk_usage
+
+    def disk_usage(path: Path) -> Any:
+        of_cache = Path(path).is_relative_to(cache)
+        return usage(path)._replace(free=0) if full in ("both", "cache" if of_cache else "temporary") else usage(path)
+
+    monkeypatch.setattr(shutil, "disk_usage", disk_usage)
+    if full != "both":
+        assert compiler.load_compiled(SOURCE)
+        assert str(temporary if full == "cache" else cache) == seen.read_text().splitlines()[-1]
+        assert bool(list(cache.glob("*.so"))) == (full == "temporary")
+        return
+    odd.write_text("#!/bin/sh\nexit 1\n")
+    with pytest.raises(OSError, match="No space left") as error:
+        compiler.load_compiled(SOURCE)
+    assert str(cache) in error.value.filename and str(temporary) in error.value.filename
 
 
 def test_no_compiler_and_one_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

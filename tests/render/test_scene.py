@@ -115,6 +115,27 @@ def test_each_mistake_is_named(kind: str, table: Any, message: str) -> None:
     assert str(caught.value).startswith("test.toml: ") and ", expected " in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("kind", "grey", "colour"),
+    [
+        ("materials", {"m": {"kind": "glossy", "specular": 0.04, "roughness": 0.3, "reflectance": 0}},
+         {"m": {"kind": "glossy", "specular": [0.04] * 3, "roughness": 0.3, "reflectance": [0] * 3}}),
+        ("materials", {"m": GLASS | {"transmittance": 0.5, "transmittance_depth_m": 1.0}},
+         {"m": GLASS | {"transmittance": [0.5] * 3, "transmittance_depth_m": 1.0}}),
+        ("discs", [DISC | {"emission": 2}], [DISC | {"emission": [2.0] * 3}]),
+        ("environment", {"colour": 0.5}, {"colour": [0.5] * 3}),
+    ],
+)  # fmt: skip
+def test_one_number_is_a_grey(kind: str, grey: Any, colour: Any) -> None:
+    """A colour of one number is three equal ones, held to the same bounds; a place of one number stays a mistake."""
+    materials = {"materials": {"m": GREY}}
+    one, three = (getattr(scene(**(materials | {kind: table})).settings, kind) for table in (grey, colour))
+    assert one == three
+    for name, table in (("discs", [DISC | {"emission": -1}]), ("discs", [DISC | {"centre_m": 1}])):
+        with pytest.raises(InputError, match="emission|centre_m"):
+            scene(**(materials | {name: table}))
+
+
 def test_empty_and_missing_files(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     for content in ("", "camera = 3", "[camera", "[camera]\nfocus_m = 2\n"):

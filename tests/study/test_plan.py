@@ -20,6 +20,7 @@ from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.ideal import Pinhole
 from neurolens.cameras.reduced import Warped
 from neurolens.cli import main
+from neurolens.cli.plan import _use
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
 from neurolens.plan import candidates as tried
@@ -354,3 +355,14 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
         for seen in (found, replace(found, asked=asked))
     )
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
+
+
+def test_a_plan_prints_one_price_and_what_it_took_itself() -> None:
+    """Seconds of the picture, and the plan's own beside them where they are more than a tenth."""
+    found = planned(0.0, 4.0, None)
+    assert found.best is not None
+    found = replace(found, work=Work((10.0, 10.0), (1.0, 1.0)), best=replace(found.best, seconds=20.0))
+    cheap, dear = (_use(found, took) for took in (1.9, 300.0))
+    assert "about 20 s" in cheap and "This plan" not in cheap
+    assert "about 20 s" in dear and "300 CPU seconds, 15 times" in dear
+    assert " ns" not in cheap + dear and "operations" not in cheap + dear

@@ -1,0 +1,41 @@
+"""Numbers with the units that people type."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TypeVar
+
+T = TypeVar("T")
+# What units are worth, by dimension: a value may be typed with any unit of its option's dimension.
+WORTH: tuple[dict[str, float], ...] = (
+    {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3, "ft": 0.3048, "in": 0.0254, '"': 0.0254},
+    {"deg": 1, "\N{DEGREE SIGN}": 1, "rad": 180 / math.pi},
+    {"s": 1, "ms": 1e-3, "min": 60, "h": 3600},
+    {"px": 1, "pixels": 1},
+    {"stops": 1},
+)
+_QUANTITY = re.compile(r"([-+]?[\d.]+(?:e[-+]?\d+)?) ?([^\d\s.,]+)", re.IGNORECASE)
+
+
+def in_unit(unit: str, convert: Callable[[str], T]) -> Callable[[str], T]:
+    """Type of an argument whose numbers may have a unit: in_unit("m", float)("6ft") is 1.8288; `unit` "f" takes f/2."""
+    worth = next((worth for worth in WORTH if unit in worth), {})
+
+    def plain(word: str) -> str:
+        if unit == "f":
+            return re.sub(r"^f/? ?(?=[\d.])", "", word, flags=re.IGNORECASE)
+        found = _QUANTITY.fullmatch(word.strip())
+        if found is None or (factor := worth.get(found[2].lower())) is None:
+            return word
+        with suppress(ValueError):  # 1.2.3
+            return f"{float(found[1]) * factor / worth[unit]:.12g}"
+        return word
+
+    def read(text: str) -> T:
+        return convert(",".join(map(plain, text.split(","))))
+
+    read.__name__ = getattr(convert, "__name__", "value")  # for messages of argparse
+    return read
