@@ -134,7 +134,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    echo "Ctrl-C stops it; without torch '$(BIN)/python -m pip install -e .' takes 265 MB, and renders with models."; \
 	fi; \
 	echo "torch and what it needs take $$size"; \
-	(while sleep 15 >/dev/null && kill -0 $$$$ 2>/dev/null; do \
+	(while sleep 15 >/dev/null 2>&1 && kill -0 $$$$ 2>/dev/null; do \
 	    echo "  pip is at work: $(VENV) has $$(du -sm $(VENV) | cut -f1) MB"; done) & beat=$$!; \
 	$(PIP_INSTALL) $$index torch; \
 	$(PIP_INSTALL) --no-build-isolation -e '.[train,dev]'; \

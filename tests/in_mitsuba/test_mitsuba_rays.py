@@ -115,7 +115,7 @@ def test_a_wavefront_of_one_draws_uniform_numbers() -> None:
 
 def test_without_mitsuba_one_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(NeurolensError, match=r"'neurolens\[mitsuba\]'"):
+    with pytest.raises(NeurolensError, match=r"pip install '\.\[mitsuba\]'"):
         load_scene("cornell-box")
 
 

@@ -115,7 +115,7 @@ def test_a_name_that_lensfun_does_not_have_is_refused_with_near_ones() -> None:
 
 def test_without_the_package_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(profiles, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"neurolens\[photographs\]"):
+    with pytest.raises(InputError, match=r"pip install '\.\[photographs\]'"):
         database.__wrapped__()
 
 
