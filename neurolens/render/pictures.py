@@ -269,6 +269,8 @@ def decoded_later_parts(path: Path) -> list[tuple[str, dict[str, NDArray[Any]]]]
         if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
             raise InputError(path, "file", f"(part {name!r} is deep)", "flat parts, or a deep file by itself")
         across, down = (int(b) - int(a) + 1 for a, b in zip(*header["dataWindow"], strict=True))
+        if min(across, down) < 1:
+            raise InputError(path, "file", f"(part {name!r} of {across}x{down} pixels)", "parts of at least a pixel")
         known.append((name, {c.name for c in header["channels"]}))
         values += across * down * len(header["channels"])
         if np.array_equal(header["dataWindow"], parts[0][1]["dataWindow"]):
