@@ -143,9 +143,10 @@ _INTRODUCTION = """\
 
 Rays that pass each lens (full aperture and field, 400-700 nm, infinity to 14 focal lengths);
 share of them, in percent, that an iteration does not find ({tolerance:g} of the stop's radius; of the front's radius
-and in radians). Published: Newton from the first-order map, undamped, 3 / 5 / 10 / 20 steps; "away": residual above 1
-after 20. Ours: direct fit, then {steps} limited steps (two for comparison). "other": another ray through the same point
-(the map is folded in the lens itself, and one ray of two is found). Both on the same model (64 coefficients)."""
+and in radians). Published (Hanika and Dachsbacher 2014, Schrade et al. 2016): Newton from the first-order map,
+undamped, 3 / 5 / 10 / 20 steps; "away": residual above 1 after 20. Ours: direct fit, then {steps} limited steps (two
+for comparison). "other": another ray through the same point (the map is folded in the lens itself, and one ray of two
+is found). Both on the same model (64 coefficients)."""
 
 
 def _share(title: str, path: str, rest: bool = False) -> lab.Column:

@@ -22,6 +22,7 @@ from typing import Any
 from experiments import lab
 from experiments.lab import markdown_table
 from experiments.methods import GROUPS, QUICK_STEPS, Bench, BenchSettings, chosen_rows, run_bench
+from experiments.published import NAMED
 from neurolens.base.errors import InputError, printable
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress
@@ -185,7 +186,7 @@ def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
         cells = [c.cell(record) for c in COLUMNS] if not record["failed"] else [""] * len(COLUMNS)
         if record["failed"]:
             cells[0] = f"failed: {_cell(record['failed'])}"
-        rows.append([record["method"], *cells])
+        rows.append([_named(record["method"]), *cells])
     for exact in _exact(records):
         time = number(exact, "ns_per_ray.min")
         cells = [DASH if c.key != "ns_per_ray.min" or time is None else show(time, 3) for c in COLUMNS]
@@ -211,7 +212,7 @@ def summary_page(found: Mapping[str, Sequence[Record]], facts: str) -> str:
         rows = [r for r in every if r["method"] == method]
         good = [r for r in rows if not r["failed"]]
         count = f"{len(good)}" if len(good) == len(rows) else f"{len(good)} of {len(rows)}"
-        cells.append([method, count, *(_median_and_worst(c, good) for c in SUMMED)])
+        cells.append([_named(method), count, *(_median_and_worst(c, good) for c in SUMMED)])
     lines = markdown_table(["method", "lenses", *(c.heading for c in SUMMED)], cells)
     failures = [f"- {r['method']}, {r['lens']}: {_cell(r['failed'])}" for r in every if r["failed"]]
     sources = {r["method"]: r["source"] for r in methods.values() if r["source"]}
@@ -263,7 +264,11 @@ def _by_lens(found: Mapping[str, Sequence[Record]], methods: Sequence[str]) -> l
         return DASH if record is None else " / ".join(c.cell(record) for c in _OF_A_LENS)
 
     lines = ([lens, *(cell(rows[lens].get(m)) for m in methods)] for lens in sorted(rows, key=worst))
-    return markdown_table(["lens", *methods], lines)
+    return markdown_table(["lens", *map(_named, methods)], lines)
+
+
+def _named(method: str) -> str:
+    return NAMED.get(method, method)
 
 
 def _cell(text: str) -> str:

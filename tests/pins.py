@@ -1,7 +1,13 @@
-"""Writes data/pins.json: which Pythons each package of constraints.txt asks for, as pip reads it of the index.
+"""Writes what the index says of the pins of constraints.txt: the Pythons that each takes, and hashes of its files.
 
-Run it after every change of a pin: `python tests/pins.py`. The first Python that we promise stands for all in pip's
-question, so that a pin which does not take it fails here already, under the name of the package. Nothing is installed.
+Run it after every change of a pin, where the package uv is installed: `python tests/pins.py`. It installs nothing.
+
+data/pins.json: the Pythons, as pip reads them. The first Python that we promise stands for all in pip's question, so
+that a pin which does not take it fails here already, under the name of the package.
+
+data/base.lock, data/all.lock: files for `pip install --require-hashes -r`, with the hashes of pins for all platforms
+and Pythons; of the base install, and of all extras but "shading". torch and its CUDA libraries are left out:
+builds for the CPU come from another index, whose files are other files.
 """
 
 import json
@@ -13,6 +19,23 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 PINS, TABLE, OLDEST = HERE.parent / "constraints.txt", HERE / "data" / "pins.json", "3.11.0"
+DATA = TABLE.parent
+EXTRAS = (
+    "train",
+    "dev",
+    "docs",
+    "mitsuba",
+    "photographs",
+    "dask",
+    "usd",
+    "web",
+)  # without "shading", which only tests use
+LOCKS: dict[Path, tuple[str, ...]] = {DATA / "base.lock": (), DATA / "all.lock": EXTRAS}
+
+
+def cuda(name: str) -> bool:
+    """Whether torch and what it brings for CUDA: packages without hashes here."""
+    return name.startswith(("torch", "triton", "cuda-", "nvidia-"))
 
 
 def pins() -> dict[str, str]:
@@ -39,5 +62,12 @@ if __name__ == "__main__":
     asked = {
         f"{plain(one['name'])}=={one['version'].partition('+')[0]}": one.get("requires_python", "") for one in found
     }
+    left_out = [f"--no-emit-package={name}" for name in pins() if cuda(name)]
+    options = ["-q", "--upgrade", "--universal", "--generate-hashes", "--no-annotate", "--no-header", *left_out]
+    options += [f"--python-version={OLDEST}", "-c", str(PINS), str(PINS.with_name("pyproject.toml"))]
+    for lock, extras in LOCKS.items():
+        command = [sys.executable, "-m", "uv", "pip", "compile", *options, *(f"--extra={extra}" for extra in extras)]
+        subprocess.run([*command, "-o", str(lock)], check=True)
+        print(lock)
     TABLE.write_text(json.dumps(dict(sorted(asked.items())), indent=1) + "\n", encoding="utf-8")
     print(f"{TABLE}: {len(asked)} packages")

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
+from urllib.parse import unquote
 
 import pytest
 from shipped import WHOLE
@@ -51,6 +52,37 @@ def test_links_lead_to_files(page: Path) -> None:
     for link in re.findall(r"\]\(([^)#\s:]+)[)#]", page.read_text(encoding="utf-8")):
         target = Path(os.path.normpath(page.parent / link))
         assert target.exists() or not MADE.isdisjoint({target, target.parent}), link
+
+
+# A name, or the first of several, and a year; of texts, these are no papers.
+AUTHORS = re.compile(r"\b([A-Z][a-z]+)(?:, [A-Z][a-z]+)*(?:,? and [A-Z][\w-]+| et al\.)?,? \(?((?:19|20)\d\d)[ab]?\b")
+NO_PAPERS = {
+    ("November", "2026"),
+    ("Brendel", "1958"),
+    ("Format", "1994"),
+}  # dates, a patent, the PLY format in brackets
+
+
+def test_every_paper_that_is_named_is_on_the_page_of_papers() -> None:
+    """In pages, docstrings, comments and measured tables; the page names two more, which nothing is after."""
+    listed = re.findall(r"^- .*(?:\n  .*)*", (DOCS / "papers.md").read_text(encoding="utf-8"), re.MULTILINE)
+    texts = [p for f in ("neurolens", "experiments") for s in ("*.py", "*.md", "*.glsl") for p in (ROOT / f).rglob(s)]
+    named = {
+        (name, year, name_of(file))
+        for file in {*PAGES, *texts} - {DOCS / "papers.md"}
+        for name, year in AUTHORS.findall(re.sub(r"\s+(?:(?:#|//) )?", " ", file.read_text(encoding="utf-8")))
+        if (name, year) not in NO_PAPERS
+    }
+    assert len({(name, year) for name, year, _ in named}) > 50  # the pattern still finds them
+    missing = [one for one in named if not any(re.search(rf"\b{one[0]}\b.* {one[1]}", e, re.DOTALL) for e in listed)]
+    assert not missing
+
+
+def test_papers_are_linked_by_their_own_doi() -> None:
+    page = (DOCS / "papers.md").read_text(encoding="utf-8")
+    links = re.findall(r"\[(10\.\d{4,5}/[^\]\s]+)\]\(https://doi\.org/([^)\s]+)\)", page)
+    assert len(links) == page.count("https://doi.org/") == len(set(links)) > 50
+    assert all(unquote(target) == shown for shown, target in links)
 
 
 Row = Mapping[str, str]

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
-from pins import OLDEST, TABLE, pins, plain
+from pins import EXTRAS, LOCKS, OLDEST, TABLE, cuda, pins, plain
 from test_imports import statements
 
 import neurolens
@@ -54,6 +54,23 @@ def test_every_pin_takes_every_python_that_is_promised() -> None:
     for pin, wanted in asked.items():
         for python in (OLDEST, "3.11.2", "3.11.14", "3.12.0", "3.13.0"):
             assert python in SpecifierSet(wanted or ""), f"{pin} wants Python {wanted}, not {python}"
+
+
+def test_locks_have_hashes_of_what_is_installed_at_the_pinned_versions() -> None:
+    """Every package at the version of its pin, and none without a hash, as pip demands it."""
+    wanted = {plain(name): version for name, version in pins().items() if not cuda(name)}
+    locked = {}
+    for lock in LOCKS:
+        text = lock.read_text(encoding="utf-8")
+        entries = re.split(r"\n(?=\S)", text)
+        assert all(re.search(r" --hash=sha256:[0-9a-f]{64}$", entry, re.MULTILINE) for entry in entries)
+        locked[lock.stem] = {plain(e.partition("==")[0]): e.partition("==")[2].split()[0] for e in entries}
+    assert locked["base"].items() < locked["all"].items() <= wanted.items(), "run python tests/pins.py"
+    extras = PROJECT["optional-dependencies"]
+    for names, lines in (("base", PROJECT["dependencies"]), *(("all", extras[extra]) for extra in EXTRAS)):
+        asked = {plain(Requirement(line).name) for line in lines} - {"torch"}
+        assert asked <= set(locked[names]), names
+    assert {*EXTRAS, "shading"} == set(extras) and "scipy" not in locked["base"]
 
 
 def imported(text: str, tree: ast.Module) -> Iterator[str]:

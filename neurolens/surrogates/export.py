@@ -53,6 +53,10 @@ UNITS = {
     "stop_xy_mm": "mm",
     "status": "integer, see status_codes",
 }
+LENSFUN = (
+    "rims fitted to photographs and the table measured are made from lensfun's database (https://lensfun.github.io), "
+    "CC BY-SA 3.0 (https://creativecommons.org/licenses/by-sa/3.0/): see lenses/LICENSE"
+)
 _CHECKED = 20_000  # rays that inverse maps are to find
 FRAME = (
     "Lens frame: z along the optical axis, front vertex at z = 0, film at z > 0, x right and y up seen from behind the "
@@ -234,6 +238,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "dispersive": lens.dispersive,
         **({"believed_to_be": lens.believed_to_be} if lens.believed_to_be else {}),
         **({"measured": dict(lens.measured)} if lens.measured else {}),
+        **({"licence": LENSFUN} if lens.measured or lens.rims == "photographs" else {}),
         **({} if data.front_efl_mm == data.efl_mm else {"index_ratio": float(data.front_efl_mm / data.efl_mm)}),
     }
 

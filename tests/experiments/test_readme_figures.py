@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from experiments.make_models import errors_by_kind
+from experiments.surrogates import lens_page, summary_page
 from neurolens.study.pages import recommended
 
 ROOT = Path(__file__).parents[2]
@@ -170,3 +171,19 @@ def test_light_of_averaged_polarisation() -> None:
     worst = [r["bare"]["relative"] for r in results("transmittance")["lenses"]]
     text = README.partition("averaging it at every surface")[2].partition("(`python")[0]
     assert_printed(text, [100 * max(worst), len(worst), 100 * statistics.median(worst)])
+
+
+LIMITS = {"neurolens2017-128x3": "not converged", **dict.fromkeys(("ray-lut-8", "ray-lut-32"), "judged on a CPU")}
+
+
+def test_tables_of_methods_say_what_limits_a_figure_in_its_cell() -> None:
+    """As the benchmark writes them today, and as they are committed."""
+    records = [
+        {"method": name, "lens": "any", "group": "published", "source": "", "failed": "not run", "rms_px": None}
+        for name in (*LIMITS, "hanika-d5")
+    ]
+    folder = ROOT / "experiments" / "results" / "surrogates"
+    pages = [lens_page("any", records, ""), summary_page({"any": records}, "")]
+    for page in [*pages, *(file.read_text(encoding="utf-8") for file in sorted(folder.glob("*.md")))]:
+        found = re.findall(r"\| ((?:neurolens2017-128x3|ray-lut-8|ray-lut-32|hanika-d5)[^|]*) (?=\|)", page)
+        assert set(found) == {*(f"{name}, {limit}" for name, limit in LIMITS.items()), "hanika-d5"}

@@ -30,12 +30,15 @@ from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
 from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import first_order
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 from neurolens.study.speed import CompiledSource
 from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import MODEL_KEY, card_to_json, read_metadata
-from neurolens.surrogates.export import card_of, export_onnx
+from neurolens.surrogates.export import card_of, export_onnx, lens_facts
 from neurolens.surrogates.file import onnx_of, read_model
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import domain_of
 from neurolens.surrogates.source import Fix, at_wavelength, export_source, fixed_models, fused_program, identifier
 
 ROOT = Path(__file__).parents[2]
@@ -332,3 +335,16 @@ def test_the_card_stands_on_top(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="to"):
         export_source([model], tmp_path / "x.h", "fortran", card)
     assert [p.name for p in tmp_path.iterdir()] == ["lens.h"]
+
+
+@pytest.mark.parametrize(
+    ("name", "bound"),
+    [("canon_ef_20mm_f2_8_usm", True), ("canon_ef_16_35mm_f2_8l_usm", True), ("laikin_double_gauss_50", False)],
+)
+def test_a_card_names_the_licence_of_rims_and_tables_made_from_lensfun_and_no_other(name: str, bound: bool) -> None:
+    """Rims fitted to photographs, a table of what they measured, and a lens of a book, which owes lensfun nothing."""
+    lens = set_lens(read_lens(ROOT / "lenses" / f"{name}.toml"))
+    for one in (lens, replace(lens, measured=())):
+        said = lens_facts(one, domain_of(one)).get("licence", "")
+        owes = bound and (bool(one.measured) or one.rims == "photographs")
+        assert ("lensfun" in said and "CC BY-SA 3.0" in said) == owes == bool(said)
