@@ -416,7 +416,8 @@ class World:
             stops = (found < 0) | self._endless[found] | ((depth[rows] == 0) & ~own)
             follows[rows] = stops & (met[rows] == things)
             going = ~follows[rows] & (found >= 0) & ~self._endless[found]
-            rows, step, found, front, stops = (v[going] for v in (rows, step, found, front, stops))
+            rows, step, found = rows[going], step[going], found[going]
+            front, stops = front[going], stops[going]
             if not rows.size:
                 break
             way[rows] += step * (1 + _PER_M) + _THROUGH
