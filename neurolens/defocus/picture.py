@@ -239,12 +239,13 @@ def take_highlights(plate: Plate, number: int, spread: NDArray[np.float64]) -> H
     """
     layer, size = plate.layers[number], plate.size
     rgb, w = layer.texel[..., :3], layer.texel[..., 3]
-    bright = rgb.max(axis=2)
+    bright, there = rgb.max(axis=2), w >= 0
+    part = np.maximum(_around(there.astype(np.float32)), 1e-9)  # of the surroundings, where the layer has something
     log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
-    geometric = np.exp(_around(log))
-    mean = _around(np.minimum(bright, _BRIGHTER * geometric))
+    geometric = np.exp(_around(np.where(there, log, 0)) / part)
+    mean = _around(np.where(there, np.minimum(bright, _BRIGHTER * geometric), 0)) / part
     cap = np.maximum(_BRIGHTER * geometric, _ABOVE * mean)
-    row, column = np.nonzero((bright > cap) & (w >= 0))
+    row, column = np.nonzero((bright > cap) & there)
     nodes = [
         np.clip(((v + 0.5 - border) / n * (k - 1)).round().astype(int), 0, k - 1)
         for v, border, n, k in zip((row, column), plate.border_px[::-1], size[::-1], spread.shape[:2], strict=True)

@@ -31,6 +31,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.shot import Dispersion, FocusMode, Shot, Vignetting, film_size
 from neurolens.readers.glasses import more_glasses
+from neurolens.render.behind import Behind
 from neurolens.render.colour import (
     ACESCG,
     COLOUR_SPACES,
@@ -48,6 +49,7 @@ from neurolens.render.renderer import RenderResult, Watch, render, rows_of, tile
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
 from neurolens.render.sensor import about, expose
 from neurolens.render.settings import LAYERS, FilmSettings, SensorSettings, size_by_shape
+from neurolens.render.world import shared_worlds
 
 if TYPE_CHECKING:
     from neurolens.flare.canvas import Raster
@@ -96,6 +98,10 @@ class Picture:
     channels: Literal["all", "beauty"] = setting(
         "all", "of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along "
         "the axis from the film) and blocked (share of camera rays that do not pass) (default: all)", old=("layers",),
+    )  # fmt: skip
+    behind: int = setting(
+        0, "add so many layers of what stands behind the first things that a pinhole sees, as channels behind1.R and "
+        "so on, for the blur of neurolens defocus; each takes as long as the picture (default: 0)", within=(0, 8),
     )  # fmt: skip
 
 
@@ -226,12 +232,28 @@ class Prepared:
 
     def render(self, threads: int = 2, progress: Any = None, watch: Watch | None = None) -> RenderResult:
         """Path-trace the frame, without its flare; see `render.renderer.render`."""
-        width, height = self.size
-        return render(
-            self.scene, self.camera, width=width, height=height, samples=self.frame.samples, seed=self.frame.seed,
-            threads=threads, max_depth=self.frame.max_depth, film=self.film, rows=self.rows, progress=progress,
-            watch=watch,
-        )  # fmt: skip
+        (width, height), frame = self.size, self.frame
+
+        def taken(camera: Camera, watch: Watch | None) -> RenderResult:
+            return render(
+                self.scene, camera, width=width, height=height, samples=frame.samples, seed=frame.seed,
+                threads=threads, max_depth=frame.max_depth, film=self.film, rows=self.rows, progress=progress,
+                watch=watch,
+            )  # fmt: skip
+
+        with shared_worlds():
+            result = taken(self.camera, watch)
+            behind = watch and replace(watch, preview=None, checkpoint=None)
+            for k in range(1, frame.behind + 1):
+                if result.stats["complete"]:
+                    layer = taken(Behind(self.camera, self.scene, k), behind)
+                    if not layer.stats["complete"]:  # the picture itself is kept; its layers begin anew
+                        result.stats["complete"] = False
+                        if result.save is not None:
+                            result.save()
+                        break
+                    result = replace(result, behind=(*result.behind, layer))
+        return result
 
 
 def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepared:
@@ -257,6 +279,9 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
     PixelGrid(width, height, shot.film_mm)  # checked before the slow make_camera
     rows = None if frame.tile is None else rows_of(height, frame.tile)
     camera = make_camera(str(frame.camera), shot, progress)
+    if frame.behind and (camera.settings.get("camera") != "pinhole" or frame.channels != "all"):
+        shown = f"(with --camera {frame.camera}, --channels {frame.channels})"
+        raise InputError("neurolens render", f"--behind {frame.behind}", shown, "a pinhole, and all channels")
     for note in camera.settings.get("notes", ()):
         warn(note)
     error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
@@ -378,7 +403,12 @@ def write_pictures(
     metadata |= {"render": plain(result.stats), "colour": space.stated}
     layers: Layers = {}
     if frame.channels == "all" or not result.stats["complete"]:
-        layers, metadata["layers"] = asdict(result.layers), MEANING
+        layers, metadata["layers"] = asdict(result.layers), dict(MEANING)
+    for k, layer in enumerate(result.behind, 1):
+        behind = converted(layer.rgb, conversion(SRGB, space)).astype(np.float32)
+        layers |= {f"behind{k}.{c}": behind[..., n] for n, c in enumerate("RGB")}
+        layers |= {f"behind{k}.A": 1 - layer.layers.blocked, f"behind{k}.Z": layer.layers.depth}
+        metadata["layers"][f"behind{k}"] = f"what follows the first {k} things on each ray; premultiplied"
     rows = prepared.rows or (0, height)
     if (sensor := prepared.sensor) is not None:
         added = (flare[name][slice(*rows)] for name in LAYERS if name in flare)  # it stands behind the lens, too

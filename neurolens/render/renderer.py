@@ -170,6 +170,7 @@ class RenderResult:
             samples count those before a checkpoint, too.
         layers: additional channels.
         identity: what pictures of the same settings have in common, to tell whether rows belong together; of a part.
+        behind: pictures of what is behind the first thing on each ray, behind the first two, and so on.
         save: writes the watch's checkpoint, for use if the picture cannot be written; raises OSError or
             NeurolensError. None without a watch that names one.
     """
@@ -179,6 +180,7 @@ class RenderResult:
     layers: Layers
     identity: dict[str, Any] | None = None
     save: Callable[[], None] | None = None
+    behind: tuple[RenderResult, ...] = ()
 
 
 def render(

@@ -40,6 +40,7 @@ from neurolens.render.primitives import (
     Rays,
     SphereClusters,
     Spheres,
+    dot,
     has_embree,
     triangle_planes,
 )
@@ -51,6 +52,8 @@ _STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still fi
 DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
 _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
 _MANY_QUADS = 128  # beyond, a mesh is faster than testing one after the other
+_THROUGH, _PER_M = np.float32(1e-4), np.float32(1e-5)  # m, and of the way: how far behind a surface a ray goes on
+_SURFACES = 64  # that one ray passes on its way to a layer behind; most are backs of what it has entered
 
 
 def _frame(origin: Frame, u: Frame, v: Frame, size: Sequence[float] = (1.0, 1.0)) -> Frame:
@@ -315,6 +318,7 @@ class World:
         self.kind = spread([_KINDS[m.kind] if m else NOTHING for m in materials], np.uint8)
         shining = np.array([part.emitter is not None for part in parts])
         self.light = np.repeat(np.where(shining, np.cumsum(shining) - 1, -1), counts)
+        self._thing = np.repeat(np.arange(len(parts)), counts)  # which one surfaces are parts of, such as a mesh
         self.emission_row = spread([self._emission(part.emitter) for part in parts], np.intp)
         reflectances = [palette.reflectance((m and m.reflectance) or BLACK) for m in materials]
         self.reflectance_row = spread(reflectances, np.intp)
@@ -342,6 +346,10 @@ class World:
         for number, sphere in enumerate(self.scene.settings.spheres, first):
             self._spheres[:, number] = (*sphere.centre_m, 1 / sphere.radius_m)
         self._has_spheres = bool(self.scene.settings.spheres)
+        self._solid, self._endless = self._spheres[3] > 0, np.zeros(len(self.kind), bool)
+        self._solid[[box.first for box in self._boxes if not box.room]] = True
+        endless = (s.first for s in self._primitives if type(s) is Plane or (isinstance(s, Box) and s.room))
+        self._endless[list(endless)] = True
 
     def _make_lights(self, surfaces: list[Surfaces]) -> None:
         """All lights, in the order of `Assembly` those with a surface: quads, discs, spheres."""
@@ -386,6 +394,37 @@ class World:
         for shape in self._primitives:
             shape.nearer(rays, best, found)
         return best, found
+
+    def behind(self, origin: FloatArray, direction: FloatArray, things: int) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Ways [N] in m along rays [3, N] to just behind the first things that they meet, and whether anything follows.
+
+        What is met inside of balls and boxes is no thing of its own, nor is the back of a mesh whose front was met
+        last. The sky follows, too. Nothing follows an infinite plane or the wall of a room: these have no edges past
+        which a lens could see.
+        """
+        count = origin.shape[1]
+        way, follows = np.zeros(count, np.float32), np.zeros(count, bool)
+        met, depth, entered = np.zeros(count, int), np.zeros(count, int), np.full(count, -1)
+        rows: Index = np.arange(count)
+        for _ in range(_SURFACES):
+            along, before = direction.take(rows, axis=1), way[rows]
+            step, found = self.nearest(Rays.of(origin.take(rows, axis=1) + before * along, along))
+            with np.errstate(invalid="ignore"):  # infinitely far
+                at = origin.take(rows, axis=1) + (before + step) * along
+                front = dot(self.normals(self.surfaces(found, at), at)[0], along) < 0
+            own = ~front & (self._thing[found] == entered[rows])
+            stops = (found < 0) | self._endless[found] | ((depth[rows] == 0) & ~own)
+            follows[rows] = stops & (met[rows] == things)
+            going = ~follows[rows] & (found >= 0) & ~self._endless[found]
+            rows, step, found = rows[going], step[going], found[going]
+            front, stops = front[going], stops[going]
+            if not rows.size:
+                break
+            way[rows] += step * (1 + _PER_M) + _THROUGH
+            met[rows] += stops
+            depth[rows] = np.maximum(depth[rows] + np.where(front, 1, -1) * self._solid[found], 0)
+            entered[rows] = np.where(front, self._thing[found], np.where(stops, -1, entered[rows]))
+        return way, follows
 
     def visible(self, origin: FloatArray, direction: FloatArray, distance: FloatArray) -> NDArray[np.bool_]:
         """Visibility [N] of lights at `distance` [N] from origins [3, N]."""
