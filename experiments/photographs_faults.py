@@ -24,9 +24,9 @@ import torch
 from experiments import lab
 from experiments.lab import Row
 from experiments.table_faults import ONE_OF, alarm, changed, check, glasses, opened_at, swapped, transposed
+from experiments.table_figures import Measures, measure
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import Measures, measure
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.verify import found_for
 from neurolens.readers.any_format import read_any

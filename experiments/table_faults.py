@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.table_figures import Measures, measure
 from neurolens.analysis.fields import Result
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import Measures, measure
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.rims import at_focal_length
 

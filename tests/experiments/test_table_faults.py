@@ -10,10 +10,10 @@ import pytest
 from shipped import whole
 
 from experiments.table_faults import ONE_OF, Checked, alarm, changed, check, opened_at, swapped, transposed
+from experiments.table_figures import SHARES, Tables, chief_rays, measure
 from neurolens.analysis import field_curves
 from neurolens.analysis.fields import Scene
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import SHARES, Tables, chief_rays, measure
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.verify import compare, found_for
 from neurolens.readers.any_format import read_any
