@@ -4,6 +4,9 @@ The tables are the primes of OpticsDatabase (github.com/amegahed/OpticsDatabase,
 whose match with a profile of lensfun is certain and whose distortion was measured. Each is broken once in every kind
 (chosen by a seed), of an asphere at each surface that has one. Whether a fault is found is asked of every table, and
 which change is named of those of some lenses, for the search takes seconds. Writes faults.md and faults.json.
+
+With --alarms nothing is broken: any folder of lens files will do, and alarms.md has the share of tables that alarm, by
+group. Zooms are asked at the shortest, middle and longest measured focal length near a state of their table.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import argparse
 import math
 import random
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -23,21 +27,36 @@ import torch
 
 from experiments import lab
 from experiments.lab import Row
-from experiments.table_faults import ONE_OF, alarm, changed, check, glasses, opened_at, swapped, transposed
+from experiments.table_faults import (
+    ALARM,
+    ONE_OF,
+    VARIES,
+    alarm,
+    changed,
+    check,
+    focal_lengths,
+    glasses,
+    opened_at,
+    swapped,
+    transposed,
+)
+from experiments.table_figures import Measures, measure
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import Measures, measure
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.verify import found_for
 from neurolens.readers.any_format import read_any
 
 SEVERAL = "all of several aspheres dropped"  # which no single change mends
+_GROUPS = {"certain": "primes, certain match", "likely": "primes, likely match",
+           "fixed": "fixed-aperture zooms", "variable": "variable-aperture zooms"}  # fmt: skip
 SEEN = 0.3  # percent by which a dropped asphere changes distortion, from which it should be found
 
 OPTIONS = (
     lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase"),
     lab.count("lenses", 40, "lenses whose faults are to be named (default: 40)"),
     lab.count("seed", 1, "of the choices"), lab.ONLY, lab.out(),
+    lab.option("--alarms", action="store_true", help="only whether tables as they are alarm; breaks none"),
 )  # fmt: skip
 
 
@@ -74,11 +93,11 @@ def broken(lens: Lens, some: random.Random) -> Iterator[tuple[str, str, Lens]]:
 
 
 def of_folder(folder: Path, only: str, quiet: bool) -> list[tuple[str, str, Lens, Profile]]:
-    """Name, certainty of the match ("zoom", of zooms with a certain one), table, profile."""
+    """Name, certainty of the match (of zooms with a certain one, their kind), table, profile."""
     found = []
-    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".zmx" and only in p.stem)
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in (".zmx", ".toml") and only in p.stem)
     if not files:
-        raise InputError(folder, "files", "(no .zmx)", "a clone of OpticsDatabase")
+        raise InputError(folder, "files", "(no .zmx and no .toml)", "a clone of OpticsDatabase")
     for file in lab.counted(files, "files", quiet):
         try:
             lens = read_any(file)
@@ -92,13 +111,51 @@ def of_folder(folder: Path, only: str, quiet: bool) -> list[tuple[str, str, Lens
             and not lens.ideal
             and not (zoom and match.certainty != "certain")
         ):
-            found.append((file.stem, "zoom" if zoom else match.certainty, lens, profiles[0]))
+            kind = "variable" if VARIES.search(profiles[0].model) else "fixed"
+            found.append((file.stem, kind if zoom else match.certainty, lens, profiles[0]))
     return found
+
+
+def alarms_of(lens: Lens, profile: Profile) -> list[Row]:
+    """What the table as it is raises, at the ends of a zoom's measured focal lengths and in the middle."""
+    known = focal_lengths(lens, profile)
+    rows: list[Row] = []
+    for focal in dict.fromkeys((known[0], known[len(known) // 2], known[-1])):
+        found = measure([opened_at(lens, profile, focal)], profile, focal).figures
+        over = {name: float(v[0]) for name, v in found._asdict().items() if v[0] > getattr(ALARM, name)}
+        rows.append({"focal_mm": focal, "alarm": float(alarm(found)[0]), "beyond": over})
+    return rows
+
+
+def alarms_page(groups: dict[str, list[list[Row]]], title: str) -> str:
+    """The share of tables that alarm, by group, and what they alarm by."""
+    lines = []
+    for group, text in (pair for pair in _GROUPS.items() if pair[0] in groups):
+        tables = groups[group]
+        rows = [row for each in tables for row in each]
+        middle = [each[len(each) // 2] for each in tables]
+        why = Counter(name for row in rows for name in row["beyond"])
+        told = ", ".join(f"{name} {count}" for name, count in why.most_common(3))
+        lines.append([text, str(len(tables)), _share(middle), str(len(rows)), _share(rows), told])
+    return lab.page(
+        f"# Alarms of tables as they are: {title}",
+        f"`python -m experiments photographs-faults FOLDER --alarms`; {lab.machine_line()}",
+        lab.table("tables|number|alarms in the middle|states|alarms of states|by most often", lines),
+        "States: a prime, or the shortest, middle and longest measured focal length near a state of the table. "
+        "The limits were set by OpticsDatabase's primes of certain match; no other group here set any, but primes of "
+        "other collections are partly of the same patents. Some alarms are real: tables are transcribed.",
+    )
+
+
+def _share(rows: Sequence[Row]) -> str:
+    count = sum(row["alarm"] > 1 for row in rows)
+    return f"{count} ({100 * count / max(len(rows), 1):.0f}%)"
 
 
 def rows_of(lens: Lens, profile: Profile, seed: str, named: bool) -> list[Row]:
     """The sound table, and each of its broken ones."""
-    focal = sorted(r.focal_mm for r in profile.distortion)[len(profile.distortion) // 2]
+    known = focal_lengths(lens, profile)
+    focal = known[len(known) // 2]
     lens = opened_at(lens, profile, focal)
     some = random.Random(seed)
 
@@ -123,16 +180,15 @@ def rows_of(lens: Lens, profile: Profile, seed: str, named: bool) -> list[Row]:
 
 
 def _line(kind: str, rows: Sequence[Row]) -> list[str]:
-    found, asked = [r for r in rows if r["alarm"] > 1], [r for r in rows if "said" in r]
+    asked = [r for r in rows if "said" in r]
     sound = [r for r in asked if r["change"]]
     named = [(r["right"], [f"{one} " for one in r["change"].removeprefix(ONE_OF).split("; ")]) for r in sound]
     right = [(own, each) for own, each in named if any(own in one for one in each)]
     first = [own for own, each in right if own in each[0]]
-    share = f"{100 * len(found) / max(len(rows), 1):.0f}%"
     return [
         kind,
         str(len(rows)),
-        f"{len(found)} ({share})",
+        _share(rows),
         str(len(asked)),
         str(len(sound)),
         str(len(right)),
@@ -151,12 +207,9 @@ def page(groups: dict[str, list[list[Row]]]) -> str:
         if "dropped" in kind:
             lines.append(_line(f"... that change distortion by over {SEEN}%", [r for r in some if r["moved"] > SEEN]))
     alarms = []
-    words = {"certain": "primes, certain match: the limits were set by them", "likely": "primes, likely match",
-             "zoom": "zooms, certain match, at one focal length"}  # fmt: skip
-    for group, text in ((group, words[group]) for group in words if group in groups):
+    for group, text in (pair for pair in _GROUPS.items() if pair[0] in groups):
         each = [r for found in groups[group] for r in found if r["kind"] == "sound"]
-        count = sum(r["alarm"] > 1 for r in each)
-        alarms.append([text, str(len(each)), f"{count} ({100 * count / max(len(each), 1):.0f}%)"])
+        alarms.append([text, str(len(each)), _share(each)])
     figures = np.array([r["figures"] for found in groups["certain"] for r in found if r["kind"] == "sound"])
     told = [[name, *(f"{v:.3g}" for v in np.percentile(column, (50, 90, 95, 98), method="lower"))]
             for name, column in zip(Measures._fields, figures.T, strict=True)]  # fmt: skip
@@ -178,6 +231,17 @@ def run(args: argparse.Namespace) -> None:
     lenses = of_folder(args.folder, args.only, args.quiet)
     random.Random(args.seed).shuffle(lenses)
     left, groups = args.lenses, dict[str, list[Any]]()
+    if args.alarms:
+        for name, group, lens, profile in lab.counted(lenses, "lenses", args.quiet):
+            try:
+                rows = alarms_of(lens, profile)
+            except NeurolensError:
+                continue
+            groups.setdefault(group, []).append([row | {"file": name} for row in rows])
+        print(
+            lab.write_results(args.out, "alarms", alarms_page(groups, args.folder.resolve().name), {"groups": groups})
+        )
+        return
     for name, group, lens, profile in lab.counted(lenses, "lenses", args.quiet):
         try:
             rows = rows_of(lens, profile, f"{args.seed} {name}", group == "certain" and left > 0)

@@ -23,7 +23,7 @@ from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
 from neurolens.lens.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import image_radius_mm, on_plane
-from neurolens.trace.aiming import Axis, aim_at_stop, between, bracket, without_rims
+from neurolens.trace.aiming import Axis, aim_at_stop, between, bracket, from_stop, without_rims
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 
@@ -73,6 +73,11 @@ class ChiefRays(NamedTuple):
     exists: Tensor
     height_mm: Tensor
     film: Rays
+
+    @property
+    def field_rad(self) -> Tensor:
+        """[F], angles to the axis in the scene."""
+        return torch.atan2(torch.hypot(self.start.dx, self.start.dy), self.start.dz)
 
 
 @dataclass(frozen=True)
@@ -154,12 +159,24 @@ class Scene:
         angles = torch.deg2rad(torch.as_tensor(field_deg, dtype=torch.float64).reshape(-1))
         middle = torch.zeros(len(angles), 1, dtype=torch.float64)
         aimed = aim_at_stop(self.lens, angles, middle, axis=self.axis, wavelength_nm=nm)
+        return self._from(aimed.rays, aimed.reached[:, 0], nm)
+
+    def chief_rays_at(self, stop_rad: Sequence[float] | Array, wavelength_nm: float | None = None) -> ChiefRays:
+        """Chief rays by their angles [F] in the stop, which need no search; `ChiefRays.field_rad` has their fields."""
+        nm = self.lens.reference_nm if wavelength_nm is None else wavelength_nm
+        angle = torch.as_tensor(stop_rad, dtype=torch.float64).reshape(1, -1)
+        front = without_rims(replace(self.lens, surfaces=self.lens.surfaces[: self.lens.stop_index + 1]))
+        start, _, exists = from_stop(front, torch.zeros_like(angle), angle, self.axis, nm)
+        return self._from(start, exists[0], nm)
+
+    def _from(self, start: Rays, exists: Tensor, nm: float) -> ChiefRays:
+        """Chief rays from before the front surface to the film."""
         with torch.no_grad():
-            out = trace(without_rims(self.lens), aimed.rays, nm, towards="film")
-        exists = aimed.reached[:, 0] & (out.status == 0)
+            out = trace(without_rims(self.lens), start, nm, towards="film")
+        exists = exists & (out.status == 0)
         film = on_plane(out.rays, self.film_z_mm)
         height, _ = self.image_axes(film.x, film.y)
-        return ChiefRays(aimed.rays, exists, torch.where(exists, height, math.nan), film)
+        return ChiefRays(start, exists, torch.where(exists, height, math.nan), film)
 
     def object_points(self, chief: Rays) -> tuple[Tensor, Tensor, Tensor] | None:
         """The points of the object that the chief rays leave, [F] each, mm; None for a distant object."""

@@ -15,13 +15,14 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
-from neurolens.analysis.fields import Result
+from neurolens.analysis.field_curves import PROJECTIONS, RECTILINEAR
+from neurolens.analysis.fields import Result, Scene
 from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import between, chief_angles, heights_of, ideal_heights, shapes
 from neurolens.photographs.profiles import Light, Match, Profile, Radial, matches, name_of, profile_named
 from neurolens.photographs.rims import Array, at_focal_length, near_f8, open_light, stop_for
 from neurolens.setting.pupils import image_radius_mm
@@ -34,6 +35,14 @@ SOUND_STOPS = 0.15
 _OTHER_FOCAL = 0.06  # relative difference of focal length from which a profile is of another lens
 # Broad bands of a camera: those at which rays agree best with lensfun's lateral colour.
 _BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
+_HEIGHTS, _FEWEST = 16, 4  # image heights that are compared; fewest chief rays of a curve
+_INNER = 0.25  # share of half the diagonal from which shapes are compared
+_OUTER_MM = 20.0  # of full frame, to which
+_RAYS, _NEAR_RAD = 25, 1e-4  # chief rays; the angle in the stop of one as good as paraxial
+_FARTHER, _STEEPEST = 1.4, 2.0  # than its slope for the greatest height; the steepest slope in the stop
+_SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor and table
+_IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
+          "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
 FREE = "free in a profile, and taken out: the scale, the light on the axis; unknown: the distance of the photographs"
 
 
@@ -81,6 +90,79 @@ class Comparison(Result):
     size: float = 1.0
 
 
+def heights_of(profile: Profile, lens: Lens) -> Array:
+    """Image heights at which shapes are compared: within the profile's film and, where its file tells, the lens's."""
+    half = profile.half_diagonal_mm
+    told = lens.image_radius_mm is not None or lens.half_field_deg is not None
+    end = min(_OUTER_MM / profile.crop, image_radius_mm(lens)[0] if told else math.inf)
+    return np.linspace(_INNER * half, max(end, 1.01 * _INNER * half), _HEIGHTS)
+
+
+def ideal_heights(profile: Profile, angle: Array) -> Array:
+    """The heights, to a scale, of the ideal picture of a profile at field angles in rad."""
+    return PROJECTIONS[_IDEAL.get(profile.projection, RECTILINEAR)](angle)
+
+
+def chief_angles(lens: Lens, height_mm: float, wavelengths_nm: Sequence[float]) -> tuple[Array, Array]:
+    """Field angles [R] in rad, and by wavelength the image heights [W, R] of the chief rays of a lens whose film is
+    placed, rising to beyond a height where there are such rays.
+
+    Raises:
+        InputError: ideal lenses.
+    """
+    lens.require_glass("verify")
+    scene = Scene(lens)
+    reach = float(scene.chief_rays_at([_NEAR_RAD]).height_mm[0]) / _NEAR_RAD
+    steepest = min(_FARTHER * height_mm / abs(reach), _STEEPEST)
+    stop = np.arctan(steepest * np.linspace(0.02, 1, _RAYS))
+    found = [scene.chief_rays_at(stop, nm) for nm in wavelengths_nm]
+    each = [(np.where(c.exists, c.field_rad, math.nan), c.height_mm.numpy()) for c in found]
+    count = min(_rising(values) for both in each for values in both)
+    if count < _FEWEST:
+        return np.zeros(0), np.zeros((len(each), 0))
+    angle = each[0][0][:count]
+    return angle, np.array([CubicSpline(field[:count], height[:count])(angle) for field, height in each])
+
+
+def _rising(height_mm: Array) -> int:
+    """How many heights of chief rays rise from the axis on."""
+    return int(np.argmin(np.diff(height_mm, append=-math.inf) > 0)) + 1 if height_mm[0] > 0 else 0
+
+
+def between(height_mm: Array, known_mm: Array, values: Array) -> Array:
+    """Values at heights between known ones, as far as these rise; NaN beyond, and where too few are known."""
+    count = _rising(known_mm) if len(known_mm) else 0
+    if count < _FEWEST:
+        return np.full_like(height_mm, math.nan)
+    known = np.where(height_mm <= known_mm[count - 1], height_mm, math.nan)
+    return np.asarray(CubicSpline(known_mm[:count], values[:count])(known))
+
+
+def shapes(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> tuple[Array, Array, float]:
+    """Measured and computed shapes of the distortion, percent beside the mean of the heights at which both exist, and
+    the size of the picture for which they agree best; NaN where no chief ray reaches.
+
+    Crop factors are rounded, and a patent's example is seldom of the product's very focal length: heights are free by
+    some percent.
+
+    Args:
+        measured: [H] the measured image height over that of the ideal picture, to a scale.
+        real_mm, stretch: [R] image heights of chief rays, and the same of them.
+    """
+    real_mm = np.where(np.isfinite(stretch), real_mm, math.nan)
+    count = _rising(real_mm) if len(real_mm) else 0
+    ours = between(np.outer(height_mm, _SIZES), real_mm[:count], stretch[:count])
+    theirs = np.where(np.isfinite(ours), measured[:, None], math.nan)
+    ours = np.where(np.isfinite(theirs), ours, math.nan)
+    most = np.isfinite(ours).sum(axis=0)
+    if most.max() < _FEWEST:
+        return np.full_like(height_mm, math.nan), np.full_like(height_mm, math.nan), 1.0
+    theirs, ours = (100 * (v / np.nanmean(v, axis=0) - 1) for v in (theirs, ours))
+    off = np.nansum((theirs - ours) ** 2, axis=0) + np.where(most == most.max(), 1e-12 * np.abs(_SIZES - 1), math.inf)
+    best = int(np.argmin(off))
+    return theirs[:, best], ours[:, best], float(_SIZES[best])
+
+
 def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curve, float]:
     """The shape of the distortion, measured and computed, and the size of the picture for which both agree best."""
     height = heights_of(profile, lens)
@@ -93,7 +175,7 @@ def colour_curves(lens: Lens, profile: Profile, radials: Mapping[str, Radial | N
     """How much farther from the axis red and blue lie than green, in um, over broad bands as a camera's."""
     height = heights_of(profile, lens)
     _, real = chief_angles(lens, float(height.max()), [nm for band in _BANDS_NM.values() for nm in band])
-    red, green, blue = (np.mean(part, axis=0) for part in np.split(np.array(real), len(_BANDS_NM)))
+    red, green, blue = (np.mean(part, axis=0) for part in np.split(real, len(_BANDS_NM)))
     found: dict[str, Curve | None] = {}
     for band, ours in (("red", red - green), ("blue", blue - green)):
         radial = radials[band]

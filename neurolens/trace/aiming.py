@@ -68,12 +68,12 @@ def aim_at_stop(
     target = field_rad[:, None].expand_as(height_mm).reshape(-1)
 
     def outwards(angle: Tensor) -> tuple[Rays, Tensor, Tensor]:
-        return _follow(front, heights[:, None].expand_as(angle), angle, axis, nm)
+        return from_stop(front, heights[:, None].expand_as(angle), angle, axis, nm)
 
     widest = math.radians(_WIDEST_DEG)
     tried = torch.linspace(-widest, widest, _GRID, dtype=torch.float64)
     each, row = torch.unique(heights, return_inverse=True)
-    _, field, exists = _follow(front, each[:, None].expand(-1, _GRID), tried.expand(len(each), -1), axis, nm)
+    _, field, exists = from_stop(front, each[:, None].expand(-1, _GRID), tried.expand(len(each), -1), axis, nm)
     exists = exists & (torch.arange(_GRID) >= _axial(tried, field, exists)[:, None])
     ends = bracket(tried.expand(len(heights), -1), field[row], exists[row], target)
     for _ in range(_ROUNDS):
@@ -132,10 +132,14 @@ def between(ends: Tensor) -> Tensor:
     return ends[:, :1] + (ends[:, 2:] - ends[:, :1]) * torch.linspace(0, 1, _ZOOM, dtype=torch.float64)
 
 
-def _follow(
+def from_stop(
     front: Lens, height: Tensor, angle: Tensor, axis: Axis, wavelength_nm: float
 ) -> tuple[Rays, Tensor, Tensor]:
-    """Trace from the stop to the scene; return the reversed rays [n * G], their field angles and existence [n, G]."""
+    """Trace from the stop to the scene; return the reversed rays [n * G], their field angles and existence [n, G].
+
+    Args:
+        front: the lens up to its stop, without rims. height, angle: [n, G] in the stop.
+    """
     stop, z = front.surfaces[-1], float(front.vertices_mm[-2])
     h, a = height.reshape(-1), angle.reshape(-1)
     known = {float(v): sag_mm(stop, float(v), 0.0) if axis == "x" else sag_mm(stop, 0.0, float(v))

@@ -9,11 +9,21 @@ import numpy as np
 import pytest
 from shipped import whole
 
-from experiments.table_faults import ONE_OF, Checked, alarm, changed, check, opened_at, swapped, transposed
+from experiments.table_faults import (
+    ONE_OF,
+    Checked,
+    alarm,
+    changed,
+    check,
+    focal_lengths,
+    opened_at,
+    swapped,
+    transposed,
+)
+from experiments.table_figures import SHARES, Tables, chief_rays, measure
 from neurolens.analysis import field_curves
 from neurolens.analysis.fields import Scene
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import SHARES, Tables, chief_rays, measure
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.verify import compare, found_for
 from neurolens.readers.any_format import read_any
@@ -138,10 +148,12 @@ def test_a_zoom_of_variable_aperture_raises_no_alarm_from_blur() -> None:
     pytest.importorskip("lensfunpy")
     lens = read_any(table)
     profile = found_for(lens)[1][0]
-    focal = sorted(r.focal_mm for r in profile.distortion)[len(profile.distortion) // 2]
-    placed = opened_at(lens, profile, focal)
+    assert focal_lengths(lens, profile) == [24.0, 50.0, 85.0]  # of 24, 28, 35, 50, 70, 85; the table has 24.7, 50, 82.5
+    placed = opened_at(lens, profile, 50.0)
     assert placed.f_number == pytest.approx(3.5, abs=0.15)
-    assert measure([placed], profile, focal).figures.blur[0] < 35 and not check(lens, profile).doubtful
+    assert measure([placed], profile, 50.0).figures.blur[0] < 35 and not check(lens, profile).doubtful
+    for focal in focal_lengths(lens, profile):
+        assert alarm(measure([opened_at(lens, profile, focal)], profile, focal).figures)[0] < 0.6
 
 
 def test_rays_that_do_not_get_through_are_an_alarm() -> None:

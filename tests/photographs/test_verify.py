@@ -13,10 +13,9 @@ from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.figures import between
 from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial, profile_named
 from neurolens.photographs.rims import open_light
-from neurolens.photographs.verify import compare, names_of, verify
+from neurolens.photographs.verify import between, compare, names_of, verify
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 

@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
-from neurolens.analysis.field_curves import PROJECTIONS, RECTILINEAR
 from neurolens.lens.glass import LINE_C_NM, LINE_F_NM, index_of
 from neurolens.lens.paraxial import System
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.profiles import Profile
+from neurolens.photographs.verify import heights_of, ideal_heights, shapes
 from neurolens.trace.arithmetic import NUMPY
 from neurolens.trace.shapes import Figure, without_rim
 from neurolens.trace.surfaces import Medium, Rays, cross, medium
@@ -29,12 +28,6 @@ Array = NDArray[np.float64]
 
 _SLOPES, SHARES = 25, (0.25, 0.4, 0.55, 0.7)  # chief rays; those with neighbours, as shares of the largest slope
 _FARTHER, _STEEPEST = 1.4, 2.0  # than the paraxial slope of the greatest height; the steepest slope in the stop
-_HEIGHTS, _FEWEST = 16, 4  # image heights that are compared; fewest chief rays of a curve
-_INNER = 0.25  # share of half the diagonal from which shapes are compared
-_OUTER_MM = 20.0  # of full frame, to which
-_SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor and table
-_IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
-          "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
 _NEAR = 1e-6  # mm and slope by which a neighbouring ray differs
 _ZONES = np.sqrt((np.arange(8) + 0.5) / 8)  # of the pupil, of equal areas
 
@@ -161,78 +154,6 @@ def chief_rays(tables: Tables, film_mm: Array, slope: Array) -> ChiefRays:
 def _slopes(reach_mm: Array, height_mm: float) -> Array:
     """Slopes in the stop [T, R] of chief rays to beyond an image height, by that of the paraxial one of slope 1."""
     return np.minimum(_FARTHER * height_mm / np.abs(reach_mm), _STEEPEST) * np.linspace(0.02, 1, _SLOPES)
-
-
-def heights_of(profile: Profile, lens: Lens) -> Array:
-    """Image heights at which shapes are compared, within the profile's film and the lens's image circle."""
-    half = profile.half_diagonal_mm
-    end = min(_OUTER_MM / profile.crop, lens.image_radius_mm or math.inf)
-    return np.linspace(_INNER * half, max(end, 1.01 * _INNER * half), _HEIGHTS)
-
-
-def ideal_heights(profile: Profile, angle: Array) -> Array:
-    """The heights, to a scale, of the ideal picture of a profile at field angles in rad."""
-    return PROJECTIONS[_IDEAL.get(profile.projection, RECTILINEAR)](angle)
-
-
-def chief_angles(lens: Lens, height_mm: float, wavelengths_nm: Sequence[float]) -> tuple[Array, list[Array]]:
-    """Field angles in rad, and by wavelength the image heights of the chief rays of a lens whose film is placed, rising
-    to beyond a height where there are such rays.
-
-    Raises:
-        InputError: ideal lenses.
-    """
-    lens.require_glass("verify")
-    tables = Tables.of([lens])
-    film = np.array([[float(lens.film_z_mm or 0.0) - float(lens.vertices_mm[len(lens.surfaces) - 1])]])
-    with np.errstate(all="ignore"):
-        slope = _slopes(_first_order(tables)[2], height_mm)
-        each = [chief_rays(tables.at(nm), film, slope) for nm in wavelengths_nm]
-    known = [(c.angle[0] + 0 * c.height_mm[0], c.height_mm[0] + 0 * c.angle[0]) for c in each]
-    count = min(_rising(values) for both in known for values in both)
-    if count < _FEWEST:
-        return np.zeros(0), [np.zeros(0) for _ in each]
-    angle = each[0].angle[0, :count]
-    return angle, [CubicSpline(c.angle[0, :count], c.height_mm[0, :count])(angle) for c in each]
-
-
-def _rising(height_mm: Array) -> int:
-    """How many heights of chief rays rise from the axis on."""
-    return int(np.argmin(np.diff(height_mm, append=-math.inf) > 0)) + 1 if height_mm[0] > 0 else 0
-
-
-def between(height_mm: Array, known_mm: Array, values: Array) -> Array:
-    """Values at heights between known ones, as far as these rise; NaN beyond, and where too few are known."""
-    count = _rising(known_mm) if len(known_mm) else 0
-    if count < _FEWEST:
-        return np.full_like(height_mm, math.nan)
-    known = np.where(height_mm <= known_mm[count - 1], height_mm, math.nan)
-    return np.asarray(CubicSpline(known_mm[:count], values[:count])(known))
-
-
-def shapes(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> tuple[Array, Array, float]:
-    """Measured and computed shapes of the distortion, percent beside the mean of the heights at which both exist, and
-    the size of the picture for which they agree best; NaN where no chief ray reaches.
-
-    Crop factors are rounded, and a patent's example is seldom of the product's very focal length: heights are free by
-    some percent.
-
-    Args:
-        measured: [H] the measured image height over that of the ideal picture, to a scale.
-        real_mm, stretch: [R] image heights of chief rays, and the same of them.
-    """
-    real_mm = np.where(np.isfinite(stretch), real_mm, math.nan)
-    count = _rising(real_mm) if len(real_mm) else 0
-    ours = between(np.outer(height_mm, _SIZES), real_mm[:count], stretch[:count])
-    theirs = np.where(np.isfinite(ours), measured[:, None], math.nan)
-    ours = np.where(np.isfinite(theirs), ours, math.nan)
-    most = np.isfinite(ours).sum(axis=0)
-    if most.max() < _FEWEST:
-        return np.full_like(height_mm, math.nan), np.full_like(height_mm, math.nan), 1.0
-    theirs, ours = (100 * (v / np.nanmean(v, axis=0) - 1) for v in (theirs, ours))
-    off = np.nansum((theirs - ours) ** 2, axis=0) + np.where(most == most.max(), 1e-12 * np.abs(_SIZES - 1), math.inf)
-    best = int(np.argmin(off))
-    return theirs[:, best], ours[:, best], float(_SIZES[best])
 
 
 class Measures(NamedTuple):
