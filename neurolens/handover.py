@@ -25,7 +25,7 @@ from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
 from neurolens.base.records import plain
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.field import Array, Complex, Field, spectrum_of, traced_light
+from neurolens.cameras.field import DIM, Array, Complex, Field, spectrum_of, traced_light
 from neurolens.render.stmap import Plates, blocks
 
 FAR_M = 1e6  # stands for infinity where a program takes no other number
@@ -352,11 +352,14 @@ def fitted_projection(
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
         focal = focal[0], focal[0]
-    fitted = projections.fit(kind, *_shown(field, size, film_mm, lit_points(field, film_mm)), size, focal, source)
+    seen = lit_points(field, film_mm)
+    shown, light = _shown(field, size, film_mm, seen), field.relative_light(seen)
+    fitted = projections.fit(kind, *shown, size, focal, source, light)
     ring = fitted.sharp_rad[:, None] + _BESIDE_PX / fitted.focal_px[0] * np.linspace(-1, 1, 33)
     ring = ring[(ring > 0) & (ring < fitted.widest_rad)]
     beside = field.point(np.stack([np.sin(ring), 0 * ring, np.cos(ring)]))
     points = np.concatenate([lit_points(field, film_mm, _HELD_OUT), film_points(field, film_mm, _ALONG), beside])
+    points = points[field.relative_light(points) >= DIM]  # the field traces no places beyond
     left = projections.residual(fitted, *_shown(field, size, film_mm, points))
     rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
     data: dict[str, Any] = {
@@ -369,6 +372,7 @@ def fitted_projection(
         "rms_px": left.rms_px,
         "worst_px": left.worst_px,
         "worst_at_deg": left.worst_at_deg,
+        "light_at_worst": float(field.relative_light(points)[left.worst]),
         "field_deg": left.field_deg,
         "turns_back_at_deg": None if left.sound else left.fold_deg,
         "by_field": rows,

@@ -558,3 +558,21 @@ def test_train_takes_the_name_of_a_lens(capsys: pytest.CaptureFixture[str], monk
     assert main(["train", "cooke_triplet_50"]) == 0
     assert [(experiment, file.stem) for experiment, file in seen] == [(None, "cooke_triplet_50")]
     assert "cooke_triplet_50" in failure(capsys, "train", "cook_triplet_50")
+
+
+@pytest.mark.parametrize(
+    ("words", "lens"),
+    [
+        ("RF 50mm f/1.2", "canon_rf_50mm_f1_2_l_usm"),
+        ("nikkor 50 1.2", "nikon_nikkor_50mm_f1_2"),
+        ("Biotar", "merte_biotar_100"),
+        ("prime master", "zeiss_arri_master_prime_t1_3_100mm"),
+        ("petzval", "petzval_portrait_100"),
+    ],
+)
+def test_words_of_a_name_in_any_order_find_the_lens(words: str, lens: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"{lens!r}" in failure(capsys, "lens", words).partition("did you mean")[2]
+
+
+def test_words_of_no_lens_find_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "did you mean" not in failure(capsys, "lens", "cooke look") + failure(capsys, "lens", " ")

@@ -163,13 +163,14 @@ class Residual:
     """The distances in pixels that a fitted projection leaves.
 
     Attributes:
-        rms_px, worst_px: over all points. worst_at_deg: the field of the worst.
+        rms_px, worst_px: over all points. worst: the point of the worst. worst_at_deg: its field.
         by_field: (from, to) in degrees, RMS and worst, of equal parts of the field.
         field_deg: the widest angle of the points. fold_deg: from here on the projection turns back.
     """
 
     rms_px: float
     worst_px: float
+    worst: int
     worst_at_deg: float
     by_field: tuple[tuple[float, float, float, float], ...]
     field_deg: float
@@ -188,13 +189,15 @@ def fit(
     size: tuple[int, int],
     focal_px: tuple[float, float],
     source: str = "projection",
+    light: Array | None = None,
 ) -> Projection:
-    """The projection of least mean squared distance of the pixels.
+    """The projection of least mean squared distance of the pixels, weighed by their light.
 
     Args:
         direction: [N, 3] unit vectors, and pixel [N, 2], where a lens shows them; spread evenly over the picture.
         size: of the picture. focal_px: paraxial fx and fy; equal: they stay equal.
         source: what errors name.
+        light: [N], that arrives; none: all alike. At the rim of an image circle only some colours do, from elsewhere.
 
     Raises:
         InputError: a field too wide for this kind, fewer points than numbers.
@@ -207,8 +210,10 @@ def fit(
         raise InputError(source, "picture", f"({len(pixel)} lit points)", "a picture that light reaches")
     start = Projection(kind, size, focal_px, (0.0,) * len(NAMES[kind]), widest)
     # A ratio with a term too many spends it on a pole beside a zero: terms of the denominator go until none is there.
+    weight = np.ones((1, 1)) if light is None else np.sqrt(light)[:, None]
     for dropped in range(4 if kind == "opencv-rational" else 1):
-        found = _adjusted(start, direction, pixel, focal_px[0] == focal_px[1], _RATIO[len(_RATIO) - dropped :])
+        fixed = _RATIO[len(_RATIO) - dropped :]
+        found = _adjusted(start, direction, pixel, weight, focal_px[0] == focal_px[1], fixed)
         if not found.pole:
             break
     return found
@@ -232,7 +237,7 @@ def residual(projection: Projection, direction: Array, pixel: Array) -> Residual
             rows.append((low, high, _rms(inside), float(inside.max())))
     worst = int(miss.argmax())
     fold = math.degrees(projection.fold_rad)
-    return Residual(_rms(miss), float(miss[worst]), float(angle[worst]), tuple(rows), widest, fold)
+    return Residual(_rms(miss), float(miss[worst]), worst, float(angle[worst]), tuple(rows), widest, fold)
 
 
 def _rms(values: Array) -> float:
@@ -240,7 +245,7 @@ def _rms(values: Array) -> float:
 
 
 def _adjusted(
-    start: Projection, direction: Array, pixel: Array, round_: bool, dropped: Sequence[str] = ()
+    start: Projection, direction: Array, pixel: Array, weight: Array, round_: bool, dropped: Sequence[str] = ()
 ) -> Projection:
     """The projection whose numbers, found from the paraxial ones, have the least squares of distances; some stay 0."""
     theta = start.kind == "f-theta"
@@ -257,7 +262,7 @@ def _adjusted(
         return whole
 
     def miss(x: NDArray[Any]) -> NDArray[Any]:
-        return (start.project(direction, numbers(x)) - pixel).reshape(-1)
+        return (weight * (start.project(direction, numbers(x)) - pixel)).reshape(-1)
 
     def slopes(x: Array) -> Array:
         return np.stack([miss(x + 1j * step).imag / _STEP for step in _STEP * np.eye(len(x))], axis=1)

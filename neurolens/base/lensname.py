@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +27,7 @@ FISHEYES = tuple(f"fisheye-{name}" for name in ("equidistant", "equisolid", "ste
 IDEAL = ("thin", "pinhole", *FISHEYES)
 _YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)|\bS\.(\d\d)-\d")  # S.53 of a Japanese patent: Showa 53, 1978
 _SHOWA = 1925
+_NEAR = 5  # names that a message offers
 _FORMATS = "a lens file of any format (see neurolens convert --help)"
 
 
@@ -92,8 +93,9 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
         expected = _FORMATS + (", a model (.onnx)" if models else "") + " or a name that ships (neurolens lens list)"
         if cameras:
             expected += f", with {FUSED}, {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
-        ours = (file.stem for folder, suffix in places for file in sorted((library() / folder).glob(f"*{suffix}")))
-        near = suggestion(word, [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())])
+        ours = [file.stem for folder, suffix in places for file in sorted((library() / folder).glob(f"*{suffix}"))]
+        known = [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())]
+        near = suggestion(word, known) or _of_words(word, ours)
         raise InputError(
             word, "camera" if cameras else "lens", "(a model)" if path.exists() else "(missing)", expected + near
         )
@@ -102,6 +104,13 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
         return Named(kind or own, Path(os.path.normpath(path.parent / file)))
     here = path in ships and path.is_relative_to(Path.cwd())
     return Named(kind, Path(os.path.relpath(path)) if here else path)
+
+
+def _of_words(text: str, known: Sequence[str]) -> str:
+    """What `suggestion` says, for lenses whose name holds each word: canon_rf_50mm_f1_2_l_usm is RF 50mm f/1.2."""
+    words = re.findall(r"[^\W_]+", text.lower().replace("f/", "f"))
+    near = [name for name in known if words and "." not in name and all(word in name for word in words)]
+    return f"; did you mean {' or '.join(map(repr, sorted(near, key=len)[:_NEAR]))}?" if near else ""
 
 
 def _planned(path: Path) -> str | None:

@@ -41,7 +41,7 @@ _FINER = 64, 4  # rings (and azimuths) of the map back over those of the map the
 _EDGE = 16  # points on each side of the film
 _TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
 _HALVINGS = 24
-_DIM = 2e-3  # of the light on the axis, nine stops below it: from there on places go straight on
+DIM = 2e-3  # of the light on the axis, nine stops below it: from there on places go straight on
 _STEPS = 6  # of Newton's method
 _SMALL = 0.004  # of the radius: where the size on the axis is measured, of cameras that do not know it
 
@@ -364,7 +364,7 @@ def field_of(
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
     # At the very rim few samples of the pupil are lit, and their mean steps to and fro: that is no fold.
-    place = np.where(found.light < _DIM * found.light[0], np.nan, place)
+    place = np.where(found.light < DIM * found.light[0], np.nan, place)
     place = _filled(place.reshape(rings, azimuths))
     rising = (np.diff(np.abs(place - place[:1]), axis=0) > 0).all(1)
     if not rising.all():

@@ -373,7 +373,8 @@ def _projection_text(data: dict[str, Any]) -> str:
     numbers = ", ".join(f"{k} {cli.number(v, 6)}" for k, v in data["coefficients"].items())
     focal, centre = (" x ".join(cli.number(v, 7) for v in data[k]) for k in ("focal_px", "centre_px"))
     radii = f"scale {focal}" if data["model"] == "f-theta" else f"focal length {focal}"
-    worst = f"at most {data['worst_px']:.3g} (at {data['worst_at_deg']:.3g} degrees)"
+    at = f"{data['worst_at_deg']:.3g} degrees, where {100 * data['light_at_worst']:.3g}% of the axis's light arrives"
+    worst = f"at most {data['worst_px']:.3g} (at {at})"
     spans = [[f"{v:.3g}" for v in row.values()] for row in data["by_field"]]
     lines = [
         f"{data['camera']}, {data['model']}: {radii}, centre {centre} pixels",

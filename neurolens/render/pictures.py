@@ -311,9 +311,9 @@ def whole_file(file: str | Path, field: str, path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # the library raises bare RuntimeError, ValueError, OSError and its own
         missing = error.strerror if isinstance(error, OSError) else None
-        expected = f"an OpenEXR file that exists ({missing})" if missing else f"a whole OpenEXR file ({error})"
+        expected = f"an OpenEXR file that exists ({missing})" if missing else "a whole OpenEXR file"
         found = "(missing)" if missing else f"({error})"
-        raise InputError(file, field, found if str(file) == str(path) else str(path), expected) from None
+        raise InputError(file, field, found if str(file) == str(path) else f"{path} {found}", expected) from None
 
 
 @contextmanager

@@ -149,6 +149,14 @@ def test_the_rim_of_the_light_is_no_fold(monkeypatch: pytest.MonkeyPatch) -> Non
     assert 18.5 < field.end_mm < 19 and (np.diff(np.abs(field.ideal(np.linspace(0, field.end_mm, 999) + 0j))) > 0).all()
 
 
+def test_blue_light_at_the_rim_does_not_bend_the_fit() -> None:
+    """From 18.4 to 18.8 mm of this film only blue light arrives, a hundredth of the axis's and less, from elsewhere."""
+    field = field_of_camera(ROOT / "lenses" / "isshiki_fisheye_10.toml")
+    _, left, told = files.fitted_projection("kannala-brandt", field, (384, 216), (36.0, 20.25), "here")
+    assert all(worst < 0.002 for _, to, _, worst in left.by_field if to < 91)  # pixels; 0.03 with all points alike
+    assert left.rms_px < 0.04 and left.worst_at_deg > 111 and 0.001 < told["light_at_worst"] < 0.02
+
+
 @pytest.mark.parametrize("camera", [GAUSS, ROOT / "models" / "nikon_zoom_14_24.ols-64.onnx"])
 def test_a_ratio_has_no_pole_in_its_picture(camera: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two lenses to which six free terms put a pole beside a zero: at every thousandth of a pixel the place is near
