@@ -88,7 +88,7 @@ class LensCamera:
         self, camera: str | Path, shot: Shot, *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
     ) -> None:
         self.spec, self.shot = str(camera), shot
-        self.device, self.dtype = torch.device(device), dtype
+        self.device, self.dtype = torch.empty(0, device=device).device, dtype  # a GPU with its number
         self._sides: dict[str, _Sides] = {}
         self._lens = self._made(shot)
 
@@ -142,8 +142,9 @@ class LensCamera:
             direction = torch.nn.functional.normalize(direction, dim=1)
         if pose is not None:
             turn, place = pose[..., :3, :3], pose[..., :3, 3]
-            origin = (turn @ origin[..., None])[..., 0] + place
-            direction = (turn @ direction[..., None])[..., 0]
+            # Not as products of matrices, which torch may take with fewer digits.
+            origin = (turn * origin[..., None, :]).sum(-1) + place
+            direction = (turn * direction[..., None, :]).sum(-1)
         return LensRays(origin, direction, weight, status)
 
     def _coordinate(self, name: str, value: Tensor | float) -> Tensor:

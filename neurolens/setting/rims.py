@@ -62,7 +62,7 @@ def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> No
             ("absorption_per_mm", s.absorption_per_mm, 0.0, 1e6),
         )
         for name, value, low, high in figures:
-            if value < low or value > high:
+            if not low <= value <= high:  # NaN, too
                 expected = f"a size from {low:g} to {high:g}" + _UNITS.get(name, "")
                 raise InputError(file, f"{state}surface {k}, {name}", float(value), expected)
 

@@ -244,6 +244,7 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
 FOCUS, FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field's edge
 _LEVEL = 3  # of the pupil's nodes: some 12,000 rays a disc
 _POWER = 4  # of the squared distance from the centre that tells the rim's light
+_SEEN = 0.01  # of the half-diagonal: the deviation of a disc that shows its shape
 _HALF_DIAGONAL_MM = 21.6  # of a picture of 36 x 24 mm, to which spots are scaled
 _GHOST_RAYS = 2000
 _SIDE, _DISC = 32, 0.92  # pixels of a disc's picture; share of the side that the widest disc takes,
@@ -257,8 +258,10 @@ class Character(Result):
     Attributes:
         cats_eye: area of the disc of a light far out of focus at 0.95 of the field over that on the axis: 1 where no
             rim cuts it.
-        swirl: how much narrower that disc is along the picture's radius than across it, compared with the axis: 1 less
-            the ratio of the standard deviations of its light; 0 for a round one.
+        swirl: how much narrower the disc at 0.6 of the field is along the picture's radius than across it, compared
+            with the axis: 1 less the ratio of the standard deviations of its light; 0 for a round one. Field curvature
+            and astigmatism make it, too. Lenses whose discs are small at one framing count in proportion: whole are
+            those with a deviation on the axis of 1% of the half-diagonal of 36 x 24 mm, at 1/29 of natural size.
         bubble: light near the rim of the disc on the axis behind the focus over that of an even disc, where light
             counts by the eighth power of its distance from the centre: 1 if even, up to 5 for a bright rim alone.
         softness_um: RMS radius of a white point on the axis at the best focus, on a picture 43.2 mm across its corners.
@@ -344,8 +347,11 @@ def cats_eye(discs: Discs) -> float:
 
 def swirl(discs: Discs) -> float:
     """See `Character`."""
-    radial, across = np.sqrt(_mean(discs.slope**2, discs.weight))[..., 0].T
-    return float(1 - radial[-1] / across[-1] / (radial[0] / across[0]))
+    radial, across = np.sqrt(_mean(discs.place_mm**2, discs.weight))[..., 0].T
+    # At one framing a disc takes a share of the picture that goes with the diameter of the entrance pupil, and so do
+    # its millimetres at one scale, as they are here.
+    seen = min(1.0, float(across[0]) / (_SEEN * _HALF_DIAGONAL_MM))
+    return float(1 - radial[1] / across[1] / (radial[0] / across[0])) * seen
 
 
 def bubble(discs: Discs) -> float:
