@@ -244,7 +244,7 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
 FOCUS, FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field's edge
 _LEVEL = 3  # of the pupil's nodes: some 12,000 rays a disc
 _POWER = 4  # of the squared distance from the centre that tells the rim's light
-_SEEN = 0.01  # of the half-diagonal: the deviation of a disc that shows its shape
+_SEEN = 0.01  # of the image's radius: the deviation of a disc that shows its shape
 _HALF_DIAGONAL_MM = 21.6  # of a picture of 36 x 24 mm, to which spots are scaled
 _GHOST_RAYS = 2000
 _SIDE, _DISC = 32, 0.92  # pixels of a disc's picture; share of the side that the widest disc takes,
@@ -260,8 +260,8 @@ class Character(Result):
             rim cuts it.
         swirl: how much narrower the disc at 0.6 of the field is along the picture's radius than across it, compared
             with the axis: 1 less the ratio of the standard deviations of its light; 0 for a round one. Field curvature
-            and astigmatism make it, too. Lenses whose discs are small at one framing count in proportion: whole are
-            those with a deviation on the axis of 1% of the half-diagonal of 36 x 24 mm, at 1/29 of natural size.
+            and astigmatism make it, too. Lenses whose discs are small in the picture count in proportion: whole are
+            those whose deviation on the axis is at least 1% of the radius of the image.
         bubble: light near the rim of the disc on the axis behind the focus over that of an even disc, where light
             counts by the eighth power of its distance from the centre: 1 if even, up to 5 for a bright rim alone.
         softness_um: RMS radius of a white point on the axis at the best focus, on a picture 43.2 mm across its corners.
@@ -305,7 +305,7 @@ def character(lens: Lens) -> tuple[Character, Discs]:
         ghosts = ghost_table(GhostTracer(scene.lens), Light(0.0, edge / 2), scene.lens.reference_nm, _GHOST_RAYS)
         flare = sum(ghost.energy for ghost in ghosts) or math.nan
     flare = flare if flare < math.inf else math.nan  # no ray of that light was found
-    return Character(cats_eye(discs), swirl(discs), bubble(discs), softness, flare), discs
+    return Character(cats_eye(discs), swirl(discs, scene.image_radius_mm), bubble(discs), softness, flare), discs
 
 
 def character_or_none(lens: Lens) -> tuple[dict[str, float | None] | None, bytes | None]:
@@ -345,12 +345,10 @@ def cats_eye(discs: Discs) -> float:
     return areas[-1] / areas[0] if areas[0] > 0 and areas[-1] > 0 else math.nan
 
 
-def swirl(discs: Discs) -> float:
+def swirl(discs: Discs, image_radius_mm: float) -> float:
     """See `Character`."""
     radial, across = np.sqrt(_mean(discs.place_mm**2, discs.weight))[..., 0].T
-    # At one framing a disc takes a share of the picture that goes with the diameter of the entrance pupil, and so do
-    # its millimetres at one scale, as they are here.
-    seen = min(1.0, float(across[0]) / (_SEEN * _HALF_DIAGONAL_MM))
+    seen = min(1.0, float(across[0]) / (_SEEN * image_radius_mm))
     return float(1 - radial[1] / across[1] / (radial[0] / across[0])) * seen
 
 
