@@ -443,14 +443,17 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A number with significant digits, "-" for None and NaN."""
+    """A number with significant digits (710, not 7.1e+02), "-" for None and NaN."""
     if value is None or isinstance(value, str):
         return value or "-"
     if isinstance(value, int):
         return str(value)
     if math.isnan(value):
         return "-"
-    return "infinity" if math.isinf(value) else f"{value + 0.0:.{digits}g}"  # no "-0"
+    if math.isinf(value):
+        return "infinity"
+    text = f"{value + 0.0:.{digits}g}"  # no "-0"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
 def first_order_light(data: dict[str, Any]) -> tuple[str, str]:
