@@ -58,6 +58,10 @@ def options() -> Iterator[tuple[str, argparse.Action]]:
                 yield name, action
 
 
+# Files or folders; layers that `render` makes, or files that hold them.
+BOTH = ("--output", "--behind")
+
+
 def test_an_option_has_one_spelling_and_one_meaning_in_all_commands() -> None:
     spellings, kinds, commands = defaultdict(set), defaultdict(set), defaultdict(set)
     for name, action in options():
@@ -66,7 +70,7 @@ def test_an_option_has_one_spelling_and_one_meaning_in_all_commands() -> None:
         kinds[spelling].add((action.dest, action.metavar, action.nargs == 0))
         commands[spelling].add(name)
     assert {dest: found for dest, found in spellings.items() if len(found) > 1} == {}
-    assert {o: found for o, found in kinds.items() if len(found) > 1 and o != "--output"} == {}
+    assert {o: found for o, found in kinds.items() if len(found) > 1 and o not in BOTH} == {}
     alike = {(o, f"{o}s") for o in commands if f"{o}s" in commands}
     assert {pair for pair in alike if commands[pair[0]] != commands[pair[1]]} == set()
 

@@ -110,7 +110,7 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
 SMALLER = {
     "--width 3840": "--width 96",
     "--width 96 -o first.exr": "--width 24 --samples 1 -o first.exr",
-    "--samples 16 -o plate.exr": "--samples 1 --width 48 -o plate.exr",
+    "--samples 16 --behind 1": "--samples 1 --width 48 --behind 1",
     "-o blurred.exr": "--samples 16 -o blurred.exr",
     "-o flare.exr": "--width 24 --bins 3 --cell 64 -o flare.exr",
     "-o room.exr": "--width 24 --samples 1 -o room.exr",
