@@ -268,7 +268,7 @@ def drawn(subject: Subject, count: int, seed: int = 7) -> Tensor:
 
 
 def camera_errors(subject: Subject, given: Tensor, found: Tensor) -> lab.Row:
-    """Of a camera: float32 on the device beside its own program in float64."""
+    """How far a camera in float32 on the device is from its own program in float64: RMS over rays that pass both."""
     numbers = {name: torch.tensor(v, dtype=torch.float64) for name, v in subject.call.items()}
     tables = {name: t.double() for name, t in subject.tables.items()}
     exact = step_by_step(subject.program, subject.rows, numbers, tables)(given.double())

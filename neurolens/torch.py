@@ -357,7 +357,7 @@ def _chosen(first: Tensor, x: Any, y: Any, dtype: torch.dtype) -> Tensor:
 
 
 def has_kernels(device: torch.device) -> bool:
-    """Test whether `on_gpu` can run on a device: an NVIDIA GPU, and a torch that compiles kernels (from 2.8 on)."""
+    """Test whether `on_gpu` can run on a device: an NVIDIA GPU, and a torch that compiles kernels (2.11 was tried)."""
     return device.type == "cuda" and torch.version.cuda is not None and hasattr(torch.cuda, "_compile_kernel")
 
 
