@@ -44,6 +44,7 @@ NAMES = {
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
     "osl-noise": ("osl_noise", "noise of dispersion in Cycles, and what adaptive sampling takes"),
     "osl-pictures": ("osl_speed:pictures", "lenses in Cycles beside its own depth of field"),
+    "answers": ("answers", "write the pages of results from what measurements have written"),
     "view": ("view_speed", "the page of `neurolens view` in software WebGL: first picture, each change"),
     "promises": ("promises", "models against the speed that their index promises"),
     "four-lenses": ("four_lenses", "the README's first picture: a night through a thin lens and three real ones"),
