@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import cast
 import numpy as np
 import OpenEXR
 import pytest
+from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
@@ -144,7 +144,7 @@ def test_a_blurred_edge_lets_the_light_behind_it_through_as_the_part_of_the_disc
     np.testing.assert_allclose(row[near], share[near], atol=0.03)
 
 
-@pytest.mark.parametrize("post", [0.1, 1.0])
+@pytest.mark.parametrize("post", [1.0, *whole(0.1)])
 def test_blurred_edges_are_as_clean_as_the_samples_that_are_asked_for(post: float) -> None:
     """Posts nearer than what is in focus: every number of samples is taken, and the default has little noise."""
     camera = thin()
@@ -152,8 +152,8 @@ def test_blurred_edges_are_as_clean_as_the_samples_that_are_asked_for(post: floa
     posts = np.arange(SIZE[0]) % 128 < 32
     rgb[:, posts], w[:, posts] = post, 2.0
     clean = blurred(camera, rgb, w, samples=512)
-    noise = [rms(blurred(camera, rgb, w, samples=n) - clean) / rms(clean) for n in (16, 64, SAMPLES, 256)]
-    assert noise[2] < 0.007 and all(few > 1.3 * more for few, more in itertools.pairwise(noise))
+    noise = [rms(blurred(camera, rgb, w, samples=n) - clean) / rms(clean) for n in (16, SAMPLES)]
+    assert noise[1] < 0.007 and noise[0] > 1.3 * noise[1]
 
 
 def test_even_light_takes_few_samples() -> None:
@@ -226,7 +226,7 @@ def test_a_lens_moves_things_as_its_distortion_says_and_dims_them_as_its_pupil_d
         assert abs(ideal - complex(place[0] + 0.5 - SIZE[0] / 2, SIZE[1] / 2 - place[1] - 0.5)) < 0.1
 
 
-@pytest.mark.parametrize("place", [(192.5, 108.5), (360.5, 197.5)])
+@pytest.mark.parametrize("place", [(360.5, 197.5), *whole(((192.5, 108.5),))])
 @pytest.mark.parametrize("w", [0.0, 2.0])
 def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     exact: Camera, place: tuple[float, float], w: float

@@ -10,6 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from shipped import whole
 
 from neurolens import frames
 from neurolens.cameras.build import make_camera
@@ -420,7 +421,7 @@ def test_no_picture_replaces_what_it_is_made_from(tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.parametrize("space", COLOUR_SPACES)
-@pytest.mark.parametrize("colour", ["0/0/1", "0/1/0", "1/0/0.2"])
+@pytest.mark.parametrize("colour", ["0/0/1", *whole("0/1/0", "1/0/0.2")])
 def test_no_picture_is_negative(tmp_path: Path, space: str, colour: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Flare of saturated lights: nothing below zero, the luminance of the light kept, the layers still its sums."""
     out = tmp_path / "led.exr"
