@@ -123,6 +123,10 @@ class _Chosen:
     def __fspath__(self) -> str:
         return self.name
 
+    def __repr__(self) -> str:
+        settings = "".join(f", {key}={value!r}" for key, value in self.settings.items())
+        return f"{self.reads.called}({self.name!r}{settings})"
+
     @cached_property
     def _read(self) -> Any:
         return command_of(self.reads, (self.name,), self.settings)
@@ -282,6 +286,9 @@ class Model(OnnxLens):
 
     def __fspath__(self) -> str:
         return str(self.path)
+
+    def __repr__(self) -> str:
+        return f"{self.path}: {self.card['fit']['method']} of {self.card['lens']['name']}"
 
     def export(self, to: str, output: str | Path, **options: Any) -> Answer:
         """Write it in another form, "c", "glsl", "osl" and more: `nl.export`."""

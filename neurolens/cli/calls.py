@@ -129,20 +129,23 @@ def call(cls: type[Any], given: Sequence[Any], named: Mapping[str, Any]) -> Answ
 
 
 def _words(action: argparse.Action, value: Any) -> list[str]:
-    """The words of a command line that give a parameter this value: a tuple is one of several numbers, as a film's
-    sides or a light's angles, a list is several values, and so is a mapping of KEY=VALUE."""
+    """The words of a command line that give a parameter this value.
+
+    A tuple is one value of several numbers, as a film's sides or a light's angles. Where an option takes several
+    values, a list holds them, or a mapping those of KEY=VALUE.
+    """
     between = next((mark for mark in "x/" if mark in str(action.metavar)), ",")
 
     def text(v: Any) -> str:  # numbers keep all their digits
-        return (
-            between.join(map(text, v)) if isinstance(v, tuple) else str(os.fspath(v) if hasattr(v, "__fspath__") else v)
-        )
+        if isinstance(v, list | tuple):
+            return between.join(map(text, v))
+        return str(os.fspath(v) if isinstance(v, os.PathLike) else v)
 
-    several = [f"{k}={text(v)}" for k, v in value.items()] if isinstance(value, Mapping) else value
-    texts = [text(v) for v in several] if isinstance(several, list) else [text(value)]
-    if not action.option_strings:
-        return texts
-    option = action.option_strings[-1]
-    if action.nargs == 0:
-        return {"True": [option], "False": []}.get(texts[0], [f"{option}={texts[0]}"])  # the last is refused
-    return [option, *texts] if action.nargs else [f"{option}={word}" for word in texts]
+    if isinstance(value, Mapping):
+        value = [f"{k}={text(v)}" for k, v in value.items()]
+    repeated = isinstance(action, argparse._AppendAction)
+    texts = [text(v) for v in value] if isinstance(value, list) and (repeated or action.nargs) else [text(value)]
+    option = action.option_strings[-1:]
+    if action.nargs == 0 and texts[0] in ("True", "False"):  # what else is given is refused as a value
+        return [*option] * (texts[0] == "True")
+    return [f"{option[0]}={word}" for word in texts] if option and not action.nargs else [*option, *texts]
