@@ -96,7 +96,8 @@ def of(name: str) -> Call:
 def run_command(cls: type[cli.Command], *given: Any, **named: Any) -> Answer:
     """Run a command; a lens or camera among the values brings its settings."""
     for value in (*given, *named.values()):
-        named = {**_settings(value), **named}
+        for one in value if isinstance(value, list) else [value]:
+            named = {**_settings(one), **named}
     return call(cls, given, named)
 
 
@@ -115,7 +116,8 @@ class _Chosen:
     @classmethod
     def make(cls, name: str | os.PathLike[str], **settings: Any) -> Self:
         """One of a name, or of another with its settings; mistakes are raised here."""
-        return cls(os.fspath(name), {**_settings(name), **settings})
+        settings = {**_settings(name), **settings}
+        return cls(os.fspath(name), {key: value for key, value in settings.items() if value is not None})
 
     def __post_init__(self) -> None:
         _ = self._read
@@ -138,6 +140,8 @@ class _Chosen:
 
 @dataclass(frozen=True, kw_only=True)
 class _ReadLens(cli.Command):
+    """What `nl.lens` takes."""
+
     called: ClassVar[str] = "nl.lens"
     file: Path = cli.lens(positional=True)
     state: cli.LensState = cli.lens_state()
@@ -145,6 +149,8 @@ class _ReadLens(cli.Command):
 
 @dataclass(frozen=True, kw_only=True)
 class _ReadCamera(cli.Command):
+    """What `nl.camera` takes."""
+
     called: ClassVar[str] = "nl.camera"
     camera: str = cli.lens(models=True, cameras=True, positional=True)
     film: tuple[float, float] = cli.film((36.0, 24.0), "in mm (default: 36x24)")
@@ -320,7 +326,7 @@ def fit(lens: str | os.PathLike[str], within_um: float | None = None, **options:
     Args:
         lens: a name, a file, or a lens that is set, whose zoom, f-number and focal length count.
         within_um: film-equivalent RMS error on rays that the fit has not seen: the smallest model within it.
-        options: further ones of `nl.train`, as output, the folder of the run.
+        options: further ones of `nl.train`, as output, the folder of the run, and set, a mapping.
 
     Raises:
         InputError: a setting that models do not have; no model within the error.
@@ -328,10 +334,10 @@ def fit(lens: str | os.PathLike[str], within_um: float | None = None, **options:
     from neurolens.study.pages import CLOSE_UM, to_use
 
     state = {key: value for key, value in _settings(lens).items() if key != "focus_m"}  # a model holds any focus
-    changes = [f"lens.{key}={state.pop(key)!r}" for key in ("zoom", "f_number", "focal_length_mm") if key in state]
+    kept = {f"lens.{key}": state.pop(key) for key in ("zoom", "f_number", "focal_length_mm") if key in state}
+    options = {"rounds": 0, **state, **options, "set": {**kept, **options.get("set", {})}}
     within = None if within_um is None else f"{within_um}um"
-    settings = {"rounds": 0, "lens": os.fspath(lens), "within": within, **state, **options}
-    run = call(command("train"), (), settings | {"set": [*changes, *options.get("set", ())]})
+    run = call(command("train"), (), {"lens": os.fspath(lens), "within": within, **options})
     if run.code:
         least = f"at least {run['target']['rms_um']:.3g}, the error of the closest model"
         raise InputError("nl.fit", "within_um", within_um, least)

@@ -118,6 +118,7 @@ def test_mistakes_that_only_a_call_can_make_are_one_line() -> None:
         (lambda: nl.load(GAUSS), "an exported model (.onnx)"),
         (lambda: nl.verify(nl.lens(GAUSS, f_number=4)), "f_number: got (unknown key)"),
         (lambda: nl.fit(nl.lens(GAUSS, blades=5)), "blades"),
+        (lambda: nl.train(lens=[nl.lens(GAUSS, f_number=4)]), "f_number: got (unknown key)"),
         (lambda: nl.lens(GAUSS).trace(np.zeros(6)), "an array (6, N)"),
     ):
         with pytest.raises(ValueError, match=re.escape(words)) as caught:
