@@ -1,11 +1,54 @@
 """neurolens: any lens prescription as a fast camera model with a measured error."""
 
+from __future__ import annotations
+
 import os
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neurolens.front import Answer, Camera, Lens, find, fit, load
+
+    def _run(*given: Any, **named: Any) -> Answer: ...
+
+    lens, camera = Lens.make, Camera.make
+    analyse = bokeh = defocus = export = flare = plan = projection = render = stmap = train = verify = _run
 
 __version__ = "0.1.0"
 # What pip calls this project. `neurolens` on PyPI is another one, with the same folder and command.
 DISTRIBUTION = "neurolens-camera"
+# The Python front: made by `front.of` when it is asked for.
+__all__ = [
+    "analyse", "bokeh", "camera", "defocus", "export", "find", "fit", "flare", "lens", "load", "plan", "projection",
+    "render", "stmap", "train", "verify",
+]  # fmt: skip
 
 # onnxruntime reads this when it is imported. Otherwise 1.31 writes a device id and events into the user's cache folder
 # and looks for a server to send them to; its own call to stop that comes too late.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
+
+class _Front(ModuleType):
+    """The package, in which a call is not hidden by the folder of its name, as neurolens.render."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name not in __all__ or not isinstance(value, ModuleType):  # Python sets a folder that it has imported
+            super().__setattr__(name, value)
+
+
+if not TYPE_CHECKING:  # to which any name would be one
+
+    def __getattr__(name: str) -> Any:
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = import_module("neurolens.front").of(name)
+        return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+sys.modules[__name__].__class__ = _Front

@@ -111,7 +111,6 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        ([], ["COMMAND"]),
         (["lense"], ["lense", "lens"]),
         (["lens"], ["FILE"]),
         (["lens", "no.toml"], ["no.toml", "missing"]),

@@ -42,6 +42,8 @@ PARTS = {
     "torch": "graph lens cameras",
     "cli": "graph lens trace setting readers analysis surrogates cameras shaders render mitsuba flare study plan view"
     " blender frames photographs defocus handover",
+    "front": "lens trace readers surrogates cameras study cli",
+    "__init__": "front",  # when a name of it is asked for
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
 PACKAGES = {

@@ -95,7 +95,9 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
             expected += f", with {FUSED}, {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
         ours = [file.stem for folder, suffix in places for file in sorted((library() / folder).glob(f"*{suffix}"))]
         known = [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())]
-        near = suggestion(word, known) or _of_words(word, ours)
+        near = suggestion(word, known)
+        if not near and (alike := of_words(word, [name for name in ours if "." not in name])[:_NEAR]):
+            near = f"; did you mean {' or '.join(map(repr, alike))}?"
         raise InputError(
             word, "camera" if cameras else "lens", "(a model)" if path.exists() else "(missing)", expected + near
         )
@@ -106,11 +108,10 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
     return Named(kind, Path(os.path.relpath(path)) if here else path)
 
 
-def _of_words(text: str, known: Sequence[str]) -> str:
-    """What `suggestion` says, for lenses whose name holds each word: canon_rf_50mm_f1_2_l_usm is RF 50mm f/1.2."""
+def of_words(text: str, known: Sequence[str]) -> list[str]:
+    """The names that hold each word, the shortest first: canon_rf_50mm_f1_2_l_usm of RF 50mm f/1.2."""
     words = re.findall(r"[^\W_]+", text.lower().replace("f/", "f"))
-    near = [name for name in known if words and "." not in name and all(word in name for word in words)]
-    return f"; did you mean {' or '.join(map(repr, sorted(near, key=len)[:_NEAR]))}?" if near else ""
+    return sorted((name for name in known if words and all(word in name for word in words)), key=len)
 
 
 def _planned(path: Path) -> str | None:

@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import onnxruntime
@@ -146,7 +146,7 @@ class OnnxLens:
         self._sessions: dict[tuple[Any, ...], Any] = {}  # by process and outputs; opened when they are needed
         self._graphs: dict[Form, Graph] = {}
 
-    def at(self, *state: float) -> OnnxLens:
+    def at(self, *state: float) -> Self:
         """The same model in another state, its card with the lens and the domain there.
 
         Raises:
@@ -154,7 +154,7 @@ class OnnxLens:
         """
         if not self.axes and not state:
             return self
-        other = OnnxLens(self.file)
+        other = type(self)(self.file)
         other.card, other.state = card_at(self.file.card, self.axes, state), tuple(float(v) for v in state)
         return other
 

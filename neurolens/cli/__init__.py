@@ -20,7 +20,7 @@ from typing import Any
 import neurolens
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, missing, one_line, printable, reason
 from neurolens.base.tasks import handled
-from neurolens.cli.arguments import Help, Parser, more_glasses
+from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
@@ -74,6 +74,15 @@ exit codes: 0 done, 1 a model breaks a promise or none has the error asked for, 
 70 a fault of neurolens itself, or no memory.
 Help of a command: neurolens COMMAND --help"""
 
+# What `neurolens` alone prints: what to type first, for each of the three ways in.
+_FIRST = """\
+A first picture:      neurolens demo
+To find a lens:       neurolens lens list
+To light or comp:     neurolens handover laikin_double_gauss_50 --film 36x20.25 --width 3840 --focus 2 -o shot/
+To do research:       neurolens analyse laikin_double_gauss_50 -o gauss
+To write a renderer:  neurolens export laikin_double_gauss_50.ols-36 --to c -o gauss.h
+All commands:         neurolens --help    (in Python: import neurolens as nl; help(nl.lens))"""
+
 
 def build_parser(first: str | None = None) -> Parser:
     """The whole command line; of a command line with such a first word, only that command is imported."""
@@ -90,11 +99,21 @@ def build_parser(first: str | None = None) -> Parser:
         for name, (place, about) in commands.items():
             own = subparsers.add_parser(name, help=about)
             if first is None or name in (first, *_RENAMED.get(first, ())):
-                module, _, command = place.partition(".")
-                getattr(import_module(f"{__name__}.{module}"), command).fill(own)
+                _class_at(place).fill(own)
         parser.add_argument_group(title)._group_actions += subparsers._choices_actions  # so that help lists them there
         subparsers._choices_actions = []
     return parser
+
+
+def _class_at(place: str) -> type[Command]:
+    module, _, name = place.partition(".")
+    found: type[Command] = getattr(import_module(f"{__name__}.{module}"), name)
+    return found
+
+
+def command(name: str) -> type[Command]:
+    """The class of a command by its name."""
+    return _class_at({k: place for commands in _COMMANDS.values() for k, (place, _) in commands.items()}[name])
 
 
 def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None = None) -> int:
@@ -109,6 +128,9 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None =
             "pip uninstall neurolens, then install this one again"
         )
     words = sys.argv[1:] if argv is None else argv
+    if not words and build is None:
+        print(_FIRST)
+        return 0
     args, received = argparse.Namespace(kept="nothing was done"), list[int]()
 
     def interrupt(number: int) -> None:

@@ -10,7 +10,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
@@ -172,10 +172,14 @@ class Reporting(Command):
     )  # fmt: skip
     quiet: bool = setting(False, "neither progress nor warnings on stderr", last=2)
     json: bool = setting(False, "print one JSON object on stdout instead of the text; keys carry their unit", last=3)
+    # Takes the answer of a call from Python (`cli.calls`), which prints nothing.
+    tell: Callable[[Mapping[str, Any], str], None] | None = field(default=None, compare=False, repr=False)
 
     def answer(self, data: Mapping[str, Any], text: Callable[[], str], code: int = 0) -> int:
         """Print `data` if --json asks for it, else `text`; returns the exit code."""
-        if self.json:
+        if self.tell is not None:
+            self.tell(data, text())
+        elif self.json:
             print_json(data)
         else:
             print(printable(text()))

@@ -1,0 +1,345 @@
+"""The Python front, `import neurolens as nl`: a lens as an object, and commands as calls.
+
+A call takes what its command takes, by the same names with their units, and returns what --json prints.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+from base64 import b64encode
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from html import escape
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from neurolens.base import lensname
+from neurolens.base.errors import InputError, NeurolensError, missing, one_line
+from neurolens.base.files import TemporaryFolder, library
+from neurolens.base.progress import Progress
+from neurolens.base.settings import setting_of
+from neurolens.cameras.onnxlens import LensRays, OnnxLens
+from neurolens.cli import arguments as cli
+from neurolens.cli import command
+from neurolens.cli.calls import Answer, call, command_of, parameters, signature_of
+from neurolens.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.surrogates.file import read_model
+
+if TYPE_CHECKING:
+    from neurolens.cameras.contract import Camera as MadeCamera
+    from neurolens.lens.prescription import Lens as Prescription
+    from neurolens.trace.rays import Towards
+
+_LENS = "laikin_double_gauss_50"
+EXAMPLES = {  # of each name: its docstring has it, and a test runs it
+    "find": "nl.find('double gauss')",
+    "lens": f"nl.lens('{_LENS}').set(focus_m=2, f_number=4)",
+    "camera": f"nl.camera('{_LENS}.ols-36', film=(36, 24), focus_m=2)",
+    "load": f"nl.load('{_LENS}.ols-36').card['lens']['efl_mm']",
+    "fit": f"nl.fit('{_LENS}', within_um=5, output='gauss')",
+    "analyse": f"nl.analyse('{_LENS}', ['spots', 'distortion'], f_number=5.6)",
+    "verify": "nl.verify('sony_sonnar_55', output='sonnar.png')",
+    "plan": f"nl.plan('experiments/scenes/garden.toml', '{_LENS}', budget='0.25px', no_fit=True)",
+    "render": f"nl.render('experiments/scenes/room.toml', '{_LENS}.ols-36', width=48, samples=4, output='room.exr')",
+    "flare": f"nl.flare('{_LENS}', light=(15, 8), width=96, quick=True, output='flare.exr')",
+    "defocus": f"nl.defocus('plate.exr', '{_LENS}.ols-36', film=(36, 24), focus_m=2, output='blurred.exr')",
+    "bokeh": f"nl.bokeh('{_LENS}.ols-36', width=480, film=(36, 24), focus_m=2, distance=[1, 5], output='bokeh')",
+    "stmap": f"nl.stmap('{_LENS}.ols-36', width=480, film=(36, 20.25), focus_m=2, output='shot')",
+    "projection": f"nl.projection('{_LENS}.ols-36', width=480, film=(36, 24), projection='opencv')",
+    "export": f"nl.export('{_LENS}.ols-36', to='c', output='lens.h')",
+    "train": f"nl.train(lens='{_LENS}', within='5um', rounds=0, output='gauss')",
+}
+
+
+class Call:
+    """A function of the front. Where a folder has its name, as neurolens.render, it leads to that folder's modules."""
+
+    def __init__(self, name: str, run: Callable[..., Any], doc: str, signature: inspect.Signature) -> None:
+        self._run, self.__name__, self.__doc__, self.__signature__ = run, name, doc, signature
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        try:
+            return self._run(*given, **named)
+        except ModuleNotFoundError as error:  # as a command says it, with the extra that brings the package
+            raise (NeurolensError(missing(error)) if missing(error) else error) from None
+
+    def __getattr__(self, name: str) -> Any:
+        folder = f"neurolens.{self.__name__}"
+        if name.startswith("__") or find_spec(folder) is None:
+            raise AttributeError(name)
+        return getattr(import_module(folder), name)
+
+    def __repr__(self) -> str:
+        return f"neurolens.{self.__name__}{self.__signature__}"
+
+
+def of(name: str) -> Call:
+    """The function of the front that has this name; its docstring has the parameters and an example."""
+    example = f"Example::\n\n    >>> import neurolens as nl\n    >>> {EXAMPLES[name]}\n"
+    if (own := {"find": find, "load": load, "fit": fit}.get(name)) is not None:
+        return Call(name, own, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own))
+    chosen = {"lens": Lens, "camera": Camera}.get(name)
+    reads = chosen.reads if chosen else command(name)
+    listed = "\n".join(f"    {key}: {action.help}" for key, action in parameters(reads)[1].items())
+    doc = f"{inspect.getdoc(chosen or reads)}\n\nParameters:\n{listed}\n\n{example}"
+    return Call(name, chosen.make if chosen else partial(run_command, reads), doc, signature_of(reads))
+
+
+def run_command(cls: type[cli.Command], *given: Any, **named: Any) -> Answer:
+    """Run a command; a lens or camera among the values brings its settings."""
+    for value in (*given, *named.values()):
+        for one in value if isinstance(value, list) else [value]:
+            named = {**_settings(one), **named}
+    return call(cls, given, named)
+
+
+def _settings(value: Any) -> Mapping[str, Any]:
+    return value.settings if isinstance(value, _Chosen) else {}
+
+
+@dataclass(frozen=True, repr=False)
+class _Chosen:
+    """A name and its settings: every call takes both where it takes a lens."""
+
+    name: str
+    settings: Mapping[str, Any]
+    reads: ClassVar[type[cli.Command]]  # the settings, by its parser
+
+    @classmethod
+    def make(cls, name: str | os.PathLike[str], **settings: Any) -> Self:
+        """One of a name, or of another with its settings; mistakes are raised here."""
+        settings = {**_settings(name), **settings}
+        return cls(os.fspath(name), {key: value for key, value in settings.items() if value is not None})
+
+    def __post_init__(self) -> None:
+        _ = self._read
+
+    def __fspath__(self) -> str:
+        return self.name
+
+    def __repr__(self) -> str:
+        settings = "".join(f", {key}={value!r}" for key, value in self.settings.items())
+        return f"{self.reads.called}({self.name!r}{settings})"
+
+    @cached_property
+    def _read(self) -> Any:
+        return command_of(self.reads, (self.name,), self.settings)
+
+    def set(self, **settings: Any) -> Self:
+        """The same with further settings; None takes one away. Raises InputError for one that cannot be."""
+        return self.make(self, **settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ReadLens(cli.Command):
+    """What `nl.lens` takes."""
+
+    called: ClassVar[str] = "nl.lens"
+    file: Path = cli.lens(positional=True)
+    state: cli.LensState = cli.lens_state()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ReadCamera(cli.Command):
+    """What `nl.camera` takes."""
+
+    called: ClassVar[str] = "nl.camera"
+    camera: str = cli.lens(models=True, cameras=True, positional=True)
+    film: tuple[float, float] = cli.film((36.0, 24.0), "in mm (default: 36x24)")
+    film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
+    vignetting: Vignetting | None = setting_of(Shot, "vignetting")
+    dispersion: Dispersion | None = setting_of(Shot, "dispersion")
+    state: cli.LensState = cli.lens_state()
+
+
+class Lens(_Chosen):
+    """A lens by its name or file, zoomed, stopped down and focused; notebooks draw it. Needs the extra "train" (torch).
+
+    Raises:
+        InputError: no such lens, with the nearest name; a setting that it cannot have.
+    """
+
+    reads = _ReadLens
+
+    def __post_init__(self) -> None:
+        _ = self.prescription
+
+    @cached_property
+    def _tabled(self) -> Prescription:
+        from neurolens.readers.any_format import read_any
+
+        return read_any(self._read.file)
+
+    @cached_property
+    def prescription(self) -> Prescription:
+        """Its surfaces, gaps and glasses in this state."""
+        found: Prescription = self._read.state.set_lens(self._tabled)
+        return found
+
+    @cached_property
+    def _figures(self) -> Mapping[str, float]:
+        from neurolens.cameras.exact import state_of
+
+        return state_of(self.prescription, Shot.wavelength_nm)
+
+    @property
+    def focal_length_mm(self) -> float:
+        """At the d line, of an anamorphic lens along y."""
+        return self._figures["effective_focal_length_mm"]
+
+    @property
+    def f_number(self) -> float:
+        """The focal length over the diameter of the entrance pupil."""
+        return self._figures["f_number"]
+
+    @property
+    def t_stop(self) -> float:
+        """The f-number of a lens without loss that sends as much light to the axis, from 400 to 700 nm."""
+        return self._figures["t_stop"]
+
+    @property
+    def focus_m(self) -> float:
+        """From the film to the object in focus, or inf."""
+        return float(self._read.state.focus_of(self._tabled, self.prescription))
+
+    def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
+        """Trace rays through every surface; the answer has the form of a model's, in float64.
+
+        Args:
+            rays: x, y, z in mm and unit direction [6, N], lens frame.
+            wavelength_nm: None takes the lens's reference, of most the d line.
+            towards: "scene" for camera rays, which run towards -z, or "film".
+
+        Raises:
+            InputError: another shape; as `neurolens.trace.rays.trace`.
+        """
+        import torch
+
+        from neurolens.trace.rays import trace
+        from neurolens.trace.surfaces import Rays
+
+        if (array := np.array(rays, np.float64)).ndim != 2 or len(array) != 6:
+            raise InputError("Lens.trace", "rays", f"({array.shape})", "an array (6, N)")
+        lens, start, stop = self.prescription, Rays(*torch.from_numpy(array)), self.prescription.stop_index
+        done = trace(lens, start, wavelength_nm, towards=towards, transmittance=True, record=(stop,))
+        crossing, through = done.crossings[stop], done.transmittance
+        assert through is not None
+        columns = (torch.stack(list(done.rays)), through, torch.stack([crossing.x, crossing.y]), done.status)
+        return LensRays(*(column.numpy() for column in columns))
+
+    def analyse(self, *what: str, **options: Any) -> Answer:
+        """Its spots, mtf, distortion and more, by these names or all: `nl.analyse`."""
+        return run_command(command("analyse"), self, list(what), **options)
+
+    def describe(self, **options: Any) -> Answer:
+        """All that `neurolens lens` prints, and draws: pupils, image circle, what stops its light, surfaces, doubts."""
+        return run_command(command("lens"), self, **options)
+
+    def draw(self, output: str | Path) -> None:
+        """Draw its section with rays, as PNG, PDF or SVG."""
+        self.describe(layout=output)
+
+    def __repr__(self) -> str:
+        size = f"{self.focal_length_mm:.4g} mm f/{self.f_number:.3g}, T{self.t_stop:.3g}"
+        focus = "infinity" if math.isinf(self.focus_m) else f"{self.focus_m:g} m"
+        return f"{one_line(self.prescription.name, 200)}: {size}, focus at {focus}"
+
+    @cached_property
+    def _png(self) -> bytes:
+        with TemporaryFolder() as folder:
+            self.draw(file := Path(folder) / "lens.png")
+            return file.read_bytes()
+
+    def _repr_png_(self) -> bytes:
+        return self._png
+
+    def _repr_html_(self) -> str:
+        picture = b64encode(self._png).decode()
+        return f'<p>{escape(repr(self))}</p><img width="705" src="data:image/png;base64,{picture}">'
+
+
+class Camera(_Chosen):
+    """A lens, a model or an ideal camera by its name, set for a shot; nl.render takes it with all its settings.
+
+    Raises:
+        InputError: no such lens, with the nearest name; a setting that is none.
+    """
+
+    reads = _ReadCamera
+
+    @cached_property
+    def made(self) -> MadeCamera:
+        """By itself, film points and random numbers to weighted scene rays: see `neurolens.cameras.contract`.
+
+        Raises:
+            InputError: a setting that this kind of camera does not have.
+        """
+        read = self._read
+        more = {name: getattr(read, name) for name in ("film_offset_mm", "vignetting", "dispersion")}
+        return cli.camera(read.camera, read.state.shot(read.film, **more), Progress(quiet=True))
+
+
+class Model(OnnxLens):
+    """An exported model. Its `card` says of what it is, how exact and where; `rays` makes scene rays of camera rays."""
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __repr__(self) -> str:
+        return f"{self.path}: {self.card['fit']['method']} of {self.card['lens']['name']}"
+
+    def export(self, to: str, output: str | Path, **options: Any) -> Answer:
+        """Write it in another form, "c", "glsl", "osl" and more: `nl.export`."""
+        return run_command(command("export"), self, to=to, output=output, **options)
+
+
+def find(words: str) -> list[str]:
+    """The names of lenses that ship and hold each of the words, the shortest first; `nl.lens` takes each."""
+    return lensname.of_words(words, [file.stem for file in sorted((library() / "lenses").glob("*.toml"))])
+
+
+def load(model: str | os.PathLike[str]) -> Model:
+    """An exported model by its file, or by the name of one that ships, checked; it needs no torch.
+
+    It has card, rays() and export(), and every call takes it where a model is named.
+
+    Raises:
+        InputError: no such model. ModelError: a file that cannot be trusted.
+    """
+    file = lensname.resolve(os.fspath(model), cameras=False).file
+    if file is None or not lensname.is_model(file):
+        raise InputError("nl.load", "model", str(file), "an exported model (.onnx)")
+    return Model(read_model(file))
+
+
+def fit(lens: str | os.PathLike[str], within_um: float | None = None, **options: Any) -> Model:
+    """Fit models to a lens as `nl.train` does, but time none, and load the one to use: a minute, as a rule.
+
+    Args:
+        lens: a name, a file, or a lens that is set, whose zoom, f-number and focal length count.
+        within_um: film-equivalent RMS error on rays that the fit has not seen: the smallest model within it.
+        options: further ones of `nl.train`, as output, the folder of the run, and set, a mapping.
+
+    Raises:
+        InputError: a setting that models do not have; no model within the error.
+    """
+    from neurolens.study.pages import CLOSE_UM, to_use
+
+    state = {key: value for key, value in _settings(lens).items() if key != "focus_m"}  # a model holds any focus
+    kept = {f"lens.{key}": state.pop(key) for key in ("zoom", "f_number", "focal_length_mm") if key in state}
+    options = {"rounds": 0, **state, **options, "set": {**kept, **options.get("set", {})}}
+    within = None if within_um is None else f"{within_um}um"
+    run = call(command("train"), (), {"lens": os.fspath(lens), "within": within, **options})
+    if run.code:
+        least = f"at least {run['target']['rms_um']:.3g}, the error of the closest model"
+        raise InputError("nl.fit", "within_um", within_um, least)
+    best = to_use(run["models"], within_um or CLOSE_UM)
+    return load(Path(run["folder"]) / (best or run["models"][0])["file"])
