@@ -46,7 +46,7 @@ def case(name: str, args: argparse.Namespace) -> list[lab.Row]:
     film = shot.film_mm[0], shot.film_mm[0] * shot.height / shot.width
     scene = replace(scene, settings=replace(scene.settings, camera=replace(shot, film_mm=film)))
     models = [lab.MODELS / f"{LENS}.{MODEL}.onnx"]
-    made = plans._priced(scene, lab.lens_of(LENS), 1e9, models=models)
+    made = plans.plan(scene, lab.lens_of(LENS), 1e9, models=models, explain=True)
     rows: list[lab.Row] = []
     for choice in made.choices:
         if choice.name in (EXACT, PLAIN) or choice.name.endswith(MODEL):

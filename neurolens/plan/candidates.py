@@ -9,8 +9,7 @@ from __future__ import annotations
 import bisect
 import math
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -64,7 +63,6 @@ class Choice:
         how: what else it needs, or how it was made.
         within: whether it meets the budget of its plan.
         settings: of a model that was fitted for the shot.
-        flip: of its picture, where a budget of FLIP asked for it.
         spread: how many times as long as the least the median of its timed calls took (1 where cost is counted).
         disperses: whether its picture depends on the wavelength.
         seconds: of one thread, of the whole picture to the noise of the exact lens (10^9 operations where no time is
@@ -81,7 +79,6 @@ class Choice:
     how: str = ""
     within: bool = False
     settings: ModelSettings | None = None
-    flip: float | None = None
     spread: float = 1.0
     disperses: bool = False
     seconds: float = math.inf
@@ -113,18 +110,11 @@ def candidates(
     say = report or (lambda done, left=None: None)
     say(0.2)
     trial = Trial(probed, target, tuple(budgets_px), explain, work)
-    tried = [*_ideal(trial), *_exact(trial)]
-    # One thread fits while the other measures what ships: neither needs the other. A film beyond the end of a model's
-    # range is no warning here: its error counts.
-    with warnings.catch_warnings(), ThreadPoolExecutor(1) as other:
+    with warnings.catch_warnings():  # a film beyond the end of a model's range: its error counts
         warnings.simplefilter("ignore", NeurolensWarning)
-        shipped = other.submit(_shipped, trial, models)
-        if not explain:
-            other.submit(lambda: probed.maps)  # the light that the lens adds, which takes seconds
+        tried = [*_ideal(trial), *_exact(trial), *_shipped(trial, models)]
         fitted = [] if folder is None else _fitted(trial, folder, tried, lambda done, left=None: say(0.2 + 0.6 * done))
-        tried += shipped.result() + fitted
-        say(0.8)
-        return tuple(_costed(trial, tried))
+        return tuple(_costed(trial, tried + fitted))
 
 
 @dataclass(frozen=True)
@@ -388,31 +378,17 @@ def _fitted(trial: Trial, folder: Path, tried: Sequence[_Judged], say: Report) -
     if not asked:
         return []
     fit, sizes = shot_fits(probed, folder), shot_terms(probed)
-    known: dict[int, list[_Judged]] = {}
+
+    found: dict[int, list[_Judged]] = {}
     for k, budget_px in enumerate(asked):
-        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
-        while low < high:
-            errors = {n: j.choice.error_px for n, judged in known.items() for j in judged}
-            size = _next_size(sizes, low, high, budget_px, errors)
-            if size not in known:
-                file, settings = fit(sizes[size])
+
+        def holds(terms: int, budget_px: float = budget_px) -> bool:
+            if terms not in found:
+                file, settings = fit(terms)
                 made = _model(trial, file, FITTED)
-                known[size] = [replace(j, choice=replace(j.choice, settings=settings)) for j in made]
-            holds = any(j.choice.meets(budget_px) for j in known[size])
-            low, high = (low, size) if holds else (size + 1, high)
-            say((k + 1 - (high - low) / len(sizes)) / len(asked))
-    return [j for js in known.values() for j in js]
+                found[terms] = [replace(j, choice=replace(j.choice, settings=settings)) for j in made]
+            return any(j.choice.meets(budget_px) for j in found[terms])
 
-
-def _next_size(sizes: Sequence[int], low: int, high: int, budget_px: float, errors: Mapping[int, float]) -> int:
-    """The size to try next of those from `low` up to `high`.
-
-    It is the least that holds if errors fall with the square of the terms from those known beside them; where nothing
-    is known, the one in the middle.
-    """
-    ends = [n for n in (low - 1, high) if 0 < budget_px * errors.get(n, 0.0) < math.inf]
-    if not ends:
-        return (low + high) // 2
-    near = min(ends, key=lambda n: abs(math.log(errors[n] / budget_px)))
-    wanted = sizes[near] * math.sqrt(errors[near] / budget_px)
-    return min(max(bisect.bisect_left(sizes, wanted), low), high - 1)
+        bisect.bisect_left(sizes, True, key=holds)
+        say((k + 1) / len(asked))
+    return [j for js in found.values() for j in js]

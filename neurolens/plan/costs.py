@@ -43,9 +43,10 @@ _STEP_NS, _DEAR_NS, _DEAR = 0.2295, 2.772, ("div", "sqrt")
 # Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
-# Of a picture, to measure noise: number of strips, paths of all; samples of a pixel at most. What thin lenses and those
-# that disperse gain by more samples differs: their noise is compared at the scene's own number.
-_STRIPS, _STRIP_PATHS, _SAMPLES = 6, 180_000, 16
+# Of a picture, to measure its paths: most strips, least rows of one (where cameras disperse, rows beside a strip have
+# light in it and are rendered, too), paths of all, of the picture's at most one in `PART`, samples of a pixel at most.
+# What thin lenses and those that disperse gain by more samples differs: noise is compared at the scene's own number.
+_STRIPS, _ROWS, _STRIP_PATHS, PART, _SAMPLES = 6, 4, 400_000, 400, 16
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 _MOST_DARK = 0.05  # of the places
 
@@ -77,7 +78,7 @@ def noise(weight: Array, share: Array) -> float:
 
 
 def ns_a_ray(camera: Camera, places: Places) -> Timing:
-    """Nanoseconds of a ray: least and median of some calls on one thread."""
+    """Nanoseconds of the processor for a ray: least and median of some calls on one thread."""
     rays = int(getattr(camera, "rays_a_call", RAYS_A_CALL))
     rng = np.random.default_rng(1)
     rows = rng.integers(0, places.film_mm.shape[1], rays)
@@ -85,9 +86,9 @@ def ns_a_ray(camera: Camera, places: Places) -> Timing:
     waves = rng.choice(places.wavelength_nm, rays, p=places.share).astype(np.float32)
     ns = []
     for _ in range(_ROUNDS):
-        began = time.perf_counter()
+        began = time.process_time()
         camera.sample(film, pupil, waves)
-        ns.append(1e9 * (time.perf_counter() - began) / rays)
+        ns.append(1e9 * (time.process_time() - began) / rays)
     return {"min": min(ns), "median": statistics.median(ns), "repeats": _ROUNDS}
 
 
@@ -105,17 +106,18 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
         plain, colours: cameras of the same lens, without and with its dispersion. weights: theirs at the places, as
             for `noise`.
     """
-    samples = min(scene.settings.camera.samples, _SAMPLES)
-    strips = strips_of(scene, _STRIP_PATHS, samples, 1, _STRIPS)
+    shot = scene.settings.camera
+    samples = min(shot.samples, _SAMPLES)
+    paths = min(shot.width * shot.height * shot.samples // PART, _STRIP_PATHS)
+    strips = strips_of(scene, paths, samples)
     rest, variance = [], []
     for camera, weight in zip((plain, colours), weights, strict=True):
         with shared_worlds():
             _strip(scene, camera, 0, (0, 1), samples)  # what is fitted or compiled once is no part of a path
-            jobs = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
-        ns = [[1e9 * j.film.seconds[1] / (j.tiling.pixels * samples) for j in some] for some in jobs]
-        besides = float(np.min(ns, axis=0).mean()) - ns_a_ray(camera, places)["min"]
-        rest.append(max(besides, 0.0))
-        one, two = (np.concatenate([develop(j)[0] for j in some]).astype(np.float64) for some in jobs)
+            some = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
+        ns = np.array([[seconds for _, seconds in row] for row in some]).min(axis=0).mean()
+        rest.append(max(float(ns) - ns_a_ray(camera, places)["min"], 0.0))
+        one, two = (np.concatenate([picture for picture, _ in row]) for row in some)
         apart = np.square(one - two).mean(axis=-1)  # twice the variance
         most = np.percentile(apart, 100 * (1 - _MOST_DARK))  # the rarest lights are left to chance
         mean = max(float(one.mean()), 1e-30)
@@ -124,21 +126,25 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
     return Work((rest[0], rest[1]), (1.0, ratio))
 
 
-def strips_of(scene: Scene, paths: int, samples: int, least: int, count: int = 3) -> list[tuple[int, int]]:
+def strips_of(scene: Scene, paths: int, samples: int) -> list[tuple[int, int]]:
     """The first row of each of some strips of a picture, and the one after its last: for so many paths in all."""
     shot = scene.settings.camera
-    rows = min(max(paths // (count * samples * shot.width), least), shot.height)
+    rows = max(paths // (samples * shot.width), 1)
+    count = min(max(rows // _ROWS, 1), _STRIPS)
+    rows = min(rows // count, shot.height)
     firsts = np.unique(np.linspace(0, shot.height - rows, count + 2).astype(int)[1:-1])
     return [(int(first), int(first) + rows) for first in firsts]
 
 
-def _strip(scene: Scene, camera: Camera, seed: int, rows: tuple[int, int], samples: int) -> Job:
-    """Rows of a picture, rendered on one thread."""
+def _strip(scene: Scene, camera: Camera, seed: int, rows: tuple[int, int], samples: int) -> tuple[Array, float]:
+    """Rows of a picture, and the nanoseconds of a path: of the processor, for other work would count by the clock."""
     shot = scene.settings.camera
     grid = PixelGrid(shot.width, shot.height, camera.film_mm)
     job = Job(scene, camera, grid, samples, seed, shot.max_depth, scene.settings.film, rows)
+    began = time.process_time()
     run(job, 1)
-    return job
+    took = time.process_time() - began
+    return develop(job)[0].astype(np.float64), 1e9 * took / (job.tiling.pixels * samples)
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:

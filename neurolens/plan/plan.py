@@ -1,4 +1,4 @@
-"""The camera for a scene by a budget of error, time or visible difference; and the trade of error against time.
+"""The camera for a scene by a budget of error or time; and the trade of error against time.
 
 A camera's error is the distance of its footprints from the exact lens's in pixels, and of its light, at the places of a
 scene that a `probe` finds; both count where they are largest but for 5% of the picture. Its cost is the time of a path
@@ -6,15 +6,18 @@ in the target named, times the noise of its picture: see `costs`. In C and onnxr
 thread; for shaders it is counted. The cheapest camera within the budget is chosen; those that take about as long are
 alike, and the exact lens is taken where it is one of them.
 
-Seconds are of one thread and of the whole picture at the scene's own size, to the noise that the exact lens has with
-the scene's samples. What a path takes besides its camera, and how dispersion adds to noise, is measured by strips of
-the picture in our renderer; in other targets the camera alone counts, in Cycles under a white sky. There cameras count
-as alike up to `pages.SAVING`, for what else a path takes is not known.
+Seconds are of one thread's processor and of the whole picture at the scene's own size, to the noise that the exact lens
+has with the scene's samples. What a path takes besides its camera, and how dispersion adds to noise, is measured by
+strips of the picture in our renderer; in other targets the camera alone counts, in Cycles under a white sky. There
+cameras count as alike up to `pages.SAVING`, for what else a path takes is not known.
+
+A plan should take at most a tenth of its picture. So it renders strips in proportion to the picture, tries no model
+where none could save enough, and looks for the light that the lens adds, which takes seconds, where a tenth of the
+picture has room for it.
 """
 
 from __future__ import annotations
 
-import bisect
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -33,10 +36,10 @@ from neurolens.base.records import pareto_front
 from neurolens.base.settings import to_toml
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import as_c, ideal_as, with_dispersion
-from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.contract import FloatArray
 from neurolens.lens.prescription import Lens
 from neurolens.plan.candidates import EXACT, PAIRS, Choice, Target, camera_of, candidates, shot_domain
-from neurolens.plan.costs import ALONE, UNIT, Work, noise, ns_a_ray, small, strips_of, work_of
+from neurolens.plan.costs import ALONE, UNIT, Work, noise, ns_a_ray, small, work_of
 from neurolens.plan.probe import LIGHT, Effect, Probe, SceneNeeds, effects_of, probe
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
@@ -47,10 +50,11 @@ from neurolens.study.scenes import Image, flip_map
 
 _SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
 _ACROSS, _SAMPLES = 240, 16  # of pictures
-_STRIP_ROWS, _STRIP_PATHS = 16, 2_000_000  # of strips of a picture: least rows, paths of all
 _SHOWN = 8  # most of them, beside the exact lens
 ALIKE = 1.2  # times the least cost of a whole picture: costs are no more accurate
-_BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for, besides the one asked for
+_BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for where every camera is asked for
+SHARE = 0.1  # of the time of its picture that a plan should take at most
+_WHOLE_S = 20.0  # CPU seconds of a plan with the light that the lens adds, at most, whatever the picture
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,7 @@ class Plan:
     """A scene's needs, the effects in falling order of worth, every camera tried by rising cost, the one to use.
 
     Attributes:
-        budget_s, budget_flip: seconds, or FLIP difference, of a plan for those, whose `budget_px` is then the error of
-            the best camera.
+        budget_s: seconds of a plan for those, whose `budget_px` is then the error of the best camera.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
         work: what a path takes besides its camera, in the same unit; none where the camera alone counts.
         alike: names of the cameras within the budget that take about as long as the cheapest, the best among them.
@@ -75,7 +78,6 @@ class Plan:
     choices: tuple[Choice, ...]
     best: Choice | None
     probed: Probe
-    budget_flip: float | None = None
     work: Work = ALONE
     alike: tuple[str, ...] = ()
 
@@ -88,6 +90,11 @@ class Plan:
     def front(self) -> list[Choice]:
         """The cameras that no other betters, see `front`."""
         return front(self.choices)
+
+    @property
+    def half(self) -> Choice | None:
+        """The best camera for half of the seconds that the picture of the chosen one takes."""
+        return None if self.best is None else best_within(self.choices, self.best.seconds / 2)
 
     @property
     def unit_s(self) -> str:
@@ -118,33 +125,40 @@ class Plan:
 
 
 def plan(
-    scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Report | None = None, **look: Any,
+    scene: Scene, lens: Lens, budget_px: float = 0.25, *, budget_s: float | None = None, target: Target = "render",
+    models: Sequence[Path] = (), folder: Path | None = None, explain: bool = False, report: Report | None = None,
+    **look: Any,
 ) -> Plan:  # fmt: skip
     """The cheapest camera for a scene whose error stays within a budget, or the exact lens where that one saves too
-    little to tell. In our renderer the whole picture counts.
+    little to tell; or the most faithful camera for a time. In our renderer the whole picture counts.
 
     Args:
         lens: as its file has it. budget_px: error of place and blur in pixels of the scene's picture.
+        budget_s: seconds of one thread that the picture may take, in place of an error; every camera is timed.
         target: what runs the camera: our renderer with all it has, compiled C, onnxruntime, Blender's Cycles (osl), or
             a renderer in GLSL.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
-        explain: whether cameras beyond the budget are compiled and timed, too; else their cost is infinite.
+        explain: whether cameras beyond the budget are compiled and timed, too, and the light that the lens adds is
+            looked for, whatever that takes; else their cost is infinite.
         look: further arguments of `probe`: zoom, dispersion, and what is made of the picture later.
 
     Raises:
-        InputError: a budget that is negative or no number; a part of the dispersion for a target other than our
-            renderer; as `probe`.
+        InputError: a budget that is negative or no number; seconds for a target whose time is not known; a part of the
+            dispersion for a target other than our renderer; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
+    if budget_s is not None and not (budget_s > 0 and UNIT[target] == "ns"):
+        told = f"({budget_s:g} s for {target})"
+        raise InputError("plan", "budget_s", told, "above 0, and a target whose time is known")
     probed = probe(scene, lens, **look)
     work = work_for(scene, probed, target)
-    folder = folder if explain or not exact_suffices(probed, work) else None
-    tried = candidates(
-        probed, (budget_px,), target, models=models, folder=folder, explain=explain, report=report, work=work
-    )
-    return decided(probed, tried, budget_px, target, work)
+    every = explain or budget_s is not None
+    if not every and exact_suffices(probed, work):
+        models, folder = (), None
+    budgets = (*_BUDGETS, 0.0 if budget_s is not None else budget_px) if every else (budget_px,)
+    tried = candidates(probed, budgets, target, models=models, folder=folder, explain=every, report=report, work=work)
+    return decided(probed, tried, budget_px, target, work, budget_s, explain)
 
 
 def work_for(scene: Scene, probed: Probe, target: Target) -> Work:
@@ -176,22 +190,31 @@ def _alike(work: Work) -> float:
     return ALIKE if any(work.rest) else SAVING
 
 
-def decided(probed: Probe, tried: Sequence[Choice], budget_px: float, target: Target, work: Work | None = None) -> Plan:
+def decided(
+    probed: Probe, tried: Sequence[Choice], budget_px: float, target: Target, work: Work | None = None,
+    budget_s: float | None = None, explain: bool = True,
+) -> Plan:  # fmt: skip
     """The plan for a budget, from candidates that serve it.
 
     Args:
-        work: of a path; None chooses the cheapest camera, whatever it saves.
+        work: of a path; None chooses the cheapest camera, whatever it saves. explain: see `plan`.
     """
-    known = work or ALONE
-    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in in_seconds(probed, tried, known))
-    held = [c for c in ranked if c.within]
-    exact = next((c for c in held if c.name == EXACT and math.isfinite(c.cost)), None) if work else None
-    best = recommended(held, lambda c: c.seconds, exact, saving=_alike(known))
-    alike = tuple(c.name for c in held if c.seconds <= _alike(known) * held[0].seconds)
-    effects = effects_of(probed, budget_px)
+    known, ranked = work or ALONE, in_seconds(probed, tried, work or ALONE)
+    alike: tuple[str, ...] = ()
+    if budget_s is not None:
+        ranked = [replace(c, within=c.seconds <= budget_s and c.light_error <= LIGHT) for c in ranked]
+        best = best_within(ranked, budget_s)
+        budget_px = math.inf if best is None else best.error_px
+    else:
+        ranked = [replace(c, within=c.meets(budget_px)) for c in ranked]
+        held = [c for c in ranked if c.within]
+        exact = next((c for c in held if c.name == EXACT and math.isfinite(c.cost)), None) if work else None
+        best = recommended(held, lambda c: c.seconds, exact, saving=_alike(known))
+        alike = tuple(c.name for c in held if c.seconds <= _alike(known) * held[0].seconds)
+    room = explain or best is None or not any(known.rest) or SHARE * best.seconds > _WHOLE_S
     return Plan(
-        probed.asked, budget_px, None, target, UNIT[target], shot_domain(probed), effects, ranked, best, probed,
-        work=known, alike=alike,
+        probed.asked, budget_px, budget_s, target, UNIT[target], shot_domain(probed),
+        effects_of(probed, budget_px, stray=room), tuple(ranked), best, probed, known, alike,
     )  # fmt: skip
 
 
@@ -223,118 +246,9 @@ class CameraPicture:
         return float(self.difference.mean())
 
 
-@dataclass(frozen=True)
-class Trade:
-    """A plan in which every camera has its seconds, and pictures of those to look at.
-
-    Attributes:
-        samples: a pixel of the pictures. exact: the lens's picture.
-    """
-
-    plan: Plan
-    samples: int
-    exact: FloatArray
-    shown: tuple[CameraPicture, ...]
-
-    @property
-    def half(self) -> Choice | None:
-        """The best camera for half of the seconds that the picture of the chosen one takes."""
-        best = self.plan.best
-        return None if best is None else best_within(self.plan.choices, best.seconds / 2)
-
-
-def _priced(
-    scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, report: Report | None = None, **look: Any,
-) -> Plan:  # fmt: skip
-    """A plan in which every camera has its seconds; arguments as for `plan`."""
-    say = report or (lambda done, left=None: None)
-    probed = probe(scene, lens, **look)
-    work = work_for(scene, probed, target)
-    tried = candidates(
-        probed, (*_BUDGETS, budget_px), target, models=models, folder=folder, explain=True,
-        report=lambda done, left=None: say(0.5 * done), work=work,
-    )  # fmt: skip
-    made = decided(probed, tried, budget_px, target, work)
-    return replace(made, choices=tuple(c for c in made.choices if math.isfinite(c.seconds)))
-
-
-def trade(scene: Scene, lens: Lens, budget_px: float, *, samples: int = _SAMPLES, **options: Any) -> Trade:
-    """Every camera for a scene with its error and its seconds, and pictures of those that no other betters.
-
-    Other arguments and errors as for `plan`.
-    """
-    if not budget_px >= 0:
-        raise InputError("trade", "budget_px", budget_px, "0 or more pixels")
-    say: Report = options.get("report") or (lambda done, left=None: None)
-    made = _priced(scene, lens, budget_px, **options)
-    some = spread(front(made.choices), made.best)
-    exact, pictures = _pictures(scene, made.probed, some, samples, lambda done, left=None: say(0.5 + 0.5 * done))
-    return Trade(made, samples, exact, tuple(pictures))
-
-
-def plan_within(scene: Scene, lens: Lens, seconds: float, **options: Any) -> Plan:
-    """The plan with the most faithful camera whose picture takes no longer than so many seconds of one thread.
-
-    Other arguments and errors as for `plan`; InputError, too, for seconds that are none and a target without time.
-    """
-    target = options.get("target", "render")
-    if not seconds > 0 or UNIT[target] != "ns":
-        raise InputError("plan", "budget", f"({seconds:g} s for {target})", "above 0, and a target whose time is known")
-    made = _priced(scene, lens, 0.0, **options)
-    choices = [replace(c, within=c.seconds <= seconds and c.light_error <= LIGHT) for c in made.choices]
-    return _rebudgeted(made, choices, best_within(choices, seconds), budget_s=seconds)
-
-
-def _rebudgeted(made: Plan, choices: Sequence[Choice], best: Choice | None, **budget: Any) -> Plan:
-    """The plan with another best camera, whose error is then the budget that effects are held against."""
-    error = math.inf if best is None else best.error_px
-    effects = effects_of(made.probed, error)
-    return replace(made, budget_px=error, effects=effects, choices=tuple(choices), best=best, alike=(), **budget)
-
-
-def plan_seen(scene: Scene, lens: Lens, flip_budget: float, **options: Any) -> Plan:
-    """The plan with the cheapest camera whose picture differs from the exact lens's by no more than so much FLIP.
-
-    FLIP is measured on strips of the picture at its own pixels (`_strips`), 16 samples, the same random numbers. It
-    contains the noise of what samples meet otherwise, so that it is more than that of finished pictures (0.02 for
-    0.01 px among many edges). Cameras that no other betters are tried by halves: with less error they are taken to have
-    less FLIP. Other arguments and errors as for `plan`; InputError, too, for a budget that is no number from 0 to 1.
-    """
-    if not 0 <= flip_budget <= 1:
-        raise InputError("plan", "budget", f"{flip_budget:g} FLIP", "0 to 1")
-    if options.get("afterwards"):
-        raise InputError("plan", "afterwards", ", ".join(options["afterwards"]), "nothing with a budget of FLIP")
-    say: Report = options.get("report") or (lambda done, left=None: None)
-    made = _priced(scene, lens, 0.0, **options)
-    by_time = front(made.choices)
-    exact = _strips(scene, made.probed.exact)
-    flips: dict[str, float] = {}
-
-    def holds(choice: Choice) -> bool:
-        pairs = zip(_strips(scene, camera_of(made.probed, choice)), exact, strict=True)
-        flips[choice.name] = 0.0 if choice.error_px == 0 else float(np.mean([flip_map(*pair) for pair in pairs]))
-        say(1 - 0.5 ** (1 + len(flips)))
-        return flips[choice.name] <= flip_budget
-
-    def judged(choice: Choice) -> Choice:
-        value = flips.get(choice.name)
-        return replace(choice, flip=value, within=value is not None and value <= flip_budget)
-
-    first = bisect.bisect_left(by_time, True, key=holds)
-    best = judged(by_time[first]) if first < len(by_time) else None
-    return _rebudgeted(made, [*map(judged, made.choices)], best, budget_flip=flip_budget)
-
-
-def _strips(scene: Scene, camera: Camera) -> list[FloatArray]:
-    """Rows of a camera's picture at the scene's own size, in some places."""
-    drawn = partial(render, scene, camera, samples=_SAMPLES, film=replace(scene.settings.film, wavelengths="one"))
-    return [drawn(rows=rows).rgb for rows in strips_of(scene, _STRIP_PATHS, _SAMPLES, _STRIP_ROWS)]
-
-
 def front(choices: Sequence[Choice]) -> list[Choice]:
     """The cameras of right light that no other betters in error and seconds."""
-    bright = [c for c in choices if c.light_error <= LIGHT]
+    bright = [c for c in choices if c.light_error <= LIGHT and math.isfinite(c.seconds)]
     return [bright[i] for i in pareto_front([(c.seconds, c.error_px) for c in bright])]
 
 
@@ -344,21 +258,21 @@ def best_within(choices: Sequence[Choice], seconds: float) -> Choice | None:
     return min(affordable, key=lambda c: (c.error_px, c.seconds), default=None)
 
 
-def _pictures(
-    scene: Scene, probed: Probe, some: Sequence[Choice], samples: int, report: Report
-) -> tuple[FloatArray, list[CameraPicture]]:
-    """The exact lens's small picture, and those of cameras: equal samples, the same random numbers."""
+def pictures(plan: Plan, samples: int, report: Report) -> tuple[FloatArray, list[CameraPicture]]:
+    """The exact lens's small picture, and those of some cameras that no other betters, the chosen one among them: equal
+    samples, the same random numbers."""
+    scene, some = plan.probed.scene, spread(plan.front, plan.best)
     film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
     width, height = small(scene, _ACROSS)
     drawn = partial(render, scene, width=width, height=height, samples=samples, film=film)
-    exact = drawn(probed.exact).rgb
-    pictures = []
+    exact = drawn(plan.probed.exact).rgb
+    shown = []
     for k, choice in enumerate(some):
         report((k + 1) / (len(some) + 1))
         same = choice.error_px == 0
-        rgb = exact if same else drawn(camera_of(probed, choice)).rgb
-        pictures.append(CameraPicture(choice, rgb, np.zeros(rgb.shape[:2]) if same else flip_map(rgb, exact)))
-    return exact, pictures
+        rgb = exact if same else drawn(camera_of(plan.probed, choice)).rgb
+        shown.append(CameraPicture(choice, rgb, np.zeros(rgb.shape[:2]) if same else flip_map(rgb, exact)))
+    return exact, shown
 
 
 def spread(choices: Sequence[Choice], chosen: Choice | None, most: int = _SHOWN) -> list[Choice]:
@@ -377,70 +291,69 @@ def spread(choices: Sequence[Choice], chosen: Choice | None, most: int = _SHOWN)
 _MAPS_A_ROW = 4
 # Light that an effect takes is dark, light that it adds is orange; none is white.
 _SIGNED = ("#10183a", "#4d6796", "#c9d1de", "#ffffff", "#f6cfae", "#e58a45", CHOSEN)
-_TITLES = {"px": "pixels (logarithmic)", "relative": "% of the light\n(dark: taken, orange: added)"}
+# By unit of effects: what a value is multiplied by, and the labels of bars and of maps.
+_DRAWN = {
+    "px": (1.0, "worth (pixels); grey: left out", "pixels"),
+    "relative": (100.0, "worth (% of the light); grey: left out", "% of the light\n(dark: taken)"),
+}
 
 
 def plot_effects(plan: Plan, path: Path, title: str) -> None:
-    """Draw effects as bars with the budget, the error of every timed camera against its time, and maps of the effects
-    that a camera needs: those in pixels, then those of light, each with one scale."""
-    asked = plan.asked
-    shown = [e for e in plan.effects if e.needed and e.name in plan.probed.maps]
-    groups = {unit: [e.name for e in shown if e.unit == unit] for unit in _TITLES}
-    groups = {unit: names for unit, names in groups.items() if names}
-    heights = [4.2, *(1.6 * -(-len(names) // _MAPS_A_ROW) + 0.15 for names in groups.values())]
+    """Draw effects as bars beside the budget, and maps of those that a camera needs, one scale for each unit."""
+    asked, shown = plan.asked, [e for e in plan.effects if math.isfinite(e.worth)]
+    needed = [e.name for e in shown if e.needed]
+    known = plan.probed.camera_maps
+    maps = {name: (known if name in known else plan.probed.maps)[name] for name in needed}
+    below = 1.5 * -(-len(maps) // _MAPS_A_ROW)
     subtitle = f"f/{asked.f_number:.3g}, focus {asked.shot.focus_m:g} m; 95% of the picture keeps these figures"
-    with drawing(path, 9.5, sum(heights), title, subtitle) as figure:
-        if not groups:
-            _bars_and_trade(plan, figure)
-            return
-        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
-        _bars_and_trade(plan, above)
-        for part, (unit, names) in zip(below, groups.items(), strict=True):
-            _maps(part, {name: plan.probed.maps[name][1] for name in names}, unit, asked.shot.film_mm)
+    with drawing(path, 9.5, 3.6 + below, title, subtitle) as figure:
+        above, *rest = figure.subfigures(2, 1, height_ratios=(3.6, below)) if maps else [figure]
+        for axes, unit, budget in zip(above.subplots(1, 2), _DRAWN, (plan.budget_px, LIGHT), strict=True):
+            _bars(axes, [e for e in shown if e.unit == unit][::-1], unit, budget)
+        for part in rest:
+            _maps(part, maps, asked.shot.film_mm)
 
 
-def _maps(figure: Any, maps: Mapping[str, Any], unit: str, film_mm: tuple[float, float]) -> None:
-    """Maps of effects of one unit, upright, in one scale of colours with its bar."""
+def _bars(axes: Any, effects: Sequence[Effect], unit: str, budget: float) -> None:
+    factor, label, _ = _DRAWN[unit]
+    worths = [factor * e.worth for e in effects]
+    least = max(min((w for w in worths if w > 0), default=1e-3) / 3, 1e-4)
+    colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in effects]
+    axes.barh([e.name for e in effects], [max(w, least) for w in worths], color=colours, left=0)
+    axes.set(xscale="log", xlabel=label)
+    axes.set_xlim(left=least)
+    if 0 < budget < math.inf:
+        axes.axvline(factor * budget, color=CHOSEN, lw=1.2, label=f"budget {factor * budget:g}")
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
+    plain_log_ticks(axes.xaxis)
+
+
+def _maps(figure: Any, maps: Mapping[str, tuple[str, Any]], film_mm: tuple[float, float]) -> None:
+    """Maps of effects, upright, with a bar of colours for each unit."""
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-    colours: Any = "magma"
-    if unit == "px":
-        low, high = error_scale(maps.values(), 98)
-        norm = log_norm(low, high)
-        maps = {name: np.maximum(value, low) for name, value in maps.items()}
-    else:
-        maps = {name: 100 * value for name, value in maps.items()}
-        high = error_scale([np.abs(value) for value in maps.values()], 98)[1]
-        norm, colours = Normalize(-high, high), LinearSegmentedColormap.from_list("signed", _SIGNED)
-    cells = figure.subplots(-(-len(maps) // _MAPS_A_ROW), _MAPS_A_ROW, squeeze=False)
-    for axes, (name, value) in zip(cells.ravel(), maps.items(), strict=False):
-        extent = (0, film_mm[0], 0, film_mm[1])
-        picture = axes.imshow(value, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
-        axes.set_title(name, fontsize=8)
-        axes.set(xticks=[], yticks=[])
-    for axes in cells.ravel()[len(maps) :]:
+    rows, across = -(-len(maps) // _MAPS_A_ROW), min(len(maps), _MAPS_A_ROW)
+    cells = figure.subplots(rows, across, squeeze=False)
+    for axes in cells.ravel():
         axes.set_axis_off()
-    bar = figure.colorbar(picture, ax=cells, extend="both", aspect=12 * len(cells), pad=0.015)
-    bar.ax.tick_params(labelsize=6.5)
-    bar.set_label(_TITLES[unit], fontsize=7)
-    if unit == "px":
-        plain_log_ticks(bar.ax.yaxis)
-
-
-def _bars_and_trade(plan: Plan, figure: Any) -> None:
-    wide = [e for e in plan.effects if e.unit == "px"][::-1]
-    bars, trade = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
-    least = max(min((e.worth for e in wide if e.worth > 0), default=1e-3) / 3, 1e-4)
-    colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in wide]
-    bars.barh([e.name for e in wide], [max(e.worth, least) for e in wide], color=colours, left=0)
-    bars.set_xscale("log")
-    bars.set_xlim(left=least)
-    bars.set_xlabel("worth (pixels), grey: left out")
-    _cameras(trade, plan)
-    trade.set_xlabel(f"{plan.unit_s} of the {plan.what}, --for {plan.target}")
-    if plan.budget_px > 0:
-        bars.axvline(plan.budget_px, color=CHOSEN, lw=1.2)
-    plain_log_ticks(bars.xaxis)
+    for unit, (factor, _, label) in _DRAWN.items():
+        drawn = {name: factor * value for name, (one, value) in maps.items() if one == unit}
+        if not drawn:
+            continue
+        low, high = error_scale([np.abs(value) for value in drawn.values()], 98)
+        norm, colours = (log_norm(low, high), "magma") if unit == "px" else (
+            Normalize(-high, high), LinearSegmentedColormap.from_list("signed", _SIGNED)
+        )  # fmt: skip
+        for axes, (name, (one, _)) in zip(cells.ravel(), maps.items(), strict=False):
+            if one == unit:
+                value = np.maximum(drawn[name], low) if unit == "px" else drawn[name]
+                picture = axes.imshow(value, extent=(0, film_mm[0], 0, film_mm[1]), cmap=colours, norm=norm)
+                axes.set_title(name, fontsize=8)
+        bar = figure.colorbar(picture, ax=cells, extend="both", aspect=12 * rows, pad=0.015)
+        bar.ax.tick_params(labelsize=6.5)
+        bar.set_label(label, fontsize=7)
+        if unit == "px":
+            plain_log_ticks(bar.ax.yaxis)
 
 
 def _cameras(axes: Any, plan: Plan) -> None:

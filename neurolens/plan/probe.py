@@ -5,8 +5,8 @@ which cameras are held against the exact lens (`footprints`), in the scene's own
 the exact footprints in pixels, or the light that it adds or takes relative to the picture, where it is largest but for
 5% of the picture.
 
-A small picture with few samples shows where the scene is bright; two of other seeds, where it has contrast that is no
-noise. The lens's ghosts, glare and stars of the scene's own lights, drawn on as few pixels, are set against it.
+A small picture with few samples shows where the scene is bright. The lens's ghosts, glare and stars of the scene's own
+lights, drawn on as few pixels, are set against it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import math
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -35,6 +35,7 @@ from neurolens.lens.paraxial import PupilBounds, colours, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Dispersion, Shot
 from neurolens.plan import footprints as prints
+from neurolens.plan.costs import PART
 from neurolens.plan.footprints import AFTERWARDS, Array, Footprints, Places, cell_centres, upright
 from neurolens.render.colour import SpectralRange
 from neurolens.render.job import expected_light
@@ -51,7 +52,7 @@ from neurolens.surrogates.pairs import domain_of
 ACROSS = 48  # pixels of the small picture along its longer side
 BLACK = 0.01  # of the picture's mean: relative to less than that nothing counts
 STRAY = {"ghosts": "flare", "glare": "glare", "starburst": "star-bursts"}  # layers, and their names in a plan
-_SAMPLES = 16
+_SAMPLES = 4, 32  # of its pixels; between them, one path for `PART` of the picture that is planned
 _MOST_LIGHTS = 8
 _STARS = 2  # lights whose stars are drawn, the brightest in view: a second each
 _HIGHLIGHT = 4.0  # times the picture's mean: what shines or mirrors what does
@@ -66,13 +67,11 @@ class Overview:
 
     Attributes:
         rgb: [H, W, 3] linear sRGB.
-        contrast: [H, W] RMS relative difference of neighbours (one to the right and one below), noise taken out.
         range_nm: the range of all but the last of its light by the eye.
         wavelength_nm, share: [W] of that, of sum 1.
     """
 
     rgb: Array
-    contrast: Array
     range_nm: tuple[float, float]
     wavelength_nm: Array
     share: Array
@@ -80,24 +79,16 @@ class Overview:
     @property
     def floor(self) -> float:
         """Radiance below which the picture is black."""
-        return _floor(self.rgb)
-
-
-def _floor(rgb: Array) -> float:
-    return max(BLACK * float(rgb.mean()), 1e-30)
+        return max(BLACK * float(self.rgb.mean()), 1e-30)
 
 
 def overview(scene: Scene, camera: Camera) -> Overview:
-    """Look at a scene through a camera."""
-    width, height = small_raster(camera.film_mm)
-    drawn = partial(render, scene, camera, width=width, height=height, samples=_SAMPLES, threads=1)
-    two = [drawn(seed=seed).rgb.astype(np.float64) for seed in (0, 1)]
-    rgb = (two[0] + two[1]) / 2
-    steps = [_steps(picture.mean(-1)) for picture in two]
-    # Noise of two seeds is independent: its product is 0 on the mean.
-    square = (steps[0] * steps[1]).mean(0)
-    contrast = np.sqrt(np.maximum(square, 0)) / np.maximum(rgb.mean(-1), _floor(rgb))
-    return Overview(rgb, contrast, *light_of(scene, camera, rgb.mean((0, 1))))
+    """Look at a scene through a camera, with the fewer samples the fewer its own picture has."""
+    (width, height), shot = small_raster(camera.film_mm), scene.settings.camera
+    samples = shot.width * shot.height * shot.samples // (PART * width * height)
+    samples = min(max(samples, _SAMPLES[0]), _SAMPLES[1])
+    rgb = render(scene, camera, width=width, height=height, samples=samples, threads=1).rgb.astype(np.float64)
+    return Overview(rgb, *light_of(scene, camera, rgb.mean((0, 1))))
 
 
 def small_raster(film_mm: tuple[float, float], across: int = ACROSS) -> tuple[int, int]:
@@ -165,7 +156,7 @@ def stray_light(scene: Scene, camera: Any, seen: Overview) -> dict[str, Array]:
         return dict.fromkeys(STRAY.values(), none)
     raster, light_nm = Raster(camera.film_mm, width, height), scene.settings.camera.wavelength_nm
     settings = FlareSettings(bins=_WAVES, cell_px=_CELL_PX, glare=_PHOTONS // len(lights))
-    layers = flare_layers(FlareJob(lens, lights, raster, settings, light_nm, threads=1))
+    layers = flare_layers(FlareJob(lens, lights, raster, settings, light_nm, threads=1, finer=1))
     half = np.array(camera.film_mm) / 2 / camera.settings["lens_state"]["pinhole_focal_length_mm"]
     stars = [a for a in lights if (np.abs(a.towards[:2]) < -1.1 * half * a.towards[2]).all()][:_STARS]
     only = replace(settings, glare=0, starburst=True, without=("ghosts",))
@@ -185,14 +176,6 @@ def _highlights(camera: Any, seen: Overview, known: list[Light]) -> list[Light]:
     found = highlights(seen.rgb.astype(np.float32), field, camera.film_mm, threshold, _MOST_LIGHTS)
     near = math.cos(math.radians(_NEAR_DEG + 45 / ACROSS))
     return [a for a in found.lights if all(float(a.towards @ b.towards) < near for b in known)]
-
-
-def _steps(picture: Array) -> Array:
-    """Differences [2, H, W] to the neighbours on the right and below; the last ones repeat those before."""
-    steps = [np.diff(picture, axis=axis) for axis in (1, 0)]
-    pads = ((0, 0), (0, 1)), ((0, 1), (0, 0))
-    edged = (np.pad(s, pad, "edge") if s.size else np.zeros_like(picture) for s, pad in zip(steps, pads, strict=True))
-    return np.stack([*edged])
 
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
@@ -217,10 +200,6 @@ class SceneNeeds:
         nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
         distant: share of the picture that shows things without a distance. dark: share that the lens leaves dark.
         light_nm: range of all but 0.2% of the scene's light, as the eye weighs it.
-        contrast: RMS relative difference of neighbours on 48 pixels across, the median.
-        edges: share of neighbours there whose blur differs by more than a pixel.
-        edge_contrast: median contrast at those, None without any: if it is little, the quality of the blur there
-            matters little.
         filter_px: side of the pixel filter, a box.
         afterwards: effects that compositing makes, of `footprints.AFTERWARDS`.
         denoised: whether noise is taken out, so that cameras are not charged for it.
@@ -234,9 +213,6 @@ class SceneNeeds:
     distant: float
     dark: float
     light_nm: tuple[float, float]
-    contrast: float
-    edges: float
-    edge_contrast: float | None
     filter_px: float = 1.0
     afterwards: tuple[str, ...] = ()
     denoised: bool = False
@@ -350,7 +326,6 @@ def probe(
     points = _grid(film, shape)
     with shared_worlds():
         small, depth = overview(scene, exact), seen_depths_m(scene, exact, points)
-        edges = _edges(scene, exact, small, film[0] / shot.width)
     far = np.where(np.isnan(depth), np.inf, depth)
     places = prints.places_of(exact, points, far, small.wavelength_nm, small.share)
     if not places.film_mm.shape[1]:
@@ -361,7 +336,7 @@ def probe(
     asked = SceneNeeds(
         replace(real, dispersion=dispersion), film[0] / shot.width, nearest, farthest,
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1], small.range_nm,
-        float(np.median(small.contrast)), *edges, afterwards=tuple(sorted(afterwards)), denoised=denoised, zoom=zoom,
+        afterwards=tuple(sorted(afterwards)), denoised=denoised, zoom=zoom,
     )  # fmt: skip
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
     wanted = prints.left_to(seen, ideal, places.share, afterwards)
@@ -384,20 +359,6 @@ def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
     with suppress(InputError):
         return domain_of(stopped, focus_m=ends, **options)
     return domain_of(stopped, focus_m=(shot.focus_m, shot.focus_m), **options)
-
-
-def _edges(scene: Scene, exact: Any, small: Overview, pixel_mm: float) -> tuple[float, float | None]:
-    """`edges` and `edge_contrast` of the needs, by the blur of a thin lens: its difference at two depths of a point."""
-    first, (width, height) = first_order(exact.lens), small_raster(exact.film_mm)
-    depth = seen_depths_m(scene, exact, _grid(exact.film_mm, (height, width)))
-    near = upright((1 / np.where(np.isnan(depth), np.inf, depth)).reshape(height, width))
-    reach = exact.settings["lens_state"]["pinhole_focal_length_mm"]
-    blur = 1e-3 * near * first.entrance_pupil_diameter_mm * reach / pixel_mm
-    step = np.zeros_like(blur)
-    step[:, :-1] = np.abs(np.diff(blur, axis=1))
-    step[:-1] = np.maximum(step[:-1], np.abs(np.diff(blur, axis=0)))
-    there = step > 1
-    return float(there.mean()), float(np.median(small.contrast[there])) if there.any() else None
 
 
 def effect_maps(probed: Probe) -> Maps:
@@ -459,8 +420,9 @@ def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Eff
         why = "made afterwards" if later else "left out" if worth <= budget else ""
         over = float((known > budget).mean())
         effects.append(Effect(name, worth, float(np.median(known)), over, unit, not why, why))
-    if stray and not {*STRAY.values()} & {e.name for e in effects}:
-        effects.append(Effect("flare", math.inf, math.inf, 1.0, "relative", True, "not known"))
+    if not {*STRAY.values()} & {e.name for e in effects}:
+        why = "not known" if stray else "not looked for: --explain does, in seconds"
+        effects.append(Effect("flare", math.inf, math.inf, 1.0, "relative", True, why))
     return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
 
 

@@ -20,7 +20,7 @@ from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.ideal import Pinhole
 from neurolens.cameras.reduced import Warped
 from neurolens.cli import main
-from neurolens.cli.plan import _use
+from neurolens.cli.plan import _dear, _sentences
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
 from neurolens.plan import candidates as tried
@@ -357,12 +357,33 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
 
 
-def test_a_plan_prints_one_price_and_what_it_took_itself() -> None:
-    """Seconds of the picture, and the plan's own beside them where they are more than a tenth."""
+def test_a_plan_prints_one_price_and_says_first_where_it_took_more_than_a_tenth_of_it() -> None:
     found = planned(0.0, 4.0, None)
     assert found.best is not None
     found = replace(found, work=Work((10.0, 10.0), (1.0, 1.0)), best=replace(found.best, seconds=20.0))
-    cheap, dear = (_use(found, took) for took in (1.9, 300.0))
-    assert "about 20 s" in cheap and "This plan" not in cheap
-    assert "about 20 s" in dear and "300 CPU seconds, 15 times" in dear
-    assert " ns" not in cheap + dear and "operations" not in cheap + dear
+    told = "\n".join(_sentences(found))
+    assert told.count("about 20 s") == 1 and " ns" not in told and "operations" not in told
+    assert _dear(found, 1.9, every=False) == []
+    (dear,) = _dear(found, 300.0, every=False)
+    assert "300 CPU seconds, 15 times" in dear
+    assert _dear(replace(found, work=costs.ALONE), 300.0, every=False) == []  # the time of the picture is not known
+
+
+@pytest.mark.parametrize("shot", [(96, 54, 16), (640, 360, 16), (640, 360, 256), (1920, 1080, 1024), (8, 1, 1)])
+def test_strips_are_a_little_of_the_picture_and_apart(shot: tuple[int, int, int]) -> None:
+    width, height, samples = shot
+    film = {"film_width_mm": 36.0, "film_height_mm": 36.0 * height / width}
+    paths, used = width * height * samples // costs.PART, min(samples, 16)
+    strips = costs.strips_of(scene_from_tables(wall(4.0, width=width, height=height, **film)), paths, used)
+    rows = [row for first, stop in strips for row in range(first, stop)]
+    assert rows and len({*rows}) == len(rows) and 0 <= min(rows) <= max(rows) < height
+    assert len(rows) == 1 or len(rows) * width * used <= paths
+
+
+def test_light_that_the_lens_adds_is_looked_for_where_a_tenth_of_the_picture_has_room_for_it() -> None:
+    found = planned(0.0, 4.0, None)
+    for ns, looked in ((1.0, False), (1e6, True)):
+        made = decided(found.probed, found.choices, 0.0, "render", Work((ns, ns)), explain=False)
+        assert made.best is not None and (0.1 * made.best.seconds > 20) == looked
+        (flare,) = (e for e in made.effects if e.name == "flare")
+        assert math.isinf(flare.worth) and flare.needed and flare.why.startswith("not known" if looked else "not look")

@@ -1,4 +1,4 @@
-"""A probe's results besides footprints: light, contrast, flare, effects that are made afterwards, each pixel's blur."""
+"""A probe's results besides footprints: light, flare, effects that are made afterwards, each pixel's blur."""
 
 import math
 from typing import Any
@@ -91,25 +91,6 @@ def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
     assert (1 + fall) * (1 + taken) == pytest.approx(light / light[axis], rel=1e-6) and (fall <= 0).all()
     worth = {e.name: e.worth for e in effects_of(found, 0.25, stray=False)}
     assert worth["vignetting"] > 0.05  # its size: what a camera without it gets wrong
-
-
-def test_contrast_is_that_of_the_scene_and_not_noise() -> None:
-    camera = make_camera("pinhole", Shot((36.0, 20.25), 3.0))
-    bare = overview(wall(), camera)
-    assert np.median(bare.contrast) < 0.02
-    # The right half is four times as bright: on its left a step of 3 to one of two neighbours.
-    half = overview(wall(quads=[card(9.0, 3.99, (0.0, -4.5), "light")]), camera)
-    assert np.median(half.contrast[:, 23]) == pytest.approx(3 / math.sqrt(2), rel=0.1)
-    assert np.median(half.contrast[:, [10, 40]]) < 0.02
-
-
-def test_edges_are_where_blur_differs() -> None:
-    near = [card(0.3, 1.0, (0.05, 0.1), "light")]
-    lens = set_lens(read_lens(LENS))
-    scenes = wall(), wall(4.0, {"f_number": 45.0}, quads=near), wall(quads=near)
-    bare, sharp, open_stop = (probe(s, lens, across=2).asked for s in scenes)
-    assert bare.edges == 0 and bare.edge_contrast is None and open_stop.edges > 0.005 > sharp.edges
-    assert open_stop.edge_contrast is not None and open_stop.edge_contrast > 5 * max(open_stop.contrast, 0.01)
 
 
 def test_flare_is_that_of_the_layers() -> None:

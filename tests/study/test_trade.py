@@ -1,4 +1,4 @@
-"""Offers, fronts and choices by time against what is known of them, and the page that a trade leaves."""
+"""Offers, fronts and choices by time against what is known of them."""
 
 import math
 from dataclasses import replace
@@ -7,15 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from neurolens.base.errors import InputError
-from neurolens.plan import plan as traded
 from neurolens.plan.candidates import Choice
 from neurolens.plan.costs import Work
 from neurolens.plan.plan import best_within, front, in_seconds, spread
-from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
-
-LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
 
 
 def scene(**camera: object) -> dict:
@@ -55,20 +50,6 @@ def test_the_front_holds_what_nothing_betters_and_time_buys_the_most_faithful() 
     assert [c.name for c in front(offered)] == ["a", "b", "c"]
     bought = {s: best_within(offered, s) for s in (0.5, 1.0, 5.0, 9.0)}
     assert [c and c.name for c in bought.values()] == [None, "a", "b", "c"]
-
-
-def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = scene_from_tables(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4))
-    seen, priced = {}, traded._priced(shown, read_lens(LENS), 0.0)
-    monkeypatch.setattr(traded, "_priced", lambda *args: priced)  # once for all budgets
-    for budget in (0.0, 0.05, 1.0):
-        seen[budget] = traded.plan_seen(shown, read_lens(LENS), budget).best
-        assert seen[budget] is not None and seen[budget].flip <= budget
-    right = [c.cost for c in priced.choices if c.light_error <= 0.01]
-    assert seen[0.0].name == "exact" and seen[1.0].cost == min(right) <= seen[0.05].cost <= seen[0.0].cost
-    for wrong in ({"flip_budget": 1.5}, {"flip_budget": 0.1, "afterwards": ("distortion",)}):
-        with pytest.raises(InputError):
-            traded.plan_seen(shown, read_lens(LENS), **wrong)
 
 
 def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
