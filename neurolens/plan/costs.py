@@ -44,9 +44,9 @@ _STEP_NS, _DEAR_NS, _DEAR = 0.2295, 2.772, ("div", "sqrt")
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
 # Of a picture, to measure its paths: most strips, least rows of one (where cameras disperse, rows beside a strip have
-# light in it and are rendered, too), paths of all, of the picture's at most one in `PART`, samples of a pixel at most.
+# light in it and are rendered, too), paths of all, of the picture's at most one in `_PART`, samples of a pixel at most.
 # What thin lenses and those that disperse gain by more samples differs: noise is compared at the scene's own number.
-_STRIPS, _ROWS, _STRIP_PATHS, PART, _SAMPLES = 6, 4, 400_000, 400, 16
+_STRIPS, _ROWS, _STRIP_PATHS, _PART, _SAMPLES = 6, 4, 400_000, 400, 16
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 _MOST_DARK = 0.05  # of the places
 
@@ -108,7 +108,7 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
     """
     shot = scene.settings.camera
     samples = min(shot.samples, _SAMPLES)
-    paths = min(shot.width * shot.height * shot.samples // PART, _STRIP_PATHS)
+    paths = min(shot.width * shot.height * shot.samples // _PART, _STRIP_PATHS)
     strips = strips_of(scene, paths, samples)
     rest, variance = [], []
     for camera, weight in zip((plain, colours), weights, strict=True):

@@ -291,10 +291,10 @@ def spread(choices: Sequence[Choice], chosen: Choice | None, most: int = _SHOWN)
 _MAPS_A_ROW = 4
 # Light that an effect takes is dark, light that it adds is orange; none is white.
 _SIGNED = ("#10183a", "#4d6796", "#c9d1de", "#ffffff", "#f6cfae", "#e58a45", CHOSEN)
-# By unit of effects: what a value is multiplied by, and the labels of bars and of maps.
+# By unit of effects: what a value is multiplied by, the sign after it, and the labels of bars and of maps.
 _DRAWN = {
-    "px": (1.0, "worth (pixels); grey: left out", "pixels"),
-    "relative": (100.0, "worth (% of the light); grey: left out", "% of the light\n(dark: taken)"),
+    "px": (1.0, " px", "worth (pixels); grey: left out", "pixels"),
+    "relative": (100.0, "%", "worth (% of the light); grey: left out", "% of the light\n(dark: taken)"),
 }
 
 
@@ -315,7 +315,7 @@ def plot_effects(plan: Plan, path: Path, title: str) -> None:
 
 
 def _bars(axes: Any, effects: Sequence[Effect], unit: str, budget: float) -> None:
-    factor, label, _ = _DRAWN[unit]
+    factor, sign, label, _ = _DRAWN[unit]
     worths = [factor * e.worth for e in effects]
     least = max(min((w for w in worths if w > 0), default=1e-3) / 3, 1e-4)
     colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in effects]
@@ -323,7 +323,7 @@ def _bars(axes: Any, effects: Sequence[Effect], unit: str, budget: float) -> Non
     axes.set(xscale="log", xlabel=label)
     axes.set_xlim(left=least)
     if 0 < budget < math.inf:
-        axes.axvline(factor * budget, color=CHOSEN, lw=1.2, label=f"budget {factor * budget:g}")
+        axes.axvline(factor * budget, color=CHOSEN, lw=1.2, label=f"budget {factor * budget:g}{sign}")
         axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
     plain_log_ticks(axes.xaxis)
 
@@ -336,7 +336,7 @@ def _maps(figure: Any, maps: Mapping[str, tuple[str, Any]], film_mm: tuple[float
     cells = figure.subplots(rows, across, squeeze=False)
     for axes in cells.ravel():
         axes.set_axis_off()
-    for unit, (factor, _, label) in _DRAWN.items():
+    for unit, (factor, _, _, label) in _DRAWN.items():
         drawn = {name: factor * value for name, (one, value) in maps.items() if one == unit}
         if not drawn:
             continue

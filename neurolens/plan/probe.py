@@ -35,7 +35,6 @@ from neurolens.lens.paraxial import PupilBounds, colours, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Dispersion, Shot
 from neurolens.plan import footprints as prints
-from neurolens.plan.costs import PART
 from neurolens.plan.footprints import AFTERWARDS, Array, Footprints, Places, cell_centres, upright
 from neurolens.render.colour import SpectralRange
 from neurolens.render.job import expected_light
@@ -52,7 +51,7 @@ from neurolens.surrogates.pairs import domain_of
 ACROSS = 48  # pixels of the small picture along its longer side
 BLACK = 0.01  # of the picture's mean: relative to less than that nothing counts
 STRAY = {"ghosts": "flare", "glare": "glare", "starburst": "star-bursts"}  # layers, and their names in a plan
-_SAMPLES = 4, 32  # of its pixels; between them, one path for `PART` of the picture that is planned
+_SAMPLES = 32  # of its pixels: together a tenth of a second
 _MOST_LIGHTS = 8
 _STARS = 2  # lights whose stars are drawn, the brightest in view: a second each
 _HIGHLIGHT = 4.0  # times the picture's mean: what shines or mirrors what does
@@ -83,11 +82,9 @@ class Overview:
 
 
 def overview(scene: Scene, camera: Camera) -> Overview:
-    """Look at a scene through a camera, with the fewer samples the fewer its own picture has."""
-    (width, height), shot = small_raster(camera.film_mm), scene.settings.camera
-    samples = shot.width * shot.height * shot.samples // (PART * width * height)
-    samples = min(max(samples, _SAMPLES[0]), _SAMPLES[1])
-    rgb = render(scene, camera, width=width, height=height, samples=samples, threads=1).rgb.astype(np.float64)
+    """Look at a scene through a camera."""
+    width, height = small_raster(camera.film_mm)
+    rgb = render(scene, camera, width=width, height=height, samples=_SAMPLES, threads=1).rgb.astype(np.float64)
     return Overview(rgb, *light_of(scene, camera, rgb.mean((0, 1))))
 
 

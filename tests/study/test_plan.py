@@ -373,7 +373,7 @@ def test_a_plan_prints_one_price_and_says_first_where_it_took_more_than_a_tenth_
 def test_strips_are_a_little_of_the_picture_and_apart(shot: tuple[int, int, int]) -> None:
     width, height, samples = shot
     film = {"film_width_mm": 36.0, "film_height_mm": 36.0 * height / width}
-    paths, used = width * height * samples // costs.PART, min(samples, 16)
+    paths, used = width * height * samples // costs._PART, min(samples, 16)
     strips = costs.strips_of(scene_from_tables(wall(4.0, width=width, height=height, **film)), paths, used)
     rows = [row for first, stop in strips for row in range(first, stop)]
     assert rows and len({*rows}) == len(rows) and 0 <= min(rows) <= max(rows) < height
