@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.base.lensname import FISHEYES, FUSED, IDEAL_OF, is_model, resolve
+from neurolens.base.lensname import FISHEYES, IDEAL_OF, is_model, resolve
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, ThinLens, check_field
@@ -66,8 +66,8 @@ def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     if is_model(path):
         from neurolens.cameras.model import OnnxCamera, load_model
 
-        return OnnxCamera(load_model(path), shot, runtime="c" if kind == FUSED else "onnxruntime")
-    return _exact(path, shot, kind == FUSED, progress)
+        return OnnxCamera(load_model(path), shot, progress=progress)
+    return _exact(path, shot, progress)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
@@ -154,14 +154,14 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
     )
 
 
-def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
+def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera
     from neurolens.readers.any_format import read_any
     from neurolens.setting.check import check_lens, doubts
     from neurolens.setting.states import set_lens
 
     tabled = read_any(path)
-    camera = ExactCamera(tabled, shot, progress=progress, runtime="c" if fused else "trace")
+    camera = ExactCamera(tabled, shot, progress=progress)
     camera.settings["notes"] = [
         *doubts(check_lens(tabled)),
         *_film_notes(set_lens(camera.lens, focus_m=math.inf), shot.film_mm),

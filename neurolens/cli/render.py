@@ -27,7 +27,7 @@ from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
 from neurolens.frames.farm import how_to_resume, render_frames
-from neurolens.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.lens.shot import Dispersion, Runtime, Shot, Vignetting
 from neurolens.render.pictures import write_png
 from neurolens.render.renderer import RenderResult, Watch, merge_tiles, tile_path
 from neurolens.render.settings import FilmSettings, SensorSettings
@@ -68,7 +68,7 @@ examples:
   neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more
   neurolens render experiments/scenes/room.toml --camera thin --tile 1/2 -o room.exr   # and 2/2 elsewhere
   neurolens render --merge room.tile-*.exr -o room.exr
-  neurolens render experiments/scenes/room.toml --camera fused:models/NAME.onnx --frames 1:48 \\
+  neurolens render experiments/scenes/room.toml --camera models/NAME.onnx --frames 1:48 \\
       --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
     kept = "no picture was written; older files of that name are untouched"
 
@@ -79,6 +79,7 @@ examples:
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
+    runtime: Runtime | None = setting_of(Shot, "runtime")
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
     colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)
@@ -143,7 +144,7 @@ examples:
     def frame(self) -> Frame:
         """The frame that the options describe."""
         assert self.camera is not None
-        same = ("film_offset_mm", "vignetting", "dispersion", "colour", "sensor", "tile")
+        same = ("film_offset_mm", "vignetting", "dispersion", "runtime", "colour", "sensor", "tile")
         return Frame.of(
             self.scene[0], self.camera, **self.state.settings(), **vars(self.picture), glass_files=self.glass,
             **{name: getattr(self, name) for name in same},

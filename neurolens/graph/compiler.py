@@ -12,12 +12,15 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, cache_folder, folder_of_process, keep_newest, seal, sealed_bytes
+from neurolens.base.progress import duration
 
 # -march=native uses all of the machine; the next two let square roots and divisions become vectors, also where only one
 # side of a choice needs them. NaN and infinity stay what they are. -fno-inline keeps the knowledge that the arrays of a
@@ -124,8 +127,10 @@ def c_source(file: str, **constants: object) -> str:
     return defines + (Path(__file__).parents[1] / file).read_text(encoding="utf-8")
 
 
-def load_compiled(source: str) -> ctypes.CDLL:
+def load_compiled(source: str, told: Callable[[str], None] | None = None) -> ctypes.CDLL:
     """The library of a source, which is compiled once for this machine and kept in `cache_folder`.
+
+    `told`: takes the end of a line, how long it took and where the library is kept, if one was compiled.
 
     A library of another user, or a damaged one, is compiled again. Where the disk of the cache is full, it goes to the
     folder of temporary files, for this process; a compiler itself works in whichever of the two has room.
@@ -139,9 +144,12 @@ def load_compiled(source: str) -> ctypes.CDLL:
             return ctypes.CDLL(str(library))
     if _with_room(library.parent, Path(tempfile.gettempdir())) != library.parent:
         library = Path(folder_of_process().name) / library.name
+    began = time.monotonic()
     with atomic_path(library) as temporary:
         compile_c(source, temporary, FLAGS)
         seal(temporary, 0o700)
+    if told is not None:
+        told(f"in {duration(time.monotonic() - began)}, kept for the next time in {library.parent}")
     try:
         loaded = ctypes.CDLL(str(library))
     except OSError as error:

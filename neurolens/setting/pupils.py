@@ -14,19 +14,11 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
+from neurolens.setting.azimuths import GROUPS, azimuths_on_film
 from neurolens.setting.rims import end_mm
 from neurolens.trace.rays import passing, trace
 from neurolens.trace.shapes import sag_mm
 from neurolens.trace.surfaces import Rays
-
-# Azimuths at which lenses with cylinders are searched, 5 degrees apart: at 15, one of them lost 7% of its corners.
-# Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a. In groups,
-# the first of which find most of what passes.
-_STEP_DEG = 5
-AZIMUTHS = tuple(math.radians(_STEP_DEG * k) for k in range(-18, 19))
-_GROUPS = (AZIMUTHS[18:19], AZIMUTHS[::9], tuple(a for k, a in enumerate(AZIMUTHS) if k % 9))
-# Azimuths of a film are those at radii this share smaller too: outlines are interpolated between radii.
-_BETWEEN_RADII = 0.03
 
 
 def pupil_plane_z_mm(lens: Lens) -> float:
@@ -82,9 +74,13 @@ def passes_at_any_azimuth(
     lens = replace(lens, aperture=None)
     passed = torch.zeros_like(film_radius, dtype=torch.bool)
     round_ = not lens.anamorphic
-    low, high = (None, None) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
+    low, high = (
+        (None, None)
+        if round_ or film_mm is None
+        else map(torch.from_numpy, azimuths_on_film(film_radius.numpy(), film_mm))
+    )
     planes = torch.as_tensor(film_z, dtype=film_radius.dtype).expand_as(film_radius)
-    for group in ((0.0,),) if round_ else _GROUPS:
+    for group in ((0.0,),) if round_ else GROUPS:
         # In one trace: few rays take nearly as long as many.
         azimuth = torch.tensor(group, dtype=film_radius.dtype)[:, None]
         todo = (~passed).expand(len(group), -1)
@@ -98,19 +94,6 @@ def passes_at_any_azimuth(
         rays = camera_rays(c * r, s * r, planes[left], c * u - s * v, s * u + c * v, pupil_z)
         passed[left[passing(lens, rays, wavelength_nm)]] = True
     return passed
-
-
-def azimuths_on_film(film_radius: Tensor, film_mm: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """Least and largest azimuth in the first quadrant, rad [N], at which a centred film has points that far out.
-
-    With half a step of `AZIMUTHS` beyond either; beyond the corner, those about the corner's.
-    """
-    width, height = film_mm
-    radius = (film_radius * (1 - _BETWEEN_RADII)).clamp_min(1e-12)
-    low, high = torch.acos((width / 2 / radius).clamp_max(1)), torch.asin((height / 2 / radius).clamp_max(1))
-    corner = math.atan2(height, width)
-    beyond = 1.001 * math.radians(_STEP_DEG) / 2
-    return low.clamp_max(corner) - beyond, high.clamp_min(corner) + beyond
 
 
 _STRIDE = 4  # of the points of a grid that are traced first; then only those that may widen what they found
