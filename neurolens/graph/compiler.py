@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -29,6 +30,8 @@ FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-m
 _SECONDS = 300  # the largest models known compile in ten
 _ROOM = 2**20
 _KEPT = 64  # libraries of 50 to 200 kB
+_ONE_AT_A_TIME = threading.RLock()  # threads that need the same library do not both compile it
+os.register_at_fork(after_in_child=_ONE_AT_A_TIME._at_fork_reinit)  # type: ignore[attr-defined]
 
 
 def find_compiler() -> str:
@@ -138,6 +141,11 @@ def load_compiled(source: str, told: Callable[[str], None] | None = None) -> cty
     Raises:
         InputError: as `compile_c`; a library that cannot be loaded.
     """
+    with _ONE_AT_A_TIME:
+        return _loaded(source, told)
+
+
+def _loaded(source: str, told: Callable[[str], None] | None) -> ctypes.CDLL:
     library = cache_folder() / f"{_key(source)}.so"
     if sealed_bytes(library) is not None:
         with suppress(OSError):  # another run has just removed it
