@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -50,7 +51,7 @@ from neurolens.graph.scalars import lower
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import LINE_D_NM, Surface
 from neurolens.lens.shot import Runtime
-from neurolens.setting.azimuths import AZIMUTHS, azimuths_on_film
+from neurolens.setting.azimuths import GROUPS, azimuths_on_film
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.inverse import InverseRays
 from neurolens.trace.shapes import sag_and_derivatives
@@ -60,10 +61,6 @@ Array = NDArray[np.float64]
 _ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, not a cylinder
 # Points a side of the quadrature of the exposure on the axis.
 _QUADRATURE = 256
-
-
-# Azimuths of film and pupil points at which lenses with cylinders are tried: those that differ most come first.
-_AZIMUTHS = sorted(AZIMUTHS, key=lambda a: round(math.degrees(a)) // 5 % 9)
 
 
 @dataclass(frozen=True)
@@ -114,7 +111,7 @@ class LensScene:
         """
         passed = np.zeros(film.shape[1], bool)
         low, high = (-math.inf, math.inf) if film_mm is None else azimuths_on_film(np.hypot(*film), film_mm)
-        for azimuth in _AZIMUTHS:
+        for azimuth in chain(*GROUPS):
             left = np.flatnonzero(~passed & (low <= abs(azimuth)) & (abs(azimuth) <= high))
             if len(left):
                 cos, sin = math.cos(azimuth), math.sin(azimuth)
@@ -217,6 +214,7 @@ class LensCamera:
             `loworder.WORST`: the graph's own cost as much as its rays.
     """
 
+    name: str
     path: Path
     film: LensFilm
     film_mm: tuple[float, float]

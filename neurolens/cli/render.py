@@ -52,8 +52,9 @@ class Render(cli.Reporting):
     metadata, attribute "neurolens", as JSON.
 
     The same seed gives the same picture for any number of threads; all cameras share its
-    random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
-    (.toml) does (extra "train").
+    random numbers. Lenses and models run as C where the machine has a compiler, which the first
+    picture takes some seconds for. A model (.onnx), the thin lens and the points need no torch;
+    a lens file (.toml) does (extra "train"), to be set and searched.
 
     The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
     command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""

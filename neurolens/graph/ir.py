@@ -308,7 +308,7 @@ class Graph:
         return self.each("select", truth, then, other)
 
     def first_failure(self, tests: Sequence[tuple[Value, Value]], codes: Sequence[int]) -> Value:
-        """The status of a ray: the code of the first test for which value <= limit is false, as it is for NaN; else 0."""
+        """The code of the first test for which value <= limit is false, as it is for NaN; 0 where all are true."""
         flat = [v for pair in tests for v in pair]
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 
