@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -159,16 +160,24 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera
     from neurolens.readers.any_format import read_any
-    from neurolens.setting.check import check_lens, doubts
     from neurolens.setting.states import set_lens
 
     tabled = read_any(path)
     camera = ExactCamera(tabled, shot, progress=progress)
     camera.settings["notes"] = [
-        *doubts(check_lens(tabled)),
+        *_doubts(tabled),
         *_film_notes(set_lens(camera.lens, focus_m=math.inf), shot.film_mm),
     ]
     return camera
+
+
+def _doubts(lens: Lens) -> list[str]:
+    """What a check of the lens against its source doubts; none without torch, which traces its chief rays."""
+    if find_spec("torch") is None:
+        return []
+    from neurolens.setting.check import check_lens, doubts
+
+    return doubts(check_lens(lens))
 
 
 def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:

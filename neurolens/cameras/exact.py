@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import onnxruntime
-import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
@@ -36,9 +35,7 @@ from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import SCALARS, Form
-from neurolens.trace.aiming import without_rims
-from neurolens.trace.rays import Rays, trace
-from neurolens.trace.surfaces import media
+from neurolens.trace.surfaces import Rays, media
 from neurolens.trace.tracegraph import exact_graph, light_limits
 
 
@@ -112,6 +109,10 @@ class ExactCamera(LensCamera):
     def _traced_back(
         self, position: NDArray[np.float64], direction: NDArray[np.float64], wavelength_nm: FloatArray
     ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
+        import torch
+
+        from neurolens.trace.rays import trace
+
         # Light starts a millimetre before the surface, so that it lies ahead; rays that are not finite miss it.
         rays = np.nan_to_num(np.concatenate([position + direction, -direction]), posinf=0, neginf=0)
         with torch.no_grad():
@@ -135,6 +136,11 @@ class ExactCamera(LensCamera):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rays of film points [2, N] through pupil points [2, N]: optical direction cosines at the film [2, N]; of each
         surface the distance from the axis and the path that a surface higher by 1 would add [surfaces, 2, N]."""
+        import torch
+
+        from neurolens.trace.aiming import without_rims
+        from neurolens.trace.rays import trace
+
         lens, outline, waves = without_rims(self.lens), self.film.outline, torch.from_numpy(wavelength_nm.astype("f8"))
         film_z = np.full(waves.numel(), float(self.film.film_z_mm))
         index = [np.asarray(m.n) * np.ones(waves.numel()) for m in media(lens, waves)]
