@@ -1,7 +1,4 @@
-"""A camera from what a command line names: `neurolens.base.lensname` lists the kinds.
-
-Only a lens file needs torch, which is imported when one is asked for.
-"""
+"""A camera from what a command line names: `neurolens.base.lensname` lists the kinds."""
 
 from __future__ import annotations
 
@@ -40,7 +37,6 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
     Raises:
         InputError: an unknown kind of camera, a missing file, a setting that this kind does not have or cannot reach.
         ModelError: a model that cannot be trusted.
-        ModuleNotFoundError: a lens file without torch.
     """
     camera = with_dispersion(as_c(_camera(str(spec), shot, progress)), shot)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)

@@ -51,7 +51,7 @@ from neurolens.graph.scalars import lower
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import LINE_D_NM, Surface
 from neurolens.lens.shot import Runtime
-from neurolens.setting.azimuths import GROUPS, azimuths_on_film
+from neurolens.setting.pupils import GROUPS, azimuths_on_film
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.inverse import InverseRays
 from neurolens.trace.shapes import sag_and_derivatives

@@ -53,8 +53,7 @@ class Render(cli.Reporting):
 
     The same seed gives the same picture for any number of threads; all cameras share its
     random numbers. Lenses and models run as C where the machine has a compiler, which the first
-    picture takes some seconds for. A model (.onnx), the thin lens and the points need no torch;
-    a lens file (.toml) does (extra "train"), to be set and searched.
+    picture takes some seconds for. No camera needs torch.
 
     The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
     command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
@@ -267,9 +266,9 @@ _MORE = {"thin": f"{_SIZE} --f-number 1.8", "pinhole": _SIZE, "fisheye": "--film
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(cli.Command):
-    """Render lights at many depths through a model of a 50 mm f/1.8 double Gauss, the lens itself (where the extra
-    "train" is installed), a thin lens and a pinhole that show the plane in focus at the same size, then through a
-    fisheye's model, and write them on one page, each with its command. Needs no checkout: the library ships."""
+    """Render lights at many depths through a model of a 50 mm f/1.8 double Gauss, the lens itself, a thin
+    lens and a pinhole that show the plane in focus at the same size, then through a fisheye's model,
+    and write them on one page, each with its command. Needs no checkout: the library ships."""
 
     kept = "pictures so far are kept; the same command goes on"
 
@@ -285,10 +284,8 @@ class Demo(cli.Command):
         parser = cli.Parser()
         Render.fill(parser)
         scene = str(library() / "experiments" / "scenes" / "lights.toml")
-        figures, traced = [], importlib.util.find_spec("torch") is not None
+        figures = []
         for name, camera, caption in _PICTURES:
-            if name == "exact" and not traced:
-                continue
             size = ["--width", str(self.width), "--samples", str(self.samples), "-o", str(self.out / f"{name}.exr")]
             words = [scene, "--camera", camera, *_MORE.get(name, "").split(), *size]
             command = f"{program()} render {shlex.join(words)}"
@@ -299,6 +296,6 @@ class Demo(cli.Command):
         page = html("demo.html", title="One scene, five cameras", shown=figures_of(self.out, figures))
         atomic_write_text(self.out / "index.html", page)
         more = [f"  {program()} {words}" for words in ("--help", "models", "lens list")]
-        more[2] += "" if traced else "   # with the extra 'train', which traces lenses"
+        more[2] += "" if importlib.util.find_spec("torch") else "   # with the extra 'train', which traces lenses"
         print("\n".join([f"\nLook at {self.out}/index.html\nThen", *more]))
         return 0

@@ -14,13 +14,21 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
-from neurolens.setting.azimuths import GROUPS, azimuths_on_film
 from neurolens.setting.rims import end_mm
 from neurolens.trace.arrays import follow, passing
 from neurolens.trace.shapes import sag_mm
 from neurolens.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
+
+# Azimuths at which lenses with cylinders are searched, 5 degrees apart: at 15, one of them lost 7% of its corners.
+# Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a.
+_STEP_DEG = 5
+AZIMUTHS = tuple(math.radians(_STEP_DEG * k) for k in range(-18, 19))
+# In groups, the first of which find most of what passes.
+GROUPS = (AZIMUTHS[18:19], AZIMUTHS[::9], tuple(a for k, a in enumerate(AZIMUTHS) if k % 9))
+# Azimuths of a film are those at radii this share smaller too: outlines are interpolated between radii.
+_BETWEEN_RADII = 0.03
 
 
 def pupil_plane_z_mm(lens: Lens) -> float:
@@ -85,6 +93,19 @@ def passes_at_any_azimuth(
         rays = camera_rays(c * r, s * r, film_z[left], c * u - s * v, s * u + c * v, pupil_z)
         passed[left[passing(lens, rays, wavelength_nm)]] = True
     return passed
+
+
+def azimuths_on_film(film_radius: Array, film_mm: tuple[float, float]) -> tuple[Array, Array]:
+    """Least and largest azimuth in the first quadrant, rad [N], at which a centred film has points that far out.
+
+    With half a step of `AZIMUTHS` beyond either; beyond the corner, those about the corner's.
+    """
+    width, height = film_mm
+    radius = np.maximum(film_radius * (1 - _BETWEEN_RADII), 1e-12)
+    low, high = np.arccos(np.minimum(width / 2 / radius, 1)), np.arcsin(np.minimum(height / 2 / radius, 1))
+    corner = math.atan2(height, width)
+    beyond = 1.001 * math.radians(_STEP_DEG) / 2
+    return np.minimum(low, corner) - beyond, np.maximum(high, corner) + beyond
 
 
 _STRIDE = 4  # of the points of a grid that are traced first; then only those that may widen what they found
