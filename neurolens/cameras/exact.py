@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from neurolens.lens.paraxial import PupilBounds, chief_reach_mm, first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.setting.focusing import at_infinity
-from neurolens.setting.pupils import pupil_bounds, pupil_plane_z_mm
+from neurolens.setting.pupils import passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import SCALARS, Form
 from neurolens.trace.surfaces import Rays, media
@@ -159,7 +159,14 @@ class ExactCamera(LensCamera):
         lens, planes, light = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm), self._light_nm
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
         detail, rows, points = (COARSE, 13, 48) if self.lens.anamorphic else (FINE, 17, 128)
-        azimuths = partial(lens.passes_at_any_azimuth, film_mm=self.film_mm)
+
+        def passes(film: FloatArray, pupil: FloatArray, nm: float) -> NDArray[np.bool_]:
+            if not self.lens.anamorphic:
+                return lens.passes(film, pupil, nm)
+            # Most of many azimuths are dark: as arrays, for lost rays are then left out.
+            radius, x, y = (c.astype(np.float64) for c in (film[0], *pupil))
+            film_z = np.full_like(radius, scene.film_z_mm)
+            return passes_at_any_azimuth(self.lens, radius, film_z, x, y, pupil_z_mm, nm, self.film_mm)
 
         def search() -> PupilOutline | None:
             with (progress or Progress(quiet=True)).stage(f"search the pupil of {self.name}") as report:
@@ -167,7 +174,6 @@ class ExactCamera(LensCamera):
                 boxes = bounds or pupil_bounds(
                     self.lens, corner, planes, light, rows=rows, points=points, film_mm=self.film_mm
                 )
-                passes = azimuths if self.lens.anamorphic else lens.passes
                 table = PupilTable.of(asdict(boxes))
                 return outline_of(table, passes, light, detail, lambda share: report(0.2 + 0.8 * share))
 

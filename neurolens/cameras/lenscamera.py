@@ -51,7 +51,7 @@ from neurolens.graph.scalars import lower
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import LINE_D_NM, Surface
 from neurolens.lens.shot import Runtime
-from neurolens.setting.pupils import GROUPS, azimuths_on_film
+from neurolens.setting.pupils import GROUPS
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.inverse import InverseRays
 from neurolens.trace.shapes import sag_and_derivatives
@@ -102,17 +102,11 @@ class LensScene:
         rays = np.concatenate([film, pupil, waves[None]]).astype(np.float32)
         return self.lens.status(rays, self.film_z_mm, self.stop_radius_mm) == st.PASSED
 
-    def passes_at_any_azimuth(
-        self, film: FloatArray, pupil: FloatArray, wavelength_nm: float, film_mm: tuple[float, float] | None = None
-    ) -> NDArray[np.bool_]:
-        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N].
-
-        `film_mm`: width and height of a film; of the azimuths, those at which it has points that far from its middle.
-        """
+    def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
+        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
         passed = np.zeros(film.shape[1], bool)
-        low, high = (-math.inf, math.inf) if film_mm is None else azimuths_on_film(np.hypot(*film), film_mm)
         for azimuth in chain(*GROUPS):
-            left = np.flatnonzero(~passed & (low <= abs(azimuth)) & (abs(azimuth) <= high))
+            left = np.flatnonzero(~passed)
             if len(left):
                 cos, sin = math.cos(azimuth), math.sin(azimuth)
                 turn = np.array([[cos, -sin], [sin, cos]], np.float32)
