@@ -23,7 +23,9 @@ import torch
 from torch import Tensor
 
 from neurolens.lens.glass import index_at
-from neurolens.trace.transmission import FLOOR, Shares, times_film
+from neurolens.trace.arithmetic import times
+from neurolens.trace.surfaces import Hit, Medium
+from neurolens.trace.transmission import FLOOR, Passage, Shares, times_film
 
 
 def coated_shares(
@@ -173,3 +175,14 @@ def _film(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]
     cosine = torch.where(small, cosine, torch.where(deep, even, torch.cos(phase)))
     sine = torch.where(small, sine, torch.where(deep, odd, torch.sin(phase) / phase)) * phase_per_q
     return cosine, sine, q2 * sine, fade
+
+
+class TensorPassage(Passage):
+    """The power of rays while they are traced with tensors."""
+
+    def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
+        """Return the shares that the coating of surface k transmits or reflects; see `pass_surface`."""
+        (before, after), coating = media, self.lens.surfaces[k].coating
+        cos_i = times(met.q, 1 / before.n)
+        layers = coating.layers if coating else ()
+        return coated_shares(cos_i, before.n, after.n, layers, self.wavelength_nm, sense, reflected)

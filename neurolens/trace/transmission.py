@@ -140,7 +140,7 @@ def _plus(total: Any, a: Any, b: Any) -> Any:
 
 
 class Passage:
-    """The power of rays while they are traced with tensors; absorption follows Beer and Lambert's law.
+    """The power of rays while they are traced; absorption follows Beer and Lambert's law.
 
     `polarised`: whether the polarisation is followed that each surface gives to the light, or averaged at each surface.
     """
@@ -159,13 +159,7 @@ class Passage:
 
     def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
         """Return the shares that the coating of surface k transmits or reflects; see `pass_surface`."""
-        from neurolens.trace.films import coated_shares
-
-        before, after = media
-        coating = self.lens.surfaces[k].coating
-        cos_i = times(met.q, 1 / before.n)
-        layers = coating.layers if coating else ()
-        return coated_shares(cos_i, before.n, after.n, layers, self.wavelength_nm, sense, reflected)
+        raise NotImplementedError
 
     def transmitted(self, depth: Any) -> Any:
         """Return exp(-depth)."""
