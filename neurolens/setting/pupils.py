@@ -260,7 +260,7 @@ def pupil_bounds(
     for (i, _, _), box in zip(jobs, found, strict=True):
         by_row[i] += [box] if box else []
     boxes = [union(row) if row else None for row in by_row]
-    if not any(boxes):
+    if not any(boxes) or not lens.stop_radius_mm > 0:  # the very middle of a shut stop is no light
         expected = f"rays from a film of radius {film_radius_mm:.4g} mm"
         raise InputError(lens.path, "surfaces", "(no ray passes the lens)", expected)
     merged = [union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
