@@ -82,7 +82,7 @@ LEAN_MODULES = {
 
 # Lines of Python that the package should have, as the last issue set them; a feature that needs more pays by what it
 # replaces. The test fails beyond SLACK times that: a sum without slack made each useful change a change of the number.
-MOST_LINES, MOST_MODULES, SLACK = 58405, 199, 1.03
+MOST_LINES, MOST_MODULES, SLACK = 58405, 202, 1.03
 
 
 def module_name(path: Path) -> str:
