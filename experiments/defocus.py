@@ -70,7 +70,7 @@ def camera_and_plate(scene: str, path: Path, *behind: Path) -> tuple[Camera, Pla
     """The lens as the scene sets it, and the scene's plate."""
     settings = load_scene(_scene(scene)).settings.camera
     shot = Shot(settings.film_mm, settings.focus_m, f_number=F_NUMBER, wavelength_nm=settings.wavelength_nm)
-    camera = make_camera(f"fused:{lab.LENSES / LENS}.toml", shot)
+    camera = make_camera(f"{lab.LENSES / LENS}.toml", shot)
     return camera, read_plate(path, settings.film_mm, frame_of(camera), DepthSettings(), behind)
 
 
@@ -135,7 +135,7 @@ def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> lab
     of light.
     """
     shot = Shot(_STRIP_MM, _STRIP_FOCUS_M, f_number=F_NUMBER, wavelength_nm=(400.0, 700.0))
-    camera = make_camera(f"fused:{lab.LENSES / LENS}.toml", shot)
+    camera = make_camera(f"{lab.LENSES / LENS}.toml", shot)
     size = round(_STRIP_MM[0] * _PER_MM), round(_STRIP_MM[1] * _PER_MM)
     fine = size[0] * _FINER, size[1] * _FINER  # the kernel's pixels, so that the ball's outline is sharp
     plate, ball = own_plate(camera, fine), _BALL_PX * _FINER

@@ -70,7 +70,7 @@ def case(names: tuple[str, str], args: argparse.Namespace) -> lab.Row:
     row: lab.Row = {"scene": scene_name, "lens": name, "f_number": shot.f_number, "thin_s": thin["seconds"]}
     each = {}
     for mode, (waves, kept) in MODES.items():
-        each[mode] = measured(scene, make_camera(f"fused:{path}", replace(asked, dispersion=kept)), waves, args)
+        each[mode] = measured(scene, make_camera(path, replace(asked, dispersion=kept)), waves, args)
     for mode, found in each.items():
         row[mode] = {
             "median": float(np.median(found["luminance"]) / np.median(thin["luminance"])),

@@ -123,7 +123,7 @@ PICTURES = (
         "The street by an anamorphic lens, shown unsqueezed: its cylinders draw ghosts out to streaks in both "
         "meridians. Bare, and with multi-layer coatings, its strongest streak made blue and stronger.",
         (
-            f"neurolens render {_ROAD} --camera fused:lenses/cooke_anamorphic_42.toml --film 24x18 --width 640 "
+            f"neurolens render {_ROAD} --camera lenses/cooke_anamorphic_42.toml --film 24x18 --width 640 "
             "--channels beauty -o OUT/squeezed.exr",
             f"{_ANAMORPHIC} -o OUT/anamorphic.exr",
             f"{_ANAMORPHIC} --coating multi-layer --gain g13-12=250/500/1000 -o OUT/anamorphic-blue.exr",

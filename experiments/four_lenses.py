@@ -16,7 +16,7 @@ import numpy as np
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.cameras.build import FUSED, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.lens.shot import Shot
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
@@ -92,7 +92,7 @@ def picture_of(lens: Lens, size: tuple[int, int], samples: int, report: lab.Repo
     film_mm = (lens.film_height_mm * 16 / 9 / lens.squeeze, lens.film_height_mm)
     focus: Any = "internal" if internal else "best"
     shot = Shot(film_mm, focus_m, lens.f_number, focal_length_mm=None if internal else 50.0, focus_mode=focus)
-    camera = make_camera(lens.camera if lens.camera == "thin" else f"{FUSED}{lens.camera}", shot)
+    camera = make_camera(lens.camera, shot)
     moved = replace(settings, position_m=tuple(position + back))
     scene = replace(scene, settings=replace(scene.settings, camera=moved))
     width, height = size[0], round(size[1] * lens.squeeze)  # pixels of a squeezed picture stay square

@@ -155,7 +155,7 @@ def shot_of(known: gpu.Subject) -> Shot:
     """The largest film of 16:9 in the domain, focused at infinity."""
     domain = known.model.domain
     side = 1.999 * domain.film_radius_mm / math.hypot(16, 9)
-    return Shot((16 * side, 9 * side), math.inf, wavelength_nm=domain.wavelength_nm)
+    return Shot((16 * side, 9 * side), math.inf, wavelength_nm=domain.wavelength_nm, runtime="onnxruntime")
 
 
 def camera_of(known: gpu.Subject, form: str) -> Camera:

@@ -123,8 +123,7 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     probe_s = time.process_time() - began
     asked, own = probed.asked, probed.asked.shot
     shot = Shot(own.film_mm, own.focus_m, asked.f_number, zoom=case.state, wavelength_nm=own.wavelength_nm)
-    compiled = "fused:" if probed.exact.runtime == "c" else ""
-    exact = make_camera(f"{compiled}{lens.path}", shot)  # as in a render: a plan's own has another outline of pupils
+    exact = make_camera(lens.path, shot)  # as in a render: a plan's own has another outline of pupils
     places = plan_errors.fresh_places(scene, exact, probed.overview.rgb.mean((0, 1)))
     fresh = Fresh(exact, places, plan_errors.fresh_prints(exact, places))
     report(0.1)
@@ -212,7 +211,9 @@ def _held(choice: choices.Choice, probed: Probe, state: str | None, exact: Any) 
     """The camera of a plan; of a model within the outline of the exact lens's pupil, see `candidates._model`."""
     if not choice.camera.endswith(".onnx"):
         return camera_of(choice, probed, state)
-    return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), probed.asked.shot, outline=exact.film.outline)
+    return OnnxCamera(
+        load_model(choice.camera), replace(probed.asked.shot, runtime="onnxruntime"), outline=exact.film.outline
+    )
 
 
 def camera_of(choice: choices.Choice, probed: Probe, state: str | None, smooth: bool = False) -> Camera:

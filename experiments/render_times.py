@@ -1,7 +1,7 @@
 """Render three scenes of rising cost through a pinhole, a thin lens, a stop without glass, and eight lenses.
 
-The lenses, of 2 to 40 refractions, are traced exactly (torch, and compiled as C), through their polynomials and
-networks in onnxruntime and compiled (12 minutes of one core; --quick: one). Needs the extra "train" (torch) and a C
+The lenses, of 2 to 40 refractions, are traced exactly, through their polynomials and networks, in
+onnxruntime and as compiled C (12 minutes of one core; --quick: one). Needs the extra "train" (torch) and a C
 compiler; what this machine cannot make is left out, and the page says so. The tables are those of Willi 2021
 (multi-lens cameras in appleseed), 6.2 and 6.3. Writes README.md.
 """
@@ -24,18 +24,18 @@ from experiments.lab import Report
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.cameras.build import FUSED, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.lens.shot import Shot
+from neurolens.lens.shot import Runtime, Shot
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
 from neurolens.render.settings import FilmSettings
 
 PINHOLE, THIN, STOP = "pinhole", "thin lens", "stop only"
-TORCH, EXACT_C = "exact, torch", "exact, C"
+EXACT_GRAPH, EXACT_C = "exact, onnxruntime", "exact, C"
 GRAPHS = ("polynomial, onnxruntime", "network, onnxruntime")
 FUSED_MODELS = ("polynomial, C", "network, C")
-KINDS = (TORCH, EXACT_C, *GRAPHS, *FUSED_MODELS)
+KINDS = (EXACT_GRAPH, EXACT_C, *GRAPHS, *FUSED_MODELS)
 _FILES = dict(zip((*GRAPHS, *FUSED_MODELS), ("ols-64", "mlp-16x2") * 2, strict=True))
 # Scenes of rising cost: one bounce off a wall; small lights, three; meshes, gloss, glass, six.
 CHEAP, MOVES = "cheap", "with differentials"
@@ -99,12 +99,12 @@ def make_subjects(quick: bool, report: Report) -> list[Subject]:
     for count, lens, stem, efl in LENSES:
         for kind in KINDS if not quick or count in _QUICK else ():
             file = lab.MODELS / f"{stem}.{_FILES[kind]}.onnx" if kind in _FILES else lab.LENSES / f"{stem}.toml"
-            compiled = FUSED if kind in (EXACT_C, *FUSED_MODELS) else ""
-            specs.append((Subject(lens, count, kind), f"{compiled}{file}", efl))
+            specs.append((Subject(lens, count, kind), str(file), efl))
     for k, (subject, spec, efl) in enumerate(specs):
         film, f_number = (_FILM[0] * efl, _FILM[1] * efl), None if spec == "pinhole" else _F_NUMBER
         try:
-            camera: Any = make_camera(spec, Shot(film, _FOCUS_M, f_number))
+            runtime: Runtime = "c" if subject.kind in (EXACT_C, *FUSED_MODELS) else "onnxruntime"
+            camera: Any = make_camera(spec, Shot(film, _FOCUS_M, f_number, runtime=runtime))
             subject.camera = camera
             if subject.kind in (EXACT_C, *FUSED_MODELS):  # fits its differentials here, not in every render
                 camera.sample_differentials(*(np.full((n, 1), v, np.float32) for n, v in ((2, 0), (2, 0.5))), _GREEN)
@@ -144,8 +144,8 @@ Every camera sees the same 20 degrees at f/4, focused at 5 m, one wavelength per
 {samples} samples, one thread, {rounds} rounds of all cameras in turn ({more} times as many in the cheap scene);
 seconds are the best round (the median in brackets), what differentials add is the median of the rounds' ratios.
 `cheap` is a textured wall and one bounce ({cheap}.toml), `middle` small lights and three ({middle}.toml), `dear`
-meshes, gloss, glass and six ({dear}.toml). "exact, torch" is the eager tracer, "exact, C" the same trace written as C
-and compiled, with the pupil, weights and status around it in one call, as the models "C" are (`--camera fused:FILE`);
+meshes, gloss, glass and six ({dear}.toml). Lenses and models run in onnxruntime and as compiled C (`--runtime`), each
+with the pupil, weights and status around it in one call;
 polynomials are `ols-64` of models/, networks `mlp-16x2`. Overhead is the time above the pinhole's, as a share of the
 pinhole's render, per refraction. Camera is the share of a render's time that its camera takes. Blocked rays cost no
 path: a lens that loses light renders faster for it. Differentials are computed and handed on; nothing uses them."""
@@ -184,7 +184,7 @@ def goals(subjects: Sequence[Subject]) -> list[lab.Goal]:
     made += [goal(k, f"{adds}, in the cheap render", MOST_MOVES, MOVES, moves) for k in (EXACT_C, *FUSED_MODELS)]
     text = "overhead a refraction, of the cheap pinhole render"
     share = partial(overhead, pinhole=hole, scene=CHEAP)
-    return made + [goal(kind, text, PER_REFRACTION, CHEAP, share) for kind in (EXACT_C, TORCH)]
+    return made + [goal(kind, text, PER_REFRACTION, CHEAP, share) for kind in (EXACT_C, EXACT_GRAPH)]
 
 
 def _percent(share: float | None) -> str | None:

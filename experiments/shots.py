@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -104,7 +104,7 @@ def _smallest(probed: Probe, shipped: Model, folder: Path) -> Model:
 
 
 def _onnx(probed: Probe, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
-    return OnnxCamera(load_model(file), probed.asked.shot, runtime=runtime)
+    return OnnxCamera(load_model(file), replace(probed.asked.shot, runtime=runtime))
 
 
 def _errors(probed: Probe, camera: OnnxCamera) -> tuple[float, float]:

@@ -110,7 +110,7 @@ def forms() -> dict[str, Form]:
             "status": out.status,
         }
 
-    shot = Shot((36.0, 24.0), focus_m=2.0, f_number=2.8)
+    shot = Shot((36.0, 24.0), focus_m=2.0, f_number=2.8, runtime="onnxruntime")
     camera: Any = make_camera(lab.MODELS / MODEL, shot)
     traced: Any = make_camera(lab.LENSES / f"{LENS}.toml", shot)
     whole = [camera_program(camera.film, camera.lens_graph(), derivatives=True, own_table=own) for own in (False, True)]
@@ -134,7 +134,7 @@ def forms() -> dict[str, Form]:
         ),
         "exact camera": Form(
             exact_whole, film, tables={"outline": np.asarray(traced.film.outline.table, np.float32)},
-            others={TRACER: by(traced), "c": by(traced.compiled())},
+            others={"onnx": by(traced), "c": by(traced.compiled())},
         ),
         "whole camera": Form(
             whole[0], film, tables={"outline": np.asarray(camera.film.outline.table, np.float32)},

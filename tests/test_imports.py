@@ -63,15 +63,18 @@ PACKAGES = {
 }
 EXCEPTIONS: dict[str, set[str]] = {
     "neurolens.base.cluster": {"dask", "distributed"},  # where a cluster is asked for
-    "neurolens.cameras.exact": {"torch"},  # the one camera that traces rays
+    "neurolens.cameras.exact": {"torch"},  # for light from the scene, and paths
 }
 # Modules that load torch or scipy; others load these when they are needed.
-SLOW = {"neurolens.cameras.exact"}
-SLOW |= {"neurolens.shaders.lens_source", "neurolens.cli.flare", "neurolens.cli.handover", "neurolens.cli.view"}
+SLOW = {"neurolens.shaders.lens_source", "neurolens.cli.flare", "neurolens.cli.handover", "neurolens.cli.view"}
 # What loads in a base install: these folders, models from their files, and what converts lens files.
 LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "defocus", "cli")
 LEAN_MODULES = {
-    *(f"neurolens.trace.{name}" for name in ("arithmetic", "shapes", "surfaces")),
+    *(
+        f"neurolens.trace.{name}"
+        for name in ("arithmetic", "arrays", "shapes", "surfaces", "tracegraph", "transmission")
+    ),
+    *(f"neurolens.setting.{name}" for name in ("focusing", "pupils", "rims", "states")),
     *(f"neurolens.surrogates.{name}" for name in ("assemble", "axes", "card", "cores", "file", "inverse")),
     *(f"neurolens.surrogates.{name}" for name in ("model", "source")),
 }
@@ -79,7 +82,7 @@ LEAN_MODULES = {
 
 # Lines of Python that the package should have, as the last issue set them; a feature that needs more pays by what it
 # replaces. The test fails beyond SLACK times that: a sum without slack made each useful change a change of the number.
-MOST_LINES, MOST_MODULES, SLACK = 58405, 199, 1.03
+MOST_LINES, MOST_MODULES, SLACK = 58405, 202, 1.03
 
 
 def module_name(path: Path) -> str:

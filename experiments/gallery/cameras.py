@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,13 +19,12 @@ from numpy.typing import NDArray
 from experiments.gallery.settings import Panel
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import NeurolensWarning
 from neurolens.base.files import fingerprint_of, read_kept
 from neurolens.base.progress import Report
 from neurolens.cameras import build
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.reduced import Vignetted
 from neurolens.lens.paraxial import film_z_mm, first_order
@@ -254,17 +252,17 @@ class Window:
         return self._camera.sample(film_mm + self._centre, pupil, wavelength_nm)
 
 
-def exact_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "trace") -> Camera:
+def exact_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
     """The prescription itself, sampled over the surrogate's pupil: the same rays for the same random numbers."""
     bounds = None if surrogate is None else surrogate.domain.bounds
-    return ExactCamera(replace(shot.lens, film_z_mm=None), _settings(shot), bounds=bounds, runtime=runtime)
+    return ExactCamera(replace(shot.lens, film_z_mm=None), _settings(shot), bounds=bounds)
 
 
-def surrogate_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "onnxruntime") -> Camera:
+def surrogate_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
     """The exported model."""
     assert surrogate is not None
     stop = {"f_number": float(first_order(shot.lens).f_number), "aperture": shot.lens.aperture}
-    return OnnxCamera(load_model(surrogate.file), _settings(shot, **stop), runtime=runtime)
+    return OnnxCamera(load_model(surrogate.file), _settings(shot, **stop))
 
 
 def _settings(shot: Shot, **more: Any) -> CameraShot:
@@ -296,26 +294,12 @@ CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "pinhole": partial(ideal_camera, "pinhole:"),
     "post": lambda shot, surrogate: PostProcessed(thin_camera(shot, surrogate), exact_camera(shot, surrogate)),
 }
-# The same as compiled code: many times as fast, but not for every lens, nor on every machine.
-_COMPILED: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
-    "exact": partial(exact_camera, runtime="c"),
-    "surrogate": partial(surrogate_camera, runtime="c"),
-}
 TITLES = {"exact": "exact lens", "thin": "thin lens", "post": "post-process"}  # others are called by their names
 
 
-def camera_of(column: str, shot: Shot, surrogate: Surrogate | None, compiled: bool = False) -> Camera:
-    """The camera of a column, with what the panel leaves of its vignetting.
-
-    Args:
-        compiled: as compiled code, where there can be such: the same rays to rounding.
-    """
-    camera = None
-    if compiled and column in _COMPILED:
-        with suppress(InputError):  # coatings, absorbing glass, or no compiler
-            camera = _COMPILED[column](shot, surrogate)
-    if camera is None:
-        camera = CAMERAS[column](shot, surrogate)
+def camera_of(column: str, shot: Shot, surrogate: Surrogate | None) -> Camera:
+    """The camera of a column, with what the panel leaves of its vignetting."""
+    camera = CAMERAS[column](shot, surrogate)
     left = shot.panel.vignetting
     return camera if left == "both" else Vignetted(camera, left, shot.wavelength_nm)
 

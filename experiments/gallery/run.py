@@ -149,7 +149,7 @@ def _views(
         camera = camera_of(column, shot, surrogate)
         # One wavelength per path where the lens disperses: exact lens and surrogate then share their random numbers.
         film = replace(shot.scene.settings.film, wavelengths="one" if camera.dispersive else "hero")
-        seen, height = camera_of(column, shot, surrogate, compiled=True), round(panel.width * window[3] / window[2])
+        seen, height = camera_of(column, shot, surrogate), round(panel.width * window[3] / window[2])
         size: dict[str, Any] = {"width": panel.width, "height": max(1, height), "samples": samples or panel.samples}
         done = render(shot.scene, Window(seen, window), **size, threads=threads, film=film)
         views[column] = View(shot, camera, column, done.rgb)

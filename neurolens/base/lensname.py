@@ -4,8 +4,11 @@ laikin_double_gauss_50              a lens of lenses/, or a model of models/, by
 FILE.toml, FILE.zmx, ...            a lens file of any format that `neurolens.readers.any_format` reads
 MODEL.onnx                          an exported model
 plan.toml                           a file of `neurolens plan`: the camera that it names
-fused:, thick:, thin:, pinhole:     before any of these: a kind of camera
+thick:, thin:, pinhole:             before any of these: a kind of camera
 thin, pinhole, fisheye-PROJECTION   a camera without a lens
+
+Older command lines and files have "fused:" before a lens or model that was to be compiled, as all are now: it is read,
+and changes nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import library
 from neurolens.base.tomlfile import read_toml, suggestion
 
-FUSED = "fused:"  # compiled by the system's C compiler
+_FUSED = "fused:"
 IDEAL_OF = ("thick:", "thin:", "pinhole:")  # ideal cameras that are framed as a lens is
 FISHEYES = tuple(f"fisheye-{name}" for name in ("equidistant", "equisolid", "stereographic", "orthographic"))
 IDEAL = ("thin", "pinhole", *FISHEYES)
@@ -43,14 +46,9 @@ class Named(NamedTuple):
 
 def split_kind(text: str) -> tuple[str, str]:
     """The kind of camera in front of a word, with its colon, and the word; file names may have colons of their own."""
-    kind = next((k for k in (FUSED, *IDEAL_OF) if text.startswith(k)), "")
+    text = text.removeprefix(_FUSED)
+    kind = next((k for k in IDEAL_OF if text.startswith(k)), "")
     return kind, text.removeprefix(kind)
-
-
-def compiled(text: str) -> str:
-    """The camera that an argument names, compiled to C unless the argument says how it runs; raises as `resolve`."""
-    named = resolve(text)
-    return text if named.kind or named.file is None else f"{FUSED}{text}"
 
 
 def is_model(file: str | Path) -> bool:
@@ -92,7 +90,7 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
     if (is_model(path) and (not models or kind in IDEAL_OF)) or not path.exists():
         expected = _FORMATS + (", a model (.onnx)" if models else "") + " or a name that ships (neurolens lens list)"
         if cameras:
-            expected += f", with {FUSED}, {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
+            expected += f", with {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
         ours = [file.stem for folder, suffix in places for file in sorted((library() / folder).glob(f"*{suffix}"))]
         known = [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())]
         near = suggestion(word, known)

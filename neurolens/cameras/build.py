@@ -1,20 +1,18 @@
-"""A camera from what a command line names: `neurolens.base.lensname` lists the kinds.
-
-Only a lens file needs torch, which is imported when one is asked for.
-"""
+"""A camera from what a command line names: `neurolens.base.lensname` lists the kinds."""
 
 from __future__ import annotations
 
 import math
 from contextlib import suppress
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.base.lensname import FISHEYES, FUSED, IDEAL_OF, is_model, resolve
+from neurolens.base.lensname import FISHEYES, IDEAL_OF, is_model, resolve
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, ThinLens, check_field
@@ -39,7 +37,6 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
     Raises:
         InputError: an unknown kind of camera, a missing file, a setting that this kind does not have or cannot reach.
         ModelError: a model that cannot be trusted.
-        ModuleNotFoundError: a lens file without torch.
     """
     camera = with_dispersion(as_c(_camera(str(spec), shot, progress)), shot)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
@@ -59,6 +56,8 @@ def with_dispersion(camera: Camera, shot: Shot) -> Camera:
 
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     kind, path = resolve(spec)
+    if path is None or kind in IDEAL_OF:
+        refuse(spec, "runtime", shot.runtime, "left out: only a lens or a model has a choice")
     if path is None:
         return _ideal(kind, shot)
     if kind in IDEAL_OF:
@@ -66,8 +65,8 @@ def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     if is_model(path):
         from neurolens.cameras.model import OnnxCamera, load_model
 
-        return OnnxCamera(load_model(path), shot, runtime="c" if kind == FUSED else "onnxruntime")
-    return _exact(path, shot, kind == FUSED, progress)
+        return OnnxCamera(load_model(path), shot, progress=progress)
+    return _exact(path, shot, progress)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
@@ -154,19 +153,27 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
     )
 
 
-def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
+def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera
     from neurolens.readers.any_format import read_any
-    from neurolens.setting.check import check_lens, doubts
     from neurolens.setting.states import set_lens
 
     tabled = read_any(path)
-    camera = ExactCamera(tabled, shot, progress=progress, runtime="c" if fused else "trace")
+    camera = ExactCamera(tabled, shot, progress=progress)
     camera.settings["notes"] = [
-        *doubts(check_lens(tabled)),
+        *_doubts(tabled),
         *_film_notes(set_lens(camera.lens, focus_m=math.inf), shot.film_mm),
     ]
     return camera
+
+
+def _doubts(lens: Lens) -> list[str]:
+    """What a check of the lens against its source doubts; none without torch, which traces its chief rays."""
+    if find_spec("torch") is None:
+        return []
+    from neurolens.setting.check import check_lens, doubts
+
+    return doubts(check_lens(lens))
 
 
 def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:

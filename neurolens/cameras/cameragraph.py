@@ -1,7 +1,6 @@
 """Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
 
-The graph of a camera is written here, once. onnxruntime and compiled cameras run it whole, with
-the graph of their lens inside (`whole_camera`); cameras whose lens is a function (a trace) evaluate its two halves.
+The graph of a camera is written here, once: that of its lens between the pupil and the weights (`whole_camera`).
 """
 
 from __future__ import annotations

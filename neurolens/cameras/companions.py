@@ -186,19 +186,14 @@ def companion_graph(lens: LensGraph, shift: Shift, mask_too: bool) -> Graph:
     Outputs: `status`; without `mask_too` also `stop_xy_mm` of a lens with a mask.
     """
     g = Graph()
-    there = shifted(g, shift)
-    found, aperture = lens_inside(g, lens, g.concat(there, g.input("companion_nm")), mask_too)
-    given = {**found, "lens_status": unrounded(found["status"])}
-    g.outputs["status"] = g.inline(status_graph(aperture, lens.stopped, lens.unit), given)["status"].whole()
-    return g
-
-
-def shifted(g: Graph, shift: Shift) -> Value:
-    """Film and pupil points [4] of companions in a graph of the inputs of `Shift`."""
     of_hero = {k: v for k, v in shift.of_hero.outputs.items() if k != "tint"}
     wanted = {k: shift.graph.outputs[k] for k in ("film_there", "pupil_there")}
     there = g.inline(pruned(shift.graph, wanted), g.inline(pruned(shift.of_hero, of_hero), {}))
-    return g.concat(there["film_there"], there["pupil_there"])
+    rays = g.concat(there["film_there"], there["pupil_there"], g.input("companion_nm"))
+    found, aperture = lens_inside(g, lens, rays, mask_too)
+    given = {**found, "lens_status": unrounded(found["status"])}
+    g.outputs["status"] = g.inline(status_graph(aperture, lens.stopped, lens.unit), given)["status"].whole()
+    return g
 
 
 @cache

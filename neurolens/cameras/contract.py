@@ -138,8 +138,6 @@ class Camera(Protocol):
         achromatic: optional, true where neither rays nor weights depend on the wavelength.
         tints: optional function of wavelengths [...], the light of each over that of one wavelength, where nothing else
             depends on them.
-        costly: optional; true if a ray takes longer than the rest of its path in a simple scene. Paths then carry one
-            wavelength, unless the settings of the film ask for several.
         rays_a_call: optional, how many rays at once suit it best; `RAYS_A_CALL` where it says nothing.
         settings: JSON-able description (focal length, f-number, focus, model card), kept in the picture's metadata.
     """

@@ -1,12 +1,11 @@
 """The camera class of lenses, exact or modelled: everything between the random numbers and the weighted ray.
 
-A camera is one graph, that of its lens between the pupil and the weights (`cameragraph.whole_camera`). Three runtimes
+A camera is one graph, that of its lens between the pupil and the weights (`cameragraph.whole_camera`). Two runtimes
 give the same rays to rounding:
 
-    "onnxruntime"  the graph written as ONNX
     "c"            the graph compiled by the system's C compiler when the camera is made (1 to 10 s, kept for the next
                    time, see `graph.compiler`); it runs in float32 on the thread that calls it, and forks share it
-    "trace"        the lens is traced by torch, surface by surface, and numpy runs the graph's two halves around it
+    "onnxruntime"  the graph written as ONNX, where there is no compiler, or the graph is too large for one
 """
 
 from __future__ import annotations
@@ -16,16 +15,19 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays, weight_graph, whole_camera
+from neurolens.base.progress import Progress
+from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays, status_graph, weight_graph, whole_camera
 from neurolens.cameras.companions import Shift, companion_graph, fit_shift, lanes_graph
 from neurolens.cameras.contract import (
     MANY_RAYS_A_CALL,
@@ -35,19 +37,23 @@ from neurolens.cameras.contract import (
     FloatArray,
     SpectralRays,
 )
-from neurolens.cameras.onnxlens import open_session, run_batches
+from neurolens.cameras.onnxlens import LensRays, LensRun, open_session, run_batches
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.sampling import FrontDiscs, arrived, is_light, stratified
+from neurolens.cameras.sampling import FrontDiscs, arrived, stratified
 from neurolens.graph.c import Signature, padded_columns, write_blocks
-from neurolens.graph.compiler import load_compiled
+from neurolens.graph.compiler import has_compiler, load_compiled
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import Program, row_names
 from neurolens.graph.scalars import lower
+from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import LINE_D_NM, Surface
+from neurolens.lens.shot import Runtime
+from neurolens.setting.pupils import GROUPS
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
+from neurolens.surrogates.inverse import InverseRays
 from neurolens.trace.shapes import sag_and_derivatives
 
 Array = NDArray[np.float64]
@@ -57,67 +63,98 @@ _ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, 
 _QUADRATURE = 256
 
 
-class SceneRays(NamedTuple):
-    """Scene-side rays: scene_ray [6, N] (x, y, z mm, unit direction; lens frame), transmittance [N], status [N]."""
+@dataclass(frozen=True)
+class LensScene:
+    """A lens at one focus and stop: film points [2, N] mm, pupil points [2, N] mm and wavelengths [N] nm to scene rays.
 
-    scene_ray: FloatArray
-    transmittance: FloatArray
-    status: NDArray[np.int32]
+    Attributes:
+        lens: which knows a round stop. aperture: the shape of another opening.
+    """
 
+    lens: LensRun
+    film_z_mm: float
+    stop_radius_mm: float
+    aperture: Aperture | None = None
 
-# Film points [2, N] mm, pupil points [2, N] mm and wavelengths [N] nm to scene-side rays.
-SceneFunction = Callable[[FloatArray, FloatArray, FloatArray], SceneRays]
+    def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> LensRays:
+        rays = np.concatenate([film, pupil, wavelength_nm[None]]).astype(np.float32)
+        out = self.lens.run(rays, self.film_z_mm, self.stop_radius_mm)
+        return out._replace(status=self.status_of(out))
+
+    def status_of(self, rays: LensRays | InverseRays) -> NDArray[np.int32]:
+        """Status [N] of rays of the lens with that of the stop's shape; see `status_graph`."""
+        given = {"scene_ray": rays.scene_ray, "lens_status": rays.status[None].astype(np.float32)}
+        if self.aperture is not None:
+            given |= {"stop_xy_mm": rays.stop_xy_mm, "stop_radius_mm": np.array([[self.stop_radius_mm]], np.float32)}
+            given |= {} if self.aperture.mask is None else {"mask": self.aperture.table}
+        return evaluate(status_graph(self.aperture, self.stopped), given)["status"][0].astype(np.int32)
+
+    @property
+    def stopped(self) -> int:
+        """Status of rays that the stop's shape blocks."""
+        return st.blocked(self.lens.stop_index, st.RIM)
+
+    def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
+        """Test whether rays pass at one wavelength; bool [N]. Behind a round stop only the status is computed."""
+        waves = np.full(film.shape[1], wavelength_nm, np.float32)
+        if self.aperture is not None:
+            return self(film, pupil, waves).status == st.PASSED
+        rays = np.concatenate([film, pupil, waves[None]]).astype(np.float32)
+        return self.lens.status(rays, self.film_z_mm, self.stop_radius_mm) == st.PASSED
+
+    def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
+        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
+        passed = np.zeros(film.shape[1], bool)
+        for azimuth in chain(*GROUPS):
+            left = np.flatnonzero(~passed)
+            if len(left):
+                cos, sin = math.cos(azimuth), math.sin(azimuth)
+                turn = np.array([[cos, -sin], [sin, cos]], np.float32)
+                passed[left] = self.passes(turn @ film[:, left], turn @ pupil[:, left], wavelength_nm)
+        return passed
+
+    def axial_transmittance(self, wavelength_nm: tuple[float, float]) -> float | None:
+        """Transmittance of the axial ray at the wavelength nearest to the d line; None where the stop blocks it."""
+        axis = np.zeros((2, 1), np.float32)
+        out = self(axis, axis, np.clip([LINE_D_NM], *wavelength_nm).astype(np.float32))
+        through = float(out.transmittance[0])
+        return through if out.status[0] == st.PASSED and 0 < through <= 1 else None
+
+    def squeeze(self, height_mm: float, wavelength_nm: tuple[float, float]) -> float | None:
+        """Squeeze of a lens known by its rays alone: one that leaves parallel to the axis at height h slopes h / f.
+
+        Rays count whether they pass or not.
+        """
+        h = height_mm
+        film = np.array([[h, -h, 0, 0], [0, 0, h, -h]], np.float32)
+        out = self(film, film, np.clip([LINE_D_NM] * 4, *wavelength_nm).astype(np.float32))
+        with np.errstate(all="ignore"):
+            slope = out.scene_ray[3:5].astype(np.float64) / out.scene_ray[5]
+            squeeze = float((slope[0, 0] - slope[0, 1]) / (slope[1, 2] - slope[1, 3]))
+        if abs(squeeze - 1) < _ROUND:
+            return 1.0
+        return squeeze if math.isfinite(squeeze) and squeeze > 0 else None
 
 
 class LensFilm:
-    """Film and pupil of a lens at one focus and stop: from film points and random numbers to weighted rays.
+    """Film and pupil of a lens at one focus and stop.
 
     Args:
         outline: the pupil of every film radius; None where no ray passes.
-        film_z_mm: film plane, lens frame.
         wavelength_nm: range of the wavelengths used.
-        scene: the lens.
+        scene: the lens; its film is this one.
 
     Raises:
         InputError: no ray passes from the film's centre.
     """
 
-    def __init__(
-        self, outline: PupilOutline | None, film_z_mm: float, wavelength_nm: tuple[float, float], scene: SceneFunction
-    ) -> None:
+    def __init__(self, outline: PupilOutline | None, wavelength_nm: tuple[float, float], scene: LensScene) -> None:
         if outline is None:
             raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
-        self.film_z_mm, self.scene = film_z_mm, scene
-        self.distance_mm = film_z_mm - outline.pupil_z_mm
-        self.outline = outline
+        self.film_z_mm, self.scene, self.outline = scene.film_z_mm, scene, outline
+        self.distance_mm = scene.film_z_mm - outline.pupil_z_mm
         self.exposure = 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
-
-    def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, random numbers [2, N] in [0, 1) and wavelengths [N] in nm."""
-        return camera_rays(self.outputs(film_mm, square, wavelength_nm))
-
-    def outputs(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> dict[str, NDArray[Any]]:
-        """The outputs of the camera's graph, `pupil_mm`, `area_mm2` and `transmittance`, for the inputs of `sample`."""
-        pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
-        lit = (area > 0) & is_light(wavelength_nm)
-        some = np.flatnonzero(lit)  # a film point that nothing reaches is dark: no ray is traced
-        found = self._weighted(film_mm[:, some], pupil[:, some], area[some], wavelength_nm[some])
-        whole = {name: np.zeros((*part.shape[:-1], lit.size), part.dtype) for name, part in found.items()}
-        whole["status"][:] = st.OUTSIDE_DOMAIN
-        for name, part in found.items():
-            whole[name][..., some] = part
-        return whole | {"pupil_mm": pupil, "area_mm2": area[None]}
-
-    def _weighted(
-        self, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
-    ) -> dict[str, NDArray[Any]]:
-        """The input of `camera_rays` for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
-        out = self.scene(film, pupil, wavelength_nm)
-        given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
-        given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
-        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
-        return evaluate(weight_graph(), given) | {"transmittance": out.transmittance[None]}
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -134,14 +171,19 @@ class LensFilm:
     def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
         """Integral of T cos over solid angle at the film's centre, mean over the wavelengths."""
         square, wavelength = stratified(_QUADRATURE, wavelength_nm)
-        weight = self.sample(np.zeros_like(square), square, wavelength).weight
+        film = np.zeros_like(square)
+        pupil, area = self.outline.sample(film, square, wavelength)
+        out = self.scene(film, pupil, wavelength)
+        given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
+        given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
+        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
+        weight = evaluate(weight_graph(), given)["weight"]
         exposure = float(weight.mean(dtype=np.float64))
         if not exposure > 0:
             raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
         return exposure
 
 
-Runtime = Literal["onnxruntime", "c", "trace"]
 # What a camera computes: rays, with differentials, with companions, or whether companions pass (`companion_graph`).
 Kind = Literal["rays", "differentials", "hero", "companion"]
 # Film points, pupil squares [2, N] and wavelengths [1, N] by name to what `camera_rays` takes.
@@ -166,22 +208,20 @@ class LensCamera:
             `loworder.WORST`: the graph's own cost as much as its rays.
     """
 
+    name: str
     path: Path
     film: LensFilm
     film_mm: tuple[float, float]
     settings: dict[str, Any]
     runtime: Runtime
     _light_nm: tuple[float, float]
+    _runs: dict[tuple[int, Kind, int], GraphRun]
+    _told: Callable[[str], None]
     differentials_error: float | None = None
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """The graph of the lens with its stop."""
         raise NotImplementedError
-
-    @property
-    def costly(self) -> bool:
-        """Whether a ray takes longer than the rest of most paths: torch traces it surface by surface."""
-        return self.runtime == "trace"
 
     @property
     def rays_a_call(self) -> int:
@@ -249,12 +289,24 @@ class LensCamera:
         other.start("c")
         return other
 
-    def start(self, runtime: Runtime) -> None:
-        """Choose what runs the camera; C is compiled at once. Raises InputError: no C compiler, or one that fails."""
-        self.runtime, self._runs = runtime, dict[tuple[int, Kind, int], GraphRun]()
-        if runtime == "c":
-            self.settings = self.settings | {"runtime": "fused"}
-            self._run("rays")
+    def start(self, runtime: Runtime | None, progress: Progress | None = None) -> None:
+        """Choose what runs the camera; None takes C where the machine has a compiler that takes it, else onnxruntime.
+
+        `progress`: says what is compiled, which is done at once, and how long it took.
+
+        Raises:
+            InputError: C was asked for, and there is no compiler, or one that fails.
+        """
+        self.runtime, self._runs = runtime or ("c" if has_compiler() else "onnxruntime"), {}
+        self._told = (progress or Progress(quiet=True)).note
+        if self.runtime == "c":
+            try:
+                self._run("rays")
+            except InputError:
+                if runtime:
+                    raise
+                self.runtime = "onnxruntime"
+        self.settings = self.settings | {"runtime": self.runtime}
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
         """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract.
@@ -325,8 +377,11 @@ class LensCamera:
                 area = graph.outputs.pop("area_mm2")
                 same = {k: graph.outputs[k] for k in ("pupil_mm", "weight")} | {"area_mm2": area}
                 graph.outputs |= graph.inline(lanes_graph(self._shift, companions), same)
-        made = _compiled(graph, numbers, self.film, lens) if self.runtime == "c" else None
-        return made or self._in_onnxruntime(graph, numbers, lens)
+        if self.runtime == "c":
+            return _compiled(
+                graph, numbers, self.film, lens, lambda how: self._told(f"compiled {self.name}, {kind}, {how}")
+            )
+        return self._in_onnxruntime(graph, numbers, lens)
 
     @cached_property
     def _shift(self) -> Shift | None:
@@ -387,9 +442,11 @@ class LensCamera:
         return {"rays": np.stack([*film, *pupil, wavelength])} | call, margin
 
 
-def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph) -> GraphRun:
+def _compiled(
+    graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph, told: Callable[[str], None]
+) -> GraphRun:
     """A graph of the camera as a compiled function; a mask in the stop is tested on the rays that come back."""
-    run = CompiledProgram.of(graph, numbers, padded(film.outline.table, 5))
+    run = CompiledProgram.of(graph, numbers, padded(film.outline.table, 5), told)
     mask = lens.aperture if lens.blades is None else None
     if mask is None:
         return run
@@ -420,24 +477,30 @@ class CompiledProgram:
 
     Args:
         rows: of each result, of which the program has them one by one. numbers: of the call. table: of the outline.
+        told: as of `load_compiled`.
     """
 
-    def __init__(self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray) -> None:
+    def __init__(
+        self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray,
+        told: Callable[[str], None] | None = None,
+    ) -> None:  # fmt: skip
         if len(program.steps) > MAX_STEPS:
             raise InputError("compiled camera", "steps", len(program.steps), f"up to {MAX_STEPS} for a compiler")
         self._rows = {name: (count, np.int32 if name == "status" else np.float32) for name, count in rows.items()}
         self._signature = s = Signature.of(program, "camera")
         self._numbers, self._table = np.array([numbers[name] for name in s.per_call], np.float32), table
-        self._call = load_compiled(write_blocks(program, "camera")).camera
+        self._call = load_compiled(write_blocks(program, "camera"), told).camera
         pointer = ctypes.c_void_p
         self._call.argtypes = [ctypes.c_size_t, pointer, pointer, pointer, ctypes.c_int, pointer, pointer]
         self._call.restype = None
 
     @classmethod
-    def of(cls, graph: Graph, numbers: dict[str, float], table: FloatArray) -> CompiledProgram:
+    def of(
+        cls, graph: Graph, numbers: dict[str, float], table: FloatArray, told: Callable[[str], None] | None = None
+    ) -> CompiledProgram:
         """That of a graph."""
         rows = {name: value.rows for name, value in graph.outputs.items()}
-        return cls(lower(graph).in_order_of_need(), rows, numbers, table)
+        return cls(lower(graph).in_order_of_need(), rows, numbers, table, told)
 
     def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         """The results [R, N] for inputs [R, N]; of a camera the input of `camera_rays`."""
@@ -459,27 +522,3 @@ class CompiledProgram:
         numbers, table = self._numbers.ctypes.data, self._table.ctypes.data
         self._call(count, given.ctypes.data, numbers, table, len(self._table), out.ctypes.data, places["status"])
         return found
-
-
-def axial_transmittance(scene: SceneFunction, wavelength_nm: tuple[float, float]) -> float | None:
-    """Transmittance of the axial ray at the wavelength nearest to the d line; None where the stop's shape blocks it."""
-    axis = np.zeros((2, 1), np.float32)
-    out = scene(axis, axis, np.clip([LINE_D_NM], *wavelength_nm).astype(np.float32))
-    through = float(out.transmittance[0])
-    return through if out.status[0] == st.PASSED and 0 < through <= 1 else None
-
-
-def squeeze_of(scene: SceneFunction, height_mm: float, wavelength_nm: tuple[float, float]) -> float | None:
-    """Squeeze of a lens that is known by its rays alone: one that leaves parallel to the axis at height h slopes h / f.
-
-    Rays count whether they pass or not.
-    """
-    h = height_mm
-    film = np.array([[h, -h, 0, 0], [0, 0, h, -h]], np.float32)
-    out = scene(film, film, np.clip([LINE_D_NM] * 4, *wavelength_nm).astype(np.float32))
-    with np.errstate(all="ignore"):
-        slope = out.scene_ray[3:5].astype(np.float64) / out.scene_ray[5]
-        squeeze = float((slope[0, 0] - slope[0, 1]) / (slope[1, 2] - slope[1, 3]))
-    if abs(squeeze - 1) < _ROUND:
-        return 1.0
-    return squeeze if math.isfinite(squeeze) and squeeze > 0 else None

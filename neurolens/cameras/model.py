@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.progress import Progress
 from neurolens.base.status import DOMAIN_SLACK
-from neurolens.cameras.cameragraph import LensGraph, status_graph
+from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
+from neurolens.cameras.lenscamera import LensCamera, LensFilm, LensScene
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
 from neurolens.cameras.sampling import (
@@ -25,14 +26,12 @@ from neurolens.cameras.sampling import (
     lens_state,
     refuse,
 )
-from neurolens.graph.interpret import evaluate
 from neurolens.lens import paraxial
-from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Surface
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.card import state_for
-from neurolens.surrogates.inverse import InverseModel, InverseRays, inverse_of
+from neurolens.surrogates.inverse import InverseModel, inverse_of
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
@@ -51,7 +50,7 @@ class OnnxCamera(LensCamera):
             state. Focusing moves the groups of a model that knows them, in every mode; the film then stands where the
             model's rays from the axis make the least spot, or with "paraxial" in the paraxial image.
         outline: of the pupil of the lens itself, to hold the model against it; None searches the model's own.
-        runtime: what runs the camera, "onnxruntime" or "c".
+        progress: as of `LensCamera.start`.
 
     Raises:
         InputError: a focus, stop or zoom position outside the model's domain; no C compiler where one is needed.
@@ -66,7 +65,7 @@ class OnnxCamera(LensCamera):
         shot: Shot,
         *,
         outline: PupilOutline | None = None,
-        runtime: Runtime = "onnxruntime",
+        progress: Progress | None = None,
     ) -> None:
         _check_shot(model, shot)
         if model.axes:
@@ -93,7 +92,7 @@ class OnnxCamera(LensCamera):
             outline = outline.on_plane(float(domain["pupil_z_mm"]), film_z)
         else:
             outline = _outline_of(round_stop, used)
-        self.film = LensFilm(outline, film_z, used, scene)
+        self.film = LensFilm(outline, used, scene)
         self.settings: dict[str, Any] = {
             "camera": "model",
             "model": str(model.path),
@@ -113,7 +112,7 @@ class OnnxCamera(LensCamera):
         notes = beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
         poor = ", ".join(card["errors"].get("poor") or ())
         self.settings["notes"] = [*([f"the model is poor, as its card says: {poor}"] if poor else []), *notes]
-        self.start(runtime)
+        self.start(shot.runtime, progress)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """The graph of the model in the camera's state, with its stop."""
@@ -121,7 +120,7 @@ class OnnxCamera(LensCamera):
         assert isinstance(scene, ModelScene)
         # Series decode unit directions, and their range is tested; to test the length is eight passes in onnxruntime.
         unit = form is ONNX and self.model.fitted.direction == "angle"
-        return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status, unit)
+        return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stopped, unit)
 
     @property
     def front(self) -> Surface | None:
@@ -142,53 +141,12 @@ class OnnxCamera(LensCamera):
         return inverse_of(self.model.fitted)
 
 
-@dataclass(frozen=True)
-class ModelScene:
-    """A model at one focus and stop; it knows a round stop, `aperture` is the shape of another."""
+class ModelScene(LensScene):
+    """A model at one focus and stop."""
 
-    model: OnnxLens
-    film_z_mm: float
-    stop_radius_mm: float
-    aperture: Aperture | None = None
-
-    def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
-        out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
-        return SceneRays(out.scene_ray, out.transmittance, self.status_of(out))
-
-    def status_of(self, rays: LensRays | InverseRays) -> NDArray[np.int32]:
-        """Status [N] of the model's rays with that of the stop's shape; see `status_graph`."""
-        given = {"scene_ray": rays.scene_ray, "lens_status": rays.status[None].astype(np.float32)}
-        if self.aperture is not None:
-            given |= {"stop_xy_mm": rays.stop_xy_mm, "stop_radius_mm": np.array([[self.stop_radius_mm]], np.float32)}
-            given |= {} if self.aperture.mask is None else {"mask": self.aperture.table}
-        return evaluate(status_graph(self.aperture, self.stop_status), given)["status"][0].astype(np.int32)
-
-    @property
-    def stop_status(self) -> int:
-        """Status of rays that the stop's shape blocks."""
-        return st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM)
-
-    def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Test whether rays pass at one wavelength; bool [N]. Behind a round stop only the status is computed."""
-        waves = np.full(film.shape[1], wavelength_nm, np.float32)
-        if self.aperture is not None:
-            return self(film, pupil, waves).status == st.PASSED
-        return self.model.status(film, pupil, waves, self.film_z_mm, self.stop_radius_mm) == st.PASSED
-
-    def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
-        passed = np.zeros(film.shape[1], bool)
-        for azimuth in _AZIMUTHS:
-            left = np.flatnonzero(~passed)
-            if len(left):
-                cos, sin = math.cos(azimuth), math.sin(azimuth)
-                turn = np.array([[cos, -sin], [sin, cos]], np.float32)
-                passed[left] = self.passes(turn @ film[:, left], turn @ pupil[:, left], wavelength_nm)
-        return passed
+    lens: OnnxLens
 
 
-# Of lenses with cylinders, as `setting.pupils.AZIMUTHS`; those that differ most come first.
-_AZIMUTHS = [math.radians(5 * k) for k in sorted(range(-18, 19), key=lambda k: k % 9)]
 _RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, since the stop's edge falls between two
 _WIDER = 1.3  # their disc over the axial pupil at the stop in use
 _STEPS = 4  # towards the film points from which rays go to the object
@@ -218,7 +176,7 @@ def best_focus_of_stops_mm(
 ) -> NDArray[np.float64]:
     """`best_focus_z_mm` at stop radii up to the scene's: of one set of rays, those that each lets through."""
     spot = _axial_spot(scene, focus_m, wavelength_nm)
-    found = scene.model.rays(*spot.rays, scene.film_z_mm, scene.stop_radius_mm)
+    found = scene.lens.rays(*spot.rays, scene.film_z_mm, scene.stop_radius_mm)
     radius = np.where(spot.passed, np.hypot(*found.stop_xy_mm), np.inf)
     edge_mm = scene.stop_radius_mm * _WIDER / _RINGS  # from ring to ring: those at the edge count in part
     share = ((stops_mm[:, None] - radius) / edge_mm + 0.5).clip(0, 1)
@@ -226,7 +184,7 @@ def best_focus_of_stops_mm(
     shift = -along / across
     # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
     whole = spot.best_mm - scene.film_z_mm
-    lens = scene.model.card["lens"]
+    lens = scene.lens.card["lens"]
     scale = 0.0 if math.isinf(focus_m) else (scene.film_z_mm - lens["infinity_film_z_mm"]) / lens["efl_mm"]
     best: NDArray[np.float64] = scene.film_z_mm + shift + (shift - whole) * scale**2
     return best
@@ -242,10 +200,10 @@ class _Spot(NamedTuple):
 
 
 def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> _Spot:
-    domain = scene.model.card["domain"]
+    domain = scene.lens.card["domain"]
     colours, weights = paraxial.colours(wavelength_nm)
     reach = float(domain["film_radius_mm"])
-    round_ = scene.aperture is None and squeeze_of(scene, _SQUEEZED * reach, wavelength_nm) == 1.0
+    round_ = scene.aperture is None and scene.squeeze(_SQUEEZED * reach, wavelength_nm) == 1.0
     spokes = 1 if round_ else _SPOKES  # of a round lens one stands for all
     shape = len(colours), _RINGS, spokes
     pupil = np.tile(_axial_pupil(domain, scene.stop_radius_mm, spokes), len(colours))
@@ -281,7 +239,7 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
         passed = (status == st.PASSED) & np.isfinite(moments).all(0)
         along, across = np.where(passed, moments, 0.0).sum(1)
         if not across > 0:
-            raise InputError(scene.model.path, "focus_mode", "best", "a model that lets axial light pass")
+            raise InputError(scene.lens.path, "focus_mode", "best", "a model that lets axial light pass")
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0).clip(-reach, reach)  # rays that do not pass may go anywhere
     return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
@@ -289,16 +247,16 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
 
 def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilOutline | None:
     """The pupil of a model with a round stop; one for all azimuths of a lens with cylinders, which fits none."""
-    domain = scene.model.card["domain"]
+    domain = scene.lens.card["domain"]
     bounds = PupilTable.of(domain["bounds"])
-    if squeeze_of(scene, _SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
+    if scene.squeeze(_SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
         return outline_of(bounds, scene.passes, wavelength_nm)
     return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE)
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:
     """The table `lens_state` of the settings, by the first-order data of the card."""
-    model, film_z = scene.model, scene.film_z_mm
+    model, film_z = scene.lens, scene.film_z_mm
     lens, radius = model.card["lens"], model.card["domain"]["film_radius_mm"]
     efl, front_efl = lens["efl_mm"], lens["efl_mm"] * paraxial.index_ratio(lens)
     focal_points = lens["front_principal_z_mm"] - front_efl, lens["rear_principal_z_mm"] + efl
@@ -311,8 +269,8 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
         pinhole_mm=paraxial.reach_mm(efl, front_efl, focal_points, entrance, film_z),
         entrance_pupil_mm=film_z - entrance,
         f_number=f_number,
-        transmittance=axial_transmittance(scene, wavelength_nm),
-        squeeze=squeeze_of(scene, _SQUEEZED * radius, wavelength_nm),
+        transmittance=scene.axial_transmittance(wavelength_nm),
+        squeeze=scene.squeeze(_SQUEEZED * radius, wavelength_nm),
     )
 
 

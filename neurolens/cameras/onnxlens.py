@@ -129,21 +129,61 @@ class LensRays(NamedTuple):
     status: NDArray[np.int32]
 
 
-class OnnxLens:
+class LensRun:
+    """The graph of a lens, exact or modelled, run by onnxruntime: rays through points of its pupil.
+
+    Attributes:
+        path: of the file of the lens, for messages.
+        stop_index: the surface at its stop.
+    """
+
+    stop_index: int
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._sessions: dict[tuple[Any, ...], Any] = {}  # by process and outputs; opened when they are needed
+
+    def graph(self, form: Form = SCALARS) -> Graph:
+        """The graph of the lens; inputs and outputs as `surrogates.assemble` says."""
+        raise NotImplementedError
+
+    def run(self, rays: FloatArray, film_z_mm: ArrayLike, stop_radius_mm: float) -> LensRays:
+        """The scene rays of columns [5, N] as of `ray_columns`."""
+        call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
+        names = tuple(OUTPUTS)
+        return LensRays(*run_batches(self.path, self._session(names), names, {"rays": rays}, call, BATCH))
+
+    def status(self, rays: FloatArray, film_z_mm: float, stop_radius_mm: float) -> NDArray[np.int32]:
+        """`run(...).status` alone, in less time: nothing else is computed."""
+        call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
+        names = ("status",)
+        found: NDArray[np.int32] = run_batches(self.path, self._session(names), names, {"rays": rays}, call, BATCH)[0]
+        return found
+
+    def _session(self, outputs: tuple[str, ...]) -> Any:
+        key = os.getpid(), *outputs  # a forked process opens its own
+        if key not in self._sessions:
+            graph = self.graph(ONNX)
+            wanted = pruned(graph, {name: graph.outputs[name] for name in outputs})
+            shapes = {name: OUTPUTS[name] for name in outputs}
+            self._sessions[key] = open_session(self.path, write_onnx(wanted, {}), INPUTS, shapes)
+        return self._sessions[key]
+
+
+class OnnxLens(LensRun):
     """An exported model, loaded and checked. Make it with `load_model`.
 
     Attributes:
         file: what the file says.
         card: see `neurolens.surrogates.card`; its lens and domain are those of `state`.
-        path: of the file.
         axes: what the model's state is made of (zoom in mm, focus in 1/m); none for a model of one state.
         state: a number for every axis.
     """
 
     def __init__(self, file: ModelFile) -> None:
-        self.file, self.path, self.card = file, file.path, file.card
-        self.axes, self.state = file.axes, default_state(file.card)
-        self._sessions: dict[tuple[Any, ...], Any] = {}  # by process and outputs; opened when they are needed
+        super().__init__(file.path)
+        self.file, self.card, self.axes, self.state = file, file.card, file.axes, default_state(file.card)
+        self.stop_index = int(file.card["lens"].get("stop_surface", 0))
         self._graphs: dict[Form, Graph] = {}
 
     def at(self, *state: float) -> Self:
@@ -210,34 +250,11 @@ class OnnxLens:
             ray, through, crossing = (np.zeros(shape, np.float32) for shape in ((6, count), (count,), (2, count)))
             return LensRays(ray, through, crossing, status)
         if len(plane) == 1:
-            return self._run(columns, plane, stop)
+            return self.run(columns, plane, stop)
         planes, at = np.unique(plane, return_inverse=True)
-        parts = [self._run(columns[:, at == k], planes[k : k + 1], stop) for k in range(len(planes))]
+        parts = [self.run(columns[:, at == k], planes[k : k + 1], stop) for k in range(len(planes))]
         place = np.argsort(np.argsort(at, kind="stable"), kind="stable")
         return LensRays(*(np.concatenate(of_one, -1)[..., place] for of_one in zip(*parts, strict=True)))
-
-    def _run(self, rays: FloatArray, plane: FloatArray, stop_radius_mm: float) -> LensRays:
-        session, call = self._session(tuple(OUTPUTS)), {"film_z_mm": plane, "stop_radius_mm": stop_radius_mm}
-        return LensRays(*run_batches(self.path, session, tuple(OUTPUTS), {"rays": rays}, call, BATCH))
-
-    def status(
-        self, film_xy_mm: FloatArray, pupil_xy_mm: FloatArray, wavelength_nm: FloatArray, film_z_mm: float, stop: float
-    ) -> NDArray[np.int32]:
-        """`rays(...).status` alone, in less time: nothing else is computed. Arguments as there."""
-        points = {"film_xy_mm": film_xy_mm, "pupil_xy_mm": pupil_xy_mm}
-        rays = {"rays": ray_columns("OnnxLens.status", points, wavelength_nm)}
-        session, call = self._session(("status",)), {"film_z_mm": film_z_mm, "stop_radius_mm": stop}
-        found: NDArray[np.int32] = run_batches(self.path, session, ("status",), rays, call, BATCH)[0]
-        return found
-
-    def _session(self, outputs: tuple[str, ...]) -> Any:
-        key = os.getpid(), *outputs  # a forked process opens its own
-        if key not in self._sessions:
-            graph = self.graph(ONNX)
-            wanted = pruned(graph, {name: graph.outputs[name] for name in outputs})
-            shapes = {name: OUTPUTS[name] for name in outputs}
-            self._sessions[key] = open_session(self.path, write_onnx(wanted, {}), INPUTS, shapes)
-        return self._sessions[key]
 
 
 def load_model(path: str | Path, lens: str | None = None) -> OnnxLens:

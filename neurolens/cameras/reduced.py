@@ -126,8 +126,6 @@ class ReducedDispersion:
         InputError: "lateral" of a camera that shows nothing.
     """
 
-    costly = False  # companions need no rays
-
     def __init__(
         self, camera: Any, dispersion: Dispersion, wavelength_nm: tuple[float, float] = (400.0, 700.0)
     ) -> None:
@@ -285,7 +283,7 @@ class Vignetted:
         self.camera, self.vignetting = camera, vignetting
         self.name, self.film_mm, self.wavelength_nm = camera.name, camera.film_mm, camera.wavelength_nm
         self.dispersive, self.achromatic = camera.dispersive, getattr(camera, "achromatic", False)
-        self.costly, self.lateral = getattr(camera, "costly", False), getattr(camera, "lateral", False)
+        self.lateral = getattr(camera, "lateral", False)
         self.rays_a_call = getattr(camera, "rays_a_call", RAYS_A_CALL)
         self.settings: dict[str, Any] = {**camera.settings, "vignetting": vignetting}
         light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)

@@ -42,7 +42,6 @@ cameras:
   LENS                         the lens of a file (.toml, .zmx, ..., see neurolens convert) or of a name in lenses/,
                                traced exactly, every ray through every surface
   MODEL.onnx                   an exported model of a lens
-  fused:LENS, fused:MODEL.onnx the same, compiled by the system's C compiler: many times faster
   thick:LENS                   its principal planes and pupils: ideal imaging, no rims
   thin:LENS, pinhole:LENS      a thin lens, a point: the plane in focus has the lens's size
   thin, pinhole                the same of any focal length (--focal-length)
@@ -263,7 +262,7 @@ def floats(text: str, between: str = ",") -> list[float]:
 def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: bool = False, **details: Any) -> Any:
     """An argument of `named_lens`; `also`: what its help adds."""
     taken = ", model (.onnx), or name of either" if models else ", or its name in lenses/"
-    taken += ", fused: before it, thick:LENS, thin, pinhole or fisheye-PROJECTION" if cameras else ""
+    taken += ", thick:LENS, thin, pinhole or fisheye-PROJECTION" if cameras else ""
     details = {"metavar": "CAMERA" if cameras else "LENS", "kind": partial(named_lens, models, cameras)} | details
     return setting(default, f"lens file of any format{taken}{also}", **details)
 

@@ -321,7 +321,7 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
     rows: dict[str, list[Any]] = {"distortion_um": [], "blur_um": [], "light": []}
     with suppress(InputError):
         for focus in (math.inf, near):
-            camera = ExactCamera(lens, Shot(film, focus))
+            camera = ExactCamera(lens, Shot(film, focus, runtime="onnxruntime"))  # of few rays
             nm, share = spectrum_of(camera)
             share = share / share.sum()
             places = prints.places_of(camera, points, np.full(radii.size, focus), nm, share)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neurolens import __version__
-from neurolens.base.lensname import compiled
 from neurolens.base.settings import group, positive, setting, setting_of, whole
 from neurolens.cameras.field import frame_of
 from neurolens.cli import arguments as cli
@@ -18,7 +17,7 @@ from neurolens.defocus.kernels import Cell, Grooves, as_picture, as_preview, asp
 from neurolens.defocus.picture import SAMPLES, check_field, defocus
 from neurolens.defocus.plate import DepthSettings, read_plate
 from neurolens.frames import Files
-from neurolens.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.lens.shot import Dispersion, Runtime, Shot, Vignetting
 from neurolens.render.pictures import standard_attributes, write_channels, write_exr, write_png
 from neurolens.render.sensor import about, expose
 from neurolens.render.settings import SensorSettings
@@ -43,7 +42,7 @@ class Defocus(cli.Reporting):
 examples:
   neurolens defocus plate.exr --lens lenses/laikin_double_gauss_50.toml --film 36x20.25 --focus 2 \\
       --f-number 2 -o out.exr
-  neurolens defocus beauty.exr --depth Depth.Z --lens fused:models/NAME.onnx --film 36x24 --focus 1.2 -o out.exr"""
+  neurolens defocus beauty.exr --depth Depth.Z --lens models/NAME.onnx --film 36x24 --focus 1.2 -o out.exr"""
     kept = "no picture was written; older files of that name are untouched"
 
     plate: Path = setting(..., "OpenEXR file, sharp, with depth", positional=True, metavar="PLATE.exr")
@@ -67,6 +66,7 @@ examples:
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
+    runtime: Runtime | None = setting_of(Shot, "runtime")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = cli.exposure()
     sensor: SensorSettings = group("sensor (any of these adds what it reads as channels raw)", unset=True)
@@ -83,10 +83,9 @@ examples:
         if self.depth_scale == 0:
             self.refuse("--depth-scale", 0, "metres of a unit")
         progress = self.progress()
-        settings = {k: getattr(self, k) for k in ("film_offset_mm", "vignetting", "dispersion")}
+        settings = {k: getattr(self, k) for k in ("film_offset_mm", "vignetting", "dispersion", "runtime")}
         shot = self.state.shot(self.film, **settings)
-        # Kernels ask for many rays: compiled, unless the argument says how.
-        camera = cli.camera(compiled(self.lens), shot, progress)
+        camera = cli.camera(self.lens, shot, progress)
         check_field(camera)
         starts = {"auto": None, "film": True, "pinhole": False}
         depth = DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
@@ -158,7 +157,7 @@ examples:
     def run(self) -> int:
         """Find the kernels of all distances, then write an atlas for each."""
         progress = self.progress()
-        camera, shot = self.make(self.state, progress, compiled=True)
+        camera, shot = self.make(self.state, progress, None)
         check_field(camera)
         grooves = Grooves(self.ring_height, self.ring_spacing) if self.ring_height else None
         if grooves:

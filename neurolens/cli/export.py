@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text
-from neurolens.base.lensname import FUSED, is_model
+from neurolens.base.lensname import is_model, split_kind
 from neurolens.base.settings import positive, setting
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.onnxlens import load_model
@@ -95,7 +95,7 @@ examples:
 
     def run(self) -> int:
         """Check the options, then load, fix and write."""
-        file, fixed = Path(self.model.removeprefix(FUSED)), _fixed(self.fix)
+        file, fixed = Path(split_kind(self.model)[1]), _fixed(self.fix)
         if file.is_dir():
             raise InputError(file, "file", "(a folder)", "a model or a lens file, as FOLDER/models/NAME.onnx")
         whole = set(self.only) == set(_PARTS) and not fixed

@@ -13,7 +13,7 @@ from neurolens.base.records import plain
 from neurolens.base.settings import positive, setting, setting_of, whole
 from neurolens.cli import arguments as cli
 from neurolens.frames import Files
-from neurolens.lens.shot import Dispersion, Shot
+from neurolens.lens.shot import Dispersion, Runtime, Shot
 from neurolens.mitsuba import load_scene, render
 from neurolens.mitsuba.sensor import FILM_WIDTH_MM, libraries
 from neurolens.render.pictures import standard_attributes, write_exr, write_png
@@ -44,6 +44,7 @@ examples:
     )  # fmt: skip
     exposure: float = cli.exposure()
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
+    runtime: Runtime | None = setting_of(Shot, "runtime")
     state: cli.LensState = cli.lens_state()
 
     def run(self) -> int:
@@ -53,7 +54,7 @@ examples:
         width, height = (int(v) for v in scene.sensors()[0].film().size())
         progress = self.progress()
         film = self.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width)
-        shot = self.state.shot(film, dispersion=self.dispersion)
+        shot = self.state.shot(film, dispersion=self.dispersion, runtime=self.runtime)
         camera = cli.camera(self.camera, shot, progress)
         began = time.perf_counter()
         with progress.stage(f"render {self.scene}, {camera.name}") as report:

@@ -27,7 +27,7 @@ from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
 from neurolens.frames.farm import how_to_resume, render_frames
-from neurolens.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.lens.shot import Dispersion, Runtime, Shot, Vignetting
 from neurolens.render.pictures import write_png
 from neurolens.render.renderer import RenderResult, Watch, merge_tiles, tile_path
 from neurolens.render.settings import FilmSettings, SensorSettings
@@ -52,8 +52,8 @@ class Render(cli.Reporting):
     metadata, attribute "neurolens", as JSON.
 
     The same seed gives the same picture for any number of threads; all cameras share its
-    random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
-    (.toml) does (extra "train").
+    random numbers. Lenses and models run as C where the machine has a compiler, which the first
+    picture takes some seconds for. No camera needs torch.
 
     The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
     command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
@@ -68,7 +68,7 @@ examples:
   neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more
   neurolens render experiments/scenes/room.toml --camera thin --tile 1/2 -o room.exr   # and 2/2 elsewhere
   neurolens render --merge room.tile-*.exr -o room.exr
-  neurolens render experiments/scenes/room.toml --camera fused:models/NAME.onnx --frames 1:48 \\
+  neurolens render experiments/scenes/room.toml --camera models/NAME.onnx --frames 1:48 \\
       --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
     kept = "no picture was written; older files of that name are untouched"
 
@@ -79,6 +79,7 @@ examples:
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
+    runtime: Runtime | None = setting_of(Shot, "runtime")
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
     colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)
@@ -143,7 +144,7 @@ examples:
     def frame(self) -> Frame:
         """The frame that the options describe."""
         assert self.camera is not None
-        same = ("film_offset_mm", "vignetting", "dispersion", "colour", "sensor", "tile")
+        same = ("film_offset_mm", "vignetting", "dispersion", "runtime", "colour", "sensor", "tile")
         return Frame.of(
             self.scene[0], self.camera, **self.state.settings(), **vars(self.picture), glass_files=self.glass,
             **{name: getattr(self, name) for name in same},
@@ -265,9 +266,9 @@ _MORE = {"thin": f"{_SIZE} --f-number 1.8", "pinhole": _SIZE, "fisheye": "--film
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(cli.Command):
-    """Render lights at many depths through a model of a 50 mm f/1.8 double Gauss, the lens itself (where the extra
-    "train" is installed), a thin lens and a pinhole that show the plane in focus at the same size, then through a
-    fisheye's model, and write them on one page, each with its command. Needs no checkout: the library ships."""
+    """Render lights at many depths through a model of a 50 mm f/1.8 double Gauss, the lens itself, a thin
+    lens and a pinhole that show the plane in focus at the same size, then through a fisheye's model,
+    and write them on one page, each with its command. Needs no checkout: the library ships."""
 
     kept = "pictures so far are kept; the same command goes on"
 
@@ -283,10 +284,8 @@ class Demo(cli.Command):
         parser = cli.Parser()
         Render.fill(parser)
         scene = str(library() / "experiments" / "scenes" / "lights.toml")
-        figures, traced = [], importlib.util.find_spec("torch") is not None
+        figures = []
         for name, camera, caption in _PICTURES:
-            if name == "exact" and not traced:
-                continue
             size = ["--width", str(self.width), "--samples", str(self.samples), "-o", str(self.out / f"{name}.exr")]
             words = [scene, "--camera", camera, *_MORE.get(name, "").split(), *size]
             command = f"{program()} render {shlex.join(words)}"
@@ -297,6 +296,6 @@ class Demo(cli.Command):
         page = html("demo.html", title="One scene, five cameras", shown=figures_of(self.out, figures))
         atomic_write_text(self.out / "index.html", page)
         more = [f"  {program()} {words}" for words in ("--help", "models", "lens list")]
-        more[2] += "" if traced else "   # with the extra 'train', which traces lenses"
+        more[2] += "" if importlib.util.find_spec("torch") else "   # with the extra 'train', which traces lenses"
         print("\n".join([f"\nLook at {self.out}/index.html\nThen", *more]))
         return 0

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from neurolens import __version__
-from neurolens.base import lensname
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
@@ -24,7 +23,7 @@ from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Complex, Field, field_of, frame_of, parallax_mm, spectrum_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
-from neurolens.lens.shot import Shot
+from neurolens.lens.shot import Runtime, Shot
 from neurolens.render.film import PixelGrid
 from neurolens.render.pictures import read_channels, standard_attributes, write_channels
 from neurolens.render.settings import size_by_shape
@@ -88,17 +87,19 @@ class PictureCommand(cli.Reporting):
             self.refuse("--width", "(missing)", "--width or --height of the lens's picture")
         return self.size or size_by_shape(self.film[0] / self.film[1], self.width, self.height)
 
-    def make(self, state: cli.LensState, progress: Progress, compiled: bool = False) -> tuple[Camera, Shot]:
+    def make(
+        self, state: cli.LensState, progress: Progress, runtime: Runtime | None = "onnxruntime"
+    ) -> tuple[Camera, Shot]:
         """The camera in a state of its lens, and its settings; what the camera notes is a warning.
 
-        `compiled`: a lens or model is compiled, unless the argument says how it runs.
+        `runtime`: as of `Shot`; maps take so few rays that compiling would take longer.
 
         Raises:
             InputError: a film whose shape is not that of the picture.
         """
         PixelGrid(*self.picture, self.film)
-        shot = state.shot(self.film, wavelength_nm=LIGHT_NM)
-        return cli.camera(lensname.compiled(self.camera) if compiled else self.camera, shot, progress), shot
+        shot = state.shot(self.film, wavelength_nm=LIGHT_NM, runtime=runtime)
+        return cli.camera(self.camera, shot, progress), shot
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,11 @@ from neurolens.lens import glass
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, same_medium
 from neurolens.trace.arithmetic import TINY, Graphs
+from neurolens.trace.films import Layers, reflectance
 from neurolens.trace.shapes import Centred, Figure, figure_of, is_plain
 from neurolens.trace.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
 from neurolens.trace.tracegraph import transmitted
-from neurolens.trace.transmission import Layers, path_mm, reflectance
+from neurolens.trace.transmission import path_mm
 
 Action = Literal["T", "R"]
 STATE = 8  # rows of a ray: x, y, z (mm, this step's frame), direction, power, `worst` (largest r^2 / R^2 at a rim)

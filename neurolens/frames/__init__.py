@@ -29,7 +29,7 @@ from neurolens.base.records import plain
 from neurolens.base.settings import setting, whole
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.lens.shot import Dispersion, FocusMode, Shot, Vignetting, film_size
+from neurolens.lens.shot import Dispersion, FocusMode, Runtime, Shot, Vignetting, film_size
 from neurolens.readers.glasses import more_glasses
 from neurolens.render.behind import Behind
 from neurolens.render.colour import (
@@ -112,7 +112,7 @@ class Frame(Picture):
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
         focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, cover_glass_mm,
-            vignetting, dispersion: as in `lens.shot.Shot`.
+            vignetting, dispersion, runtime: as in `lens.shot.Shot`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
         colour: changes of the scene's [film] table by their keys, as {"white_balance": "A"}.
@@ -133,6 +133,7 @@ class Frame(Picture):
     cover_glass_mm: float | None = None
     vignetting: Vignetting | None = None
     dispersion: Dispersion | None = None
+    runtime: Runtime | None = None
     glass_files: tuple[Path, ...] = ()
     position_m: Vector | None = None
     look_at_m: Vector | None = None

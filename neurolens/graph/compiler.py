@@ -12,12 +12,16 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import threading
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, cache_folder, folder_of_process, keep_newest, seal, sealed_bytes
+from neurolens.base.progress import duration
 
 # -march=native uses all of the machine; the next two let square roots and divisions become vectors, also where only one
 # side of a choice needs them. NaN and infinity stay what they are. -fno-inline keeps the knowledge that the arrays of a
@@ -26,6 +30,8 @@ FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-m
 _SECONDS = 300  # the largest models known compile in ten
 _ROOM = 2**20
 _KEPT = 64  # libraries of 50 to 200 kB
+_ONE_AT_A_TIME = threading.RLock()  # threads that need the same library do not both compile it
+os.register_at_fork(after_in_child=_ONE_AT_A_TIME._at_fork_reinit)  # type: ignore[attr-defined]
 
 
 def find_compiler() -> str:
@@ -124,8 +130,10 @@ def c_source(file: str, **constants: object) -> str:
     return defines + (Path(__file__).parents[1] / file).read_text(encoding="utf-8")
 
 
-def load_compiled(source: str) -> ctypes.CDLL:
+def load_compiled(source: str, told: Callable[[str], None] | None = None) -> ctypes.CDLL:
     """The library of a source, which is compiled once for this machine and kept in `cache_folder`.
+
+    `told`: takes the end of a line, how long it took and where the library is kept, if one was compiled.
 
     A library of another user, or a damaged one, is compiled again. Where the disk of the cache is full, it goes to the
     folder of temporary files, for this process; a compiler itself works in whichever of the two has room.
@@ -133,15 +141,23 @@ def load_compiled(source: str) -> ctypes.CDLL:
     Raises:
         InputError: as `compile_c`; a library that cannot be loaded.
     """
+    with _ONE_AT_A_TIME:
+        return _loaded(source, told)
+
+
+def _loaded(source: str, told: Callable[[str], None] | None) -> ctypes.CDLL:
     library = cache_folder() / f"{_key(source)}.so"
     if sealed_bytes(library) is not None:
         with suppress(OSError):  # another run has just removed it
             return ctypes.CDLL(str(library))
     if _with_room(library.parent, Path(tempfile.gettempdir())) != library.parent:
         library = Path(folder_of_process().name) / library.name
+    began = time.monotonic()
     with atomic_path(library) as temporary:
         compile_c(source, temporary, FLAGS)
         seal(temporary, 0o700)
+    if told is not None:
+        told(f"in {duration(time.monotonic() - began)}, kept for the next time in {library.parent}")
     try:
         loaded = ctypes.CDLL(str(library))
     except OSError as error:

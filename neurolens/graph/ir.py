@@ -308,12 +308,7 @@ class Graph:
         return self.each("select", truth, then, other)
 
     def first_failure(self, tests: Sequence[tuple[Value, Value]], codes: Sequence[int]) -> Value:
-        """The status of a ray: the code of the first test for which value <= limit is false, as it is for NaN; else 0.
-
-        Codes fall in the order in which rays meet the tests, but for several at one surface (`base.status`). ONNX
-        gives NaN another number that is not 0, and clips value - limit between 0 and the code, so tests must be scaled
-        so that a failure exceeds every code.
-        """
+        """The code of the first test for which value <= limit is false, as it is for NaN; 0 where all are true."""
         flat = [v for pair in tests for v in pair]
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 

@@ -421,19 +421,10 @@ def _between(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 
 def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """Camera rays meet the last surface first: the first failure has the largest code, at one surface the smallest."""
-    failed: dict[int, str] = {}  # by surface
-    tests = zip(node.inputs[::2], node.inputs[1::2], node.static, strict=True)
-    for value, limit, status in sorted(tests, key=lambda t: t[2]):
-        zero = _is_constant(w, limit, 0.0)
-        test = w.name(value) if zero else w.op("Sub", w.name(value), w.name(limit))
-        code = w.op("Clip", test, w.const(0.0), w.const(float(status)))
-        surface = status // 4
-        if surface in failed:
-            earlier = failed[surface]
-            code = w.op("Where", w.op("Greater", earlier, w.const(0.0)), earlier, code)
-        failed[surface] = code
-    return w.op("Max", *failed.values())
+    status, tests = w.const(0.0), zip(node.inputs[::2], node.inputs[1::2], node.static, strict=True)
+    for value, limit, code in reversed([*tests]):  # NaN fails
+        status = w.op("Where", w.op("LessOrEqual", w.name(value), w.name(limit)), status, w.const(float(code)))
+    return status
 
 
 def _lookup(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:

@@ -16,6 +16,7 @@ from neurolens.base.units import in_unit
 FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
 Dispersion = Literal["full", "lateral", "off"]
+Runtime = Literal["c", "onnxruntime"]
 FILMS = {"super35": "24.89x18.66", "fullframe": "36x24", "apsc": "23.6x15.7", "mft": "17.3x13", "super16": "12.52x7.41"}
 
 
@@ -44,9 +45,11 @@ class Shot:
             opens the stop of a lens file as far as the rims let light through.
         vignetting: the part that is kept; see `neurolens.cameras.reduced`.
         dispersion: the part that is kept; see `neurolens.cameras.reduced`.
+        runtime: what runs the camera of a lens or a model; None takes C where the machine has a compiler that takes it,
+            else onnxruntime.
 
     Raises:
-        InputError: a film, focus, f-number, focus mode, vignetting or dispersion that no camera has.
+        InputError: a film, focus, f-number, focus mode, vignetting, dispersion or runtime that no camera has.
     """
 
     film_mm: tuple[float, float]
@@ -93,13 +96,17 @@ class Shot:
         "full", "parts that are kept: full; lateral, the picture's shift with the wavelength, for less noise; off "
         "(default: full)",
     )  # fmt: skip
+    runtime: Runtime | None = setting(
+        None, "what runs a lens or model, to compare: the same rays (default: c where the machine has a C compiler)"
+    )
 
     def __post_init__(self) -> None:
         check_bounds(self, "camera")
-        for field, kind in (("focus_mode", FocusMode), ("vignetting", Vignetting), ("dispersion", Dispersion)):
-            choices = get_args(kind)
-            if getattr(self, field) not in choices:
-                raise InputError("camera", field, getattr(self, field), f"one of: {', '.join(choices)}")
+        kinds = {"focus_mode": FocusMode, "vignetting": Vignetting, "dispersion": Dispersion, "runtime": Runtime}
+        for field, kind in kinds.items():
+            value, choices = getattr(self, field), get_args(kind)
+            if value not in choices and not (field == "runtime" and value is None):
+                raise InputError("camera", field, value, f"one of: {', '.join(choices)}")
         object.__setattr__(self, "film_mm", check_film(self.film_mm))
         object.__setattr__(self, "focus_m", float(self.focus_m))
 

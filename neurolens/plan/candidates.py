@@ -218,7 +218,7 @@ def camera_of(probed: Probe, choice: Choice) -> Camera:
         flat = as_c(ideal_as(kind, probed.exact.lens, probed.asked.shot))
         mapped = choice.name.endswith(_MAPPED)
         return Warped(flat, probed.exact, probed.asked.shot.focus_m, tables=probed.exact_field) if mapped else flat
-    model = OnnxCamera(load_model(path), probed.asked.shot, runtime="c" if kind else "onnxruntime")
+    model = OnnxCamera(load_model(path), probed.asked.shot)
     return with_dispersion(model, probed.asked.shot)
 
 
@@ -257,8 +257,7 @@ def _exact(trial: Trial) -> Iterator[_Judged]:
     }.get(target, lambda: trial.timed(shown, seen))
     if target in ("render", "osl", "glsl") or (target == "c" and compiled):
         with suppress(InputError):  # a shader that is too large
-            spec = f"{'fused:' if compiled and target in OURS else ''}{path}"
-            yield trial.judged(EXACT, spec, seen, cost, disperses=shown.dispersive)
+            yield trial.judged(EXACT, str(path), seen, cost, disperses=shown.dispersive)
 
 
 def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = ()) -> Iterator[_Judged]:
@@ -278,7 +277,7 @@ def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = (
         if form in without or not (compiled or target != "c"):
             return
         shot = trial.probed.asked.shot
-        whole = OnnxCamera(model, shot, outline=trial.probed.exact.film.outline)
+        whole = OnnxCamera(model, replace(shot, runtime="onnxruntime"), outline=trial.probed.exact.film.outline)
         camera = with_dispersion(whole, shot)
         seen = prints.footprints(camera, trial.probed.places)
         beside = prints.light_beside(camera, trial.probed.places) / np.maximum(trial.probed.seen.light, 1e-30)
@@ -290,9 +289,8 @@ def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = (
                 return trial.counted(glsl_operations(whole), seen)
             return trial.timed(with_dispersion(whole.compiled(), shot) if compiled else camera, seen)
 
-        spec = f"{'fused:' if compiled else ''}{file}"
         size = _operations(model)
-        yield trial.judged(file.stem, spec, seen, cost, how, form, size, beside, camera.dispersive)
+        yield trial.judged(file.stem, str(file), seen, cost, how, form, size, beside, camera.dispersive)
 
 
 def _operations(model: OnnxLens) -> int:

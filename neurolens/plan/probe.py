@@ -424,10 +424,7 @@ def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Eff
 
 
 def exact_camera(lens: Lens, shot: Shot, bounds: PupilBounds) -> ExactCamera:
-    """The exact camera, compiled as C where the machine has a compiler."""
-    with suppress(InputError):
-        if has_compiler():
-            return ExactCamera(lens, shot, bounds=bounds, runtime="c")
+    """The exact camera."""
     return ExactCamera(lens, shot, bounds=bounds)
 
 

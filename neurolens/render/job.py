@@ -399,7 +399,7 @@ def mode_for(
         return "hero"
     asked = film.wavelengths == "hero"
     placed = film.fill_factor == 1 and getattr(camera, "companion_reach_mm", None) is not None
-    if placed and has_compiler() and (asked or not getattr(camera, "costly", False)):
+    if placed and has_compiler():
         return "companions"
     if asked:
         why = f"camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"

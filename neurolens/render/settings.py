@@ -24,8 +24,7 @@ class FilmSettings:
         colour_space: of the EXR, linear: "sRGB" (Rec. 709 primaries, D65) or "ACEScg" (AP1, the white of ACES).
         white_balance: illuminant that becomes neutral, named as those of lights are; None leaves D65 neutral.
         wavelengths: of a path: "one"; "hero", four that share the path (Wilkie et al. 2014), each with its own film
-            point where the camera disperses, which takes a C compiler; "auto", hero where the camera can at little
-            cost, else one.
+            point where the camera disperses, which takes a C compiler; "auto", hero where the camera can, else one.
         wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
         fill_factor: share of a pixel that takes light, a square in its middle: the filter of a pixel is a box.
     """
@@ -35,7 +34,7 @@ class FilmSettings:
         None, "light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene", metavar="LIGHT"
     )
     wavelengths: WavelengthMode = setting(
-        "auto", "of a path: one; hero, four that share it; auto, hero where the camera can at little cost",
+        "auto", "of a path: one; hero, four that share it; auto, hero where the camera can",
         option="wavelength-mode", old=("wavelengths",),
     )  # fmt: skip
     wavelength_sampling: WavelengthSampling = setting(

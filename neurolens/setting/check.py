@@ -23,6 +23,7 @@ from neurolens.setting.pupils import on_plane, pupil_plane_z_mm
 from neurolens.setting.rims import end_mm
 from neurolens.setting.states import in_state
 from neurolens.trace.aiming import aim_at_stop
+from neurolens.trace.arrays import follow
 from neurolens.trace.rays import trace
 from neurolens.trace.shapes import sag_mm
 from neurolens.trace.surfaces import Rays
@@ -233,8 +234,7 @@ def axial_blur_mm(lens: Lens) -> float:
 
     Both coordinates count, for an anamorphic lens may have two foci; inf where no ray passes.
     """
-    with torch.no_grad():
-        out = trace(lens, axial_rays(lens, -math.inf), towards="film")
+    out = follow(lens, axial_rays(lens, -math.inf), lens.reference_nm, "film")
     r = Rays(*(c[out.status == st.PASSED] for c in out.rays))
     if not len(r.x):
         return math.inf

@@ -12,15 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens, Surface
-from neurolens.trace.rays import trace
+from neurolens.trace.arrays import follow
 from neurolens.trace.surfaces import Rays
+
+Array = NDArray[np.float64]
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
@@ -216,15 +216,15 @@ def _least_spot_mm(
     one = (lens.reference_nm, lens.reference_nm)
     wavelengths, weights = paraxial.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
     along, across, at_stop = _moments(lens, object_z_mm, wavelengths)
-    share = torch.from_numpy(weights)[:, None, None].expand_as(along)[None]
+    share = weights[None, :, None, None]
     if stops_mm is not None:  # rays at the edge count in part
-        square = torch.tensor(stops_mm, dtype=torch.float64)[:, None, None, None] ** 2
+        square = np.array(stops_mm)[:, None, None, None] ** 2
         ring = (_WIDER * lens.stop_radius_mm) ** 2 / along.shape[1]
-        share = share * ((square - at_stop**2) / ring + 0.5).clamp(0, 1)
+        share = share * ((square - at_stop**2) / ring + 0.5).clip(0, 1)
     along, across = ((share * m).sum((1, 2, 3)) for m in (along, across))
-    if not bool((across > 0).all()):
+    if not (across > 0).all():
         raise InputError(lens.path, "focus_mode", "best", "a lens that axial light passes and bends")
-    return np.asarray((-along / across).numpy())
+    return np.asarray(-along / across)
 
 
 def best_focus_of_stops_mm(
@@ -319,27 +319,27 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     data = paraxial.first_order(lens)
     round_ = not lens.anamorphic and lens.aperture is None
     rings, spokes = (_RINGS, 1) if round_ else (_RINGS_OF_SPOKES, _SPOKES)
-    ring = torch.sqrt((torch.arange(rings, dtype=torch.float64) + 0.5) / rings)
-    spoke = 2 * math.pi * (torch.arange(spokes, dtype=torch.float64) + 0.5) / spokes
+    ring = np.sqrt((np.arange(rings) + 0.5) / rings)
+    spoke = 2 * math.pi * (np.arange(spokes) + 0.5) / spokes
     widest = max(data.entrance_pupil_diameter_mm, paraxial.first_order(lens, meridian="x").entrance_pupil_diameter_mm)
     radius = _WIDER / 2 * widest * ring[:, None]
-    x, y = (radius * torch.cos(spoke)).reshape(-1), (radius * torch.sin(spoke)).reshape(-1)
+    x, y = (radius * np.cos(spoke)).reshape(-1), (radius * np.sin(spoke)).reshape(-1)
     # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
     front_mm = lens.surfaces[0].diameter_mm
     start = -max(10.0, front_mm if math.isfinite(front_mm) else 10.0)
     if math.isinf(object_z_mm):
-        zero = torch.zeros_like(x)
+        zero = np.zeros_like(x)
         return Rays(x, y, zero + start, zero, zero, zero + 1)
     depth = data.entrance_pupil_z_mm - object_z_mm
-    length = torch.sqrt(x * x + y * y + depth * depth) * math.copysign(1.0, depth)
+    length = np.sqrt(x * x + y * y + depth * depth) * math.copysign(1.0, depth)
     dx, dy, dz = x / length, y / length, depth / length
     t = (start - object_z_mm) / dz
     if object_z_mm > start:
-        t = torch.zeros_like(t)
+        t = np.zeros_like(t)
     return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
 
 
-def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64]) -> tuple[Tensor, Tensor, Tensor]:
+def _moments(lens: Lens, object_z_mm: float, wavelength_nm: Array) -> tuple[Array, Array, Array]:
     """x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes], 0 of one that is blocked; and how far from
     the axis it meets the stop.
 
@@ -348,13 +348,15 @@ def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64])
     """
     rays = axial_rays(lens, object_z_mm)
     count, colours = len(rays.x), len(wavelength_nm)
-    with torch.no_grad():
-        many = Rays(*(c.repeat(colours) for c in rays))
-        waves, stop = torch.from_numpy(wavelength_nm).repeat_interleave(count), lens.stop_index
-        out = trace(lens, many, waves, towards="film", record=[stop])
+    out = follow(lens, Rays(*(np.tile(c, colours) for c in rays)), np.repeat(wavelength_nm, count), "film")
     r, passed = out.rays, out.status == 0
-    tx, ty = r.dx / r.dz, r.dy / r.dz
-    along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
     shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
-    at_stop = torch.hypot(out.crossings[stop].x, out.crossings[stop].y)
-    return along.where(passed, 0.0).reshape(shape), across.where(passed, 0.0).reshape(shape), at_stop.reshape(shape)
+    with np.errstate(all="ignore"):  # of lost rays
+        tx, ty = r.dx / r.dz, r.dy / r.dz
+        along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
+        at_stop = np.nan_to_num(np.hypot(*out.at_stop))
+    return (
+        np.where(passed, along, 0.0).reshape(shape),
+        np.where(passed, across, 0.0).reshape(shape),
+        at_stop.reshape(shape),
+    )

@@ -6,25 +6,27 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import PupilBounds, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.setting.rims import end_mm
-from neurolens.trace.rays import passing, trace
+from neurolens.trace.arrays import follow, passing
 from neurolens.trace.shapes import sag_mm
 from neurolens.trace.surfaces import Rays
 
+Array = NDArray[np.float64]
+
 # Azimuths at which lenses with cylinders are searched, 5 degrees apart: at 15, one of them lost 7% of its corners.
-# Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a. In groups,
-# the first of which find most of what passes.
+# Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a.
 _STEP_DEG = 5
 AZIMUTHS = tuple(math.radians(_STEP_DEG * k) for k in range(-18, 19))
-_GROUPS = (AZIMUTHS[18:19], AZIMUTHS[::9], tuple(a for k, a in enumerate(AZIMUTHS) if k % 9))
+# In groups, the first of which find most of what passes.
+GROUPS = (AZIMUTHS[18:19], AZIMUTHS[::9], tuple(a for k, a in enumerate(AZIMUTHS) if k % 9))
 # Azimuths of a film are those at radii this share smaller too: outlines are interpolated between radii.
 _BETWEEN_RADII = 0.03
 
@@ -43,74 +45,67 @@ def pupil_plane_z_mm(lens: Lens) -> float:
     return float(z) if useful else rear_opening_mm(lens, film)[1]
 
 
-def camera_rays(
-    film_x: Tensor, film_y: Tensor, film_z: Tensor | float, pupil_x: Tensor, pupil_y: Tensor, pupil_z: float
-) -> Rays:
-    """Camera rays from film points towards (or away from) pupil points, all [N] in mm, lens frame; dz is negative."""
-    x, y = pupil_x - film_x, pupil_y - film_y
-    z = torch.as_tensor(pupil_z, dtype=film_x.dtype, device=film_x.device) - film_z
-    scale = -torch.sign(z) / torch.sqrt(x * x + y * y + z * z)
-    start_z = torch.as_tensor(film_z, dtype=film_x.dtype, device=film_x.device).expand_as(film_x)
-    return Rays(film_x, film_y, start_z, x * scale, y * scale, (z * scale).expand_as(film_x))
+def camera_rays(film_x: Any, film_y: Any, film_z: Any, pupil_x: Any, pupil_y: Any, pupil_z: float) -> Rays:
+    """Camera rays from film points towards (or away from) pupil points, all [N] in mm, lens frame; dz is negative.
+
+    Arrays or tensors; the planes may be numbers.
+    """
+    x, y, z = pupil_x - film_x, pupil_y - film_y, 0 * film_x + (pupil_z - film_z)
+    scale = -1 / (x * x + y * y + z * z) ** 0.5
+    scale = scale * (z / abs(z))
+    return Rays(film_x, film_y, film_z + 0 * film_x, x * scale, y * scale, z * scale)
 
 
 def on_plane(rays: Rays, z_mm: float) -> Rays:
     """Rays moved along themselves to the plane at z."""
     t = (z_mm - rays.z) / rays.dz
-    return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=torch.full_like(rays.z, z_mm))
+    return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=z_mm + 0 * rays.z)
 
 
 def passes_at_any_azimuth(
     lens: Lens,
-    film_radius: Tensor,
-    film_z: Tensor | float,
-    pupil_x: Tensor,
-    pupil_y: Tensor,
+    film_radius: Array,
+    film_z: Array,
+    pupil_x: Array,
+    pupil_y: Array,
     pupil_z: float,
     wavelength_nm: float,
     film_mm: tuple[float, float] | None = None,
-) -> Tensor:
+) -> NDArray[np.bool_]:
     """Test whether light passes from film points on +x through pupil points at any azimuth of the whole, bool [N].
 
     Blades and masks are left out: the round opening about them holds what they let through at every azimuth. Only
     lenses with cylinders are traced at more than one azimuth, `AZIMUTHS`.
 
     Args:
-        film_radius, pupil_x, pupil_y: [N] mm. film_z, pupil_z: planes, mm, lens frame.
+        film_radius, film_z, pupil_x, pupil_y: [N] mm. pupil_z: plane, mm, lens frame.
         film_mm: width and height of a film; of the azimuths, those at which it has points that far from its middle.
     """
     lens = replace(lens, aperture=None)
-    passed = torch.zeros_like(film_radius, dtype=torch.bool)
-    round_ = not lens.anamorphic
-    low, high = (None, None) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
-    planes = torch.as_tensor(film_z, dtype=film_radius.dtype).expand_as(film_radius)
-    for group in ((0.0,),) if round_ else _GROUPS:
-        # In one trace: few rays take nearly as long as many.
-        azimuth = torch.tensor(group, dtype=film_radius.dtype)[:, None]
-        todo = (~passed).expand(len(group), -1)
-        if low is not None and high is not None:
-            todo = todo & (low <= azimuth.abs()) & (high >= azimuth.abs())
-        which, left = torch.nonzero(todo, as_tuple=True)
-        if not len(left):
-            continue
+    passed, round_ = np.zeros(len(film_radius), bool), not lens.anamorphic
+    low, high = (-math.inf, math.inf) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
+    for group in ((0.0,),) if round_ else GROUPS:
+        # Together: few rays take nearly as long as many.
+        azimuth = np.array(group)[:, None]
+        which, left = np.nonzero(~passed & (low <= abs(azimuth)) & (abs(azimuth) <= high))
         r, u, v = film_radius[left], pupil_x[left], pupil_y[left]
-        c, s = torch.cos(azimuth[which, 0]), torch.sin(azimuth[which, 0])
-        rays = camera_rays(c * r, s * r, planes[left], c * u - s * v, s * u + c * v, pupil_z)
+        c, s = np.cos(azimuth[which, 0]), np.sin(azimuth[which, 0])
+        rays = camera_rays(c * r, s * r, film_z[left], c * u - s * v, s * u + c * v, pupil_z)
         passed[left[passing(lens, rays, wavelength_nm)]] = True
     return passed
 
 
-def azimuths_on_film(film_radius: Tensor, film_mm: tuple[float, float]) -> tuple[Tensor, Tensor]:
+def azimuths_on_film(film_radius: Array, film_mm: tuple[float, float]) -> tuple[Array, Array]:
     """Least and largest azimuth in the first quadrant, rad [N], at which a centred film has points that far out.
 
     With half a step of `AZIMUTHS` beyond either; beyond the corner, those about the corner's.
     """
     width, height = film_mm
-    radius = (film_radius * (1 - _BETWEEN_RADII)).clamp_min(1e-12)
-    low, high = torch.acos((width / 2 / radius).clamp_max(1)), torch.asin((height / 2 / radius).clamp_max(1))
+    radius = np.maximum(film_radius * (1 - _BETWEEN_RADII), 1e-12)
+    low, high = np.arccos(np.minimum(width / 2 / radius, 1)), np.arcsin(np.minimum(height / 2 / radius, 1))
     corner = math.atan2(height, width)
     beyond = 1.001 * math.radians(_STEP_DEG) / 2
-    return low.clamp_max(corner) - beyond, high.clamp_min(corner) + beyond
+    return np.minimum(low, corner) - beyond, np.maximum(high, corner) + beyond
 
 
 _STRIDE = 4  # of the points of a grid that are traced first; then only those that may widen what they found
@@ -166,22 +161,20 @@ def search(
     """
     if not places:
         return []
-    low, high, half = (
-        torch.tensor([getattr(b, k) for b in boxes], dtype=torch.float64) for k in ("low", "high", "half")
-    )
-    u = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, points, dtype=torch.float64)
-    v = half[:, None] * torch.linspace(0, 1, points // 2, dtype=torch.float64)
-    radius, film_z = (torch.tensor(c, dtype=torch.float64) for c in zip(*places, strict=True))
-    pu, pv = u[:, :, None].expand(-1, -1, v.shape[1]), v[:, None, :].expand(-1, u.shape[1], -1)
-    passed = torch.zeros(pu.shape, dtype=torch.bool)
+    low, high, half = (np.array([getattr(b, k) for b in boxes], np.float64) for k in ("low", "high", "half"))
+    u = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
+    v = half[:, None] * np.linspace(0, 1, points // 2)
+    radius, film_z = np.array(places, np.float64).T
+    pu, pv = np.broadcast_arrays(u[:, :, None], v[:, None, :])
+    passed = np.zeros(pu.shape, bool)
 
-    def look(at: Tensor) -> None:
+    def look(at: NDArray[np.bool_]) -> None:
         for w in wavelengths:
-            job, i, j = torch.nonzero(at & ~passed, as_tuple=True)
+            job, i, j = np.nonzero(at & ~passed)
             x, y = u[job, i], v[job, j]
             passed[job, i, j] = passes_at_any_azimuth(lens, radius[job], film_z[job], x, y, pupil_z, w, film_mm)
 
-    first = torch.zeros_like(passed)
+    first = np.zeros_like(passed)
     first[:, ::_STRIDE, ::_STRIDE] = True
     look(first)
     du, dv = u[:, 1] - u[:, 0], v[:, 1] - v[:, 0]
@@ -193,24 +186,24 @@ def search(
     ]
 
 
-def _extent(passed: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _extent(passed: NDArray[np.bool_], u: Array, v: Array) -> tuple[Array, Array, Array, Array]:
     """Return the least and largest u, largest v and largest distance from the axis of the passing points, each [M]."""
-    nothing = torch.tensor(-math.inf, dtype=u.dtype)
-    largest = [torch.where(passed, c, nothing).amax((1, 2)) for c in (-u, u, v, torch.hypot(u, v))]
+    largest = [np.where(passed, c, -math.inf).max((1, 2)) for c in (-u, u, v, np.hypot(u, v))]
     return -largest[0], largest[1], largest[2], largest[3]
 
 
-def _may_widen(passed: Tensor, u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> Tensor:
+def _may_widen(passed: NDArray[np.bool_], u: Array, v: Array, du: Array, dv: Array) -> NDArray[np.bool_]:
     """Points that may lie beyond the extent found, by less than a step, along, across or from the axis; or more."""
     least, most, across, reach = (t[:, None, None] for t in _extent(passed, u, v))
     du, dv = du[:, None, None], dv[:, None, None]
-    distance = torch.hypot(u, v)
-    within = (u > least - du) & (u < most + du) & (v < across + dv) & (distance < reach + torch.hypot(du, dv))
+    distance = np.hypot(u, v)
+    within = (u > least - du) & (u < most + du) & (v < across + dv) & (distance < reach + np.hypot(du, dv))
     beyond = (u < least) | (u > most) | (v > across) | (distance > reach)
     count = passed.sum((1, 2))[:, None, None]
     # With few found, all points within two steps are tried; with none, the whole grid.
     near = (u > least - 2 * du) & (u < most + 2 * du) & (v < across + 2 * dv)
-    return (within & beyond) | ((count < FEW) & near) | (count == 0)
+    found: NDArray[np.bool_] = (within & beyond) | ((count < FEW) & near) | (count == 0)
+    return found
 
 
 # Where rays are looked for again: within so many paraxial exit pupils of the axis, where the box of the rear rim is so
@@ -267,7 +260,7 @@ def pupil_bounds(
     for (i, _, _), box in zip(jobs, found, strict=True):
         by_row[i] += [box] if box else []
     boxes = [union(row) if row else None for row in by_row]
-    if not any(boxes):
+    if not any(boxes) or not lens.stop_radius_mm > 0:  # the very middle of a shut stop is no light
         expected = f"rays from a film of radius {film_radius_mm:.4g} mm"
         raise InputError(lens.path, "surfaces", "(no ray passes the lens)", expected)
     merged = [union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
@@ -338,20 +331,20 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
     f = first_order(lens).front_efl_mm  # of angles in the medium in front
     if lens.half_field_deg is not None and lens.half_field_deg < 60:
         return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
-    radii = torch.linspace(0, 3 * abs(f), 481, dtype=torch.float64)
+    radii = np.linspace(0, 3 * abs(f), 481)
     points = 48
     if not _illumination(lens, radii[:1])[0] > 0:  # a nearly closed stop lies between the points of the grid
         radii, points = radii[:: len(radii) // 60], 384
     on_axis = _illumination(lens, radii[:1], points)[0]
     if not on_axis > 0:
         raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
-    coarse = torch.arange(0, len(radii), _COARSE)
+    coarse = np.arange(0, len(radii), _COARSE)
     known = _illumination(lens, radii[coarse], points)
 
-    def last(holds: Callable[[Tensor, Tensor], Tensor]) -> float:
+    def last(holds: Callable[[Array, Array], NDArray[np.bool_]]) -> float:
         """The last radius at which a statement about illumination and angle holds: coarse steps, then those between."""
         from_ = int(coarse[holds(*known)].max())
-        closer = torch.arange(from_, min(from_ + _COARSE, len(radii)))
+        closer = np.arange(from_, min(from_ + _COARSE, len(radii)))
         return float(radii[closer[holds(*_illumination(lens, radii[closer], points))]].max())
 
     lit = last(lambda share, _: share >= 0.1 * on_axis)
@@ -363,19 +356,19 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
     return lit, "relative illumination of 10%"
 
 
-def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, Tensor]:
+def _illumination(lens: Lens, radii: Array, points: int = 48) -> tuple[Array, Array]:
     """Return the relative film irradiance (any unit) and mean angle (rad) of the passing rays at each film radius."""
     film_z = lens.film_z_mm if lens.film_z_mm is not None else float(lens.vertices_mm[-1])
     rear, rear_z = rear_opening_mm(lens, film_z)
-    grid = torch.linspace(-rear, rear, points, dtype=torch.float64)
+    grid = np.linspace(-rear, rear, points)
     # The half above the axis stands for both.
-    film, px, py = (t.reshape(-1) for t in torch.meshgrid(radii, grid, grid[points // 2 :], indexing="ij"))
-    rays = camera_rays(film, torch.zeros_like(film), film_z, px, py, rear_z)
-    traced = trace(lens, rays)
-    passed = ((traced.status == 0) & (px * px + py * py <= rear * rear)).reshape(len(radii), -1)
-    weight = passed * (rays.dz**4).reshape(passed.shape)
-    theta = torch.atan2(torch.hypot(traced.rays.dx, traced.rays.dy), -traced.rays.dz).reshape(passed.shape)
-    return weight.sum(1), (theta * weight).sum(1) / weight.sum(1).clamp_min(1e-30)
+    film, px, py = (t.reshape(-1) for t in np.meshgrid(radii, grid, grid[points // 2 :], indexing="ij"))
+    rays = camera_rays(film, 0 * film, film_z, px, py, rear_z)
+    found = follow(lens, rays, lens.reference_nm)
+    passed = (found.status == 0) & (px * px + py * py <= rear * rear)
+    weight = np.where(passed, rays.dz**4, 0.0).reshape(len(radii), -1)
+    theta = np.where(passed, np.arctan2(np.hypot(found.rays.dx, found.rays.dy), -found.rays.dz), 0.0)
+    return weight.sum(1), (theta.reshape(weight.shape) * weight).sum(1) / np.maximum(weight.sum(1), 1e-30)
 
 
 def rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
@@ -33,8 +32,6 @@ from neurolens.setting.focusing import (
 )
 from neurolens.setting.pupils import image_radius_mm, on_plane
 from neurolens.setting.rims import check_clearance
-from neurolens.trace.aiming import aim_at_stop
-from neurolens.trace.rays import trace
 
 
 def set_lens(
@@ -191,6 +188,11 @@ def _check(
 
 def _factor_for_field(lens: Lens, field_deg: float) -> float:
     """Scale at which the chief ray of half the field meets the edge of the image circle, at infinity focus."""
+    import torch  # chief rays are aimed by it; nothing else here takes it
+
+    from neurolens.trace.aiming import aim_at_stop
+    from neurolens.trace.rays import trace
+
     lens = at_infinity(lens)
     lens = replace(lens, film_z_mm=paraxial.film_z_mm(lens, math.inf), aperture=None)
     radius, _ = image_radius_mm(lens)

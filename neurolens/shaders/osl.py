@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.progress import Report
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
-from neurolens.cameras.lenscamera import squeeze_of, stratified
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.cameras.pupil_outline import PupilTable
+from neurolens.cameras.sampling import stratified
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import low_orders, low_tests, with_film_derivatives
@@ -385,7 +385,7 @@ def shader_lens(model: OnnxLens) -> ShaderLens:
     short, long = visible if visible[0] < visible[1] else all_nm
     stop = float(d["stop_radius_mm"])
     height = _BESIDE * float(d["film_radius_mm"])
-    squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
+    squeeze = ModelScene(model, float(low), stop).squeeze(height, (short, long))
     return ShaderLens(
         graph=model.graph(),
         table=PupilTable.of(d["bounds"]),

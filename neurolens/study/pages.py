@@ -118,14 +118,14 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
         if best is None or not (best is exact or best.get("file")):
             continue
         if exact is not None and best is exact:
-            name, file, fused = "the exact lens", str(lens) if whole else "", " C" in exact["name"]
+            name, file = "the exact lens", str(lens) if whole else ""
             why = _why_exact(exact, to_use(models, within), within, rest)
         else:
-            name, file, fused = str(best["name"]), str(folder / best["file"]), bool(best.get("fused_ns_per_ray"))
+            name, file = str(best["name"]), str(folder / best["file"])
             why = _why_model(best, exact, within)
         if rest:
-            scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"  # as C if it can
-            words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]
+            scene = Path("experiments/scenes/room.toml")
+            words = [str(scene if scene.is_file() else library() / scene), "--camera", file, "-o", "room.exr"]
             command = f"{program()} render {shlex.join(words)}"
         else:  # one model of many states is no function of a ray alone
             command = "" if best.get("states") else f"{program()} export {shlex.quote(file)} --to c -o lens.h"
@@ -280,7 +280,7 @@ _MODEL_COLUMNS = (
     Column("p99 (µm)", "p99_um", about="99% of those rays are closer than this"),
     Column("pixels RMS", "rms_px", digits=2, about="the RMS error in pixels of a picture 4000 wide"),
     Column("C (ns/ray)", "fused_ns_per_ray.min", about="nanoseconds a ray on one core as compiled C: "
-           "--camera fused:MODEL, or neurolens export --to c"),
+           "in our renderer, or by neurolens export --to c"),
     Column("onnxruntime (ns/ray)", "ns_per_ray.min", about="the same as an ONNX graph, as most programs run models"),
     Column("C: × exact", "fused_speedup", about="how many times faster than the exact lens as C, in the same race"),
     Column("false pass (%)", "false_pass", 100, 2, "rays that the model passes and the lens does not"),

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -241,10 +241,12 @@ def scene_cameras(
     """
     widest = first_order(lens).f_number
     # The same light for all cameras.
-    real = Shot(shot.film_mm, shot.focus_m, max(shot.f_number or widest, widest), wavelength_nm=shot.wavelength_nm)
-    exact = ExactCamera(lens, real, bounds=domain.bounds, runtime="c" if fused else "trace")
-    runtime: Literal["c", "onnxruntime"] = "c" if fused else "onnxruntime"
-    fitted = {name: OnnxCamera(load_model(file), real, runtime=runtime) for name, file in models.items()}
+    real = Shot(
+        shot.film_mm, shot.focus_m, max(shot.f_number or widest, widest), wavelength_nm=shot.wavelength_nm,
+        runtime=None if fused else "onnxruntime",
+    )  # fmt: skip
+    exact = ExactCamera(lens, real, bounds=domain.bounds)
+    fitted = {name: OnnxCamera(load_model(file), real) for name, file in models.items()}
     thin, pinhole = (ideal_as(kind, exact.lens, real) for kind in ("thin:", "pinhole:"))
     return {EXACT: exact, **fitted, "thin lens": thin, "pinhole": pinhole}
 

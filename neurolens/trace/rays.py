@@ -23,6 +23,7 @@ from neurolens.base.tasks import keep_memory
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.arithmetic import is_number, times
+from neurolens.trace.films import TensorPassage
 from neurolens.trace.shapes import centred, figure_of, is_deep, start_of
 from neurolens.trace.surfaces import (
     Hit,
@@ -37,7 +38,6 @@ from neurolens.trace.surfaces import (
     rim_tests,
 )
 from neurolens.trace.tensors import Survival, Tensors, at_most
-from neurolens.trace.transmission import Passage
 
 Towards = Literal["scene", "film"]
 
@@ -312,7 +312,7 @@ def _trace_chunk(
 ) -> Traced:
     sense, order = _path(lens, towards)
     tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], path or bool(record), freeze)
-    power = Passage(tracing.o, lens, tracing.wavelength_nm) if transmittance else None
+    power = TensorPassage(tracing.o, lens, tracing.wavelength_nm) if transmittance else None
     crossings: dict[int, Crossing] = {}
     passed: list[Rays] = []
     for k in order:
@@ -433,7 +433,7 @@ def follow(
     check_rays(lens, rays, wavelength_nm)
     _check(len(lens.surfaces), steps, towards)
     tracing = Tracing(lens, rays, wavelength_nm, 1 if towards == "film" else -1, steps[0][0], guard=True)
-    passage = Passage(tracing.o, lens, tracing.wavelength_nm, polarised)
+    passage = TensorPassage(tracing.o, lens, tracing.wavelength_nm, polarised)
     points = []
     for k, action in steps:
         sense, reflected = tracing.sense, action == "R"

@@ -1,6 +1,5 @@
 """What the cameras' tests share: cameras by name, samples of the unit square, mean film values."""
 
-from copy import copy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,17 +9,22 @@ import numpy as np
 import torch
 from film_light import FilmLight, film_light
 
+from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
+from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.reduced import Vignetted
 from neurolens.lens.shot import Shot
+from neurolens.setting.pupils import camera_rays as start
+from neurolens.trace.rays import trace
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
 GAUSS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
 FISHEYES = ("fisheye-equidistant", "fisheye-equisolid", "fisheye-stereographic", "fisheye-orthographic")
 # Every kind of camera.
-KINDS = ("pinhole", "thin", "thick", "exact", "exact64", "polynomial", "network", *FISHEYES)
+KINDS = ("pinhole", "thin", "thick", "exact", "polynomial", "network", *FISHEYES)
 _MODELS = {"polynomial": "ols-60", "network": "mlp-16x2"}
 
 
@@ -29,15 +33,27 @@ def camera(kind: str, focus_m: float = 2.0, f_number: float | None = 4.0) -> Any
     """A camera of a 50 mm lens (14 mm for a fisheye projection) on `FILM`."""
     if kind == "exact":
         return lens_models.exact_camera(focus_m, f_number)
-    if kind == "exact64":  # the same outline, not searched again
-        double = copy(camera("exact", focus_m, f_number))
-        double._dtype, double.film = torch.float64, copy(double.film)
-        double.film.scene = double._scene
-        return double
     if kind in _MODELS:
         model = load_model(ROOT / "models" / f"{GAUSS.stem}.{_MODELS[kind]}.onnx")
         return OnnxCamera(model, Shot(FILM, focus_m, f_number, wavelength_nm=(400.0, 700.0)))
     return make_camera(f"thick:{GAUSS}" if kind == "thick" else kind, Shot(FILM, focus_m, f_number))
+
+
+def traced(
+    camera: ExactCamera, film: np.ndarray, square: np.ndarray, nm: np.ndarray, dtype: torch.dtype = torch.float64
+) -> CameraRays:
+    """The rays of an exact camera by the tracer and the formula of the contract, round stops alone."""
+    (pupil, area), plane, z = camera.film.outline.sample(film, square, nm), camera.film.outline.pupil_z_mm, camera.film
+    x, y, u, v, waves = (torch.from_numpy(np.ascontiguousarray(a)).to(dtype) for a in (*film, *pupil, nm))
+    found = trace(camera.lens, start(x, y, z.film_z_mm, u, v, plane), waves, transmittance=True)
+    ray, through = (t.numpy() for t in (torch.stack(list(found.rays)), found.transmittance))  # type: ignore[arg-type]
+    low, high = camera.wavelength_nm or (0.0, np.inf)
+    known = (area > 0) & (low / st.DOMAIN_SLACK <= nm) & (nm <= high * st.DOMAIN_SLACK)
+    status = np.where(known, found.status.numpy(), st.OUTSIDE_DOMAIN)
+    cos2 = 1 / (1 + np.square((pupil - film) / z.distance_mm).sum(0))
+    weight = (status == st.PASSED) * through * area * np.square(cos2 / z.distance_mm) / z.exposure
+    origin = 1e-3 * (ray[:3] - np.array([[0.0], [0.0], [z.film_z_mm]]))
+    return CameraRays(origin, ray[3:], weight.astype(np.float32), status.astype(np.int32))
 
 
 @cache

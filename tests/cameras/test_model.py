@@ -312,7 +312,7 @@ def test_models_need_no_torch_and_write_nothing(path: Path, tmp_path: Path) -> N
         "from neurolens.cameras.model import OnnxCamera, load_model\n"
         "from neurolens.lens.shot import Shot\n"
         "from neurolens.lens.shot import Shot\n"
-        f"camera = OnnxCamera(load_model({str(path)!r}), Shot((36, 24), 2))\n"
+        f"camera = OnnxCamera(load_model({str(path)!r}), Shot((36, 24), 2, runtime='onnxruntime'))\n"
         "import numpy as np\n"
         "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"
         "assert (rays.status == 0).all() and (rays.direction[2] < -.9).all()\n"

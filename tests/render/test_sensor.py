@@ -46,7 +46,7 @@ def edge(y_m: float) -> dict[str, Any]:
 
 @cache
 def of_triplet(shot: Shot) -> ExactCamera:
-    return ExactCamera(read_lens(TRIPLET), shot, runtime="c")
+    return ExactCamera(read_lens(TRIPLET), replace(shot, runtime="c"))
 
 
 def contrast(picture: NDArray[Any], at: float, frequency: NDArray[Any]) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens.trace.transmission import Layers, power_amplitudes
+from neurolens.trace.films import Layers, power_amplitudes
 
 Vector = Sequence[Tensor]  # x, y, z, each [N], lens frame
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.lens import designs
 from neurolens.lens.glass import index_at
-from neurolens.trace.transmission import Layers, power_amplitudes, reflectance
+from neurolens.trace.films import Layers, power_amplitudes, reflectance
 
 LAM_NM = 550.0
 FROM_AIR, FROM_GLASS = (1.0, 1.52), (1.52, 1.0)

@@ -13,8 +13,8 @@ from neurolens.base import status as st
 from neurolens.lens import glass
 from neurolens.lens.designs import design
 from neurolens.lens.prescription import Lens, Surface
+from neurolens.trace.films import reflectance
 from neurolens.trace.rays import Rays, Towards, trace
-from neurolens.trace.transmission import reflectance
 
 FISHEYES = [name for name in SOME if "fisheye" in name]
 

@@ -67,7 +67,8 @@ def test_one_surface_between_two_media_images_as_in_closed_form(front: float, be
     assert film_z_mm(lens, (1000.0 + image) / 1000) == pytest.approx(image, rel=1e-12)
     focused = set_lens(lens, focus_m=1.0)
     assert focused.film_z_mm is not None
-    traced = trace(focused, axial_rays(focused.with_stop_radius(1e-3), focused.film_z_mm - 1000.0), towards="film")
+    start = axial_rays(focused.with_stop_radius(1e-3), focused.film_z_mm - 1000.0)
+    traced = trace(focused, Rays(*map(torch.from_numpy, start)), towards="film")
     r = traced.rays
     across = torch.hypot(r.x + (focused.film_z_mm - r.z) * r.dx / r.dz, r.y + (focused.film_z_mm - r.z) * r.dy / r.dz)
     assert float(across.max()) < 1e-9

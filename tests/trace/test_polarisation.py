@@ -13,7 +13,8 @@ from polarised_fields import Step, pass_surface, power, powers, transmittance, u
 from torch import Tensor
 
 from neurolens.trace import transmission
-from neurolens.trace.transmission import Layers, Light, coated_shares, crossed, fresnel, turned
+from neurolens.trace.films import Layers, coated_shares
+from neurolens.trace.transmission import Light, crossed, fresnel, turned
 
 ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared" / "data" / "oracle"

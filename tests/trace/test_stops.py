@@ -82,7 +82,7 @@ def test_plates_before_and_behind_a_pinhole_shorten_its_distances() -> None:
 def test_the_exact_camera_takes_a_pinhole(point: tuple[float, float]) -> None:
     """Its falloff is cos^4, and its rays leave from the hole, opposite to the film point."""
     hole = pinhole(30.0, 0.2, image_radius_mm=21.6)
-    camera = ExactCamera(hole, Shot((36.0, 24.0), math.inf), dtype="float64")
+    camera = ExactCamera(hole, Shot((36.0, 24.0), math.inf))
     rng = np.random.default_rng(0)
     film = np.repeat(np.array([point], np.float32).T, 20_000, axis=1)
     out = camera.sample(film, rng.random((2, 20_000), np.float32), np.full(20_000, 550, np.float32))
