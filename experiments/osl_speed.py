@@ -152,7 +152,7 @@ def one_colour(shader: str) -> str:
     Raises:
         Unmeasured: it has none.
     """
-    text = shader.replace("int dispersion = 1", "int dispersion = 0")
+    text = shader.replace("int dispersion = 2", "int dispersion = 0")
     if text == shader:
         raise lab.Unmeasured("the shader has no dispersion to switch off")
     return text

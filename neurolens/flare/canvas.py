@@ -40,6 +40,7 @@ _STEP, _STEPS = 0.125, 256  # movements are rounded to so many pixels, and to su
 _CORNERS = 64  # of an ellipse
 _THIN = 0.25  # least width of a patch in pixels
 _FINE = 12.0  # pixels that draw the width of a smear, at least
+_FADING = 0.15  # step of light, over the most light, between parts of a patch that fades over 16 or more: 0.1 at most
 
 
 def edges_of(rays: Floats, columns: int, size: tuple[int, int], per_mm: float) -> Doubles:
@@ -119,8 +120,10 @@ class Smear(NamedTuple):
     @property
     def coarse(self) -> int:
         """How many pixels wide those pixels may be that the smeared picture is drawn with."""
-        (a, b, c, d), parts = self.sides, max(map(len, self.weights), default=1)
-        cells = parts // FADE if parts > CELLS else parts  # the light may jump between cells, not between their parts
+        (a, b, c, d), weights = self.sides, np.array(self.weights or ((1.0,),))
+        parts, steps = max(weights.shape), (np.abs(np.diff(weights, axis=axis)).max(initial=0) for axis in (0, 1))
+        # The light may jump between cells, not between their parts; a patch of even light only fades.
+        cells = 1 if max(steps) < _FADING else parts // FADE if parts > CELLS else parts
         wide = abs(a * d - b * c) / max(math.hypot(a, b), math.hypot(c, d))
         return 1 << max(0, math.floor(math.log2(wide / cells / _FINE)))
 

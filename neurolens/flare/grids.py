@@ -57,6 +57,11 @@ class Grid:
         )
         return np.stack([np.tile(u, len(v)), np.repeat(v, len(u))])
 
+    def coarser(self, factor: int, least: int) -> Grid:
+        """The grid with a part of the cells of its sides and of its wavelengths, but with `least` cells a side."""
+        columns, rows = (min(n, max(n // factor, least)) for n in (self.columns, self.rows))
+        return replace(self, columns=columns, rows=rows, wavelengths=max(self.wavelengths // factor, 1))
+
     @property
     def cell(self) -> float:
         """Area of a cell over that of the disc."""

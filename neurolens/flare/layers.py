@@ -7,6 +7,7 @@ Each maker makes one picture, and by name others that are parts of it. A layer t
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
@@ -50,9 +51,10 @@ _EDGES = 176  # bytes of a cell's edges
 FEWEST = 4  # wavelengths that stand for all
 _PATCH_DEG = 2.0  # of an extended light: see `patches`
 _PATCHES, _CELLS = (4, 6, 9), 48  # along a side, at most; cells of a ghost along a side, which many patches keep
+_BEGUN, _SMEARED = 14_000, 0.45  # times to begin a group of ghosts, and to smear a pixel, in that of a cell
+_MUCH, _TRIALS = 2e7, 6  # work that takes seconds; groups whose time is measured before it
 _UNEVEN, _FAINT = 0.6, 5e-4  # share of its light that may come or go over a patch; share of all light, of a faint ghost
 Layers = dict[str, Floats]
-Done = Callable[[float], None]  # is called with the share of the work that is done
 REST = "rest"
 
 
@@ -127,43 +129,101 @@ class _Task(NamedTuple):
     wavelengths_nm: list[float]
     colours: Doubles
 
+    @property
+    def work(self) -> int:
+        """Cells that are drawn."""
+        return len(self.wavelengths_nm) * self.grid.columns * self.grid.rows
 
-def ghost_layers(job: FlareJob, layers: Sequence[int], done: Done = lambda share: None) -> Iterator[tuple[int, Floats]]:
+
+def _quietly(fraction: float, seconds_left: float | None = None) -> None:
+    """Report nothing."""
+
+
+def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) -> Iterator[tuple[int, Floats]]:
     """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
 
     Each ghost is drawn as the areas of a grid of rays (`flare.canvas`). Of the wavelengths, fewer stand for all where a
     ghost's colours part little.
 
     Args:
-        layers: for each pair of the tracer, the layer that takes it. done: is called with the share of the work.
+        layers: for each pair of the tracer, the layer that takes it. done: is called with the share of the work that is
+            done, and of long work with the seconds that are left, first by a trial.
     """
     tracer, raster, spectral = job.tracer, job.raster, job.spectral(job.finer)
     layer = dict(zip(tracer.pairs, layers, strict=True))
     unit, nm = raster.per_mm**2 / job.exposure / spectral.bins, spectral.centres_nm
-    groups: dict[tuple[int, Smear | None], list[_Task]] = {}
+    groups: dict[tuple[int, int, Smear | None], list[_Task]] = {}
     for light in job.lights:
         for patch, pair, grid, moves in _parts(job, tracer, light, nm.tolist()):
             response = np.asarray(unit * spectral.response * spectral.spectrum(patch.light.rgb), np.float64).T
+            smear = canvas.smear_of(patch, raster.per_mm * moves * (-1, 1))
+            coarse = 1 if smear is None else smear.coarse
+            grid = grid.coarser(coarse, _CELLS)
             task = _Task(patch.light, pair, grid, *_bands(nm, response, grid))
-            groups.setdefault((layer[pair], canvas.smear_of(patch, raster.per_mm * moves * (-1, 1))), []).append(task)
-    count, whole = 0, max(sum(map(len, groups.values())), 1)
-    for number in sorted({number for number, _ in groups}):
-        picture = np.zeros((raster.height, raster.width, 3), np.float32)
-        for smear, tasks in ((smear, tasks) for (of, smear), tasks in groups.items() if of == number):
-            coarse, drawing, kernel = 1, picture, None
-            if smear is not None:
-                coarse = smear.coarse
-                kernel = smear.kernel(max(raster.width, raster.height) // 2, coarse)
-                more = 3 * (coarse > 1) - 1
-                room = [n // coarse + k + more for n, k in zip(picture.shape[:2], kernel.shape, strict=True)]
-                drawing = np.zeros((*room, 3), np.float32)
-            for drawn in _draw(tracer, tasks, drawing, raster.per_mm / coarse, job.threads):
-                count += drawn
-                done(count / whole)
-            if kernel is not None:
-                light_of = canvas.smeared(drawing, kernel) / np.float32(coarse**2)
-                picture += canvas.enlarged(light_of, coarse, raster.height, raster.width)
-        yield number, picture
+            groups.setdefault((layer[pair], coarse, smear), []).append(task)
+    ordered = [_Group(*key, tasks) for key, tasks in groups.items()]
+    whole, expected = max(sum(group.work(raster) for group in ordered), 1.0), _expected_s(job, ordered)
+    done(0.0, expected)
+    began, worked = time.perf_counter(), 0.0
+    for number in sorted({group.layer for group in ordered}):
+        pictures: dict[int, Floats] = {}
+        for group in (group for group in ordered if group.layer == number):
+            picture = pictures.setdefault(group.coarse, np.zeros((*group.size(raster), 3), np.float32))
+            for work in _add(job, group, picture):
+                worked += work
+                left, taken = 1 - worked / whole, time.perf_counter() - began
+                done(1 - left, None if expected is None else left * (left * expected + taken))
+        drawn = (canvas.enlarged(picture, k, raster.height, raster.width) for k, picture in pictures.items())
+        yield number, sum(drawn, np.zeros((raster.height, raster.width, 3), np.float32))
+
+
+class _Group(NamedTuple):
+    """Ghosts of one layer that are smeared alike and drawn together, with pixels so many times as wide (`coarse`)."""
+
+    layer: int
+    coarse: int
+    smear: Smear | None
+    tasks: list[_Task]
+
+    def size(self, raster: Raster) -> tuple[int, int]:
+        """Rows and columns of its picture; one that is enlarged has a border."""
+        rows, columns = (n // self.coarse + 3 * (self.coarse > 1) for n in (raster.height, raster.width))
+        return rows, columns
+
+    def work(self, raster: Raster) -> float:
+        """About the time that it takes, in that of a cell at one wavelength."""
+        rows, columns = self.size(raster)
+        smeared = 0 if self.smear is None else _SMEARED * rows * columns
+        return _BEGUN + smeared + sum(task.work for task in self.tasks)
+
+
+def _add(job: FlareJob, group: _Group, picture: Floats) -> Iterator[float]:
+    """Add ghosts to a picture of the group's size, and yield the work that was done each time."""
+    raster, kernel, drawing = job.raster, None, picture
+    if group.smear is not None:
+        kernel = group.smear.kernel(max(raster.width, raster.height) // 2, group.coarse)
+        room = [n + k - 1 for n, k in zip(group.size(raster), kernel.shape, strict=True)]
+        drawing = np.zeros((*room, 3), np.float32)
+    yield from _draw(job.tracer, group.tasks, drawing, raster.per_mm / group.coarse, job.threads)
+    if kernel is not None:
+        picture += canvas.smeared(drawing, kernel) / np.float32(group.coarse**2)
+    yield group.work(raster) - sum(task.work for task in group.tasks)
+
+
+def _expected_s(job: FlareJob, groups: Sequence[_Group]) -> float | None:
+    """Seconds that ghosts will take, by a ghost each of a few groups, drawn for trial; None for little work.
+
+    They stand at equal steps of the work, so that large groups are tried more often.
+    """
+    steps = np.cumsum([group.work(job.raster) for group in groups])
+    if not groups or steps[-1] < _MUCH:
+        return None
+    pace = []
+    for at in np.unique(np.searchsorted(steps, steps[-1] * (np.arange(_TRIALS) + 0.5) / _TRIALS)):
+        began, group = time.perf_counter(), groups[at]._replace(tasks=groups[at].tasks[:1])
+        work = sum(_add(job, group, np.zeros((*group.size(job.raster), 3), np.float32)))
+        pace.append((time.perf_counter() - began) / work)
+    return float(steps[-1]) * float(np.mean(pace))
 
 
 def _parts(
@@ -193,8 +253,8 @@ def _parts(
         yield from (part for part in found if needs[part[1]] == most)
 
 
-def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: float, threads: int) -> Iterator[int]:
-    """Add ghosts to a picture of so many pixels per mm, and yield how many were added each time."""
+def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: float, threads: int) -> Iterator[float]:
+    """Add ghosts to a picture of so many pixels per mm, and yield the work that was done each time."""
     height, width, _ = picture.shape
     high = max(1, _STRIP // (32 * width))
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
@@ -215,14 +275,14 @@ def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: 
         )  # fmt: skip
         for _ in in_order(threads, strip, strips):
             pass
-        yield len(batch)
+        yield sum(task.work for task in batch)
 
 
 def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
     """Tasks in order, of one light and as many at a time as have room for their edges."""
     batch, used = list[_Task](), 0
     for task in tasks:
-        size = _EDGES * len(task.wavelengths_nm) * task.grid.columns * task.grid.rows
+        size = _EDGES * task.work
         if batch and (used + size > _ROOM or task.light is not batch[0].light):
             yield batch
             batch, used = [], 0
@@ -264,7 +324,7 @@ PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
 }
 
 
-def photon_picture(job: FlareJob, part: str, photons: int, done: Done = lambda share: None) -> Floats:
+def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quietly) -> Floats:
     """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
 
     Args:
@@ -442,7 +502,7 @@ def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
     return sum((layers[name] for name in MAKERS if name in layers), none)
 
 
-def brightest(frames: Sequence[FlareJob], done: Done = lambda share: None) -> tuple[str, ...]:
+def brightest(frames: Sequence[FlareJob], done: Report = _quietly) -> tuple[str, ...]:
     """Names of the ghosts whose own pictures, with their gains, have the greatest values on the film in any frame.
 
     These are at most `settings.brightest` names, the brightest first. A ghost without light on the film is never one.
@@ -454,7 +514,7 @@ def brightest(frames: Sequence[FlareJob], done: Done = lambda share: None) -> tu
     check_memory(raster.width, raster.height, 12 * (2 * min(count, max(map(len, every))) + 4))
     for number, (job, pairs) in enumerate(zip(frames, every, strict=True)):
         factors = _factors(job)
-        report = partial(lambda begun, share: done((begun + share) / len(frames)), number)
+        report = partial(lambda begun, share, _=None: done((begun + share) / len(frames)), number)
         for k, picture in ghost_layers(job, range(len(pairs)), report):
             peak = float((picture.max(0).max(0) * factors[pairs[k]]).max())
             peaks[pairs[k].name] = max(peak, peaks.get(pairs[k].name, 0.0))

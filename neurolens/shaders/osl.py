@@ -70,8 +70,8 @@ _FRAME = """\
     float raster_x = raster[0], raster_y = raster[1], first = pair[0], second = pair[1];
     float pixel_x = pixel_right[0], pixel_y = pixel_up[1], sensor_x_mm = sensor[0], sensor_y_mm = sensor[1];
     float half_cos = cos(half_turn), half_sin = sin(half_turn), edge_cos = cos(first_edge), edge_sin = sin(first_edge);
-    float count = blades, in_colour = dispersion, shaded = vignetting, as_lens = exposure, at_pupil = origin;
-    float warned = warn;
+    float count = blades, shaded = vignetting, as_lens = exposure, at_pupil = origin, warned = warn;
+    float in_colour = dispersion > 1 ? 1 - few : dispersion;
 """
 
 
@@ -145,7 +145,7 @@ class OslLens:
 
 def parameters(lens: OslLens) -> list[Parameter]:
     """The inputs that a user turns, in order: f_number, focus_m, zoom_mm of a zoom's range, blades, roundness,
-    rotation, exposure, vignetting, dispersion, origin, unit_m, warn."""
+    rotation, exposure, vignetting, dispersion, few, origin, unit_m, warn."""
     widest = float(f"{lens.f_number:.4g}")
     zoom = []
     for axis, name in zip(lens.axes, state_names(lens.axes), strict=True):
@@ -163,7 +163,10 @@ def parameters(lens: OslLens) -> list[Parameter]:
         Parameter("exposure", "Exposure", "As Blender's camera, or as the lens: its stop and what glass and focus take",
                   0, widget="mapper", options="Blender:0|Lens:1"),
         Parameter("vignetting", "Vignetting", "Darkening towards the corners", 1, widget="boolean"),
-        Parameter("dispersion", "Dispersion", "Colours part; off, pixels have less noise", 1, widget="boolean"),
+        Parameter("dispersion", "Dispersion", "Colours part; off, all light goes the way of the d line, with less noise",
+                  2, widget="mapper", options="Off:0|On:1|Off for few samples:2"),
+        Parameter("few", "Few Samples", "Whether samples are few; the extension of neurolens sets it", 0,
+                  widget="boolean"),
         Parameter("origin", "Origin", "What stands where Blender's camera stands, and distances are measured from",
                   1, widget="mapper", options="Film:0|Entrance pupil:1"),
         Parameter("unit_m", "Metres per Unit", "Length of a unit of the scene, its Unit Scale", 1.0, 1e-6, 1e6),

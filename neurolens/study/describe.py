@@ -1,8 +1,8 @@
 """A lens in figures, a folder of lenses as a table, their sections, and the character of a lens in five numbers.
 
 Character is that of a lens wide open. Its discs are those of lights at infinity while the lens is focused at 30 focal
-lengths: on the axis, at 0.6 and at 0.95 of the field. Vignetting follows the rims: where the file's are derived or
-estimated, cat's eye and swirl are, too.
+lengths, where lenses on films of one size frame a subject alike: on the axis, at 0.6 and at 0.95 of the field.
+Vignetting follows the rims: where the file's are derived or estimated, cat's eye and swirl are, too.
 """
 
 from __future__ import annotations
@@ -244,7 +244,8 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
 FOCUS, FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field's edge
 _LEVEL = 3  # of the pupil's nodes: some 12,000 rays a disc
 _POWER = 4  # of the squared distance from the centre that tells the rim's light
-_SEEN = 0.01  # of the image's radius: the deviation of a disc that shows its shape
+_SEEN = 0.01  # of the image's radius: the standard deviation of a disc that shows its shape
+_UNCUT = 1.5  # times the disc on the axis; where that at the field's edge is larger, aberrations and no rims shape it
 _HALF_DIAGONAL_MM = 21.6  # of a picture of 36 x 24 mm, to which spots are scaled
 _GHOST_RAYS = 2000
 _SIDE, _DISC = 32, 0.92  # pixels of a disc's picture; share of the side that the widest disc takes,
@@ -255,16 +256,21 @@ _WIDEST = 1.5  # which counts as no more than so many times that on the axis
 class Character(Result):
     """What a lens is known for; NaN where a figure cannot be had.
 
+    Shapes of discs that are small in the picture count in proportion: whole from a standard deviation on the axis of
+    1% of the image's radius on. This concerns the first three figures.
+
     Attributes:
         cats_eye: area of the disc of a light far out of focus at 0.95 of the field over that on the axis: 1 where no
-            rim cuts it.
+            rim cuts it. NaN above 1.5: aberrations shape such discs, as of condensers, which are no picture lenses.
         swirl: how much narrower the disc at 0.6 of the field is along the picture's radius than across it, compared
             with the axis: 1 less the ratio of the standard deviations of its light; 0 for a round one. Field curvature
-            and astigmatism make it, too. Lenses whose discs are small in the picture count in proportion: whole are
-            those whose deviation on the axis is at least 1% of the radius of the image.
+            and astigmatism make it, too.
         bubble: light near the rim of the disc on the axis behind the focus over that of an even disc, where light
-            counts by the eighth power of its distance from the centre: 1 if even, up to 5 for a bright rim alone.
-        softness_um: RMS radius of a white point on the axis at the best focus, on a picture 43.2 mm across its corners.
+            counts by the eighth power of its distance from the centre: 1 if even, up to 5 for a bright rim alone. The
+            film is moved to where the deviation is 1% of the image's radius, so that discs of one size are compared;
+            NaN where the sharpest one is larger.
+        softness_um: RMS radius of a white point on the axis at the best focus of a far light, where the picture has 43.2 mm across
+            its corners.
         flare: light of all ghosts of two reflections on the film's plane over that of the image, of a light at half
             the field; glass without a coating in the file is bare.
     """
@@ -298,14 +304,14 @@ def character(lens: Lens) -> tuple[Character, Discs]:
     scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
     scene.require_power()
     edge = scene.edge.field_deg
-    discs = discs_of(lens, [share * edge for share in FIELDS])
-    softness = float(spots(scene, [0.0], rings=1, shift_mm=[0.0]).rms_um[0]) * _HALF_DIAGONAL_MM / scene.image_radius_mm
+    discs, radius = discs_of(lens, [share * edge for share in FIELDS]), scene.image_radius_mm
+    softness = float(spots(scene, [0.0], rings=1, shift_mm=[0.0]).rms_um[0]) * _HALF_DIAGONAL_MM / radius
     flare = math.nan
     with suppress(NeurolensError):  # a lens whose ghosts cannot be traced has the other figures
         ghosts = ghost_table(GhostTracer(scene.lens), Light(0.0, edge / 2), scene.lens.reference_nm, _GHOST_RAYS)
         flare = sum(ghost.energy for ghost in ghosts) or math.nan
     flare = flare if flare < math.inf else math.nan  # no ray of that light was found
-    return Character(cats_eye(discs), swirl(discs, scene.image_radius_mm), bubble(discs), softness, flare), discs
+    return Character(cats_eye(discs, radius), swirl(discs, radius), bubble(discs, radius), softness, flare), discs
 
 
 def character_or_none(lens: Lens) -> tuple[dict[str, float | None] | None, bytes | None]:
@@ -335,28 +341,47 @@ def _mean(values: Array, weight: Array) -> Array:
         return np.asarray((weight[:, None] * values).sum(2, keepdims=True) / weight.sum(1)[:, None, None])
 
 
-def cats_eye(discs: Discs) -> float:
+def _on_axis(discs: Discs, one: Array, other: Array) -> float:
+    """The mean product of two quantities [F, 2, P] of the light on the axis, along one direction."""
+    return float(_mean(one * other, discs.weight)[0].mean())
+
+
+def _seen(discs: Discs, image_radius_mm: float) -> float:
+    """The share, up to 1, in which the shapes of discs count. See `Character`."""
+    place = discs.place_mm
+    return min(1.0, math.sqrt(_on_axis(discs, place, place)) / (_SEEN * image_radius_mm))
+
+
+def cats_eye(discs: Discs, image_radius_mm: float) -> float:
     """See `Character`. The disc of a light far out of focus has the shape of the rays' slopes."""
     areas = []
     for slope, outline in zip(discs.slope, discs.passed & (discs.weight == 0), strict=True):
         x, y = slope[:, outline]
         x, y = (c[np.argsort(np.arctan2(y, x))] for c in (x, y))
         areas.append(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
-    return areas[-1] / areas[0] if areas[0] > 0 and areas[-1] > 0 else math.nan
+    if not 0 < areas[-1] <= _UNCUT * areas[0]:
+        return math.nan
+    return 1 - (1 - areas[-1] / areas[0]) * _seen(discs, image_radius_mm)
 
 
 def swirl(discs: Discs, image_radius_mm: float) -> float:
     """See `Character`."""
     radial, across = np.sqrt(_mean(discs.place_mm**2, discs.weight))[..., 0].T
-    seen = min(1.0, float(across[0]) / (_SEEN * image_radius_mm))
-    return float(1 - radial[1] / across[1] / (radial[0] / across[0])) * seen
+    return float(1 - radial[1] / across[1] / (radial[0] / across[0])) * _seen(discs, image_radius_mm)
 
 
-def bubble(discs: Discs) -> float:
-    """See `Character`."""
-    weight, r2 = discs.weight[0], np.where(discs.passed[0], (discs.place_mm[0] ** 2).sum(0), 0.0)
+def bubble(discs: Discs, image_radius_mm: float) -> float:
+    """See `Character`. Rays move by their slope times the way of the film."""
+    place, slope = discs.place_mm, discs.slope
+    here, mixed, steep = (_on_axis(discs, *pair) for pair in ((place, place), (place, slope), (slope, slope)))
+    root = mixed**2 - steep * (here - (_SEEN * image_radius_mm) ** 2)
+    if not root >= 0:
+        return math.nan
+    moved = place[0] + (math.sqrt(root) - mixed) / steep * slope[0]  # the root behind the focus
+    weight, r2 = discs.weight[0], np.where(discs.passed[0], (moved**2).sum(0), 0.0)
     share = r2 / r2.max()
-    return float((_POWER + 1) * (weight * share**_POWER).sum() / weight.sum())
+    found = float((_POWER + 1) * (weight * share**_POWER).sum() / weight.sum())
+    return 1 + (found - 1) * _seen(discs, image_radius_mm)
 
 
 def picture(discs: Discs) -> bytes:

@@ -236,6 +236,48 @@ def test_settings_are_animated_saved_and_rendered_without_the_extension(scene: A
     assert bpy.context.scene.camera.data.type == "PERSP"
 
 
+# What the shaders of lenses make of `dispersion` and `few` (`_FRAME` in shaders/osl.py).
+COLOURS = SHADER.replace("  int vignetting", "  int dispersion = 2,\n  int few = 0 [[ string widget = \"boolean\" ]],\n  int vignetting")
+COLOURS = COLOURS.replace("blades / 10.0", "dispersion > 1 ? 1 - few : dispersion")
+
+
+def test_few_samples_have_no_dispersion_unless_the_user_chose_it(scene: Any, tmp_path: Path) -> None:
+    """In renders by their number of samples, in the viewport always; files keep what their render takes."""
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    camera, on_camera = scene.camera.data, sys.modules[f"{MODULE}.camera"]
+    custom = camera.cycles_custom
+    camera.custom_shader.from_string(COLOURS)
+    on_camera._compile(camera)
+    on_camera.tell_samples(render=False)
+    for samples, told in ((1, "nor does this render of 1 samples"), (15, "of 15 samples"), (16, "nor do renders below 16")):
+        scene.cycles.samples = samples
+        assert middle(scene, tmp_path)[2] == pytest.approx(float(samples >= 16))
+        assert custom["few"] is True and told in " ".join(panel(scene))
+        for chosen in (0, 1):
+            custom["dispersion"] = chosen
+            assert middle(scene, tmp_path)[2] == pytest.approx(chosen)
+            assert "viewport has no dispersion" not in " ".join(panel(scene))
+        custom["dispersion"] = 2
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "many.blend"))
+    assert custom["few"] is True
+    bpy.ops.preferences.addon_disable(module=MODULE)
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "many.blend"))
+        assert middle(bpy.context.scene, tmp_path)[2] == pytest.approx(1)
+    finally:
+        bpy.ops.preferences.addon_enable(module=MODULE)
+
+
+def test_a_switch_of_an_earlier_version_stays_off(scene: Any) -> None:
+    on_camera, custom = sys.modules[f"{MODULE}.camera"], scene.camera.data.cycles_custom
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    custom["dispersion"] = False
+    camera = scene.camera.data
+    lens = sys.modules[f"{MODULE}.panel"].LIBRARY.lenses["gauss"]
+    on_camera._set(scene, camera, lens, lens.variants["exact"], COLOURS, None, 1.0)
+    assert custom["dispersion"] == 0 and custom["dispersion"] is not False
+
+
 def said(**given: Any) -> str:
     """The message of an operator that must fail."""
     with pytest.raises(RuntimeError) as failed:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .flare import CLASSES as OF_FLARE
-from .panel import CLASSES, LIBRARY, CameraSettings, warn_of_black
+from .panel import CLASSES, HANDLERS, LIBRARY, CameraSettings
 
 
 def register() -> None:
@@ -15,12 +15,14 @@ def register() -> None:
     bpy.types.Camera.neurolens = bpy.props.PointerProperty(type=CameraSettings)
     bpy.types.Scene.neurolens_before = bpy.props.StringProperty(options={"HIDDEN"})
     LIBRARY.load()
-    bpy.app.handlers.render_pre.append(warn_of_black)
+    for when, act in HANDLERS:
+        getattr(bpy.app.handlers, when).append(act)
 
 
 def unregister() -> None:
     """Take them away; cameras keep their lenses, and render."""
-    bpy.app.handlers.render_pre.remove(warn_of_black)
+    for when, act in HANDLERS:
+        getattr(bpy.app.handlers, when).remove(act)
     LIBRARY.close()
     del bpy.types.Scene.neurolens_before
     del bpy.types.Camera.neurolens

@@ -13,7 +13,7 @@ from typing import Any
 
 import bpy
 
-from .library import PASSES, LensError, LensFacts, Setting, Variant, fitting_width_mm, refusals, refused
+from .library import FEW, PASSES, LensError, LensFacts, Setting, Variant, fitting_width_mm, refusals, refused
 
 # Of the camera and of the scene, what `apply` changes; the scene's first camera of this extension writes the scene's.
 _CAMERA = (
@@ -23,6 +23,7 @@ _CAMERA = (
 _RAYS = (24, 14)  # across and down, that tell the depths in view
 _TEXT = "neurolens "  # the names of our shaders in a file start so
 _ZOOM = 'cycles_custom["zoom_mm"]'
+_BY_SAMPLES = 2  # value of the shader's input `dispersion` that heeds its input `few`
 
 
 def camera_of(context: Any) -> Any:
@@ -74,6 +75,7 @@ def setting_of(scene: Any, found: Any) -> Setting:
         on_gpu=_on_other_gpu(scene),
         darkens=bool(custom.get("vignetting", 1)) or bool(custom.get("exposure", 0)),
         passes=_passes(scene),
+        samples=int(scene.cycles.samples) if custom.get("dispersion") == _BY_SAMPLES and "few" in custom else None,
     )
 
 
@@ -178,6 +180,7 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
         if not scene.neurolens_before:
             scene.neurolens_before = json.dumps(memory["scene"])
     camera.neurolens.on = f"{lens.lens_id}/{kind}"
+    tell_samples(render=False)
 
 
 def _set(
@@ -197,6 +200,8 @@ def _set(
         render = scene.render
         across, down = (width_mm, width_mm * sensor_mm(camera, render)[1] / sensor_mm(camera, render)[0])
         camera.sensor_fit, camera.sensor_width = "AUTO", max(across, down)
+    if camera.cycles_custom.get("dispersion") is False:  # a switch in earlier versions; a number keeps the choice
+        camera.cycles_custom["dispersion"] = 0
     camera.type, camera.custom_mode = "CUSTOM", "INTERNAL"
     old = camera.custom_shader
     camera.custom_shader = _text(f"{_TEXT}{variant.path.name}", source)
@@ -211,6 +216,19 @@ def _set(
     if first and opened is not None and "f_number" in custom:
         custom["f_number"] = max(float(opened), variant.f_number)
     _follow_zoom(camera)
+
+
+def tell_samples(render: bool) -> None:
+    """Tell the shaders of all cameras whether they get few samples: in the viewport always, in renders by their number.
+
+    It is no setting of the user's: files keep the render's, so that they render alike without the extension.
+    """
+    for scene in bpy.data.scenes:
+        few = not render or scene.cycles.samples < FEW
+        for camera in (o.data for o in scene.objects if o.type == "CAMERA" and applied(o.data)):
+            if bool(camera.cycles_custom.get("few", few)) != few:
+                camera.cycles_custom["few"] = few
+                camera.update_tag()
 
 
 def _text(name: str, source: str) -> Any:

@@ -25,6 +25,7 @@ ORDERS = {"focal_length": "Focal Length", "speed": "Speed", "year": "Year", "mak
 OLDEST = (4, 5, 0)  # the first Blender whose Cycles runs cameras written in OSL
 BEYOND = 1.02  # a film of 36 x 24 mm over an image circle of 43.2 mm is as lenses are engraved
 NOMINAL = 1.02  # and so is f/1.8 for f/1.83
+FEW = 16  # samples of a pixel below which its colours are far off where wavelengths part
 DAMAGED = (ValueError, KeyError, TypeError, AttributeError, OverflowError)  # errors of reading damaged facts
 _HEADROOM = 1.001  # of a near limit, for rounding
 
@@ -226,6 +227,7 @@ class Setting:
         on_gpu: whether a GPU that cannot run OSL cameras is chosen.
         darkens: whether vignetting or exposure let the lens weaken light.
         passes: those of `PASSES` that are rendered.
+        samples: of a pixel of the render, where they decide whether colours part; else None.
     """
 
     sensor_mm: tuple[float, float]
@@ -241,6 +243,7 @@ class Setting:
     on_gpu: bool = False
     darkens: bool = True
     passes: tuple[str, ...] = ()
+    samples: int | None = None
 
 
 def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
@@ -301,6 +304,9 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
         if shift and not math.isclose(side, setting.shift_side_mm, rel_tol=1e-3):  # so Cycles has it
             same = f"set {shift * setting.shift_side_mm / side:.4g}"
             found.append(f"Shift {axis} counts {name} here: for what {shift:.4g} does in Blender's own camera, {same}")
+    if setting.samples is not None:
+        render = f"does this render of {setting.samples}" if setting.samples < FEW else f"do renders below {FEW}"
+        found.append(f"The viewport has no dispersion, nor {render} samples: colours would be noise. Dispersion: On keeps them")
     if setting.on_gpu:
         found.append("OSL cameras run on the CPU, or on a GPU by OptiX")
     error = error_px(variant, setting)

@@ -22,6 +22,7 @@ _LABELS = {  # where Blender would show the name alone
     "exposure": "Exposure: 0 Blender, 1 Lens",
     "origin": "Origin: 0 Film, 1 Pupil",
     "unit_m": "Metres per Unit",
+    "dispersion": "Dispersion: 0 Off, 1 On, 2 by Samples",
 }
 
 
@@ -303,7 +304,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
     def _draw_settings(self, camera: Any) -> None:
         """The shader's own parameters: what is keyframed is what Cycles reads."""
         layout, custom = self.layout, camera.cycles_custom
-        names = [n for n in _FIRST if n in custom] + [n for n in custom.keys() if n not in _FIRST]
+        names = [n for n in _FIRST if n in custom] + [n for n in custom.keys() if n not in (*_FIRST, "few")]
         column = layout.column()
         column.prop(camera.dof, "focus_object")
         distance = column.row()
@@ -326,6 +327,26 @@ def warn_of_black(scene: Any, _graph: Any = None) -> None:
         asked = lens.variants[kind], on_camera.setting_of(scene, found)
         for line in (*facts.refusals(*asked), *facts.outside(*asked)):
             print(f"neurolens: camera {found.name!r}, frame {scene.frame_current}: {line}", file=sys.stderr)
+
+
+@bpy.app.handlers.persistent
+def samples_of_render(*_: Any) -> None:
+    """Before a render, and before a file is saved."""
+    on_camera.tell_samples(render=True)
+
+
+@bpy.app.handlers.persistent
+def samples_of_viewport(*_: Any) -> None:
+    """After these, and after a file is read."""
+    on_camera.tell_samples(render=False)
+
+
+# Handlers of the extension, by the list of `bpy.app.handlers` that calls them.
+HANDLERS = (
+    ("render_pre", warn_of_black),
+    *((name, samples_of_render) for name in ("render_init", "save_pre")),
+    *((name, samples_of_viewport) for name in ("render_complete", "render_cancel", "save_post", "load_post")),
+)
 
 
 def _wrapped(layout: Any, text: str, icon: str) -> None:
