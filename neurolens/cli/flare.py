@@ -20,6 +20,7 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.settings import changed, group, positive, setting
+from neurolens.base.units import in_unit
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import placed_settings
@@ -363,8 +364,9 @@ def _with_warning(kept: KeptLights, path: Path) -> list[Light]:
 def _light(text: str) -> Light:
     """The light of a --light option."""
     words = text.split(",")
-    angles, rgb = cli.floats(",".join(words[:2])), cli.floats(words[2], "/") if len(words) > 2 else [SUN]
-    distance = cli.floats(words[3]) if len(words) > 3 else [math.inf]
+    angles = in_unit("deg", cli.floats)(",".join(words[:2]))
+    rgb = cli.floats(words[2], "/") if len(words) > 2 else [SUN]
+    distance = in_unit("m", cli.floats)(words[3]) if len(words) > 3 else [math.inf]
     if len(angles) != 2 or len(words) > 4 or len(rgb) not in (1, 3) or not distance:
         raise InputError(_COMMAND, "--light", text, "AZ,EL[,E[,M]], numbers, E also as R/G/B")
     try:

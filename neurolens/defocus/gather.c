@@ -201,8 +201,8 @@ void gather(
 
 /* Add the light of points of a plate to a film. `points` [count, 8]: place in the plate, inverse depth, first column and
    row of the kernel in the film (not whole), and light of red, green and blue. `sweep`: see `kernels.Kernel`; columns and
-   rows of it are those of the kernel. A film pixel from which something nearer hides the point takes none: the light that
-   is hidden so, the sum of all channels, is returned. */
+   rows of it are those of the kernel. A film pixel from which something nearer hides the point takes none. The light that
+   is hidden so where no layer shows what is behind, as far away as the point, is returned, the sum of all channels. */
 double splat(
     const struct layer *layers, int layer_count, const float *points, int count, const float *kernel, int wide, int high,
     const float *sweep, int width, int height, float *film)
@@ -229,14 +229,15 @@ double splat(
                 const float s = i + 0.5f - fx, t = j + 0.5f - fy;
                 const float bx = sweep[0] + sweep[1] * s + sweep[2] * t, by = sweep[3] + sweep[4] * s + sweep[5] * t;
                 const struct line line = { p[0] - bx * w, p[1] - by * w, bx, by };
-                int hidden = 0;
+                int hidden = 0, known = 0, at_x = 0, at_y = 0;
                 for (int k = 0; k < layer_count && !hidden; k++) {
                     float found;
-                    int at_x, at_y;
                     hidden = layers[k].nearest > near && follow(layers + k, line, near, &found, &at_x, &at_y) == MET;
                 }
+                for (int k = 0; k < layer_count && hidden; k++)
+                    known |= depth_at(layers + k, at_x, at_y) >= 0.0f && depth_at(layers + k, at_x, at_y) <= near;
                 for (int c = 0; c < 3; c++)
-                    if (hidden) lost += light[c] * p[5 + c];
+                    if (hidden) lost += known ? 0.0f : light[c] * p[5 + c];
                     else film[3 * ((size_t)y * width + x) + c] += light[c] * p[5 + c];
             }
         }

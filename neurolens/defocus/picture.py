@@ -57,7 +57,7 @@ _CELLS, _COLOURS = 24, 2
 class Gathered:
     """The picture [H, W, 3] that a camera takes of a plate, and the shares of its light that the plate did not have:
     `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs; `lost`
-    is the share of the light of those that edges hide in the plate, if there are as many as beside them."""
+    is the share of the light of those that no layer shows, if there are as many behind edges as beside them."""
 
     rgb: FloatArray
     filled: float
@@ -285,7 +285,8 @@ def spread_highlights(
     camera: Camera,
     report: Callable[[float], None] = lambda _: None,
 ) -> float:
-    """Add the light of highlights to a picture [H, W, 3]; returns that which nearer things hide, summed likewise."""
+    """Add the light of highlights to a picture [H, W, 3]; returns that which nearer things hide, where no layer shows
+    what is behind them, summed likewise."""
     (width, height), border = plate.size, np.array(plate.border_px)
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
@@ -333,16 +334,14 @@ def defocus(
     taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:
         found = gather(plate, camera, spread, 1 << (samples - 1).bit_length(), threads, report)
-    hidden, light = 0.0, float(found.rgb.sum(dtype=np.float64))
-    for k, some in enumerate(taken):
-        behind = 0.0
+    hidden = 0.0
+    for some in taken:
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                behind = spread_highlights(found.rgb, some, plate, camera, report)
-            before, light = light, float(found.rgb.sum(dtype=np.float64))
-            # Edges hide as much of highlights that a plate shows as they let through of those that it does not: of a
-            # point's pupil they cover, on the mean over points, what they leave open of a hidden one's.
-            hidden += before - light if k else behind
+                # Edges hide as much of highlights that a plate shows as they let through of those that it does not: of
+                # a point's pupil they cover, on the mean over points, what they leave open of a hidden one's.
+                hidden += spread_highlights(found.rgb, some, plate, camera, report)
+    light = float(found.rgb.sum(dtype=np.float64))
     lost, number = max(hidden, 0) / max(light + hidden, 1e-30), sum(len(some.radius_px) for some in taken)
     _say(found := replace(found, highlights=number, lost=lost), len(plate.layers))
     return found

@@ -85,7 +85,7 @@ class Light:
     shape: Shape | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not (abs(self.elevation_deg) < 90 and math.isfinite(self.azimuth_deg) and self.towards[2] < 0):
+        if not (abs(self.elevation_deg) < 90 and abs(self.azimuth_deg) < 90):
             angles = (self.azimuth_deg, self.elevation_deg)
             raise InputError("light", "azimuth, elevation", angles, "angles within 90 degrees of the axis")
         if not self.distance_m > 0:
@@ -208,6 +208,7 @@ class Track:
         """The light at a frame; None while it stands behind the lens."""
         values = (float(np.interp(frame, self.keys[:, 0], column)) for column in self.keys.T[1:])
         azimuth, elevation, r, g, b, diameter, near, shown = values
+        azimuth = math.remainder(azimuth, 360.0)  # a light that goes round the camera
         if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
             return None
         rgb = shown * r, shown * g, shown * b

@@ -198,6 +198,24 @@ def test_the_light_of_hidden_highlights_is_counted_as_lost(recwarn: pytest.Warni
     assert two.lost < 0.01 and f"{100 * one.lost:.1f}% of the light is lost" in str(recwarn[0].message)
 
 
+def test_only_highlights_that_no_layer_shows_are_counted_as_lost() -> None:
+    """Posts before a far night. The layer behind shows lights behind the lower halves of the posts, or a night without any: of the
+    light of all, what is missing is as stated, or nothing is."""
+    camera = thin()
+    rgb, w = flat(0.05, 0.0)
+    rgb[5::54, 3::13] = 20.0
+    front, near = rgb.copy(), w.copy()
+    posts = np.arange(SIZE[0]) % 64 < 32
+    front[:, posts], near[:, posts] = 0.0, 2.0
+    half, dark = w.copy(), flat(0.05, 0.0)
+    half[: SIZE[1] // 2] = -1.0
+    behind = {"whole": (rgb, w), "half": (rgb, half), "dark": dark}
+    found = {k: defocus(plate_of(camera, (front, near), v), camera, samples=32) for k, v in behind.items()}
+    true = 1 - found["half"].rgb.sum() / found["whole"].rgb.sum()
+    assert found["half"].lost == pytest.approx(true, rel=0.2) and true > 0.03
+    assert found["dark"].lost < 1e-3
+
+
 def test_planes_that_recede_have_no_edges() -> None:
     camera = thin()
     rgb, w = flat(1.0, 0.0)

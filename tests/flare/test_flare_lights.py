@@ -46,6 +46,8 @@ def test_lists_hold_keys_and_both_kinds_say_the_same(tmp_path: Path) -> None:
         assert sun.at(-100) == sun.at(1) and sun.at(99) == Light(20.0, 5.0, (1.0, 0.5, 0.25))
         assert lamp.at(2) == Light(60.0, 0.0, (3.0, 3.0, 3.0), 1 / 1.5)
         assert lamp.at(3) is None  # behind the lens
+    one.write_text("light,frame,azimuth_deg,elevation_deg\na,1,350,2\na,2,359,2\n")  # it went round the camera
+    assert read_lights(one)[0].at(1) == Light(-10.0, 2.0, (SUN,) * 3)
     one.write_text("azimuth_deg,elevation_deg\n1,2\n3,4\n")
     assert [track.at(0) for track in read_lights(one)] == [Light(*at, (SUN,) * 3) for at in ((1.0, 2.0), (3.0, 4.0))]
     one.write_text("azimuth_deg,elevation_deg,diameter_deg\n1,2,0.533\n3,4,0\n")
