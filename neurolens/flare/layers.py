@@ -52,7 +52,7 @@ FEWEST = 4  # wavelengths that stand for all
 _PATCH_DEG = 2.0  # of an extended light: see `patches`
 _PATCHES, _CELLS = (4, 6, 9), 48  # along a side, at most; cells of a ghost along a side, which many patches keep
 _BEGUN, _SMEARED = 14_000, 0.45  # times to begin a group of ghosts, and to smear a pixel, in that of a cell
-_MUCH, _TRIALS = 2e7, 6  # work that takes seconds; groups whose time is measured before it
+_MUCH, _TRIALS = 1e7, 6  # work that takes seconds; groups whose time is measured before it
 _UNEVEN, _FAINT = 0.6, 5e-4  # share of its light that may come or go over a patch; share of all light, of a faint ghost
 Layers = dict[str, Floats]
 REST = "rest"
@@ -223,7 +223,7 @@ def _expected_s(job: FlareJob, groups: Sequence[_Group]) -> float | None:
         began, group = time.perf_counter(), groups[at]._replace(tasks=groups[at].tasks[:1])
         work = sum(_add(job, group, np.zeros((*group.size(job.raster), 3), np.float32)))
         pace.append((time.perf_counter() - began) / work)
-    return float(steps[-1]) * float(np.mean(pace))
+    return float(steps[-1] * np.median(pace))  # the first imports and compiles
 
 
 def _parts(

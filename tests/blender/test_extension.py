@@ -237,7 +237,9 @@ def test_settings_are_animated_saved_and_rendered_without_the_extension(scene: A
 
 
 # What the shaders of lenses make of `dispersion` and `few` (`_FRAME` in shaders/osl.py).
-COLOURS = SHADER.replace("  int vignetting", "  int dispersion = 2,\n  int few = 0 [[ string widget = \"boolean\" ]],\n  int vignetting")
+COLOURS = SHADER.replace(
+    "  int vignetting", '  int dispersion = 2,\n  int few = 0 [[ string widget = "boolean" ]],\n  int vignetting'
+)
 COLOURS = COLOURS.replace("blades / 10.0", "dispersion > 1 ? 1 - few : dispersion")
 
 
@@ -249,7 +251,11 @@ def test_few_samples_have_no_dispersion_unless_the_user_chose_it(scene: Any, tmp
     camera.custom_shader.from_string(COLOURS)
     on_camera._compile(camera)
     on_camera.tell_samples(render=False)
-    for samples, told in ((1, "nor does this render of 1 samples"), (15, "of 15 samples"), (16, "nor do renders below 16")):
+    for samples, told in (
+        (1, "nor does this render of 1 samples"),
+        (15, "of 15 samples"),
+        (16, "nor do renders below 16"),
+    ):
         scene.cycles.samples = samples
         assert middle(scene, tmp_path)[2] == pytest.approx(float(samples >= 16))
         assert custom["few"] is True and told in " ".join(panel(scene))

@@ -242,7 +242,7 @@ def test_a_changed_file_is_not_the_index_s(tmp_path: Path, monkeypatch: pytest.M
 def test_a_folder_of_ones_own_is_sorted_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A lens whose rims are a guess says so; one that cannot be read stands last."""
     for name, words in (("a", ('rims = "source"',)), ("b", ('rims = "derived"', "diameter_mm = 12.0"))):
-        text = Path("lenses/thorlabs_lb1471_biconvex_50.toml").read_text()
+        text = Path("lenses/smith_double_gauss_100.toml").read_text()
         (tmp_path / f"{name}.toml").write_text(text if name == "a" else _renamed(text, words))
     (tmp_path / "broken.toml").write_text("schema = 1\n")
     assert main(["lens", str(tmp_path), "--sort", "swirl"]) == 0
