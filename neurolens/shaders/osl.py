@@ -163,7 +163,7 @@ def parameters(lens: OslLens) -> list[Parameter]:
         Parameter("exposure", "Exposure", "As Blender's camera, or as the lens: its stop and what glass and focus take",
                   0, widget="mapper", options="Blender:0|Lens:1"),
         Parameter("vignetting", "Vignetting", "Darkening towards the corners", 1, widget="boolean"),
-        Parameter("dispersion", "Dispersion", "Colours part; off, all light goes the way of the d line, with less noise",
+        Parameter("dispersion", "Dispersion", "Colours part; off, light goes the way of the d line, with less noise",
                   2, widget="mapper", options="Off:0|On:1|Off for few samples:2"),
         Parameter("few", "Few Samples", "Whether samples are few; the extension of neurolens sets it", 0,
                   widget="boolean"),

@@ -269,8 +269,8 @@ class Character(Result):
             counts by the eighth power of its distance from the centre: 1 if even, up to 5 for a bright rim alone. The
             film is moved to where the deviation is 1% of the image's radius, so that discs of one size are compared;
             NaN where the sharpest one is larger.
-        softness_um: RMS radius of a white point on the axis at the best focus of a far light, where the picture has 43.2 mm across
-            its corners.
+        softness_um: RMS radius of a white point on the axis at the best focus of a far light, on a picture of
+            43.2 mm across its corners.
         flare: light of all ghosts of two reflections on the film's plane over that of the image, of a light at half
             the field; glass without a coating in the file is bare.
     """

@@ -199,8 +199,8 @@ def test_the_light_of_hidden_highlights_is_counted_as_lost(recwarn: pytest.Warni
 
 
 def test_only_highlights_that_no_layer_shows_are_counted_as_lost() -> None:
-    """Posts before a far night. The layer behind shows lights behind the lower halves of the posts, or a night without any: of the
-    light of all, what is missing is as stated, or nothing is."""
+    """Posts before a far night. The layer behind shows lights behind the lower halves of the posts, or a night without
+    any: of the light of all, what is missing is as stated, or nothing is."""
     camera = thin()
     rgb, w = flat(0.05, 0.0)
     rgb[5::54, 3::13] = 20.0

@@ -306,9 +306,7 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
             found.append(f"Shift {axis} counts {name} here: for what {shift:.4g} does in Blender's own camera, {same}")
     if setting.samples is not None:
         render = f"does this render of {setting.samples}" if setting.samples < FEW else f"do renders below {FEW}"
-        found.append(
-            f"The viewport has no dispersion, nor {render} samples: colours would be noise. Dispersion: On keeps them"
-        )
+        found.append(f"The viewport has no dispersion, nor {render} samples: it would be noise. Dispersion On keeps it")
     if setting.on_gpu:
         found.append("OSL cameras run on the CPU, or on a GPU by OptiX")
     error = error_px(variant, setting)
