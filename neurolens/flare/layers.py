@@ -164,9 +164,9 @@ def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) 
     ordered = [_Group(*key, tasks) for key, tasks in groups.items()]
     whole, expected = max(sum(group.work(raster) for group in ordered), 1.0), _expected_s(job, ordered)
     done(0.0, expected)
-    began, worked = time.perf_counter(), 0.0
+    began, worked, pictures = time.perf_counter(), 0.0, dict[int, Floats]()
     for number in sorted({group.layer for group in ordered}):
-        pictures: dict[int, Floats] = {}
+        pictures.clear()
         for group in (group for group in ordered if group.layer == number):
             picture = pictures.setdefault(group.coarse, np.zeros((*group.size(raster), 3), np.float32))
             for work in _add(job, group, picture):
@@ -185,15 +185,13 @@ class _Group(NamedTuple):
     smear: Smear | None
     tasks: list[_Task]
 
-    def size(self, raster: Raster) -> tuple[int, int]:
+    def size(self, raster: Raster) -> list[int]:
         """Rows and columns of its picture; one that is enlarged has a border."""
-        rows, columns = (n // self.coarse + 3 * (self.coarse > 1) for n in (raster.height, raster.width))
-        return rows, columns
+        return [n // self.coarse + 3 * (self.coarse > 1) for n in (raster.height, raster.width)]
 
     def work(self, raster: Raster) -> float:
         """About the time that it takes, in that of a cell at one wavelength."""
-        rows, columns = self.size(raster)
-        smeared = 0 if self.smear is None else _SMEARED * rows * columns
+        smeared = 0 if self.smear is None else _SMEARED * math.prod(self.size(raster))
         return _BEGUN + smeared + sum(task.work for task in self.tasks)
 
 
@@ -211,10 +209,8 @@ def _add(job: FlareJob, group: _Group, picture: Floats) -> Iterator[float]:
 
 
 def _expected_s(job: FlareJob, groups: Sequence[_Group]) -> float | None:
-    """Seconds that ghosts will take, by a ghost each of a few groups, drawn for trial; None for little work.
-
-    They stand at equal steps of the work, so that large groups are tried more often.
-    """
+    """Seconds that ghosts will take, by a ghost each of a few groups, drawn for trial, which are at equal
+    steps of the work; None for little work."""
     steps = np.cumsum([group.work(job.raster) for group in groups])
     if not groups or steps[-1] < _MUCH:
         return None

@@ -256,8 +256,8 @@ _WIDEST = 1.5  # which counts as no more than so many times that on the axis
 class Character(Result):
     """What a lens is known for; NaN where a figure cannot be had.
 
-    Shapes of discs that are small in the picture count in proportion: whole from a standard deviation on the axis of
-    1% of the image's radius on. This concerns the first three figures.
+    In the first three, discs that are small in the picture count in proportion: whole from a standard deviation on the
+    axis of 1% of the image's radius on.
 
     Attributes:
         cats_eye: area of the disc of a light far out of focus at 0.95 of the field over that on the axis: 1 where no
@@ -341,15 +341,9 @@ def _mean(values: Array, weight: Array) -> Array:
         return np.asarray((weight[:, None] * values).sum(2, keepdims=True) / weight.sum(1)[:, None, None])
 
 
-def _on_axis(discs: Discs, one: Array, other: Array) -> float:
-    """The mean product of two quantities [F, 2, P] of the light on the axis, along one direction."""
-    return float(_mean(one * other, discs.weight)[0].mean())
-
-
 def _seen(discs: Discs, image_radius_mm: float) -> float:
     """The share, up to 1, in which the shapes of discs count. See `Character`."""
-    place = discs.place_mm
-    return min(1.0, math.sqrt(_on_axis(discs, place, place)) / (_SEEN * image_radius_mm))
+    return min(1.0, math.sqrt(_mean(discs.place_mm**2, discs.weight)[0].mean()) / (_SEEN * image_radius_mm))
 
 
 def cats_eye(discs: Discs, image_radius_mm: float) -> float:
@@ -373,7 +367,8 @@ def swirl(discs: Discs, image_radius_mm: float) -> float:
 def bubble(discs: Discs, image_radius_mm: float) -> float:
     """See `Character`. Rays move by their slope times the way of the film."""
     place, slope = discs.place_mm, discs.slope
-    here, mixed, steep = (_on_axis(discs, *pair) for pair in ((place, place), (place, slope), (slope, slope)))
+    squares = (place * place, place * slope, slope * slope)
+    here, mixed, steep = (float(_mean(v, discs.weight)[0].mean()) for v in squares)
     root = mixed**2 - steep * (here - (_SEEN * image_radius_mm) ** 2)
     if not root >= 0:
         return math.nan

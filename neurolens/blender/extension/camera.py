@@ -220,9 +220,7 @@ def _set(
 
 def tell_samples(render: bool) -> None:
     """Tell the shaders of all cameras whether they get few samples: in the viewport always, in renders by their number.
-
-    It is no setting of the user's: files keep the render's, so that they render alike without the extension.
-    """
+    Files keep what is told for renders, so that they render alike without the extension."""
     for scene in bpy.data.scenes:
         few = not render or scene.cycles.samples < FEW
         for camera in (o.data for o in scene.objects if o.type == "CAMERA" and applied(o.data)):

@@ -22,7 +22,6 @@ _LABELS = {  # where Blender would show the name alone
     "exposure": "Exposure: 0 Blender, 1 Lens",
     "origin": "Origin: 0 Film, 1 Pupil",
     "unit_m": "Metres per Unit",
-    "dispersion": "Dispersion: 0 Off, 1 On, 2 by Samples",
 }
 
 
@@ -329,24 +328,13 @@ def warn_of_black(scene: Any, _graph: Any = None) -> None:
             print(f"neurolens: camera {found.name!r}, frame {scene.frame_current}: {line}", file=sys.stderr)
 
 
-@bpy.app.handlers.persistent
-def samples_of_render(*_: Any) -> None:
-    """Before a render, and before a file is saved."""
-    on_camera.tell_samples(render=True)
-
-
-@bpy.app.handlers.persistent
-def samples_of_viewport(*_: Any) -> None:
-    """After these, and after a file is read."""
-    on_camera.tell_samples(render=False)
-
-
-# Handlers of the extension, by the list of `bpy.app.handlers` that calls them.
-HANDLERS = (
-    ("render_pre", warn_of_black),
-    *((name, samples_of_render) for name in ("render_init", "save_pre")),
-    *((name, samples_of_viewport) for name in ("render_complete", "render_cancel", "save_post", "load_post")),
+_render, _viewport = (
+    bpy.app.handlers.persistent(lambda *_, render=render: on_camera.tell_samples(render)) for render in (True, False)
 )
+HANDLERS = (  # by the list of `bpy.app.handlers` that calls them
+    ("render_pre", warn_of_black), ("render_init", _render), ("render_complete", _viewport),
+    ("render_cancel", _viewport), ("save_pre", _render), ("save_post", _viewport), ("load_post", _viewport),
+)  # fmt: skip
 
 
 def _wrapped(layout: Any, text: str, icon: str) -> None:
