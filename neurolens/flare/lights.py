@@ -208,11 +208,10 @@ class Track:
         """The light at a frame; None while it stands behind the lens."""
         values = (float(np.interp(frame, self.keys[:, 0], column)) for column in self.keys.T[1:])
         azimuth, elevation, r, g, b, diameter, near, shown = values
-        azimuth = math.remainder(azimuth, 360.0)  # a light that goes round the camera
         if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
             return None
         rgb = shown * r, shown * g, shown * b
-        return with_disc(Light(azimuth, elevation, rgb, 1 / near if near else math.inf), diameter)
+        return with_disc(Light(math.remainder(azimuth, 360), elevation, rgb, 1 / near if near else math.inf), diameter)
 
 
 def read_lights(path: Path) -> list[Track]:

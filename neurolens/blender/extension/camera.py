@@ -23,7 +23,6 @@ _CAMERA = (
 _RAYS = (24, 14)  # across and down, that tell the depths in view
 _TEXT = "neurolens "  # the names of our shaders in a file start so
 _ZOOM = 'cycles_custom["zoom_mm"]'
-_BY_SAMPLES = 2  # value of the shader's input `dispersion` that heeds its input `few`
 
 
 def camera_of(context: Any) -> Any:
@@ -75,7 +74,7 @@ def setting_of(scene: Any, found: Any) -> Setting:
         on_gpu=_on_other_gpu(scene),
         darkens=bool(custom.get("vignetting", 1)) or bool(custom.get("exposure", 0)),
         passes=_passes(scene),
-        samples=int(scene.cycles.samples) if custom.get("dispersion") == _BY_SAMPLES and "few" in custom else None,
+        samples=int(scene.cycles.samples) if custom.get("dispersion") == 2 and "few" in custom else None,
     )
 
 
