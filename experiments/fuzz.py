@@ -204,10 +204,10 @@ def _restore(good: Path, place: Path, clean: dict[str, tuple[int, ...]]) -> dict
     for path, about in sorted(_state(place).items(), reverse=True):  # what is in a folder before the folder
         if about != clean.get(path):
             shutil.rmtree(path) if stat.S_ISDIR(about[1]) else os.unlink(path)
-    for source in sorted(good.rglob("*")):
-        path = place / source.relative_to(good)
+    for path in clean or map(str, sorted(place / source.relative_to(good) for source in good.rglob("*"))):
         if not os.path.lexists(path):
-            source.is_dir() and path.mkdir()
+            source = good / os.path.relpath(path, place)
+            source.is_dir() and os.mkdir(path)
             source.is_file() and shutil.copy(source, path)
             source.is_fifo() and os.mkfifo(path)
     return _state(place)

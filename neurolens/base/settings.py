@@ -31,6 +31,7 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from numbers import Real
 from pathlib import Path
 from types import NoneType
@@ -41,6 +42,7 @@ from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_u
 from neurolens.base.units import WORTH, in_unit
 
 T = TypeVar("T")
+_hints = cache(get_type_hints)  # which evaluates every annotation anew
 # Bounds that every input keeps: beyond them searches take minutes or find no light.
 F_NUMBER = 0.1, 10_000.0
 FOCAL_MM = 1e-3, 1e6
@@ -123,7 +125,7 @@ def group(title: str, **more: Any) -> Any:
 
 def check_bounds(settings: Any, what: str) -> None:
     """Refuse numbers out of the bounds of their fields, for `__post_init__`; raises InputError about `what`."""
-    hints = get_type_hints(type(settings))
+    hints = _hints(type(settings))
     for f in fields(settings):
         value, option = getattr(settings, f.name), f.metadata.get("option")
         if not option or option.within is None or value is None:
@@ -183,7 +185,7 @@ def add_options(
         texts: for some fields, what replaces {} in their help.
         root: the parser that gets the groups of arguments, where `parser` is a group.
     """
-    hints, apart, texts = get_type_hints(cls), dict[str, Any](), texts or {}
+    hints, apart, texts = _hints(cls), dict[str, Any](), texts or {}
     for f in sorted(_options(cls), key=lambda f: getattr(f.metadata.get("option"), "last", 0)):
         option: Option | None = f.metadata.get("option")
         if option is None:
@@ -256,7 +258,7 @@ def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False)
     Raises:
         InputError: what the class refuses.
     """
-    hints, values = get_type_hints(cls), dict[str, Any]()
+    hints, values = _hints(cls), dict[str, Any]()
     for f in _options(cls):
         if is_dataclass(hints[f.name]):
             values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", False))
@@ -374,7 +376,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
         data = {key: value for key, value in data.items() if key != name}
         warnings.warn(f"{file}: {_join(prefix, name)} has no effect any more", NeurolensWarning, stacklevel=2)
     reject_unknown(file, prefix and f"{prefix}.", data, list(known))
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     values: dict[str, Any] = {}
     for name, f in known.items():
         place = _join(prefix, name)
