@@ -29,6 +29,7 @@ import re
 import types
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
@@ -135,12 +136,12 @@ def check_bounds(settings: Any, what: str) -> None:
 
 
 def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
-    """Type of an argument: the number of a text where it is `good`, which NaN never is."""
+    """Type of an argument: the number of a text where it is `good`, which NaN and digits beyond any float never are."""
 
     def convert(text: str) -> T:
         try:
             value = kind(text)
-            if good(value):
+            if good(value) and (value != math.inf or not re.search(r"\d", text)):
                 return value
         except ValueError:
             pass
@@ -381,7 +382,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
     for name, f in known.items():
         place = _join(prefix, name)
         if name in data:
-            values[name] = _convert(data[name], hints[name], file, place)
+            values[name] = _convert(_in_unit_of(name, data[name]), hints[name], file, place)
         elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
             raise InputError(file, place, "(missing)", _describe(hints[name]))
     try:
@@ -408,6 +409,14 @@ def _with_new_names(
 
 def _join(prefix: str, name: str) -> str:
     return f"{prefix}.{name}" if prefix else name
+
+
+def _in_unit_of(name: str, value: Any) -> Any:
+    """The number of a text with a unit, "6ft", in the unit that a field's name ends with; other values as they are."""
+    if isinstance(value, str) and (unit := _UNIT.fullmatch(name)) and (plain := in_unit(unit[2], str)(value)) != value:
+        with suppress(ValueError):  # two numbers
+            return float(plain)
+    return value
 
 
 def _convert(value: Any, kind: Any, file: str | Path, place: str) -> Any:

@@ -124,7 +124,7 @@ def format_value(value: Any) -> str:
     """One TOML value on one line; floats and texts come back bit for bit.
 
     Raises:
-        TypeError: a value that TOML has no form for.
+        TypeError: a value that TOML has no form for. InputError: a name whose bytes are no UTF-8.
     """
     match value:
         case bool():
@@ -132,6 +132,8 @@ def format_value(value: Any) -> str:
         case int() | float():
             return repr(value)
         case str():
+            if any("\ud800" <= c <= "\udfff" for c in value):  # TOML has no escape for them either
+                raise InputError("TOML", "text", value, "UTF-8: rename the file or the folder")
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
             pairs = ", ".join(f"{format_key(k)} = {format_value(v)}" for k, v in value.items())
