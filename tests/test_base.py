@@ -44,7 +44,7 @@ from neurolens.base.settings import (
     to_dict,
     to_toml,
 )
-from neurolens.base.tomlfile import format_toml
+from neurolens.base.tomlfile import format_toml, parse_toml
 from neurolens.base.units import in_unit
 
 
@@ -452,6 +452,9 @@ def test_quantities_of_files_take_units_and_none_overflows() -> None:
     for wrong in ("1e400", "1e400m", "1" * 400):
         with pytest.raises(argparse.ArgumentTypeError, match="expected m from 0.01"):
             focus(wrong)
+    assert parse_toml("a = [inf, -1e300]", "s.toml") == {"a": [math.inf, -1e300]}
+    with pytest.raises(ValueError, match="-1e400 is too large"):
+        parse_toml("a = -1e400", "s.toml")
 
 
 def test_toml_refuses_names_that_it_could_not_read_again() -> None:

@@ -40,7 +40,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
-from neurolens.base.units import WORTH, in_unit
+from neurolens.base.units import WORTH, as_float, in_unit
 
 T = TypeVar("T")
 _hints = cache(get_type_hints)  # which evaluates every annotation anew
@@ -140,8 +140,8 @@ def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -
 
     def convert(text: str) -> T:
         try:
-            value = kind(text)
-            if good(value) and (value != math.inf or not re.search(r"\d", text)):
+            value = as_float(text) if kind is float else kind(text)
+            if good(value):
                 return value
         except ValueError:
             pass

@@ -13,6 +13,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_bytes
+from neurolens.base.units import as_float
 
 MAX_BYTES = 1_000_000
 _DEEPEST = 100  # tables in each other, or parts of a key
@@ -45,7 +46,7 @@ def parse_toml(text: str, file: str | Path) -> dict[str, Any]:
     # The parser's time grows with the square of the parts of a dotted key.
     if any(piece.count(".") > _DEEPEST for piece in re.split(r"[=,{}\[\]\n]", text)):
         raise ValueError(f"a key of more than {_DEEPEST} parts")
-    data = tomllib.loads(text)
+    data = tomllib.loads(text, parse_float=as_float)
     check_tree(data, file)
     return data
 
