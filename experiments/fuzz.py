@@ -89,7 +89,9 @@ class Verdict:
 # ---- Cases, one after the other in a process of their own. ----------------------------------------------------------
 
 
-def run_cases(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str, keep: Path | None) -> list[Verdict]:
+def run_cases(
+    good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str, keep: Path | None
+) -> list[Verdict]:
     """Run cases on a copy of good files; the files of one that has a fault are kept in a folder by its number."""
     verdicts = list[Verdict]()
     while rest := cases[len(verdicts) :]:
@@ -207,9 +209,12 @@ def _restore(good: Path, place: Path, clean: dict[str, tuple[int, ...]]) -> dict
     for path in clean or map(str, sorted(place / source.relative_to(good) for source in good.rglob("*"))):
         if not os.path.lexists(path):
             source = good / os.path.relpath(path, place)
-            source.is_dir() and os.mkdir(path)
-            source.is_file() and shutil.copy(source, path)
-            source.is_fifo() and os.mkfifo(path)
+            if source.is_dir():
+                os.mkdir(path)
+            elif source.is_file():
+                shutil.copy(source, path)
+            else:
+                os.mkfifo(path)
     return _state(place)
 
 

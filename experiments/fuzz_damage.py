@@ -90,7 +90,7 @@ def damage_text(chance: Chance, data: bytes) -> bytes:
 
 
 def _somewhere(chance: Chance, pattern: re.Pattern[bytes], data: bytes) -> re.Match[bytes] | None:
-    """What a pattern finds first from a place on: much cheaper in a large file than a choice among all that it finds."""
+    """What a pattern finds first from a place on: cheaper in a large file than a choice among all it finds."""
     return pattern.search(data, chance.randrange(len(data) + 1)) or pattern.search(data)
 
 

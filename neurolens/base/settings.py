@@ -36,14 +36,14 @@ from functools import cache
 from numbers import Real
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
 from neurolens.base.units import WORTH, as_float, in_unit
 
 T = TypeVar("T")
-_hints = cache(get_type_hints)  # which evaluates every annotation anew
+_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)  # which evaluates every annotation anew
 # Bounds that every input keeps: beyond them searches take minutes or find no light.
 F_NUMBER = 0.1, 10_000.0
 FOCAL_MM = 1e-3, 1e6
@@ -140,9 +140,9 @@ def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -
 
     def convert(text: str) -> T:
         try:
-            value = as_float(text) if kind is float else kind(text)
+            value: Any = as_float(text) if kind is float else kind(text)
             if good(value):
-                return value
+                return cast(T, value)
         except ValueError:
             pass
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")

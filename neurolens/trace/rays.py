@@ -343,7 +343,7 @@ def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
 def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
     """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not stated.
 
-    Warn of wavelengths at which the index of a glass is not stated; of tensors on a GPU, which that would stop, nothing.
+    Warn of wavelengths at which the index of a glass is not stated, but not of tensors on a GPU, which would wait.
     """
     shape, dtype = rays.x.shape, rays.x.dtype
     if dtype not in (torch.float32, torch.float64):
