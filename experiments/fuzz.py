@@ -6,7 +6,9 @@ when the exit code is 0, or 2 with one line on stderr (warnings aside; 1 where a
 temporary file stays, a refused command has written nothing, a file that was cut or lost bytes (kinds "cut ...") is
 refused or gives the pixels of the good one, and processor time, waiting and memory stay within bounds.
 
-Every case runs in a process that is forked for it, on a copy of good files; one that dies or hangs costs itself alone.
+Cases run one after the other in a process that has all modules loaded, which is what makes them cheap; what a case
+changes in its folder is made good again. A case with a fault runs again in a process of its own, and the page says
+where only others before it bring the fault about; one that ends the process, or hangs, costs itself alone.
 Case K of seed S is always the same: `--seed S --first K --cases 1 --keep DIR` shows a fault again. A run that is
 interrupted goes on, for finished batches are kept.
 """
@@ -14,6 +16,7 @@ interrupted goes on, for finished batches are kept.
 from __future__ import annotations
 
 import argparse
+import gc
 import io
 import json
 import os
@@ -25,37 +28,35 @@ import signal
 import stat
 import sys
 import tempfile
-import threading
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import chdir, redirect_stdout, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from importlib.metadata import version
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
+from pkgutil import walk_packages
 
 import numpy as np
 
+import neurolens
 from experiments import lab
 from experiments.fuzz_good import make_seeds
 from experiments.fuzz_kinds import KINDS, RIGHT, SEEDS, build, chosen, plate, shorten
 from experiments.lab import cpu_s, resident_kb
 from neurolens import __version__, cli
 from neurolens.base.files import atomic_write_text, write_json
+from neurolens.cli.arguments import Parser
 
 __all__ = ["KINDS", "SEEDS"]
 
 CPU_S, LONG_CPU_S, WALL_S, MEMORY = 20.0, 60.0, 300.0, 2 << 30
-_BATCH = 200
+_BATCH = 500
+_UNFINISHED = "unfinished"
 _JUDGES = ("evaluate", "models", "library", "survey", "train")  # their exit code 1 is an answer
-_LOADED = (
-    *("onnxruntime", "torch", "onnx", "matplotlib.pyplot", "neurolens.readers.any_format"),
-    *("neurolens.surrogates.export", "neurolens.render.renderer", "neurolens.render.scene", "neurolens.cameras.build"),
-    *("neurolens.cameras.model", "neurolens.render.pictures", "neurolens.setting.check", "neurolens.flare.layers"),
-    *("neurolens.cli.render", "neurolens.study.survey", "neurolens.analysis.spots"),
-    "neurolens.photographs.rims",
-)
 OPTIONS = (
     lab.count("cases", 1000, "cases (default 1000)"),
     lab.count("seed", 0, "of the random numbers (default 0)", 0),
@@ -85,63 +86,89 @@ class Verdict:
     memory: int = 0
 
 
-# ---- A case, in a process of its own. --------------------------------------------------------------------------------
+# ---- Cases, one after the other in a process of their own. ----------------------------------------------------------
 
 
-def run_case(good: Path, scratch: Path, case: int, seed: int, only: str, keep: Path | None = None) -> Verdict:
-    """Run a case on a copy of good files; where it has a fault, its files are kept in a folder."""
-    chance, kind = chosen(seed, case, only)
-    place, answer = scratch / "work", scratch / "answer.json"
+def run_cases(
+    good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str, keep: Path | None
+) -> list[Verdict]:
+    """Run cases on a copy of good files; the files of one that has a fault are kept in a folder by its number."""
+    verdicts = list[Verdict]()
+    while rest := cases[len(verdicts) :]:
+        for verdict in _process(good, scratch, rest, seed, only):
+            if verdict.faults and len(rest) > 1:
+                (alone,) = run_cases(good, scratch, [verdict.case], seed, only, keep)
+                verdict = alone if alone.faults else replace(verdict, faults=[*verdict.faults, "only after others"])
+            elif verdict.faults and keep is not None:
+                _keep(scratch / "work", keep / f"{seed}-{verdict.case}", verdict)
+            verdicts.append(verdict)
+    return verdicts
+
+
+def _process(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str) -> list[Verdict]:
+    """Verdicts of the cases that one process runs: all, or those up to the one that ends it."""
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
-    shutil.copytree(good, place, copy_function=shutil.copy, ignore=lambda *_: ["fifo"])
-    os.mkfifo(place / "fifo")
-    argv = KINDS[kind][1](chance, place)
+    answers, answer = Pipe(duplex=False)
     process = os.fork()
     if not process:
         try:
-            _child(case, kind, argv, place, answer)
+            answers.close()
+            _work(good, scratch, cases, seed, only, answer)
         finally:
             os._exit(0)
-    late = threading.Timer(WALL_S, os.killpg, (process, signal.SIGKILL))
-    late.start()
+    answer.close()
+    verdicts = dict[int, Verdict]()
+    try:
+        while answers.poll(WALL_S):
+            verdict = Verdict(**json.loads(answers.recv_bytes()))
+            verdicts[verdict.case] = verdict
+    except EOFError:
+        pass
+    finally:  # where this process is interrupted, too
+        with suppress(ProcessLookupError):
+            os.killpg(process, signal.SIGKILL)  # what hangs, and what the cases left behind
+        os.kill(process, signal.SIGKILL)
     _, status, used = os.wait4(process, 0)
-    late.cancel()
-    with suppress(ProcessLookupError):
-        os.killpg(process, signal.SIGKILL)  # what it left behind
-    if answer.exists():
-        verdict = Verdict(**json.loads(answer.read_text()))
-    else:
+    if not verdicts:
+        raise RuntimeError((scratch / "stderr").read_text())
+    if verdict.faults == [_UNFINISHED]:
         code, said = os.waitstatus_to_exitcode(status), (scratch / "stderr").read_bytes()[-2000:]
         why = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-        cpu = used.ru_utime + used.ru_stime
-        verdict = Verdict(
-            case, kind, argv, code, said.decode(errors="backslashreplace"), [why], cpu, used.ru_maxrss << 10
-        )
-    if verdict.faults and keep is not None:
-        shutil.rmtree(keep, ignore_errors=True)
-        fifos = [path for path in place.rglob("*") if path.is_fifo()]
-        shutil.copytree(place, keep, symlinks=True, ignore=lambda f, names: [n for n in names if Path(f, n) in fifos])
-        write_json(keep / "verdict.json", asdict(verdict))
-    return verdict
+        text, memory = said.decode(errors="backslashreplace"), used.ru_maxrss << 10
+        verdicts[verdict.case] = replace(verdict, code=code, said=text, faults=[why], memory=memory)
+    return list(verdicts.values())
 
 
-def _child(case: int, kind: str, argv: list[str], place: Path, answer: Path) -> None:
-    """Run the command of a case within bounds, judge how it ends, and write the verdict."""
+def _work(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str, answer: Connection) -> None:
+    """Run cases in the new process: before each, tell that it begins; after it, the verdict."""
     os.setsid()
     os.environ["NEUROLENS_TRACEBACK"] = "1"
-    for number, name in ((0, os.devnull), (1, os.devnull), (2, str(answer.with_name("stderr")))):
+    for number, name in ((0, os.devnull), (1, os.devnull), (2, str(scratch / "stderr"))):
         os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND), number)
     sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", errors="backslashreplace")
     resource.setrlimit(resource.RLIMIT_DATA, (2 * MEMORY + 1024 * resident_kb("VmData"),) * 2)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 28,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    before, spent = _state(place), cpu_s()
+    parser, place, clean = build(), scratch / "work", dict[str, tuple[int, ...]]()
+    place.mkdir()
+    for case in cases:
+        clean = _restore(good, place, clean)
+        chance, kind = chosen(seed, case, only)
+        verdict = Verdict(case, kind, KINDS[kind][1](chance, place), 0, "", [_UNFINISHED])
+        answer.send_bytes(json.dumps(asdict(verdict)).encode())
+        answer.send_bytes(json.dumps(asdict(_judged(verdict, place, lambda: parser))).encode())
+
+
+def _judged(begun: Verdict, place: Path, parser: Callable[[], Parser]) -> Verdict:
+    """Run the command of a case within bounds, and judge how it ends."""
+    before, spent, of_children = _state(place), cpu_s(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
     os.chdir(place)
+    os.ftruncate(2, 0)
     Path("/proc/self/clear_refs").write_text("5")  # the largest memory counts from here
-    signal.setitimer(signal.ITIMER_PROF, CPU_S if kind != "long runs" else LONG_CPU_S)
+    signal.setitimer(signal.ITIMER_PROF, CPU_S if begun.kind != "long runs" else LONG_CPU_S)
     try:
-        code = cli.main(argv, build)
+        code = cli.main(begun.argv, parser)
     except SystemExit as stopped:
         code = stopped.code if isinstance(stopped.code, int) else 1
     except BaseException:
@@ -151,19 +178,52 @@ def _child(case: int, kind: str, argv: list[str], place: Path, answer: Path) -> 
     with suppress(OSError, ValueError):
         sys.stdout.flush()
         sys.stderr.flush()
-    memory = max(resident_kb("VmHWM"), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss) << 10
+    memory, children = resident_kb("VmHWM"), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    memory = max(memory, children if children > of_children else 0) << 10
     after = _state(place)
-    new = [path.name for path in after if after[path] != before.get(path)]
-    said = answer.with_name("stderr").read_bytes().decode(errors="backslashreplace")
-    faults = [*_faults(argv, code, said, new, memory), *(_other_pixels(place) if code == 0 else ())]
-    verdict = Verdict(case, kind, argv, code, said[-2000:], faults, cpu_s() - spent, memory)
-    answer.write_text(json.dumps(asdict(verdict)))
+    new = [os.path.basename(path) for path in after if after[path] != before.get(path)]
+    said = (place.parent / "stderr").read_bytes().decode(errors="backslashreplace")
+    faults = [*_faults(begun.argv, code, said, new, memory), *(_other_pixels(place) if code == 0 else ())]
+    with suppress(ChildProcessError):
+        if os.waitpid(-1, os.WNOHANG) == (0, 0):
+            faults.append("a process stayed")
+    return replace(begun, code=code, said=said[-2000:], faults=faults, cpu_s=cpu_s() - spent, memory=memory)
 
 
-def _state(place: Path) -> dict[Path, tuple[int, int, int]]:
+def _state(place: Path) -> dict[str, tuple[int, ...]]:
     """The paths in a folder, with numbers that change with their contents."""
-    about = {path: path.lstat() for path in place.rglob("*")}
-    return {p: (a.st_ino, a.st_size, 0 if stat.S_ISDIR(a.st_mode) else a.st_mtime_ns) for p, a in about.items()}
+    found = dict[str, tuple[int, ...]]()
+    for folder, folders, names in os.walk(place):
+        for path in (os.path.join(folder, name) for name in (*folders, *names)):
+            about = os.lstat(path)
+            changing = () if stat.S_ISDIR(about.st_mode) else (about.st_size, about.st_ctime_ns)
+            found[path] = (about.st_ino, about.st_mode, *changing)
+    return found
+
+
+def _restore(good: Path, place: Path, clean: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """Make the folder of cases equal to that of good files again; `clean` and the result are its states when it is."""
+    for path, about in sorted(_state(place).items(), reverse=True):  # what is in a folder before the folder
+        if about != clean.get(path):
+            shutil.rmtree(path) if stat.S_ISDIR(about[1]) else os.unlink(path)
+    for path in clean or map(str, sorted(place / source.relative_to(good) for source in good.rglob("*"))):
+        if not os.path.lexists(path):
+            source = good / os.path.relpath(path, place)
+            if source.is_dir():
+                os.mkdir(path)
+            elif source.is_file():
+                shutil.copy(source, path)
+            else:
+                os.mkfifo(path)
+    return _state(place)
+
+
+def _keep(place: Path, keep: Path, verdict: Verdict) -> None:
+    """Keep the files of a case, and its verdict."""
+    shutil.rmtree(keep, ignore_errors=True)
+    fifos = [path for path in place.rglob("*") if path.is_fifo()]
+    shutil.copytree(place, keep, symlinks=True, ignore=lambda f, names: [n for n in names if Path(f, n) in fifos])
+    write_json(keep / "verdict.json", asdict(verdict))
 
 
 def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memory: int) -> Iterator[str]:
@@ -232,20 +292,22 @@ def run(args: argparse.Namespace) -> int:
     wanted = range(args.first, args.first + args.cases)
     kinds = {chosen(args.seed, case, args.only)[1] for case in wanted}
     verdicts = list[Verdict]()
-    for module in _LOADED:  # once, not in every process
-        import_module(module)
+    for module in walk_packages(neurolens.__path__, "neurolens."):  # once, not in every process
+        with suppress(ImportError):  # of an extra, or of Blender
+            module.name.endswith("__main__") or import_module(module.name)
     import_module("torch").set_num_threads(1)  # a fork has none of the threads that a library counts on
     shorten()
     with tempfile.TemporaryDirectory(prefix="neurolens-fuzz-", dir=_disk()) as scratch:
         good = Path(scratch) / "good"
         make_seeds(good, kinds, _single)
         _warm(good, Path(scratch) / "warm")
+        gc.collect()
+        gc.freeze()
         for first in range(args.first, wanted.stop, _BATCH):
             cases = range(first, min(first + _BATCH, wanted.stop))
             kept = folder / f"{args.seed}-{first}-{len(cases)}{args.only and '-'}{args.only}.json"
             if args.restart or not kept.exists():
-                places = {case: args.keep and args.keep / f"{args.seed}-{case}" for case in cases}
-                made = [run_case(good, Path(scratch) / "case", k, args.seed, args.only, to) for k, to in places.items()]
+                made = run_cases(good, Path(scratch) / "case", cases, args.seed, args.only, args.keep)
                 write_json(kept, [asdict(v) for v in made])
             verdicts += [Verdict(**row) for row in json.loads(kept.read_text())]
             bad = [v for v in verdicts if v.faults]

@@ -43,9 +43,10 @@ def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple
         scene.read_text().replace('aperture_mask = "mask.png"\n', "")
     )  # whose area takes a tenth of a second
     lens, models = lab.LENSES / "cooke_triplet_50.toml", lab.MODELS / "cooke_triplet_50"
-    for place in ("lens.toml", "good.toml", "fold/lens.toml"):
-        (folder / place).parent.mkdir(exist_ok=True)
+    (folder / "fold").mkdir()
+    for place in ("lens.toml", "fold/lens.toml"):
         shutil.copy(lens, folder / place)
+    shutil.copy(lab.LENSES / "thorlabs_lb1471_biconvex_50.toml", folder / "good.toml")  # with one ghost
     shutil.copy(lab.LENSES / "nikon_zoom_80_200.toml", folder / "states.toml")
     shutil.copy(folder / "lens.zmx", folder / "fold" / "=lens.zmx")
     shutil.copy(f"{models}.ols-64.onnx", folder / "model.onnx")

@@ -71,13 +71,13 @@ def _of_lens(chance: Chance, folder: Path) -> Words:
             (0.5, rendered("lens.toml")),
             (0.3, rendered("fused:lens.toml")),
             (0.1, ("stmap", "lens.toml", *_FILM, "-o", "shot")),
-            (0.05, ("handover", "lens.toml", *_FILM, "-o", "shot")),
+            (0.02, ("handover", "lens.toml", *_FILM, "-o", "shot")),
             (0.3, ("export", "lens.toml", "--to", "c", "-o", "out.h", "--json")),
             (0.2, ("export", "lens.toml", "--to", "glsl", "-o", "out.glsl", "--json")),
             (0.5, _flare("lens.toml", *light)),
             (2, _flare("lens.toml", *light)[:4]),
             (0.5, ("models", "lens.toml")),
-            (0.1, ("survey", "fold", "--no-fit", "-o", "new", "--jobs", "1", "--quiet")),
+            (0.05, ("survey", "fold", "--no-fit", "-o", "new", "--jobs", "1", "--quiet")),
             (1, ("verify", "lens.toml", "--profile", "Canon EF 50mm f/1.8", "--lens-file", "out.toml")),
             (0.5, ("rims", "lens.toml", "--profile", "Canon EF 50mm f/1.4 USM", "-o", "out.toml")),
         ),
@@ -90,7 +90,7 @@ def _of_zoom(chance: Chance, folder: Path) -> Words:
         chance,
         (
             (4, ("lens", "states.toml", "good.toml")),
-            (2, ("lens", "states.toml", "--zoom", "100", "--focus", "2")),
+            (0.5, ("lens", "states.toml", "--zoom", "100", "--focus", "2")),
             (1, ("lens", "states.toml", "--focus-mode", "internal", "--focus", "1.5")),
             (2, rendered("thick:states.toml", "--zoom", "100")),
         ),
@@ -151,7 +151,7 @@ def _of_model(chance: Chance, folder: Path) -> Words:
             (0.3, ("export", name, "--to", "c", "-o", "out.h", "--json")),
             (0.1, ("stmap", name, *_FILM, "-o", "shot")),
             (0.1, ("bokeh", name, *_FILM, "--distance", "2", "--grid", "1x1", "-o", "shot")),
-            (0.1, ("handover", name, *_FILM, "-o", "shot")),
+            (0.02, ("handover", name, *_FILM, "-o", "shot")),
             (0.1, ("view", name, "--downloads", "glsl", "-o", "out.html", "--json")),
             (0.1, ("blender", "add", name, "--extension", "pack.zip", "--quiet")),
         ),
@@ -220,7 +220,7 @@ def _of_kept(chance: Chance, folder: Path) -> Words:
         "out.exr.part": rendered("thin", "--samples", "16"),
         **{name: ["survey", "fold", "--no-fit", "-o", "done", "--quiet"] for name in records},
     }
-    rare = [{"out.exr.part": 3}.get(name.partition("/")[0], 0.5) for name in commands]
+    rare = [{"out.exr.part": 3}.get(name.partition("/")[0], 0.2) for name in commands]
     (name,) = chance.choices(list(commands), rare)
     (folder / "kept.part").rename(folder / "out.exr.part")
     hurt(chance, folder, name)
@@ -376,7 +376,7 @@ KINDS: dict[str, tuple[float, Callable[[Chance, Path], Words]]] = {
     "cut plate": (3, _cut_plate),
     "cut tile": (3, _cut_tile),
     "cut checkpoint": (3, _cut_checkpoint),
-    "cut map": (1, _cut_map),
+    "cut map": (0.3, _cut_map),
     "large": (0.8, _of_large),
     "long runs": (0.1, _of_long_runs),
 }
@@ -413,12 +413,12 @@ def build() -> Parser:
 
 
 def shorten() -> None:
-    """Replace steps that take long and read no further file: a survey's processes, a shader's pupil, the field of the
-    good lens of plates, which is made once."""
+    """Replace steps that take long and read no further file: a survey's processes, a shader's pupil, the models of the
+    library, the field of the good lens of plates, which is made once."""
     from neurolens.base.tasks import Here
     from neurolens.blender import Form
     from neurolens.cameras.onnxlens import load_model
-    from neurolens.cli import blender, flare, train
+    from neurolens.cli import blender, flare, models, train
 
     def form_of(file: Path, **_: Any) -> Form:
         card = load_model(file).card
@@ -438,3 +438,4 @@ def shorten() -> None:
     flare.Shots._field = field  # type: ignore[assignment,method-assign]
     train.Processes = lambda *_: Here()  # type: ignore[assignment,misc]
     blender.form_of = form_of
+    models._places = lambda: [place for place in [Path("models")] if place.is_dir()]

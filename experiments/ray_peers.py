@@ -186,10 +186,15 @@ _DRAWING = ("vtk", "vtk.util", "vtk.util.numpy_support")
 
 def optiland(task: Task, backend: str, precision: str, device: str = "cpu") -> Prepared:
     """Optiland with constant indices and without records of each surface, which is its fastest way."""
-    if "vtk" not in sys.modules and importlib.util.find_spec("vtk") is None:
-        sys.modules.update((name, mock.MagicMock()) for name in _DRAWING)
-    be, optics = package("optiland.backend"), package("optiland.optic")
-    material, rays = package("optiland.materials").IdealMaterial, package("optiland.rays").RealRays
+    absent = "vtk" not in sys.modules and importlib.util.find_spec("vtk") is None
+    stand_ins = {name: mock.MagicMock() for name in _DRAWING if absent}
+    sys.modules.update(stand_ins)
+    try:
+        be, optics = package("optiland.backend"), package("optiland.optic")
+        material, rays = package("optiland.materials").IdealMaterial, package("optiland.rays").RealRays
+    finally:
+        for name in stand_ins:
+            del sys.modules[name]
 
     def settle() -> None:
         be.set_backend(backend)

@@ -34,6 +34,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.settings import (
     add_options,
     apply_overrides,
+    between,
     changed,
     check_bounds,
     from_dict,
@@ -43,6 +44,7 @@ from neurolens.base.settings import (
     to_dict,
     to_toml,
 )
+from neurolens.base.tomlfile import format_toml, parse_toml
 from neurolens.base.units import in_unit
 
 
@@ -425,12 +427,42 @@ def test_settings_are_options(capsys: pytest.CaptureFixture[str]) -> None:
         ("m", "1.5e3mm", "1.5"), ("m", "2", "2"), ("mm", "2in", "50.8"), ("mm", "-0.1mm", "-0.1"),
         ("deg", "30deg", "30"), ("nm", "0.55um,600nm,700", "550,600,700"), ("s", "2min", "120"),
         ("pixels", "3840px", "3840"), ("f", "f/2", "2"), ("f", "F2.8", "2.8"), ("f", "2.8", "2.8"),
-        ("m", "2kg", "2kg"), ("m", "2deg", "2deg"), ("m", "1.2.3m", "1.2.3m"), ("deg", "2m", "2m"), ("f", "2m", "2m"),
+        ("m", "2kg", "2kg"), ("m", "2deg", "2deg"), ("m", "1.2.3m", "1.2.3m"), ("m", "2M", "2"),
+        ("m", "1e400m", "1e400m"), ("mm", "1e308m", "1e308m"), ("deg", "2m", "2m"), ("f", "2m", "2m"),
     ],
 )  # fmt: skip
 def test_numbers_take_the_units_of_their_dimension(unit: str, typed: str, value: str) -> None:
     """What is no quantity of the option's dimension is left for the option to refuse."""
     assert in_unit(unit, str)(typed) == value
+
+
+@dataclass(frozen=True)
+class _Focus:
+    focus_m: float = 1.0
+    size_mm: tuple[float, float] | None = None
+
+
+def test_quantities_of_files_take_units_and_none_overflows() -> None:
+    """Infinity is typed as "inf": digits beyond any float are a mistake."""
+    assert from_dict(_Focus, {"focus_m": "6ft"}, "s.toml") == _Focus(1.8288)
+    for wrong in ("2 kg", "6ft,3m", "1e400m", "far"):
+        with pytest.raises(InputError, match=r"s\.toml: focus_m: got .*, expected a number"):
+            from_dict(_Focus, {"focus_m": wrong}, "s.toml")
+    focus = in_unit("m", between(0.01, math.inf, "m"))
+    assert focus("inf") == math.inf and focus("1e300") == 1e300
+    for wrong in ("1e400", "1e400m", "1" * 400):
+        with pytest.raises(argparse.ArgumentTypeError, match="expected m from 0.01"):
+            focus(wrong)
+    assert parse_toml("a = [inf, -1e300]", "s.toml") == {"a": [math.inf, -1e300]}
+    with pytest.raises(ValueError, match="-1e400 is too large"):
+        parse_toml("a = -1e400", "s.toml")
+
+
+def test_toml_refuses_names_that_it_could_not_read_again() -> None:
+    for text in ("caf\udce9/lens.toml", "\ud800"):
+        for data in ({"file": text}, {text: 1}, {"files": [text]}):
+            with pytest.raises(InputError, match="rename the file or the folder"):
+                format_toml(data)
 
 
 class Clock:

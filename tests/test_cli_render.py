@@ -223,6 +223,9 @@ def test_keys_of_files(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "each quantity once" in failure(capsys, *start, "--key", "focus=1:1")
     csv.unlink()
     assert "keys.csv" in failure(capsys, *start)
+    for empty in ("", "frame,focus\n", "frame,focus\n1,\n2,\n", "frame\n1\n"):  # a file that was cut, for one
+        csv.write_text(empty)
+        assert "keys.csv: keys: got (none), expected a value of focus" in failure(capsys, *start)
 
 
 def test_frames_follow_their_keys_and_what_exists_is_kept(
@@ -260,6 +263,7 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
     capsys.readouterr()
     for wrong, words in (
         (("--key", "focus=1:0"), "a number from 1e-06 to inf"),
+        (("--key", "focus=1:1e400"), "a number from 1e-06 to inf"),
         (("--key", "f-number=1:1e-320"), "a number from 0.1 to 10000"),
         (("--key", "position=1:0/1"), "X/Y/Z"),
         (("--key", "focus=3:1,2:1"), "frames increasing"),

@@ -326,7 +326,8 @@ def fingerprint_of(values: Sequence[Any]) -> str:
 
 
 def atomic_write_text(path: str | Path, text: str) -> None:
-    """Write `text` (UTF-8) to `path` atomically; bytes of names that are no UTF-8 are written as \\u and digits."""
+    """Write `text` (UTF-8) to `path` atomically; bytes of names that are no UTF-8 are written as \\u and digits, which
+    TOML could not read again (`tomlfile.format_value` refuses them)."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 

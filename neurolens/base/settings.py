@@ -29,18 +29,21 @@ import re
 import types
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from numbers import Real
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
-from neurolens.base.units import WORTH, in_unit
+from neurolens.base.units import WORTH, as_float, in_unit
 
 T = TypeVar("T")
+_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)  # which evaluates every annotation anew
 # Bounds that every input keeps: beyond them searches take minutes or find no light.
 F_NUMBER = 0.1, 10_000.0
 FOCAL_MM = 1e-3, 1e6
@@ -123,7 +126,7 @@ def group(title: str, **more: Any) -> Any:
 
 def check_bounds(settings: Any, what: str) -> None:
     """Refuse numbers out of the bounds of their fields, for `__post_init__`; raises InputError about `what`."""
-    hints = get_type_hints(type(settings))
+    hints = _hints(type(settings))
     for f in fields(settings):
         value, option = getattr(settings, f.name), f.metadata.get("option")
         if not option or option.within is None or value is None:
@@ -133,13 +136,13 @@ def check_bounds(settings: Any, what: str) -> None:
 
 
 def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
-    """Type of an argument: the number of a text where it is `good`, which NaN never is."""
+    """Type of an argument: the number of a text where it is `good`, which NaN and digits beyond any float never are."""
 
     def convert(text: str) -> T:
         try:
-            value = kind(text)
+            value: Any = as_float(text) if kind is float else kind(text)
             if good(value):
-                return value
+                return cast(T, value)
         except ValueError:
             pass
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
@@ -183,7 +186,7 @@ def add_options(
         texts: for some fields, what replaces {} in their help.
         root: the parser that gets the groups of arguments, where `parser` is a group.
     """
-    hints, apart, texts = get_type_hints(cls), dict[str, Any](), texts or {}
+    hints, apart, texts = _hints(cls), dict[str, Any](), texts or {}
     for f in sorted(_options(cls), key=lambda f: getattr(f.metadata.get("option"), "last", 0)):
         option: Option | None = f.metadata.get("option")
         if option is None:
@@ -256,7 +259,7 @@ def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False)
     Raises:
         InputError: what the class refuses.
     """
-    hints, values = get_type_hints(cls), dict[str, Any]()
+    hints, values = _hints(cls), dict[str, Any]()
     for f in _options(cls):
         if is_dataclass(hints[f.name]):
             values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", False))
@@ -374,12 +377,12 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
         data = {key: value for key, value in data.items() if key != name}
         warnings.warn(f"{file}: {_join(prefix, name)} has no effect any more", NeurolensWarning, stacklevel=2)
     reject_unknown(file, prefix and f"{prefix}.", data, list(known))
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     values: dict[str, Any] = {}
     for name, f in known.items():
         place = _join(prefix, name)
         if name in data:
-            values[name] = _convert(data[name], hints[name], file, place)
+            values[name] = _convert(_in_unit_of(name, data[name]), hints[name], file, place)
         elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
             raise InputError(file, place, "(missing)", _describe(hints[name]))
     try:
@@ -406,6 +409,14 @@ def _with_new_names(
 
 def _join(prefix: str, name: str) -> str:
     return f"{prefix}.{name}" if prefix else name
+
+
+def _in_unit_of(name: str, value: Any) -> Any:
+    """The number of a text with a unit, "6ft", in the unit that a field's name ends with; other values as they are."""
+    if isinstance(value, str) and (unit := _UNIT.fullmatch(name)) and (plain := in_unit(unit[2], str)(value)) != value:
+        with suppress(ValueError):  # two numbers
+            return float(plain)
+    return value
 
 
 def _convert(value: Any, kind: Any, file: str | Path, place: str) -> Any:

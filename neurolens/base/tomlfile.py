@@ -13,6 +13,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_bytes
+from neurolens.base.units import as_float
 
 MAX_BYTES = 1_000_000
 _DEEPEST = 100  # tables in each other, or parts of a key
@@ -45,7 +46,7 @@ def parse_toml(text: str, file: str | Path) -> dict[str, Any]:
     # The parser's time grows with the square of the parts of a dotted key.
     if any(piece.count(".") > _DEEPEST for piece in re.split(r"[=,{}\[\]\n]", text)):
         raise ValueError(f"a key of more than {_DEEPEST} parts")
-    data = tomllib.loads(text)
+    data = tomllib.loads(text, parse_float=as_float)
     check_tree(data, file)
     return data
 
@@ -124,7 +125,7 @@ def format_value(value: Any) -> str:
     """One TOML value on one line; floats and texts come back bit for bit.
 
     Raises:
-        TypeError: a value that TOML has no form for.
+        TypeError: a value that TOML has no form for. InputError: a name whose bytes are no UTF-8.
     """
     match value:
         case bool():
@@ -132,6 +133,8 @@ def format_value(value: Any) -> str:
         case int() | float():
             return repr(value)
         case str():
+            if any("\ud800" <= c <= "\udfff" for c in value):  # TOML has no escape for them either
+                raise InputError("TOML", "text", value, "UTF-8: rename the file or the folder")
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
             pairs = ", ".join(f"{format_key(k)} = {format_value(v)}" for k, v in value.items())

@@ -20,8 +20,19 @@ WORTH: tuple[dict[str, float], ...] = (
 _QUANTITY = re.compile(r"([-+]?[\d.]+(?:e[-+]?\d+)?) ?([^\d\s.,]+)", re.IGNORECASE)
 
 
+def as_float(text: str) -> float:
+    """The number of a text; ValueError, too, where its digits are beyond any float, which is not infinity."""
+    value = float(text)
+    if math.isinf(value) and re.search(r"\d", text):
+        raise ValueError(f"{text[:40]} is too large")
+    return value
+
+
 def in_unit(unit: str, convert: Callable[[str], T]) -> Callable[[str], T]:
-    """Type of an argument whose numbers may have a unit: in_unit("m", float)("6ft") is 1.8288; `unit` "f" takes f/2."""
+    """Type of an argument whose numbers may have a unit: in_unit("m", float)("6ft") is 1.8288; `unit` "f" takes f/2.
+
+    Units may be typed in capitals: 2M is 2 m, for no option has a use for megametres.
+    """
     worth = next((worth for worth in WORTH if unit in worth), {})
 
     def plain(word: str) -> str:
@@ -31,7 +42,8 @@ def in_unit(unit: str, convert: Callable[[str], T]) -> Callable[[str], T]:
         if found is None or (factor := worth.get(found[2].lower())) is None:
             return word
         with suppress(ValueError):  # 1.2.3
-            return f"{float(found[1]) * factor / worth[unit]:.12g}"
+            value = as_float(found[1]) * factor / worth[unit]
+            return f"{value:.12g}" if math.isfinite(value) else word
         return word
 
     def read(text: str) -> T:

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import sys
+import time
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -34,6 +35,7 @@ _ID = "neurolens"
 _CODE = (*sorted(path.name for path in EXTENSION.glob("*.py")), "blender_manifest.toml")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
 _LARGEST = 1 << 28  # of a library: 200 lenses unpacked are some 80 MB
+LONGEST_S = 60.0  # that a lens waits for another to be added
 
 
 @dataclass(frozen=True)
@@ -126,16 +128,38 @@ def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """A block that one process or thread at a time runs for a folder; others wait. Systems without such locks let all
-    of them through."""
+    of them through.
+
+    Raises:
+        InputError: another held it for `LONGEST_S`.
+    """
     handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
     try:
-        if handle is not None:
-            with suppress(OSError):
-                fcntl.flock(handle, fcntl.LOCK_EX)
+        end = time.monotonic() + LONGEST_S
+        while handle is not None:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    raise InputError(folder, "lock", _holder(folder), f"freed within {LONGEST_S:g} s") from None
+                time.sleep(0.05)
+                continue
+            except OSError:
+                pass
+            break
         yield
     finally:
         if handle is not None:
             os.close(handle)  # which ends the lock
+
+
+def _holder(folder: Path) -> str:
+    """Who locks a folder, where the system tells (Linux does)."""
+    with suppress(OSError):
+        for words in map(str.split, Path("/proc/locks").read_text().splitlines()):
+            if words[1] == "FLOCK" and words[5].endswith(f":{folder.stat().st_ino}"):
+                return f"(held by process {words[4]})"
+    return "(held by another process)"
 
 
 def check_takes(to: Path) -> None:

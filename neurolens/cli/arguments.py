@@ -30,6 +30,7 @@ from neurolens.base.settings import (
     setting_of,
     spelling,
 )
+from neurolens.base.units import as_float
 from neurolens.lens.shot import FocusMode, Shot, StopShape, film_size
 
 if TYPE_CHECKING:
@@ -251,7 +252,7 @@ def named_lens(models: bool, cameras: bool, text: str) -> Any:
 def floats(text: str, between: str = ",") -> list[float]:
     """The numbers of a text; none where a word is no number."""
     try:
-        return [float(word) for word in text.split(between)]
+        return [as_float(word) for word in text.split(between)]
     except ValueError:
         return []
 

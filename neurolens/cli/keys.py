@@ -132,6 +132,8 @@ def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str
     rows = read_rows(path, "a list of keys")
     for number, row in enumerate(rows):
         reject_unknown(path, f"row {number + 1}, ", row, ["frame", *names])
+    if all(row.get(name) in (None, "") for row in rows for name in names):
+        raise InputError(path, "keys", "(none)", f"a value of {', '.join(names)} at a frame")
     for name in names:
         keys = []
         for number, row in enumerate(rows):

@@ -341,7 +341,10 @@ def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
 
 
 def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
-    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not stated."""
+    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not stated.
+
+    Warn of wavelengths at which the index of a glass is not stated, but not of tensors on a GPU, which would wait.
+    """
     shape, dtype = rays.x.shape, rays.x.dtype
     if dtype not in (torch.float32, torch.float64):
         raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
@@ -353,6 +356,11 @@ def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
         if wavelength_nm.ndim and wavelength_nm.shape != shape:
             found = f"({tuple(wavelength_nm.shape)})"
             raise InputError("trace", "wavelength_nm", found, f"a number or a tensor {tuple(shape)}")
+        if wavelength_nm.device.type == "cpu" and not torch.compiler.is_compiling():
+            low, high = glass.stated_nm(lens)
+            known = wavelength_nm.detach()[(wavelength_nm >= low) & (wavelength_nm <= high)]  # other rays have a status
+            for nm in torch.stack(known.aminmax()).tolist() if known.numel() else ():
+                glass.check_light(lens, nm)
     elif not 0 < wavelength_nm < math.inf:
         raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
     else:

@@ -81,6 +81,18 @@ def test_lenses_added_at_once_are_all_there(suffix: str, tmp_path: Path, monkeyp
     assert ids == {f"lens_{k}" for k in range(8)} | ({"first"} if suffix else set())
 
 
+@pytest.mark.skipif(not Path("/proc/locks").exists(), reason="this system does not tell who locks a folder")
+def test_a_lock_that_stays_is_named_and_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blender, "LONGEST_S", 0.2)
+    with (
+        blender.locked(tmp_path),
+        pytest.raises(InputError, match=rf"lock: got \(held by process {os.getpid()}\), expected freed within 0.2 s"),
+    ):
+        add_lens(tmp_path, lens())
+    assert not list(tmp_path.iterdir())
+    add_lens(tmp_path, lens())
+
+
 def test_user_folder_adds_to_the_lenses_that_ship(tmp_path: Path) -> None:
     shipped, own = tmp_path / "shipped", tmp_path / "own"
     add_lens(shipped, lens())
