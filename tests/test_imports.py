@@ -40,8 +40,10 @@ PARTS = {
     "blender": "",
     "frames": "lens readers cameras render flare",
     "torch": "graph lens cameras",
+    "hosts": "graph lens cameras render",
+    "__init__": "hosts",
     "cli": "graph lens trace setting readers analysis surrogates cameras shaders render mitsuba flare study plan view"
-    " blender frames photographs defocus handover",
+    " blender frames photographs defocus handover hosts",
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
 PACKAGES = {

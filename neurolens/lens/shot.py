@@ -7,7 +7,7 @@ import re
 from argparse import ArgumentTypeError
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, between, check_bounds, said, setting, within
@@ -96,10 +96,6 @@ class Shot:
 
     def __post_init__(self) -> None:
         check_bounds(self, "camera")
-        for field, kind in (("focus_mode", FocusMode), ("vignetting", Vignetting), ("dispersion", Dispersion)):
-            choices = get_args(kind)
-            if getattr(self, field) not in choices:
-                raise InputError("camera", field, getattr(self, field), f"one of: {', '.join(choices)}")
         object.__setattr__(self, "film_mm", check_film(self.film_mm))
         object.__setattr__(self, "focus_m", float(self.focus_m))
 
