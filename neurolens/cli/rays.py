@@ -96,7 +96,9 @@ examples:
 
             def tensors(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
                 with atomic_path(path) as temporary:
+                    mode = temporary.stat().st_mode  # the library's files are for their owner alone
                     save_file(dict(arrays), temporary, {"neurolens": json.dumps(about)})
+                    temporary.chmod(mode)
 
             return tensors
         if asked.compact or asked.samples > _MOST_LAYERS:
