@@ -228,9 +228,10 @@ def run(args: argparse.Namespace) -> None:
     depth = depth_error(size) if find_spec("newton") else None
     told = "" if depth is None else (
         f"Newton's depth along {depth['rays']} rays differs from our own intersection by {depth['median_mm']:.2g} mm "
-        f"(median; 99% within {depth['p99_mm']:.2g}, worst {depth['worst_mm']:.2g} mm)."
+        f"(median; 99% within {depth['p99_mm']:.2g}, worst, past the edge of a ball, {depth['worst_mm']:.2g} mm)."
     )  # fmt: skip
-    said = f"# One scene, three hosts\n\nShares of the mean of the picture; {size[0]} x {size[1]} pixels, {args.samples} rays each."
+    said = f"Shares of the mean of the picture; {size[0]} x {size[1]} pixels, {args.samples} rays each."
+    said = f"# One scene, three hosts\n\n{said} `python -m experiments hosts`"
     print(lab.write_results(args.out, "hosts", lab.page(said, lab.table(_COLUMNS, rows), told, lab.machine_line()), {
         "rows": rows, "depth": depth, "machine": lab.machine(),
     }))  # fmt: skip

@@ -6,7 +6,7 @@
 The value of a pixel is the mean of weight times radiance over its samples. Film point, pupil point and wavelength of a
 sample are one point of a Sobol' sequence, scrambled for each pixel by the seed, as in our renderer: one seed names the
 same rays for every host. The axes and arrays of the hosts were read in the sources of Newton 1.8.0, gsplat 1.6.0,
-3DGRUT (July 2026) and Mitsuba 3.9.1.
+3DGRUT at a37ef721 and Mitsuba 3.9.1.
 """
 
 from __future__ import annotations
