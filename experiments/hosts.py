@@ -51,7 +51,7 @@ def colour_of(rgb: tuple[float, ...], grey: bool) -> list[float]:
     return [rgb[1]] * 3 if grey else list(rgb)
 
 
-def shapes(grey: bool) -> tuple[list[tuple[tuple[float, ...], list[float]]], list[tuple[float, float, list[float]]]]:
+def shapes(grey: bool) -> tuple[list[Any], list[Any]]:
     """The balls with their colours, and the corners x and z of the tiles with theirs."""
     balls = [(ball, colour_of(c, grey)) for ball, c in zip(BALLS, COLOURS, strict=True)]
     return balls, [(i * TILE, -k * TILE, colour_of((PALE, DARK)[(i + k) % 2], grey)) for i, k in TILES]
@@ -183,7 +183,7 @@ HOSTS = {"our renderer": (ours, ""), "Mitsuba 3": (mitsuba, "mitsuba"), "Newton"
 def compared(size: tuple[int, int], samples: int) -> list[lab.Row]:
     """For each host that is here: noise of a pixel, and its difference from our renderer, all in shares of the mean."""
     rows: list[lab.Row] = []
-    reference = noise_of_ours = None
+    reference, noise_of_ours = None, 0.0
     for k, (name, (picture, module)) in enumerate(HOSTS.items()):
         if module and find_spec(module) is None:
             continue

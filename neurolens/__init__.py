@@ -13,9 +13,8 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
 def __getattr__(name: str) -> Any:
-    """`neurolens.rays`, loaded where it is first used."""
-    if name == "rays":
-        from neurolens.hosts import rays
+    if name != "rays":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from neurolens.hosts import rays  # loads numpy and the renderer, which the command line does not need at once
 
-        return rays
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return rays

@@ -291,7 +291,7 @@ class RayJob:
 
     def _compact(self, origin: FloatArray, direction: FloatArray) -> Arrays:
         """Rays [3, N] of our frame as the arrays of `compact`."""
-        steps = np.rint(_met(origin, direction, self._plane_z)[0] / self._step)
+        steps = np.rint(_met(origin, direction, self._plane_z) / self._step)
         return {
             "origin_xy": (steps * self._signs[:2]).T.astype(np.int16),
             "direction_xy": (direction[:2] * self._signs[:2]).T,
@@ -300,23 +300,22 @@ class RayJob:
     def _rounding(self, focus_m: float) -> tuple[float, float]:
         """z of the plane where rays of `compact` start, and their step there, in metres in our frame.
 
-        Rounding moves a ray sideways by up to a step over the root of 2: in the plane in focus by that many pixels as
-        such a plane shows.
+        Rounding moves a ray sideways by up to a step over the root of 2, whatever its distance.
         """
-        rng, film_mm = np.random.default_rng(0), np.array(self.grid.film_mm)[:, None]
+        rng, light = np.random.default_rng(0), np.full(_PROBES, np.mean(self.settings.light_nm), np.float32)
         place, square = rng.random((2, _PROBES)), rng.random((2, _PROBES), np.float32)
         place[:, :4] = [[0, 0, 1, 1], [0, 1, 0, 1]]
-        film, nm = 0.999 * (place - 0.5) * film_mm, np.full(_PROBES, np.mean(self.settings.light_nm), np.float32)
-        beside = film - np.sign(film) * film_mm / [[self.grid.width], [self.grid.height]]
-        found = [self.camera.sample(f.astype(np.float32), square, nm) for f in (film, beside)]
-        passed = (found[0].status == 0) & (found[1].status == 0)
-        if not (passed.any() and (-found[0].direction[2, passed] > _FLATTEST).all()):
+        film = 0.999 * (place - 0.5) * np.array(self.grid.film_mm)[:, None]
+        found = self.camera.sample(film.astype(np.float32), square, light)
+        passed = found.status == 0
+        if not (passed.any() and (-found.direction[2, passed] > _FLATTEST).all()):
             raise InputError("rays", "compact", True, "rays within 80 degrees of the axis: leave it out")
-        plane_z = float(found[0].origin_m[2, passed].mean())
-        near, far = (_met(r.origin_m[:, passed], r.direction[:, passed], plane_z) for r in found)
-        step = 2 * max(float(np.abs(near[0]).max()), 1e-3) / np.iinfo(np.int16).max  # twice what was met
-        seen = np.hypot(*((near[0] - far[0]) / (focus_m + plane_z) + near[1] - far[1]))  # radians from the plane
-        self.compact_px = step / math.sqrt(2) / (focus_m + plane_z) / float(seen.min())
+        plane_z = float(found.origin_m[2, passed].mean())
+        widest = np.abs(_met(found.origin_m[:, passed], found.direction[:, passed], plane_z)).max()
+        step = 2 * max(float(widest), 1e-3) / np.iinfo(np.int16).max  # twice what was met
+        frame, pixels = frame_of(self.camera), (self.grid.width, self.grid.height)
+        pixel = min(mm / n / reach for mm, n, reach in zip(self.grid.film_mm, pixels, frame.reach_mm, strict=True))
+        self.compact_px = step / math.sqrt(2) / (pixel * (focus_m - frame.pupil_mm[0] / 1e3))
         if not self.compact_px <= MOST_COMPACT_PX:
             most = f"rays off by at most {MOST_COMPACT_PX:g} pixels, not {self.compact_px:.2g}: leave it out"
             raise InputError("rays", "compact", True, most)
@@ -326,10 +325,10 @@ class RayJob:
 _COMPACT = {"origin_xy": np.int16, "direction_xy": np.float32}
 
 
-def _met(origin: FloatArray, direction: FloatArray, plane_z: float) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Where rays [3, N] that run towards -z meet a plane, and their slopes there: x and y, [2, N]."""
-    slope = direction[:2] / -np.where(direction[2] < 0, direction[2], np.float32(-1))
-    return origin[:2] + slope * (origin[2] - np.float32(plane_z)), slope
+def _met(origin: FloatArray, direction: FloatArray, plane_z: float) -> FloatArray:
+    """x and y [2, N] where rays [3, N] that run towards -z meet a plane."""
+    along = (origin[2] - np.float32(plane_z)) / -np.where(direction[2] < 0, direction[2], np.float32(-1))
+    return origin[:2] + along * direction[:2]
 
 
 def from_compact(arrays: Mapping[str, NDArray[Any]]) -> tuple[FloatArray, FloatArray]:
