@@ -40,6 +40,7 @@ NAMES = {
     "render": ("render_times", "render time by camera and scene"),
     "defocus": ("defocus", "the blur of a lens for sharp pictures, beside path-traced ones"),
     "dispersion": ("dispersion", "noise and time of lenses that disperse, beside a thin lens"),
+    "hosts": ("hosts", "one scene by the rays of `neurolens rays`: our renderer, Mitsuba 3, NVIDIA Newton"),
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
     "osl-noise": ("osl_noise", "noise of dispersion in Cycles, and what adaptive sampling takes"),

@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurolens.front import Answer, Camera, Lens, find, fit, load
+    from neurolens.front import Answer, Camera, Lens, find, fit, load, rays
 
     def _run(*given: Any, **named: Any) -> Answer: ...
 
@@ -22,7 +22,7 @@ DISTRIBUTION = "neurolens-camera"
 # The Python front: made by `front.of` when it is asked for.
 __all__ = [
     "analyse", "bokeh", "camera", "defocus", "export", "find", "fit", "flare", "lens", "load", "plan", "projection",
-    "render", "stmap", "train", "verify",
+    "rays", "render", "stmap", "train", "verify",
 ]  # fmt: skip
 
 # onnxruntime reads this when it is imported. Otherwise 1.31 writes a device id and events into the user's cache folder

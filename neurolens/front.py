@@ -30,6 +30,7 @@ from neurolens.cameras.onnxlens import LensRays, OnnxLens
 from neurolens.cli import arguments as cli
 from neurolens.cli import command
 from neurolens.cli.calls import Answer, call, command_of, parameters, signature_of
+from neurolens.hosts import rays
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
 from neurolens.surrogates.file import read_model
 
@@ -54,6 +55,7 @@ EXAMPLES = {  # of each name: its docstring has it, and a test runs it
     "bokeh": f"nl.bokeh('{_LENS}.ols-36', width=480, film=(36, 24), focus_m=2, distance=[1, 5], output='bokeh')",
     "stmap": f"nl.stmap('{_LENS}.ols-36', width=480, film=(36, 20.25), focus_m=2, output='shot')",
     "projection": f"nl.projection('{_LENS}.ols-36', width=480, film=(36, 24), projection='opencv')",
+    "rays": f"nl.rays('{_LENS}.ols-36', (36, 24), width=48, focus_m=2, samples=4)['direction'].shape",
     "export": f"nl.export('{_LENS}.ols-36', to='c', output='lens.h')",
     "train": f"nl.train(lens='{_LENS}', within='5um', rounds=0, output='gauss')",
 }
@@ -84,7 +86,8 @@ class Call:
 def of(name: str) -> Call:
     """The function of the front that has this name; its docstring has the parameters and an example."""
     example = f"Example::\n\n    >>> import neurolens as nl\n    >>> {EXAMPLES[name]}\n"
-    if (own := {"find": find, "load": load, "fit": fit}.get(name)) is not None:
+    others: dict[str, Callable[..., Any]] = {"find": find, "load": load, "fit": fit, "rays": rays}
+    if (own := others.get(name)) is not None:
         return Call(name, own, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own))
     chosen = {"lens": Lens, "camera": Camera}.get(name)
     reads = chosen.reads if chosen else command(name)

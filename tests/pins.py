@@ -25,6 +25,7 @@ EXTRAS = (
     "dev",
     "docs",
     "mitsuba",
+    "rays",
     "photographs",
     "dask",
     "usd",

@@ -40,9 +40,10 @@ PARTS = {
     "blender": "",
     "frames": "lens readers cameras render flare",
     "torch": "graph lens cameras",
+    "hosts": "graph lens cameras render",
     "cli": "graph lens trace setting readers analysis surrogates cameras shaders render mitsuba flare study plan view"
-    " blender frames photographs defocus handover",
-    "front": "lens trace readers surrogates cameras study cli",
+    " blender frames photographs defocus handover hosts",
+    "front": "lens trace readers surrogates cameras study cli hosts",
     "__init__": "front",  # when a name of it is asked for
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.

@@ -109,6 +109,7 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
 # The README's lines run, some in a smaller size: what is printed, and what stands for it or follows it here.
 SMALLER = {
     "--width 3840": "--width 96",
+    "--width 480": "--width 24",
     "--width 96 -o first.exr": "--width 24 --samples 1 -o first.exr",
     "-o flare.exr": "--width 24 --bins 3 --cell 64 -o flare.exr",
     "train --lens my_lens.toml": "train --lens my_lens.toml --rounds 0 --set 'model=[{method=\"ols\",terms=12}]'"

@@ -20,6 +20,7 @@ EXTRAS = {
     **dict.fromkeys(("mitsuba", "drjit"), "mitsuba"),
     **dict.fromkeys(("onnx", "mpmath"), "dev"),
     "lensfunpy": "photographs",
+    "safetensors": "rays",
 }
 
 

@@ -125,14 +125,17 @@ def group(title: str, **more: Any) -> Any:
 
 
 def check_bounds(settings: Any, what: str) -> None:
-    """Refuse numbers out of the bounds of their fields, for `__post_init__`; raises InputError about `what`."""
+    """Refuse numbers out of the bounds of their fields, and texts that are not among those of their type, for
+    `__post_init__`; raises InputError about `what`."""
     hints = _hints(type(settings))
     for f in fields(settings):
-        value, option = getattr(settings, f.name), f.metadata.get("option")
+        value, option, (kind, _) = getattr(settings, f.name), f.metadata.get("option"), _kind(hints[f.name])
+        if get_origin(kind) is Literal and value is not None and value not in get_args(kind):
+            raise InputError(what, f.name, value, f"one of: {', '.join(map(str, get_args(kind)))}")
         if not option or option.within is None or value is None:
             continue
         if not isinstance(value, Real) or isinstance(value, bool) or not within(option.within, float(value)):
-            raise InputError(what, f.name, value, _expected(_kind(hints[f.name])[0], option.within, option.unit))
+            raise InputError(what, f.name, value, _expected(kind, option.within, option.unit))
 
 
 def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
@@ -160,6 +163,11 @@ def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     largest = (1 << 63) - 1 if most is None else most  # what generators of random numbers take
     expected = _expected(int, (least, math.inf if most is None else most), "an integer")
     return number(int, lambda value: least <= value <= largest, expected)
+
+
+def wavelengths_nm(text: str) -> tuple[float, ...]:
+    """Type of --wavelengths: one or more in nm, with commas between them."""
+    return tuple(between(*WAVELENGTH_NM, "wavelengths in nm")(word) for word in text.split(","))
 
 
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:

@@ -54,6 +54,7 @@ _COMMANDS = {
         "handover": ("handover.Handover", "a lens as files for Nuke, Blender, USD, OpenTrackIO, lensfun, OpenCV"),
         "stmap": ("stmap.StMap", "ST maps, which undistort and redistort pictures of a lens"),
         "projection": ("stmap.Projection", "fit a lens with a projection of OpenCV, nerfstudio or NVIDIA"),
+        "rays": ("rays.Rays", "rays of a lens as arrays: Newton, gsplat, 3DGRUT, Mitsuba, OpenGL, OpenCV"),
         "export": ("export.Export", "source code (C, shading languages) of a model; fix what a scene fixes"),
         "blender": ("blender.Blender", "the extension for Blender, and lenses in it"),
         "mitsuba": ("mitsuba.Mitsuba", "render a scene of Mitsuba 3 through a neurolens camera"),

@@ -12,7 +12,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from neurolens.base.errors import InputError, warned
-from neurolens.base.settings import WAVELENGTH_NM, between, said, setting
+from neurolens.base.settings import WAVELENGTH_NM, between, said, setting, wavelengths_nm
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ examples:
     wavelengths: tuple[tuple[float, ...], ...] | None = setting(
         None, f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
         "(default: d, F and C, or the file's own where its range lacks the d line)",
-        kind=cli.wavelengths_nm, nargs="+", metavar="NM",
+        kind=wavelengths_nm, nargs="+", metavar="NM",
     )  # fmt: skip
     frequencies: tuple[float, ...] | None = setting(
         None, "of mtf-height (default: 10 20 40)", kind=between(0, 1000, "cycles per mm"), nargs="+",

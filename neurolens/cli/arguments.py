@@ -21,9 +21,7 @@ from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, program
 from neurolens.base.settings import (
-    WAVELENGTH_NM,
     add_options,
-    between,
     from_options,
     group,
     setting,
@@ -48,7 +46,11 @@ cameras:
   thin, pinhole                the same of any focal length (--focal-length)
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
                                points with these projections; --field sets the picture's circle"""
-_SUFFIXES = {"png": (".png", ".pdf", ".svg"), "html": (".html", ".htm")}  # of files that a placeholder stands for
+_SUFFIXES = {
+    "png": (".png", ".pdf", ".svg"),
+    "html": (".html", ".htm"),
+    "npz": (".npz", ".safetensors", ".exr"),
+}  # of files that a placeholder stands for
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
@@ -220,11 +222,6 @@ def rms_error(text: str) -> tuple[str, float]:
     if not value:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0")
     return f"rms_{unit}", value
-
-
-def wavelengths_nm(text: str) -> tuple[float, ...]:
-    """Type of --wavelengths: one or more in nm, with commas between them."""
-    return tuple(between(*WAVELENGTH_NM, "wavelengths in nm")(word) for word in text.split(","))
 
 
 def words_of(choices: Sequence[str], least: str = "") -> Callable[[str], tuple[str, ...]]:

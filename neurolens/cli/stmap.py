@@ -18,7 +18,7 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.base.settings import positive, setting
+from neurolens.base.settings import positive, setting, wavelengths_nm
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Complex, Field, field_of, frame_of, parallax_mm, spectrum_of
 from neurolens.cli import arguments as cli
@@ -52,7 +52,7 @@ def whole_pair(names: str, most: int) -> Callable[[str], tuple[int, int]]:
 
 def channels_nm(text: str) -> tuple[float, ...]:
     """Type of --wavelengths: those of red, green and blue."""
-    waves = cli.wavelengths_nm(text)
+    waves = wavelengths_nm(text)
     if len(waves) == 3 and all(LIGHT_NM[0] <= nm <= LIGHT_NM[1] for nm in waves):
         return waves
     span = f"{LIGHT_NM[0]:g} to {LIGHT_NM[1]:g}"
@@ -88,9 +88,13 @@ class PictureCommand(cli.Reporting):
         return self.size or size_by_shape(self.film[0] / self.film[1], self.width, self.height)
 
     def make(
-        self, state: cli.LensState, progress: Progress, runtime: Runtime | None = "onnxruntime"
+        self,
+        state: cli.LensState,
+        progress: Progress,
+        runtime: Runtime | None = "onnxruntime",
+        light_nm: tuple[float, float] = LIGHT_NM,
     ) -> tuple[Camera, Shot]:
-        """The camera in a state of its lens, and its settings; what the camera notes is a warning.
+        """The camera in a state of its lens, for light of this range, and its settings; what it notes is a warning.
 
         `runtime`: as of `Shot`; maps take so few rays that compiling would take longer.
 
@@ -98,7 +102,7 @@ class PictureCommand(cli.Reporting):
             InputError: a film whose shape is not that of the picture.
         """
         PixelGrid(*self.picture, self.film)
-        shot = state.shot(self.film, wavelength_nm=LIGHT_NM, runtime=runtime)
+        shot = state.shot(self.film, wavelength_nm=light_nm, runtime=runtime)
         return cli.camera(self.camera, shot, progress), shot
 
 

@@ -7,7 +7,7 @@ import re
 from argparse import ArgumentTypeError
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, between, check_bounds, said, setting, within
@@ -102,11 +102,6 @@ class Shot:
 
     def __post_init__(self) -> None:
         check_bounds(self, "camera")
-        kinds = {"focus_mode": FocusMode, "vignetting": Vignetting, "dispersion": Dispersion, "runtime": Runtime}
-        for field, kind in kinds.items():
-            value, choices = getattr(self, field), get_args(kind)
-            if value not in choices and not (field == "runtime" and value is None):
-                raise InputError("camera", field, value, f"one of: {', '.join(choices)}")
         object.__setattr__(self, "film_mm", check_film(self.film_mm))
         object.__setattr__(self, "focus_m", float(self.focus_m))
 

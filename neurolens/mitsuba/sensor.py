@@ -38,7 +38,7 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, 
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.lens.shot import Shot, StopShape
-from neurolens.render.colour import SpectralRange
+from neurolens.render.colour import ChannelWavelengths
 from neurolens.render.film import PixelGrid
 from neurolens.render.images import make_aperture
 from neurolens.render.job import mode_for
@@ -197,26 +197,6 @@ class FilmRays:
         offset, part = (np.array(x, np.float32)[:, None] for x in (self.crop_offset, self.crop_size))
         place = (position * part + offset) * size
         return self.grid.film_points(np.zeros(position.shape[1], np.intp), place)
-
-
-class ChannelWavelengths:
-    """Draws wavelengths over a range and weighs them for R, G and B.
-
-    Args:
-        low_nm, high_nm: the range, within 380 to 780 nm. One too narrow to tell colours apart gives weights of 1.
-    """
-
-    def __init__(self, low_nm: float, high_nm: float) -> None:
-        even = np.array([low_nm, high_nm]), np.ones(2)
-        self._range = SpectralRange(low_nm, high_nm, light=even)
-        diagonal = np.maximum(self._range.response * self._range.basis, 0)
-        weights = diagonal / diagonal.mean(axis=1, keepdims=True)
-        self._weights = (weights if self._range.colours else np.ones_like(weights)).astype(np.float32)
-
-    def draw(self, sample: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Wavelengths [N] in nm and weights [3, N] for uniform samples [N] in [0, 1)."""
-        weights = self._weights.take(self._range.bin_of(sample), axis=1)
-        return self._range.wavelengths_nm(sample)[0], weights
 
 
 def wavelength_samples(position: FloatArray, aperture: FloatArray) -> FloatArray:

@@ -403,6 +403,26 @@ class SpectralRange:
         return np.full(self.bins, index_at(n_d, v_d, self.centres_nm), np.float32)
 
 
+class ChannelWavelengths:
+    """Draws wavelengths over a range and weighs them for R, G and B.
+
+    Args:
+        low_nm, high_nm: the range, within 380 to 780 nm. One too narrow to tell colours apart gives weights of 1.
+    """
+
+    def __init__(self, low_nm: float, high_nm: float) -> None:
+        even = np.array([low_nm, high_nm]), np.ones(2)
+        self._range = SpectralRange(low_nm, high_nm, light=even)
+        diagonal = np.maximum(self._range.response * self._range.basis, 0)
+        weights = diagonal / diagonal.mean(axis=1, keepdims=True)
+        self._weights = (weights if self._range.colours else np.ones_like(weights)).astype(np.float32)
+
+    def draw(self, sample: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Wavelengths [N] in nm and weights [3, N] for uniform samples [N] in [0, 1)."""
+        weights = self._weights.take(self._range.bin_of(sample), axis=1)
+        return self._range.wavelengths_nm(sample)[0], weights
+
+
 class Palette:
     """Spectra [rows, bins], looked up by row and wavelength bin; colours that occur twice share a row."""
 

@@ -11,8 +11,8 @@ from neurolens.cameras.contract import RAYS_A_CALL as BATCH
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.mitsuba import load_scene
 from neurolens.mitsuba import sensor as library
-from neurolens.mitsuba.sensor import ChannelWavelengths, FilmRays, wavelength_samples
-from neurolens.render.colour import SpectralRange
+from neurolens.mitsuba.sensor import FilmRays, wavelength_samples
+from neurolens.render.colour import ChannelWavelengths, SpectralRange
 from neurolens.render.film import PixelGrid
 
 FILM = (30.0, 20.0)
