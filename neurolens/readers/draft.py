@@ -14,6 +14,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError, printable
 from neurolens.base.settings import WAVELENGTH_NM, within
+from neurolens.lens.figures import figure_of
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import (
     MAX_TERMS,
@@ -58,7 +59,7 @@ class Block:
         return 1 / self.curvature if self.curvature else math.inf
 
     def rotational(self, asphere: Iterable[tuple[int, float]] = ()) -> dict[str, Any]:
-        """Return the fields of `Surface` for a surface of revolution; the conic of a plane has no effect."""
+        """Return radius and figure of a surface of revolution, for `row`; the conic of a plane has no effect."""
         conic = self.conic if self.curvature else 0.0
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
@@ -87,9 +88,9 @@ class Block:
         return self.rotational(terms)
 
     def row(self, shape: dict[str, Any]) -> Row:
-        """The row of a surface whose fields of shape are given."""
-        diameter = 2 * self.semi_diameter
-        surface = Surface(thickness_mm=self.thickness, diameter_mm=diameter, stop=self.stop, **shape, **self.medium)
+        """The row of a surface of this `radius_mm` and figure, by the keys of `figures.figure_of`."""
+        lengths = shape["radius_mm"], self.thickness, 2 * self.semi_diameter
+        surface = Surface(*lengths, stop=self.stop, figure=figure_of(shape), **self.medium)
         return Row(surface, self.aperture, self.name)
 
 
@@ -372,7 +373,7 @@ def _without_dummies(draft: Draft) -> Draft:
     if len(draft.rows) > MAX_SURFACES:
         raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
     rows, surfaces, medium = draft.rows, [row.surface for row in draft.rows], Medium(**draft.object_medium)
-    flat = [math.isinf(s.radius_mm) and not s.stop and not s.asphere for s in surfaces]
+    flat = [math.isinf(s.radius_mm) and not s.stop and not s.figure.bends for s in surfaces]
     idle = [flat[k] and not row.aperture and same_medium(surfaces, k, medium) for k, row in enumerate(rows)]
     dropped = [k for k in range(len(rows)) if idle[k]]
     kept = [k for k in range(len(rows)) if k not in dropped]

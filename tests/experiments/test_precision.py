@@ -15,6 +15,7 @@ from experiments.__main__ import main
 from neurolens.base.errors import InputError
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, WAVELENGTH
 from neurolens.graph.scalars import lower
+from neurolens.lens.figures import Figure
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers import assemble
 from neurolens.readers.assemble import qcon_terms
@@ -37,7 +38,7 @@ def forbes(count: int, seed: int = 1) -> list[float]:
 
 
 def surface_of(a: list[float]) -> Surface:
-    return Surface(40.0, 3.0, 2 * RIM, 1.5, asphere=qcon_terms(a, RIM, RIM))
+    return Surface(40.0, 3.0, 2 * RIM, 1.5, figure=Figure(asphere=qcon_terms(a, RIM, RIM)))
 
 
 @pytest.mark.parametrize("name", [WORST, "fujifilm_fujinon_xf_14mm_f2_8_r", "fujifilm_fujinon_xf_56mm_f1_2_r"])
@@ -99,14 +100,14 @@ def test_odd_powers_that_cancel_are_centred_exactly() -> None:
     """A centred polynomial is the same polynomial: in 60 digits its coefficients give back those of the powers."""
     mp = pytest.importorskip("mpmath").mp.clone()
     mp.dps = 60
-    for surface in (s for s in read_lens(LENSES / f"{WORST}.toml").surfaces if s.asphere):
-        found = shapes.centred(surface)
-        assert found is not None and any(p % 2 for p, _ in surface.asphere)
+    for surface in (s for s in read_lens(LENSES / f"{WORST}.toml").surfaces if s.figure.asphere):
+        found, powers = shapes.centred(surface), surface.figure.asphere
+        assert found is not None and any(p % 2 for p, _ in powers)
         for share in (0.0, 0.3, 0.8, 1.0, 1.2):
             h = mp.mpf(share * surface.semi_diameter_mm)
             t = h * found.scale - 1
             exact = [sum(mp.mpf(w) * a * h ** (p - 2) for p, a, w in rows) for rows in (
-                [(p, a, 1) for p, a in surface.asphere], [(p, a, p) for p, a in surface.asphere])]  # fmt: skip
+                [(p, a, 1) for p, a in powers], [(p, a, p) for p, a in powers])]  # fmt: skip
             for coefficients, wanted in zip(found[1:], exact, strict=True):
                 size = sum(abs(c) * abs(t) ** k for k, c in enumerate(coefficients))
                 assert abs(sum(mp.mpf(c) * t**k for k, c in enumerate(coefficients)) - wanted) < 2e-16 * size
@@ -131,7 +132,7 @@ def test_the_graph_of_a_lens_in_float32() -> None:
 
 
 def test_lenses_whose_powers_do_not_cancel_stay_as_they_are() -> None:
-    steep = Surface(40.0, 3.0, 2 * RIM, 1.5, asphere=((4, 1.0), (6, 1.0)))  # far beyond, but of one sign
+    steep = Surface(40.0, 3.0, 2 * RIM, 1.5, figure=Figure(asphere=((4, 1.0), (6, 1.0))))  # far beyond, but of one sign
     assert shapes.centred(steep) is None
     assert all(shapes.centred(s) is None for path in PATHS for s in read_lens(path).surfaces)
 
@@ -147,7 +148,7 @@ def test_what_float32_does_not_carry_is_refused(monkeypatch: pytest.MonkeyPatch)
         check_figures([surface_of([3e-4] * 20)], "a file")
     for a in (1e20, 1e200, 1e308):  # no overflow on the way to the refusal
         with pytest.raises(InputError, match="surface 0, asphere"):
-            check_figures([replace(sound, asphere=((4, a), (42, -a)))], "a file")
-    endless = replace(sound, asphere=((4, 1e308), (6, -1e308)))
+            check_figures([replace(sound, figure=replace(sound.figure, asphere=((4, a), (42, -a))))], "a file")
+    endless = replace(sound, figure=replace(sound.figure, asphere=((4, 1e308), (6, -1e308))))
     with pytest.raises(InputError, match="surface 0, asphere"):
         check_figures([endless], "a file")

@@ -17,6 +17,7 @@ from neurolens.flare.layers import FlareJob, axis_irradiance
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.figures import Biconic, Toroid
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.settings import FlareSettings
@@ -56,9 +57,9 @@ def toric() -> Lens:
     """A triplet with an aspheric toroid at its front and a biconic at its back."""
     lens = lens_of("cooke_triplet_50")
     first, *middle, last = lens.surfaces
-    ends = (first.radius_mm * 1.2, None), (last.radius_mm * 0.9, -0.6)
-    front = replace(first, cylinder="x", asphere=((4, -1e-6),), across=ends[0])
-    return replace(lens, surfaces=(front, *middle, replace(last, cylinder="y", conic=0.3, across=ends[1])))
+    toroid = Toroid(cylinder="x", asphere=((4, -1e-6),), across_mm=first.radius_mm * 1.2)
+    biconic = Biconic(cylinder="y", conic=0.3, across_mm=last.radius_mm * 0.9, across_conic=-0.6)
+    return replace(lens, surfaces=(replace(first, figure=toroid), *middle, replace(last, figure=biconic)))
 
 
 # The letter F.

@@ -13,6 +13,7 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
 from neurolens.graph.scalars import lower
+from neurolens.lens.figures import figure_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.trace.rays import Rays, Traced, trace
@@ -29,7 +30,7 @@ def lens_of(*surfaces: Surface) -> Lens:
 
 
 def surface(radius_mm: float, diameter_mm: float = 20.0, n_d: float = GLASS, **shape: Any) -> Surface:
-    return Surface(radius_mm, 5.0, diameter_mm, n_d, **shape)
+    return Surface(radius_mm, 5.0, diameter_mm, n_d, figure=figure_of(shape))
 
 
 def rays_of(points: Tensor, directions: Tensor) -> Rays:
@@ -246,13 +247,14 @@ BEFORE_FILM: dict[str, tuple[float, dict[str, Any]]] = {
     "toroid": (13.0, {"cylinder": "y", "across": (-30.0, None)}),
     "aspheric toroid": (-16.0, {"cylinder": "x", "conic": -1.2, "asphere": ((4, 2e-5),), "across": (14.0, None)}),
     "biconic": (14.0, {"cylinder": "x", "conic": -1.2, "across": (12.0, 0.2)}),
-    "ideal": (math.inf, {"n_d": 1.0, "V_d": None, "focal_mm": -30.0}),
+    "ideal": (math.inf, {"focal_mm": -30.0}),
 }
 
 
 def lens_before_film(radius_mm: float, shape: dict[str, Any]) -> Lens:
     """A plane stop, a plane into glass, and the surface, as light comes from the film; the rim at 10 mm."""
-    front = Surface(radius_mm, 9.0, 20.0, **{"n_d": 1.6, "V_d": 40.0} | shape)
+    glass: dict[str, Any] = {} if "focal_mm" in shape else {"n_d": 1.6, "V_d": 40.0}
+    front = Surface(radius_mm, 9.0, 20.0, figure=figure_of(shape), **glass)
     return Lens("one", "", (front, Surface(math.inf, 3.0, 40.0), Surface(math.inf, 30.0, 30.0, stop=True)), 2.0)
 
 

@@ -1,0 +1,357 @@
+"""The figures of surfaces: what shape each has besides its radius of curvature.
+
+A figure is a class below, named in `FIGURES`, and nothing outside asks which class it is. Its fields are the keys of a
+surface in a lens file. It answers what readers, hashes, first-order and Seidel sums and checks ask, and gives
+`trace.shapes` the numbers by which rays meet it: a conic of the surface's radius, a second section across it, and a
+polynomial of the height. Lengths are in mm, heights h are distances from the axis (from the plane of symmetry of a
+cylinder).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# Slopes at the rim of an asphere's powers, all of one sign, from which on they are summed about the middle of the zone.
+# Float32 loses 6e-8 rad for each 1; below 180 no lens that ships gains by it (`python -m experiments precision`).
+CANCELS = 100.0
+Bound = tuple[str, float, float, float, str]
+
+
+class Centred(NamedTuple):
+    """Sums of A_p h^(p - 2) and of p A_p h^(p - 2) by powers, lowest first, of t = scale h^2 - 1 (scale h - 1 where odd
+    ones occur), which runs from -1 on the axis to 1 at the rim; float32 has the scale exactly."""
+
+    scale: Any
+    sag: Sequence[Any]
+    slope: Sequence[Any]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A conic, of which a sphere is the simplest, and a polynomial of the height added to it.
+
+    Attributes:
+        conic: Schwarzschild's K (0 sphere, -1 paraboloid): c h^2 / (1 + sqrt(1 - (1 + K) c^2 h^2)).
+        asphere: (power, coefficient) pairs, sorted by power: sum of A_p h^p, A_p in mm^(1 - p). Odd powers and p = 2
+            (which adds 2 A_2 to the curvature at the vertex) are allowed.
+
+    Both may be 0-d tensors where gradients with respect to them are wanted.
+    """
+
+    conic: Any = 0.0
+    asphere: tuple[tuple[int, Any], ...] = ()
+
+    @property
+    def axis(self) -> str | None:
+        """The transverse axis, "x" or "y", of a figure that is not round: along it runs the curve of the radius."""
+        return None
+
+    @property
+    def across(self) -> tuple[float, float] | None:
+        """Radius and conic constant of the section across that curve; None where it is straight or there is none."""
+        return None
+
+    @property
+    def round(self) -> Figure:
+        """The figure of revolution that has the curve of the radius."""
+        return self
+
+    @property
+    def turned(self) -> bool:
+        """Whether the curve is turned about a line parallel to its axis, as a toroid's is."""
+        return False
+
+    @property
+    def power(self) -> float:
+        """1 / focal length of an ideal lens; 0.0 of a surface that refracts."""
+        return 0.0
+
+    @property
+    def polynomial(self) -> bool:
+        """Whether a polynomial is added to the conic."""
+        return bool(self.asphere)
+
+    @property
+    def aspheric(self) -> bool:
+        """Whether the curve of the radius is more than a circle; a conic constant that is a tensor may become so."""
+        return self.polynomial or not isinstance(self.conic, int | float) or self.conic != 0
+
+    @property
+    def plain(self) -> bool:
+        """Whether the surface is a sphere or a plane."""
+        return not (self.aspheric or self.axis)
+
+    @property
+    def bends(self) -> bool:
+        """Whether rays are bent by it even where the radius is infinite."""
+        return self.polynomial or self.across is not None or self.power != 0
+
+    @property
+    def values(self) -> list[Any]:
+        """All that gradients may be taken by."""
+        return [self.conic, *(a for _, a in self.asphere)]
+
+    def vertex_curvature(self, curvature: Any, meridian: str) -> Any:
+        """Curvature at the vertex along "x" or "y" in 1/mm, of a surface of this curvature."""
+        if self.axis not in (None, meridian):
+            return 0.0 if self.across is None else 1.0 / self.across[0]
+        return curvature + sum(2 * a for p, a in self.asphere if p == 2)
+
+    def fourth(self) -> float:
+        """Coefficient of h^4 that the polynomial adds, in 1/mm^3, for Seidel sums."""
+        return float(dict(self.asphere).get(4, 0.0))
+
+    def centred(self, rim_mm: float) -> Centred | None:
+        """The polynomial about the middle of the zone inside the rim; None where float32 carries its powers.
+
+        The powers of Forbes's polynomials of n terms exceed their sum by 6^n, those about the middle by 2.4^n.
+        """
+        return _centred(tuple((int(p), _number(a)) for p, a in self.asphere if p >= 2), rim_mm)
+
+    def scaled(self, factor: float) -> Figure:
+        """Return the figure with all lengths times `factor`."""
+        return replace(self, asphere=tuple((p, a * factor ** (1 - p)) for p, a in self.asphere))
+
+    def bounds(self, rim_mm: float) -> list[Bound]:
+        """What `setting.rims.check_figures` checks: key, size, least, most, and what the size is of."""
+        sags = [float(a) * rim_mm**p for p, a in self.asphere]
+        sag = max(1e-6 * sum(map(abs, sags)), abs(sum(sags)))
+        return [("conic", abs(self.conic), 0.0, 1e9, ""), ("asphere", sag, 0.0, 1e6, " mm of sag at the rim")]
+
+    @classmethod
+    def read(cls, row: Any) -> dict[str, Any]:
+        """Fields from a surface of a lens file, a `readers.source.Table`; raises its errors."""
+        example = "a table such as { 4 = 1e-6, 6 = 2e-9 }"
+        found: dict[str, Any] = {"conic": row.number("conic")} if "conic" in row else {}
+        return found | ({"asphere": row.powers("asphere", example)} if "asphere" in row else {})
+
+    def cells(self) -> dict[str, Any]:
+        """Values by the keys of a lens file, without those that say nothing."""
+        given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        given |= {"conic": float(self.conic)} if "conic" in given else {}
+        return given | ({"asphere": {str(p): float(a) for p, a in self.asphere}} if self.asphere else {})
+
+    def record(self) -> dict[str, Any]:
+        """Numbers by key, for hashes, caches and files of models, from which `figure_of` makes the figure again.
+
+        Hashes of lens files are made of them: keys and their order do not change.
+        """
+        found = self.cells()
+        found |= {"asphere": [(int(p), float(a)) for p, a in self.asphere]} if self.asphere else {}
+        across = found.pop("across_mm", None), found.pop("across_conic", None)
+        return found if across[0] is None else found | {"across": across}
+
+    def words(self) -> str:
+        """What a table of surfaces says of it besides the radius; empty for a sphere."""
+        powers = [p for p, _ in self.asphere]
+        span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
+        return _joined(span, f"K {float(self.conic):.4g}" if self.conic else "")
+
+
+SPHERE = Figure()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder(Figure):
+    """A curve along one transverse axis, straight along the other.
+
+    Attributes:
+        cylinder: the axis along which it is curved, "x" or "y".
+    """
+
+    cylinder: str
+
+    @property
+    def axis(self) -> str | None:
+        return self.cylinder
+
+    @property
+    def round(self) -> Figure:
+        return Figure(self.conic, self.asphere)
+
+    @classmethod
+    def read(cls, row: Any) -> dict[str, Any]:
+        for key in (k for k in ("across_mm", "across_conic") if k in row and "cylinder" not in row):
+            raise row.error("cylinder", "(missing)", f'the axis of the curve that {key} goes with: "x" or "y"')
+        axis = row.text("cylinder")
+        if axis not in ("x", "y"):
+            raise row.error("cylinder", axis, 'the axis along which it is curved: "x" or "y"')
+        return super().read(row) | {"cylinder": axis}
+
+    def words(self) -> str:
+        if self.across is None:
+            return _joined(super().words(), f"cylinder {self.cylinder}")
+        kind = "toroid" if self.turned else f"biconic K {self.across[1]:.4g}"
+        other = "x" if self.cylinder == "y" else "y"
+        return _joined(super().words(), f"{kind}, {self.across[0]:.4f} mm along {other}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Toroid(Cylinder):
+    """A curve along one transverse axis, turned about a line parallel to that axis.
+
+    Attributes:
+        across_mm: radius at which it is turned.
+    """
+
+    across_mm: float
+
+    @property
+    def across(self) -> tuple[float, float] | None:
+        return self.across_mm, 0.0
+
+    @property
+    def turned(self) -> bool:
+        return True
+
+    def scaled(self, factor: float) -> Figure:
+        return replace(self, asphere=super().scaled(factor).asphere, across_mm=self.across_mm * factor)
+
+    def bounds(self, rim_mm: float) -> list[Bound]:
+        return [("across_mm", abs(self.across_mm), 1e-6, math.inf, ""), *super().bounds(rim_mm)]
+
+    @classmethod
+    def read(cls, row: Any) -> dict[str, Any]:
+        """As `Figure.read`; an infinite radius leaves a cylinder."""
+        found = super().read(row)
+        if "across_mm" not in row:
+            raise row.error("across_mm", "(missing)", "the radius that across_conic goes with")
+        radius = row.number("across_mm", unit="mm", finite=False)
+        if not abs(radius) > 0:
+            raise row.error("across_mm", radius, "a radius of curvature other than 0, or inf")
+        return found | ({"across_mm": radius} if math.isfinite(radius) else {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Biconic(Toroid):
+    """Two conic sections, along both transverse axes, without a polynomial.
+
+    Attributes:
+        across_mm, across_conic: radius and conic constant of the second section.
+    """
+
+    across_conic: float
+
+    @property
+    def across(self) -> tuple[float, float] | None:
+        return self.across_mm, self.across_conic
+
+    @property
+    def turned(self) -> bool:
+        return False
+
+    def bounds(self, rim_mm: float) -> list[Bound]:
+        return [("across_conic", abs(self.across_conic), 0.0, 1e9, ""), *super().bounds(rim_mm)]
+
+    @classmethod
+    def read(cls, row: Any) -> dict[str, Any]:
+        found = super().read(row)
+        if "asphere" in row:
+            raise row.error("asphere", row.data["asphere"], "none: a biconic has no polynomial (a toroid has)")
+        return found | ({"across_conic": row.number("across_conic")} if "across_mm" in found else {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ideal(Figure):
+    """An ideal thin lens in air, a plane that refracts nothing: slopes change by -x / f and -y / f.
+
+    Attributes:
+        focal_mm: f.
+    """
+
+    focal_mm: float
+
+    @property
+    def power(self) -> float:
+        return 1 / self.focal_mm
+
+    def scaled(self, factor: float) -> Figure:
+        return replace(self, focal_mm=self.focal_mm * factor)
+
+    def bounds(self, rim_mm: float) -> list[Bound]:
+        return [("focal_mm", abs(self.focal_mm), 1e-6, 1e9, "")]
+
+    @classmethod
+    def read(cls, row: Any) -> dict[str, Any]:
+        shaped = [key for key in ("conic", "asphere", *KEYS, "coating") if key in row and key != "focal_mm"]
+        if shaped or not math.isinf(row.number("radius_mm", finite=False)):
+            key = shaped[0] if shaped else "radius_mm"
+            expected = "a plane in air (radius_mm = inf, nothing else), as focal_mm makes it an ideal thin lens"
+            raise row.error(key, row.data.get(key), expected)
+        focal = row.number("focal_mm", unit="mm")
+        if focal == 0:
+            raise row.error("focal_mm", focal, "a focal length other than 0")
+        return {"focal_mm": focal}
+
+    def words(self) -> str:
+        return f"ideal lens, f {self.focal_mm:.4g} mm"
+
+
+# The key of a surface that marks each figure, of several the last; a surface with none of them is a `Figure`.
+FIGURES: dict[str, type[Figure]] = {
+    "cylinder": Cylinder,
+    "across_mm": Toroid,
+    "across_conic": Biconic,
+    "focal_mm": Ideal,
+}
+_COMMON = {f.name for f in fields(Figure)}
+KEYS = tuple(dict.fromkeys(f.name for kind in FIGURES.values() for f in fields(kind) if f.name not in _COMMON))
+
+
+def figure_of(record: Mapping[str, Any]) -> Figure:
+    """Return the figure of numbers by key, as `Figure.record` or `Figure.read` gives them; other keys are ignored."""
+    given = {key: value for key, value in record.items() if value is not None}
+    across_mm, across_conic = given.pop("across", (None, None))
+    given |= {} if across_mm is None else {"across_mm": across_mm}
+    given |= {} if across_conic is None else {"across_conic": across_conic}
+    if "asphere" in given:
+        given["asphere"] = tuple((int(p), a) for p, a in given["asphere"])
+    kind = _kind(given)
+    return kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
+
+
+def read_figure(row: Any) -> Figure:
+    """Return the figure of a surface of a lens file, a `readers.source.Table`; raises its errors."""
+    kind = _kind(row.data)
+    found = figure_of(kind.read(row))
+    known = {f.name for f in fields(kind)}
+    for key in (key for key in KEYS if key in row and key not in known):
+        raise row.error(key, row.data[key], f"none beside {next(k for k in FIGURES if k in known and k in row)}")
+    return found
+
+
+def _kind(given: Mapping[str, Any]) -> type[Figure]:
+    return next((kind for key, kind in reversed(FIGURES.items()) if key in given), Figure)
+
+
+def _joined(*words: str) -> str:
+    return ", ".join(word for word in words if word)
+
+
+def _number(value: Any) -> float:
+    return float(value.detach() if hasattr(value, "detach") else value)
+
+
+@lru_cache(maxsize=4096)
+def _centred(asphere: tuple[tuple[int, float], ...], rim_mm: float) -> Centred | None:
+    down = 1 if any(p % 2 for p, _ in asphere) else 2
+    with np.errstate(all="ignore"):
+        reach = float(sum(p * abs(a) * np.float64(rim_mm) ** (p - 1) for p, a in asphere))
+        scale = float(np.float32(2 / np.float64(rim_mm) ** down))
+    if not (CANCELS < reach < 1e30 and 0 < scale < math.inf):
+        return None
+    # Exact, but for one rounding of each coefficient.
+    terms = [((p - 2) // down, p, Fraction(a) / Fraction(scale) ** ((p - 2) // down)) for p, a in asphere]
+    powers = range(max(j for j, _, _ in terms) + 1)
+    sag, slope = (
+        tuple(float(sum(a * math.comb(j, k) * (p if sloping else 1) for j, p, a in terms if j >= k)) for k in powers)
+        for sloping in (False, True)
+    )
+    return Centred(scale, sag, slope) if 2 * rim_mm * sum(map(abs, slope)) < reach else None
