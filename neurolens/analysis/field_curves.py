@@ -310,7 +310,7 @@ def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm:
     rows = np.array([_row(s, k, n, spread, marginal, chief) for k, s in enumerate(lens.surfaces)])
     bend = petzval_curvature(lens, wavelength_nm)
     lagrange = n[0] * (marginal.before[0] * chief.y[0] - chief.before[0] * marginal.y[0])
-    odd = tuple(k for k, s in enumerate(lens.surfaces) if any(p in (1, 3) and a for p, a in s.figure.asphere))
+    odd = tuple(k for k, s in enumerate(lens.surfaces) if any(p in (1, 3) and a for p, a in s.figure.powers))
     radius = math.inf if bend == 0 else 1 / bend
     return Seidel(wavelength_nm, image_height_mm, lagrange, radius, rows, rows.sum(0), SUMS, odd)
 

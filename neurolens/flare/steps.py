@@ -55,7 +55,7 @@ class Shape(NamedTuple):
 
     terms: int = 0
     even: bool = True
-    centred: bool = False
+    centred: bool | None = None  # and whether by Chebyshev's polynomials
     steps: int = 0
     bent: tuple[bool, bool] = (True, True)
     crossed: bool = False
@@ -186,7 +186,7 @@ def _curve(shape: Shape, call: Value) -> Curve:
     other: Any = rest[1] if shape.crossed else 0.0
     start = c if shape.bent[0] else other, c if shape.bent[1] else other, cz
     terms = rest[more:]
-    centred = Centred(terms[0], terms[1::2], terms[2::2]) if shape.centred else None
+    centred = None if shape.centred is None else Centred(terms[0], terms[1::2], terms[2::2], shape.centred)
     return curve._replace(
         terms=terms, centred=centred, even=shape.even, start=start, steps=shape.steps, last_step=last_step,
         across=(rest[0], rest[2]) if shape.crossed else (), turned=shape.turned,
@@ -205,12 +205,12 @@ def _terms(curve: Curve, turn: float) -> list[float]:
     """The numbers of a polynomial: terms; of a centred one the scale, and in turn those of its sag and its slope."""
     if curve.centred is None:
         return [turn * v for v in curve.terms]
-    scale, *both = curve.centred
-    return [scale, *(turn * v for pair in zip(*both, strict=True) for v in pair)]
+    scale, sag, slope, _ = curve.centred
+    return [scale, *(turn * v for pair in zip(sag, slope, strict=True) for v in pair)]
 
 
-def _sort(curve: Curve) -> tuple[bool, bool]:
-    return curve.even, curve.centred is not None
+def _sort(curve: Curve) -> tuple[bool, bool | None]:
+    return curve.even, curve.centred and curve.centred.chebyshev
 
 
 class Stack:
@@ -235,7 +235,7 @@ class Stack:
         # All aspheres of a sort get the degree of the highest one, so that they share a function.
         self._curves = {k: traced_curve(s, float) for k, s in enumerate(lens.surfaces) if not s.figure.plain}
         curves = self._curves.values()
-        most: dict[tuple[bool, bool], int] = {}
+        most: dict[tuple[bool, bool | None], int] = {}
         for f in curves:
             most[_sort(f)] = max(most.get(_sort(f), 0), len(_terms(f, 1.0)))
         self._terms = {k: most[_sort(f)] if f.terms else 0 for k, f in self._curves.items()}

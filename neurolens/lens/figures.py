@@ -18,19 +18,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Slopes at the rim of an asphere's powers, all of one sign, from which on they are summed about the middle of the zone.
-# Float32 loses 6e-8 rad for each 1; below 180 no lens that ships gains by it (`python -m experiments precision`).
+# Slopes at the rim of an asphere's powers, all of one sign, from which on they are summed about the middle of the zone,
+# and of those powers, from which on Chebyshev's polynomials take their place. Float32 loses 6e-8 rad for each 1; below
+# 180 no lens that ships gains by it (`python -m experiments precision`).
 CANCELS = 100.0
 Bound = tuple[str, float, float, float, str]
 
 
 class Centred(NamedTuple):
-    """Sums of A_p h^(p - 2) and of p A_p h^(p - 2) by powers, lowest first, of t = scale h^2 - 1 (scale h - 1 where odd
-    ones occur), which runs from -1 on the axis to 1 at the rim; float32 has the scale exactly."""
+    """Sums of A_p h^(p - 2) and of p A_p h^(p - 2) about the middle of the zone inside the rim.
+
+    Attributes:
+        scale: of t = scale h^2 - 1 (scale h - 1 where odd powers occur), which runs from -1 on the axis to 1 at the rim;
+            float32 has it exactly.
+        sag, slope: coefficients of powers of t, lowest first; of Chebyshev's polynomials where `chebyshev` is true.
+    """
 
     scale: Any
     sag: Sequence[Any]
     slope: Sequence[Any]
+    chebyshev: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,9 +81,14 @@ class Figure:
         return 0.0
 
     @property
+    def powers(self) -> tuple[tuple[int, Any], ...]:
+        """The polynomial that is added to the conic, as (power, coefficient) pairs: sum of A_p h^p."""
+        return self.asphere
+
+    @property
     def polynomial(self) -> bool:
         """Whether a polynomial is added to the conic."""
-        return bool(self.asphere)
+        return bool(self.powers)
 
     @property
     def aspheric(self) -> bool:
@@ -96,24 +108,25 @@ class Figure:
     @property
     def values(self) -> list[Any]:
         """All that gradients may be taken by."""
-        return [self.conic, *(a for _, a in self.asphere)]
+        return [self.conic, *(a for _, a in self.powers)]
 
     def vertex_curvature(self, curvature: Any, meridian: str) -> Any:
         """Curvature at the vertex along "x" or "y" in 1/mm, of a surface of this curvature."""
         if self.axis not in (None, meridian):
             return 0.0 if self.across is None else 1.0 / self.across[0]
-        return curvature + sum(2 * a for p, a in self.asphere if p == 2)
+        return curvature + sum(2 * a for p, a in self.powers if p == 2)
 
     def fourth(self) -> float:
         """Coefficient of h^4 that the polynomial adds, in 1/mm^3, for Seidel sums."""
-        return float(dict(self.asphere).get(4, 0.0))
+        return float(dict(self.powers).get(4, 0.0))
 
     def centred(self, rim_mm: float) -> Centred | None:
         """The polynomial about the middle of the zone inside the rim; None where float32 carries its powers.
 
-        The powers of Forbes's polynomials of n terms exceed their sum by 6^n, those about the middle by 2.4^n.
+        The powers of Forbes's polynomials of n terms exceed their sum by 6^n, those about the middle by 2.4^n,
+        Chebyshev's polynomials hardly.
         """
-        return _centred(tuple((int(p), _number(a)) for p, a in self.asphere if p >= 2), rim_mm)
+        return _centred(tuple((int(p), _number(a)) for p, a in self.powers if p >= 2), rim_mm)
 
     def scaled(self, factor: float) -> Figure:
         """Return the figure with all lengths times `factor`."""
@@ -121,7 +134,7 @@ class Figure:
 
     def bounds(self, rim_mm: float) -> list[Bound]:
         """What `setting.rims.check_figures` checks: key, size, least, most, and what the size is of."""
-        sags = [float(a) * rim_mm**p for p, a in self.asphere]
+        sags = [float(a) * rim_mm**p for p, a in self.powers]
         sag = max(1e-6 * sum(map(abs, sags)), abs(sum(sags)))
         return [("conic", abs(self.conic), 0.0, 1e9, ""), ("asphere", sag, 0.0, 1e6, " mm of sag at the rim")]
 
@@ -340,18 +353,30 @@ def _number(value: Any) -> float:
 
 
 @lru_cache(maxsize=4096)
-def _centred(asphere: tuple[tuple[int, float], ...], rim_mm: float) -> Centred | None:
-    down = 1 if any(p % 2 for p, _ in asphere) else 2
+def _centred(powers: tuple[tuple[int, float | Fraction], ...], rim_mm: float) -> Centred | None:
+    down = 1 if any(p % 2 for p, _ in powers) else 2
     with np.errstate(all="ignore"):
-        reach = float(sum(p * abs(a) * np.float64(rim_mm) ** (p - 1) for p, a in asphere))
+        reach = float(sum(p * abs(float(a)) * np.float64(rim_mm) ** (p - 1) for p, a in powers))
         scale = float(np.float32(2 / np.float64(rim_mm) ** down))
     if not (CANCELS < reach < 1e30 and 0 < scale < math.inf):
         return None
     # Exact, but for one rounding of each coefficient.
-    terms = [((p - 2) // down, p, Fraction(a) / Fraction(scale) ** ((p - 2) // down)) for p, a in asphere]
-    powers = range(max(j for j, _, _ in terms) + 1)
-    sag, slope = (
-        tuple(float(sum(a * math.comb(j, k) * (p if sloping else 1) for j, p, a in terms if j >= k)) for k in powers)
+    terms = [((p - 2) // down, p, Fraction(a) / Fraction(scale) ** ((p - 2) // down)) for p, a in powers]
+    degrees = range(max(j for j, _, _ in terms) + 1)
+    exact = [
+        [sum((a * math.comb(j, k) * (p if sloping else 1) for j, p, a in terms if j >= k), Fraction()) for k in degrees]
         for sloping in (False, True)
-    )
-    return Centred(scale, sag, slope) if 2 * rim_mm * sum(map(abs, slope)) < reach else None
+    ]
+    size = 2 * rim_mm * float(sum(map(abs, exact[1])))
+    cancels = size > CANCELS
+    sag, slope = (tuple(map(float, _chebyshev(row) if cancels else row)) for row in exact)
+    return Centred(scale, sag, slope, cancels) if size < reach else None
+
+
+def _chebyshev(powers: Sequence[Fraction]) -> list[Fraction]:
+    """Return the coefficients of Chebyshev's polynomials of a sum of powers, both lowest first, exactly."""
+    found = [Fraction()] * len(powers)
+    for k, a in enumerate(powers):  # 2^k t^k = sum C(k, j) T_|k - 2 j|
+        for j in range(k + 1):
+            found[abs(k - 2 * j)] += a * math.comb(k, j) / 2**k
+    return found

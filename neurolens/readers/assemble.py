@@ -154,7 +154,7 @@ def check_rows(lens: Lens) -> None:
             raise InputError(file, f"surface {k}, radius", s.radius_mm, "a number other than 0, or a plane")
         if not math.isfinite(s.thickness_mm):
             raise InputError(file, f"surface {k}, thickness", s.thickness_mm, "a finite length")
-        for power in (p for p, _ in s.figure.asphere if not 2 <= p <= MAX_POWER):
+        for power in (p for p, _ in s.figure.powers if not 2 <= p <= MAX_POWER):
             raise InputError(file, f"surface {k}, asphere, power", power, f"a power from 2 to {MAX_POWER}")
     if not 1 <= lens.object_medium.n_d <= MAX_INDEX:
         raise InputError(file, "object, index", lens.object_medium.n_d, index)

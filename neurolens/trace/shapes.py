@@ -92,7 +92,7 @@ class Beyond(NamedTuple):
 def curve_of(surface: Surface, number: Callable[[Any], Any] = float) -> Curve:
     """Return the curve of a surface by its own numbers; `number` turns fields that are tensors into numbers."""
     figure, c, k = surface.figure, number(surface.curvature), number(surface.figure.conic)
-    powers = {int(n): number(a) for n, a in figure.asphere}
+    powers = {int(n): number(a) for n, a in figure.powers}
     if is_number(k) and k == 0 and not figure.polynomial and not figure.axis:
         return Curve(c, plain=True)
     even = all(n % 2 == 0 for n in powers)
@@ -117,7 +117,7 @@ def centred(surface: Surface) -> Centred | None:
 def cancelling(surface: Surface) -> float:
     """Sizes of the slopes that an asphere sums at its rim, over their sum or 1; float32 loses 6e-8 rad for each 1."""
     found, rim = centred(surface), float(_extent_mm(surface))
-    slopes = found.slope if found else [p * _number(a) * rim ** (p - 2) for p, a in surface.figure.asphere]
+    slopes = found.slope if found else [p * _number(a) * rim ** (p - 2) for p, a in surface.figure.powers]
     return sum(map(abs, slopes)) * rim / max(1.0, abs(sum(slopes)) * rim)
 
 
@@ -243,7 +243,7 @@ def depth(o: Arithmetic, curve: Curve, h2: Any, order: int = 2, steepest: float 
 
 def _followed(o: Arithmetic, curve: Curve, h2: Any, order: int, steepest: float) -> Depth:
     """Return the depth by a curve's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
-    sag, slope = _polynomials(o, curve, h2, order)
+    sag, slope = polynomials(o, curve, h2, order)
     c = curve.curvature
     if is_number(c) and c == 0:
         return Depth(times(h2, sag), slope + o.like(h2, 0.0), 0.0, None)
@@ -258,15 +258,15 @@ def _followed(o: Arithmetic, curve: Curve, h2: Any, order: int, steepest: float)
     return Depth(o.fma(both, cos, sag) * h2, inverse + slope, turn, cos2)
 
 
-def _polynomials(o: Arithmetic, curve: Curve, h2: Any, order: int) -> tuple[Any, Any]:
+def polynomials(o: Arithmetic, curve: Curve, h2: Any, order: int) -> tuple[Any, Any]:
     """sum A_p h^(p - 2) and sum p A_p h^(p - 2), by powers of h^2 or, where odd ones occur, of h, or centred ones."""
     if not curve.terms:
         return 0.0, 0.0
     # The root is kept from 0, where its derivative is infinite.
     h, down = (h2, 2) if curve.even else (o.held_root(h2), 1)
     if curve.centred is not None:
-        h = o.fma(h, curve.centred.scale, -1.0)
-        return 0.0 if order == 1 else o.horner(h, curve.centred.sag), o.horner(h, curve.centred.slope)
+        h, sum_ = o.fma(h, curve.centred.scale, -1.0), o.chebyshev if curve.centred.chebyshev else o.horner
+        return 0.0 if order == 1 else sum_(h, curve.centred.sag), sum_(h, curve.centred.slope)
     slopes = [a * float(2 + down * k) for k, a in enumerate(curve.terms)]
     return 0.0 if order == 1 else o.horner(h, curve.terms), o.horner(h, slopes)
 

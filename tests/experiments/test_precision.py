@@ -108,7 +108,7 @@ def test_odd_powers_that_cancel_are_centred_exactly() -> None:
             t = h * found.scale - 1
             exact = [sum(mp.mpf(w) * a * h ** (p - 2) for p, a, w in rows) for rows in (
                 [(p, a, 1) for p, a in powers], [(p, a, p) for p, a in powers])]  # fmt: skip
-            for coefficients, wanted in zip(found[1:], exact, strict=True):
+            for coefficients, wanted in zip(found[1:3], exact, strict=True):
                 size = sum(abs(c) * abs(t) ** k for k, c in enumerate(coefficients))
                 assert abs(sum(mp.mpf(c) * t**k for k, c in enumerate(coefficients)) - wanted) < 2e-16 * size
 
