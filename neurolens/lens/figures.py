@@ -22,6 +22,7 @@ import numpy as np
 # and of those powers, from which on Chebyshev's polynomials take their place. Float32 loses 6e-8 rad for each 1; below
 # 180 no lens that ships gains by it (`python -m experiments precision`).
 CANCELS = 100.0
+MOST_Q_TERMS = 20
 Bound = tuple[str, float, float, float, str]
 
 
@@ -29,8 +30,8 @@ class Centred(NamedTuple):
     """Sums of A_p h^(p - 2) and of p A_p h^(p - 2) about the middle of the zone inside the rim.
 
     Attributes:
-        scale: of t = scale h^2 - 1 (scale h - 1 where odd powers occur), which runs from -1 on the axis to 1 at the rim;
-            float32 has it exactly.
+        scale: of t = scale h^2 - 1 (scale h - 1 where odd powers occur), from -1 on the axis to 1 at the rim; float32
+            has it exactly.
         sag, slope: coefficients of powers of t, lowest first; of Chebyshev's polynomials where `chebyshev` is true.
     """
 
@@ -307,12 +308,61 @@ class Ideal(Figure):
         return f"ideal lens, f {self.focal_mm:.4g} mm"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Qcon(Figure):
+    """A conic and Forbes's strong asphere: with u = h / `norm_mm` and Jacobi's P, u^4 sum a_m P_m^(0,4)(2 u^2 - 1).
+
+    G. W. Forbes, "Shape specification for axially symmetric optical surfaces", Opt. Express 15, 5218 (2007).
+
+    Attributes:
+        qcon: a_0, a_1, ... in mm.
+        norm_mm: normalisation radius, usually that of the rim.
+    """
+
+    qcon: tuple[float, ...]
+    norm_mm: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.norm_mm < math.inf and all(map(math.isfinite, self.qcon)) and len(self.qcon) <= MOST_Q_TERMS):
+            raise ValueError(f"at most {MOST_Q_TERMS} finite coefficients and a normalisation radius above 0")
+
+    @property
+    def powers(self) -> tuple[tuple[int, Any], ...]:
+        return tuple((p, float(a)) for p, a in _qcon_powers(self.qcon, self.norm_mm))
+
+    def centred(self, rim_mm: float) -> Centred | None:
+        return _centred(_qcon_powers(self.qcon, self.norm_mm), rim_mm)
+
+    def scaled(self, factor: float) -> Figure:
+        return replace(self, qcon=tuple(a * factor for a in self.qcon), norm_mm=self.norm_mm * factor)
+
+    def bounds(self, rim_mm: float) -> list[Bound]:
+        sag, wider = sum(map(abs, self.qcon)), rim_mm / self.norm_mm
+        more = ("qcon", sag, 0.0, 1e6, " mm of sag"), ("norm_mm", wider, 0.0, 2.0, ": rim radius over it")
+        return [super().bounds(0.0)[0], *more]
+
+    @classmethod
+    def read(cls, row: Any) -> dict[str, Any]:
+        values = row.data["qcon"]
+        if not isinstance(values, list) or not 0 < len(values) <= MOST_Q_TERMS:
+            raise row.error("qcon", values, f"1 to {MOST_Q_TERMS} coefficients in mm, from m = 0")
+        if "asphere" in row:
+            raise row.error("asphere", row.data["asphere"], "none beside qcon")
+        each = replace(row, data={f"qcon[{m}]": value for m, value in enumerate(values)})
+        norm = row.number("norm_mm", unit="mm", above=0)
+        return super().read(row) | {"qcon": [each.number(key) for key in each.data], "norm_mm": norm}
+
+    def words(self) -> str:
+        return _joined(f"Qcon of {len(self.qcon)} terms", super().words())
+
+
 # The key of a surface that marks each figure, of several the last; a surface with none of them is a `Figure`.
 FIGURES: dict[str, type[Figure]] = {
     "cylinder": Cylinder,
     "across_mm": Toroid,
     "across_conic": Biconic,
     "focal_mm": Ideal,
+    "qcon": Qcon,
 }
 _COMMON = {f.name for f in fields(Figure)}
 KEYS = tuple(dict.fromkeys(f.name for kind in FIGURES.values() for f in fields(kind) if f.name not in _COMMON))
@@ -325,7 +375,8 @@ def figure_of(record: Mapping[str, Any]) -> Figure:
     given |= {} if across_mm is None else {"across_mm": across_mm}
     given |= {} if across_conic is None else {"across_conic": across_conic}
     if "asphere" in given:
-        given["asphere"] = tuple((int(p), a) for p, a in given["asphere"])
+        given["asphere"] = tuple((int(p), float(a)) for p, a in given["asphere"])
+    given |= {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     kind = _kind(given)
     return kind(**{f.name: given[f.name] for f in fields(kind) if f.name in given})
 
@@ -353,6 +404,16 @@ def _number(value: Any) -> float:
 
 
 @lru_cache(maxsize=4096)
+def _qcon_powers(a: tuple[float, ...], norm_mm: float) -> tuple[tuple[int, Fraction], ...]:
+    """The powers of h of a Qcon sum, exactly."""
+    found = [Fraction()] * len(a)
+    for m, value in enumerate(a):
+        for k in range(m + 1):
+            found[k] += (-1) ** (m + k) * math.comb(m, k) * math.comb(m + k + 4, m) * Fraction(value)
+    return tuple((2 * k + 4, sum_ / Fraction(norm_mm) ** (2 * k + 4)) for k, sum_ in enumerate(found))
+
+
+@lru_cache(maxsize=4096)
 def _centred(powers: tuple[tuple[int, float | Fraction], ...], rim_mm: float) -> Centred | None:
     down = 1 if any(p % 2 for p, _ in powers) else 2
     with np.errstate(all="ignore"):
@@ -367,10 +428,10 @@ def _centred(powers: tuple[tuple[int, float | Fraction], ...], rim_mm: float) ->
         [sum((a * math.comb(j, k) * (p if sloping else 1) for j, p, a in terms if j >= k), Fraction()) for k in degrees]
         for sloping in (False, True)
     ]
-    size = 2 * rim_mm * float(sum(map(abs, exact[1])))
+    size = rim_mm * float(sum(map(abs, exact[1])))
     cancels = size > CANCELS
     sag, slope = (tuple(map(float, _chebyshev(row) if cancels else row)) for row in exact)
-    return Centred(scale, sag, slope, cancels) if size < reach else None
+    return Centred(scale, sag, slope, cancels) if 2 * size < reach else None
 
 
 def _chebyshev(powers: Sequence[Fraction]) -> list[Fraction]:

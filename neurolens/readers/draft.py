@@ -14,17 +14,15 @@ from typing import Any
 
 from neurolens.base.errors import InputError, printable
 from neurolens.base.settings import WAVELENGTH_NM, within
-from neurolens.lens.figures import figure_of
+from neurolens.lens.figures import MOST_Q_TERMS, figure_of
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import (
-    MAX_TERMS,
     UNKNOWN,
     finish,
     first_order,
     narrowed,
     pupil_of,
     qbfs_terms,
-    qcon_terms,
     smaller_stop,
     stop_aperture,
     with_likely_rims,
@@ -77,11 +75,12 @@ class Block:
     def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
         """A surface of Forbes's kind, made as by `rotational`: coefficients from m = 0, a normalisation radius."""
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
-        if len(values) > MAX_TERMS:
-            raise self.start.error(name, f"({len(values)} terms)", f"at most {MAX_TERMS} terms")
+        if len(values) > MOST_Q_TERMS:
+            raise self.start.error(name, f"({len(values)} terms)", f"at most {MOST_Q_TERMS} terms")
+        if qcon:
+            return self.rotational() | {"qcon": values, "norm_mm": radius}
         try:
-            base = self.curvature, rim, self.conic
-            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, *base)
+            terms = qbfs_terms(values, radius, self.curvature, rim, self.conic)
         except ValueError as error:
             found = f"(curvature {self.curvature:g}, rim {rim:g})"
             raise self.start.error(name, found, str(error)) from None

@@ -398,7 +398,8 @@ def unpacked_lens(packed: dict[str, Any]) -> Lens:
         values = {f.name: row[f.name] for f in fields(Surface) if f.name in row}
         for key in ("radius_mm", "thickness_mm", "diameter_mm"):
             values[key] = float(values[key])  # "inf" too
-        if len(row.get("asphere", ())) > _MAX_TERMS or any(not 0 <= p <= _MAX_POWER for p, _ in row.get("asphere", ())):
+        long = any(len(v) > _MAX_TERMS for v in row.values() if isinstance(v, list))
+        if long or any(not 0 <= p <= _MAX_POWER for p, _ in row.get("asphere", ())):
             raise ValueError(f"an asphere of more than {_MAX_TERMS} terms, or of powers beyond {_MAX_POWER}")
         values["figure"] = figure_of(row)
         if values.get("coating"):

@@ -114,13 +114,6 @@ def centred(surface: Surface) -> Centred | None:
     return surface.figure.centred(float(_extent_mm(surface)))
 
 
-def cancelling(surface: Surface) -> float:
-    """Sizes of the slopes that an asphere sums at its rim, over their sum or 1; float32 loses 6e-8 rad for each 1."""
-    found, rim = centred(surface), float(_extent_mm(surface))
-    slopes = found.slope if found else [p * _number(a) * rim ** (p - 2) for p, a in surface.figure.powers]
-    return sum(map(abs, slopes)) * rim / max(1.0, abs(sum(slopes)) * rim)
-
-
 def traced_curve(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Curve:
     """Return the curve of a surface with the start of its iteration; arguments as of `curve_of`."""
     curve = curve_of(surface, number)
