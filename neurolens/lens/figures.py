@@ -387,7 +387,11 @@ def read_figure(row: Any) -> Figure:
     found = figure_of(kind.read(row))
     known = {f.name for f in fields(kind)}
     for key in (key for key in KEYS if key in row and key not in known):
-        raise row.error(key, row.data[key], f"none beside {next(k for k in FIGURES if k in known and k in row)}")
+        owner = next(mark for mark, one in FIGURES.items() if key in {f.name for f in fields(one)})
+        expected = f"{owner} beside it"
+        if key in FIGURES:
+            expected = f"none beside {', '.join(mark for mark in FIGURES if mark in known and mark in row)}"
+        raise row.error(key, row.data[key], expected)
     return found
 
 

@@ -14,7 +14,7 @@ from lens_models import LENSES, prepared
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.lens.figures import Cylinder, Figure
+from neurolens.lens.figures import Cylinder, Figure, Qcon
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Surface
 from neurolens.readers.lensfile import read_lens
@@ -92,6 +92,7 @@ FRONTS = {
     "concave": Surface(-80.0, 2.0, 60.0, 1.8, 30.0),
     "plane": Surface(math.inf, 2.0, 40.0, 1.5, 60.0),
     "asphere": Surface(50.0, 2.0, 60.0, 1.7, 40.0, figure=Figure(conic=-0.6, asphere=((4, 2e-6), (6, -1e-10)))),
+    "Qcon": Surface(50.0, 2.0, 60.0, 1.7, 40.0, figure=Qcon(qcon=(0.5, -0.1, 0.02), norm_mm=30.0)),
 }
 
 

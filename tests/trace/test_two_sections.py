@@ -18,7 +18,7 @@ from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.lens.figures import Cylinder, Figure, Ideal, Toroid, figure_of
+from neurolens.lens.figures import Biconic, Cylinder, Figure, Ideal, Qcon, Toroid, figure_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens, write_lens
@@ -220,10 +220,23 @@ def test_what_an_ideal_lens_has_not_is_refused_by_name() -> None:
         seidel(Scene(lens))
 
 
+@pytest.mark.parametrize("qcon", [(0.1, -0.02), (1e-3,) * 20])
+def test_a_front_of_forbes_in_a_model(qcon: tuple[float, ...]) -> None:
+    front = Surface(-25.0, 6.0, 24.0, GLASS, figure=Qcon(qcon=qcon, norm_mm=12.0))
+    h = np.linspace(-12, 12, 97)
+    wanted = sag_mm(front, 0.6 * h, 0.8 * h)
+    for form, tolerance in ((Form(sag_terms=0), 1e-13), (Form(), 2e-6)):
+        g = Graph()
+        g.outputs["z"] = sag(g.input("xy", 2), front, form)
+        found = evaluate(g, {"xy": torch.from_numpy(np.stack([0.6 * h, 0.8 * h]))})["z"]
+        assert np.abs(found.numpy() - wanted).max() < tolerance
+
+
 ROWS = {
     "toroid": 'cylinder = "y", across_mm = 40.0, conic = -1.0, asphere = { 4 = 1e-6 }, n_d = 1.6',
     "biconic": 'cylinder = "x", across_mm = -40.0, across_conic = 0.5, n_d = 1.6',
     "ideal": "focal_mm = 60.0",
+    "Qcon": "conic = -0.5, qcon = [0.06, -0.02, 4e-3], norm_mm = 9.0, n_d = 1.6",
 }
 FILE = """schema = 1
 name = "one"
@@ -251,10 +264,13 @@ def test_lens_files_hold_them(name: str, tmp_path: Path) -> None:
     again = tmp_path / "again.toml"
     write_lens(lens, again)
     assert read_lens(again).surfaces == lens.surfaces
-    assert (
-        lens.surfaces[0].figure.record().get("across")
-        == {"toroid": (40.0, None), "biconic": (-40.0, 0.5), "ideal": None}[name]
-    )
+    wanted = {
+        "toroid": Toroid(-1.0, ((4, 1e-6),), cylinder="y", across_mm=40.0),
+        "biconic": Biconic(cylinder="x", across_mm=-40.0, across_conic=0.5),
+        "ideal": Ideal(focal_mm=60.0),
+        "Qcon": Qcon(-0.5, qcon=(0.06, -0.02, 4e-3), norm_mm=9.0),
+    }
+    assert lens.surfaces[0].figure == wanted[name] and read_lens(again).sha256 == lens.sha256
     assert lens.ideal == ([0] if name == "ideal" else [])
 
 
@@ -269,6 +285,14 @@ def test_lens_files_hold_them(name: str, tmp_path: Path) -> None:
         ("focal_mm = 0.0", "focal_mm: got 0.0, expected a focal length other than 0"),
         ("focal_mm = 60.0, n_d = 1.5", "focal_mm: got 60.0, expected air on both sides of an ideal lens"),
         ("focal_mm = 60.0, conic = 1.0", "conic: got 1.0, expected a plane in air"),
+        ("qcon = 3, norm_mm = 9", "qcon: got 3, expected 1 to 20 coefficients"),
+        (f"qcon = {[1e-9] * 21}, norm_mm = 9", "qcon: got .*, expected 1 to 20 coefficients"),
+        ("qcon = [1e-3]", r"norm_mm: got \(missing\), expected a finite number above 0 in mm"),
+        ("qcon = [1e-3, true], norm_mm = 9", r"qcon\[1\]: got True, expected a finite number"),
+        ("qcon = [1e-3], norm_mm = 9, asphere = { 4 = 1e-6 }", "asphere: got .*, expected none beside qcon"),
+        ('qcon = [1e-3], norm_mm = 9, cylinder = "x"', "cylinder: got 'x', expected none beside qcon"),
+        ("qcon = [1e-3], norm_mm = 4", "norm_mm: got 2.5, expected a size from 0 to 2: rim radius over it"),
+        ("norm_mm = 4", "norm_mm: got 4, expected qcon beside it"),
     ],
 )
 def test_bad_rows_are_named(row: str, message: str, tmp_path: Path) -> None:
