@@ -353,7 +353,7 @@ def _row(s: Surface, k: int, n: list[float], spread: list[float], m: PathOfRay, 
     s5 = -a_bar * (a_bar**2 * y * inverse2 - y_bar * (2 * a_bar * y - a * y_bar) * c * inverse)
     # What the surface departs from the sphere of its vertex curvature, per r^4.
     conic = (1 + float(s.figure.conic)) * float(s.curvature) ** 3 - c**3
-    g = (conic + 8 * s.figure.fourth()) * (after - before)
+    g = (conic + 8 * float(dict(s.figure.powers).get(4, 0.0))) * (after - before)
     dispersion = spread[k + 1] / after - spread[k] / before
     return [
         -(a**2) * y * bend + g * y**4,

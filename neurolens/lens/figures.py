@@ -62,19 +62,10 @@ class Figure:
         return None
 
     @property
-    def across(self) -> tuple[float, float] | None:
-        """Radius and conic constant of the section across that curve; None where it is straight or there is none."""
+    def across(self) -> tuple[float, float | None] | None:
+        """Radius of the section across that curve, None where it is straight, and the section's conic constant, None
+        where the curve is turned about a line parallel to its axis."""
         return None
-
-    @property
-    def round(self) -> Figure:
-        """The figure of revolution that has the curve of the radius."""
-        return self
-
-    @property
-    def turned(self) -> bool:
-        """Whether the curve is turned about a line parallel to its axis, as a toroid's is."""
-        return False
 
     @property
     def power(self) -> float:
@@ -87,14 +78,9 @@ class Figure:
         return self.asphere
 
     @property
-    def polynomial(self) -> bool:
-        """Whether a polynomial is added to the conic."""
-        return bool(self.powers)
-
-    @property
     def aspheric(self) -> bool:
         """Whether the curve of the radius is more than a circle; a conic constant that is a tensor may become so."""
-        return self.polynomial or not isinstance(self.conic, int | float) or self.conic != 0
+        return bool(self.powers) or not isinstance(self.conic, int | float) or self.conic != 0
 
     @property
     def plain(self) -> bool:
@@ -104,12 +90,7 @@ class Figure:
     @property
     def bends(self) -> bool:
         """Whether rays are bent by it even where the radius is infinite."""
-        return self.polynomial or self.across is not None or self.power != 0
-
-    @property
-    def values(self) -> list[Any]:
-        """All that gradients may be taken by."""
-        return [self.conic, *(a for _, a in self.powers)]
+        return bool(self.powers or self.across or self.power)
 
     def vertex_curvature(self, curvature: Any, meridian: str) -> Any:
         """Curvature at the vertex along "x" or "y" in 1/mm, of a surface of this curvature."""
@@ -117,17 +98,13 @@ class Figure:
             return 0.0 if self.across is None else 1.0 / self.across[0]
         return curvature + sum(2 * a for p, a in self.powers if p == 2)
 
-    def fourth(self) -> float:
-        """Coefficient of h^4 that the polynomial adds, in 1/mm^3, for Seidel sums."""
-        return float(dict(self.powers).get(4, 0.0))
-
     def centred(self, rim_mm: float) -> Centred | None:
         """The polynomial about the middle of the zone inside the rim; None where float32 carries its powers.
 
         The powers of Forbes's polynomials of n terms exceed their sum by 6^n, those about the middle by 2.4^n,
         Chebyshev's polynomials hardly.
         """
-        return _centred(tuple((int(p), _number(a)) for p, a in self.powers if p >= 2), rim_mm)
+        return _centred(tuple((int(p), number_of(a)) for p, a in self.powers if p >= 2), rim_mm)
 
     def scaled(self, factor: float) -> Figure:
         """Return the figure with all lengths times `factor`."""
@@ -159,14 +136,17 @@ class Figure:
         """
         found = self.cells()
         found |= {"asphere": [(int(p), float(a)) for p, a in self.asphere]} if self.asphere else {}
-        across = found.pop("across_mm", None), found.pop("across_conic", None)
-        return found if across[0] is None else found | {"across": across}
+        rest = {key: value for key, value in found.items() if not key.startswith("across")}
+        return rest | ({"across": self.across} if self.across else {})
 
     def words(self) -> str:
-        """What a table of surfaces says of it besides the radius; empty for a sphere."""
-        powers = [p for p, _ in self.asphere]
-        span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
-        return _joined(span, f"K {float(self.conic):.4g}" if self.conic else "")
+        """What a table of surfaces says of it besides the radius, by the keys of lens files; empty for a sphere."""
+        found = self.cells()
+        if powers := list(found.pop("asphere", ())):
+            found = {"asphere": "-".join(dict.fromkeys((powers[0], powers[-1])))} | found
+        said = {key: f"of {len(value)} terms" for key, value in found.items() if isinstance(value, tuple)}
+        said |= {key: f"{value:.6g}" for key, value in found.items() if isinstance(value, float)}
+        return ", ".join(f"{key} {value}" for key, value in (found | said).items())
 
 
 SPHERE = Figure()
@@ -186,10 +166,6 @@ class Cylinder(Figure):
     def axis(self) -> str | None:
         return self.cylinder
 
-    @property
-    def round(self) -> Figure:
-        return Figure(self.conic, self.asphere)
-
     @classmethod
     def read(cls, row: Any) -> dict[str, Any]:
         for key in (k for k in ("across_mm", "across_conic") if k in row and "cylinder" not in row):
@@ -198,13 +174,6 @@ class Cylinder(Figure):
         if axis not in ("x", "y"):
             raise row.error("cylinder", axis, 'the axis along which it is curved: "x" or "y"')
         return super().read(row) | {"cylinder": axis}
-
-    def words(self) -> str:
-        if self.across is None:
-            return _joined(super().words(), f"cylinder {self.cylinder}")
-        kind = "toroid" if self.turned else f"biconic K {self.across[1]:.4g}"
-        other = "x" if self.cylinder == "y" else "y"
-        return _joined(super().words(), f"{kind}, {self.across[0]:.4f} mm along {other}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,12 +187,8 @@ class Toroid(Cylinder):
     across_mm: float
 
     @property
-    def across(self) -> tuple[float, float] | None:
-        return self.across_mm, 0.0
-
-    @property
-    def turned(self) -> bool:
-        return True
+    def across(self) -> tuple[float, float | None] | None:
+        return self.across_mm, None
 
     def scaled(self, factor: float) -> Figure:
         return replace(self, asphere=super().scaled(factor).asphere, across_mm=self.across_mm * factor)
@@ -254,12 +219,8 @@ class Biconic(Toroid):
     across_conic: float
 
     @property
-    def across(self) -> tuple[float, float] | None:
+    def across(self) -> tuple[float, float | None] | None:
         return self.across_mm, self.across_conic
-
-    @property
-    def turned(self) -> bool:
-        return False
 
     def bounds(self, rim_mm: float) -> list[Bound]:
         return [("across_conic", abs(self.across_conic), 0.0, 1e9, ""), *super().bounds(rim_mm)]
@@ -303,9 +264,6 @@ class Ideal(Figure):
         if focal == 0:
             raise row.error("focal_mm", focal, "a focal length other than 0")
         return {"focal_mm": focal}
-
-    def words(self) -> str:
-        return f"ideal lens, f {self.focal_mm:.4g} mm"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,9 +310,6 @@ class Qcon(Figure):
         norm = row.number("norm_mm", unit="mm", above=0)
         return super().read(row) | {"qcon": [each.number(key) for key in each.data], "norm_mm": norm}
 
-    def words(self) -> str:
-        return _joined(f"Qcon of {len(self.qcon)} terms", super().words())
-
 
 # The key of a surface that marks each figure, of several the last; a surface with none of them is a `Figure`.
 FIGURES: dict[str, type[Figure]] = {
@@ -399,11 +354,8 @@ def _kind(given: Mapping[str, Any]) -> type[Figure]:
     return next((kind for key, kind in reversed(FIGURES.items()) if key in given), Figure)
 
 
-def _joined(*words: str) -> str:
-    return ", ".join(word for word in words if word)
-
-
-def _number(value: Any) -> float:
+def number_of(value: Any) -> float:
+    """Return a number that may be a 0-d tensor."""
     return float(value.detach() if hasattr(value, "detach") else value)
 
 

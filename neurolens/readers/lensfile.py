@@ -143,7 +143,7 @@ def _surfaces(table: Table, in_front: Medium) -> tuple[Surface, ...]:
     if len(stops) != 1:
         found = f"(stop = true on surfaces {', '.join(map(str, stops))})" if stops else "(no stop)"
         raise table.error("surfaces", found, "exactly one row with stop = true")
-    if (terms := sum(len(s.figure.values) - 1 for s in surfaces)) > MAX_TERMS:
+    if (terms := sum(len(s.figure.powers) for s in surfaces)) > MAX_TERMS:
         raise table.error("surfaces", f"({terms} aspheric coefficients)", f"at most {MAX_TERMS}")
     return tuple(surfaces)
 

@@ -28,9 +28,8 @@ _ROUNDS = 12  # rims of aspheres settle in 2 to 4
 
 def end_mm(surface: Surface) -> float:
     """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
-    figure = surface.figure
-    sections = [(float(surface.radius_mm), float(figure.conic)), *([figure.across] if figure.across else [])]
-    return min(abs(radius) / math.sqrt(1 + k) if k > -1 else math.inf for radius, k in sections)
+    sections = [(float(surface.radius_mm), float(surface.figure.conic)), surface.figure.across or (math.inf, 0.0)]
+    return min(abs(r) / math.sqrt(1 + (k or 0.0)) if (k or 0.0) > -1 else math.inf for r, k in sections)
 
 
 def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
@@ -216,7 +215,7 @@ def with_derived_rims(lens: Lens) -> Lens:
         raise InputError(lens.path, "diameter", f"(not given for surface {missing})", expected)
     if math.isnan(lens.stop_radius_mm):
         lens = lens.with_stop_radius(stop_radius_mm(lens, lens.f_number))
-    if not any(s.figure.polynomial and math.isnan(s.diameter_mm) for s in lens.surfaces):
+    if not any(s.figure.powers and math.isnan(s.diameter_mm) for s in lens.surfaces):
         return replace(_filled(lens, derive_rims(lens)[0]), rims="derived")
     # Figures of aspheres are followed little beyond a rim: from the rims of their vertex spheres, until they stay.
     radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)

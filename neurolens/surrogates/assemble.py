@@ -304,11 +304,11 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
             return g.series(h2, series)
     # c h^2 / (1 + root) has no cancellation and no case for a paraboloid.
     other, square, sum_ = surface.figure.across, 1.0 - h2 * bend, h2 * c
-    if other is not None and not surface.figure.turned:
+    if other is not None and other[1] is not None:
         a2 = g.square(position[int(surface.figure.axis == "x")])
         square, sum_ = square - a2 * ((1 + other[1]) / other[0] ** 2), sum_ + a2 * (1 / other[0])
     z = sum_ / (square.maximum(0.0).sqrt() + 1.0)
-    if surface.figure.turned:
+    if other is not None and other[1] is None:
         return _turned(position, _with_polynomial(z, h2, surface), surface)
     return _with_polynomial(z, h2, surface)
 

@@ -202,7 +202,8 @@ def _differentiated(value: Any) -> bool:
 def _parameters(lens: Lens) -> list[Any]:
     found: list[Any] = []
     for s in lens.surfaces:
-        found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.absorption_per_mm, *s.figure.values)
+        found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.absorption_per_mm, s.figure.conic)
+        found += (a for _, a in s.figure.powers)
         found += (figure for layer in (s.coating.layers if s.coating else ()) for figure in layer)
     return found
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neurolens.lens.figures import Centred, Cylinder, Figure, figure_of
+from neurolens.lens.figures import Centred, Cylinder, Figure, figure_of, number_of
 from neurolens.lens.prescription import Surface
 from neurolens.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
 
@@ -93,7 +93,7 @@ def curve_of(surface: Surface, number: Callable[[Any], Any] = float) -> Curve:
     """Return the curve of a surface by its own numbers; `number` turns fields that are tensors into numbers."""
     figure, c, k = surface.figure, number(surface.curvature), number(surface.figure.conic)
     powers = {int(n): number(a) for n, a in figure.powers}
-    if is_number(k) and k == 0 and not figure.polynomial and not figure.axis:
+    if is_number(k) and k == 0 and not powers and not figure.axis:
         return Curve(c, plain=True)
     even = all(n % 2 == 0 for n in powers)
     numbers = all(is_number(a) for a in powers.values())  # derivatives by coefficients are taken in powers
@@ -103,9 +103,9 @@ def curve_of(surface: Surface, number: Callable[[Any], Any] = float) -> Curve:
         bent=(figure.axis != "y", figure.axis != "x"),
         terms=[powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1)],
         even=even,
-        centred=centred(surface) if figure.polynomial and numbers else None,
-        across=(1 / figure.across[0], 1 + figure.across[1]) if figure.across else (),
-        turned=figure.turned,
+        centred=centred(surface) if powers and numbers else None,
+        across=(1 / figure.across[0], 1 + (figure.across[1] or 0.0)) if figure.across else (),
+        turned=bool(figure.across and figure.across[1] is None),
     )
 
 
@@ -136,7 +136,7 @@ def without_rim(curve: Curve) -> Curve:
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
     """Return the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
     figure = figure_of(surface.figure.record())  # of numbers
-    (c, other, cz), steps = _fitted(_number(surface.curvature), figure, _extent_mm(surface))
+    (c, other, cz), steps = _fitted(number_of(surface.curvature), figure, _extent_mm(surface))
     if not figure.across:
         return (c * (figure.axis != "y"), c * (figure.axis != "x"), cz), steps
     return ((other, c, cz) if figure.axis == "y" else (c, other, cz)), steps
@@ -153,7 +153,7 @@ def followed_mm(surface: Surface) -> float:
 
 def _profile(surface: Surface, height: Any) -> tuple[Any, Any]:
     """First and second derivative by the height of a surface's meridional curve (of a cylinder: across its lines)."""
-    own = replace(surface, figure=surface.figure.round)
+    own = replace(surface, figure=_round(surface.figure))
     step = 1e-4 * height
     before, slope = (sag_and_derivatives(own, h, 0 * h)[1] for h in (height - step, height))
     return slope, (slope - before) / step
@@ -173,8 +173,9 @@ def _end_of(surface: Surface) -> Beyond:
     return Beyond(surface.followed_mm, slope, bend, length)
 
 
-def _number(value: Any) -> float:
-    return float(value.detach() if hasattr(value, "detach") else value)
+def _round(figure: Figure) -> Figure:
+    """The figure of revolution that has the curve of the radius."""
+    return Figure(figure.conic, figure.asphere) if figure.axis else figure
 
 
 @lru_cache(maxsize=4096)
@@ -186,7 +187,7 @@ def _fitted(curvature: float, figure: Figure, rim_mm: float) -> tuple[tuple[floa
         start = (curvature, 1 / across[0], 0.0) if across else (curvature, curvature, curvature * (1 + figure.conic))
         return start, STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
-    placed = replace(figure, cylinder="y") if isinstance(figure, Cylinder) and across else figure.round
+    placed = replace(figure, cylinder="y") if isinstance(figure, Cylinder) and across else _round(figure)
     same = Surface(radius_mm, 0.0, 2 * rim_mm, figure=placed)
     turns = np.linspace(0, math.pi / 2, 9) if across else np.zeros(1)
     h, turn = (v.ravel() for v in np.meshgrid(rim_mm * np.arange(1, 25) / 24, turns))
