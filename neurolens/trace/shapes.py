@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neurolens.lens.figures import Centred, Cylinder, Figure, figure_of, number_of
+from neurolens.lens.figures import Centred, Figure, figure_of, number_of
 from neurolens.lens.prescription import Surface
 from neurolens.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
 
@@ -187,7 +187,7 @@ def _fitted(curvature: float, figure: Figure, rim_mm: float) -> tuple[tuple[floa
         start = (curvature, 1 / across[0], 0.0) if across else (curvature, curvature, curvature * (1 + figure.conic))
         return start, STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
-    placed = replace(figure, cylinder="y") if isinstance(figure, Cylinder) and across else _round(figure)
+    placed = figure_of(figure.record() | {"cylinder": "y"}) if across else _round(figure)
     same = Surface(radius_mm, 0.0, 2 * rim_mm, figure=placed)
     turns = np.linspace(0, math.pi / 2, 9) if across else np.zeros(1)
     h, turn = (v.ravel() for v in np.meshgrid(rim_mm * np.arange(1, 25) / 24, turns))
@@ -217,7 +217,7 @@ class Depth(NamedTuple):
 
 
 def depth(o: Arithmetic, curve: Curve, h2: Any, order: int = 2, steepest: float = STEEPEST) -> Depth:
-    """Return the depth of a curve's curve at squared distances h2 (mm^2); held finite where its conic ends.
+    """Return the depth of a curve at squared distances h2 (mm^2); held finite where its conic ends.
 
     `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything. `steepest`: least squared cosine of the
     conic's slope.

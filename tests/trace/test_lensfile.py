@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from shipped import PATHS, SOME
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.lens.figures import Cylinder, Figure
+from neurolens.lens.figures import Cylinder, Figure, figure_of
 from neurolens.lens.prescription import Coating, Configuration, Lens, Surface
 from neurolens.readers.lensfile import format_lens, read_lens, write_lens
 from neurolens.trace.shapes import sag_mm
@@ -288,6 +288,21 @@ def test_a_design_on_two_glasses_comes_back(tmp_path: Path, name: str) -> None:
     write_lens(lens, tmp_path / "again.toml")
     assert read_lens(tmp_path / "again.toml").surfaces == lens.surfaces
     assert sum(s.coating is not None for s in lens.surfaces) == 2
+
+
+def test_hashes_of_lens_files_stay() -> None:
+    """Cards of models name the hash of their lens: that of every figure is what it was when figures were six fields."""
+    shapes: list[tuple[float, dict[str, Any]]] = [
+        (30.0, {}),
+        (-30.0, {"conic": 1.2, "asphere": [(3, 1e-4), (4, 1e-5)]}),
+        (25.0, {"conic": -0.7, "cylinder": "y"}),
+        (-18.0, {"cylinder": "x", "conic": -0.6, "asphere": [(2, 1e-3)], "across": (30.0, None)}),
+        (25.0, {"cylinder": "y", "across": (14.0, 0.4)}),
+        (math.inf, {"focal_mm": 40.0}),
+    ]
+    rows = tuple(Surface(radius, 5.0, 20.0, 1.5, figure=figure_of(shape)) for radius, shape in shapes)
+    known = "bb920500f3b2d54865066b2e1159186796a8a30d0ab0c7c7914ac0ef79af60eb"
+    assert Lens("n", "s", rows, 2.0).sha256 == known
 
 
 @pytest.mark.parametrize(
