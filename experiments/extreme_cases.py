@@ -12,6 +12,7 @@ from torch import Tensor
 from experiments import lab
 from neurolens.base import status as st
 from neurolens.lens import glass
+from neurolens.lens.figures import Cylinder, Figure
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
@@ -54,7 +55,7 @@ def apertures(count: int) -> Iterator[Case]:
     hyperbola = _lens(
         "plano-hyperbolic",
         Surface(INF, 12.0, 40.0, 1.71, stop=True),
-        Surface(-0.71 * 24.0, 20.0, 40.0, conic=-(1.71**2)),
+        Surface(-0.71 * 24.0, 20.0, 40.0, figure=Figure(conic=-(1.71**2))),
     )
     g = generator()
     for lens in (ball, hyperbola):
@@ -155,15 +156,21 @@ def shapes(count: int) -> Iterator[Case]:
     """Steep conics, aspheres of even and odd powers, and crossed cylinders."""
     plano = Surface(INF, 5.0, 24.0, 1.6)
     steep = {
-        "ellipsoid, K = -0.5": Surface(-11.0, 1.0, 20.0, conic=-0.5),
-        "paraboloid, K = -1": Surface(-8.0, 1.0, 20.0, conic=-1.0),
-        "hyperboloid, K = -50": Surface(-8.0, 1.0, 20.0, conic=-50.0),
-        "oblate, K = 2": Surface(-25.0, 1.0, 20.0, conic=2.0),
-        "even asphere": Surface(-20.0, 1.0, 20.0, asphere=((4, 2e-5), (6, -3e-7), (8, 4e-9), (10, -1e-11))),
-        "odd asphere with r^2": Surface(INF, 1.0, 20.0, asphere=((2, -0.01), (3, -4e-4), (4, 2e-5), (5, 1e-6))),
-        "asphere that turns back": Surface(-30.0, 1.0, 20.0, conic=-1.0, asphere=((4, 1e-4), (6, -8e-7))),
-        "cylinder": Surface(-11.0, 1.0, 20.0, cylinder="y"),
-        "acylinder": Surface(-20.0, 1.0, 20.0, conic=-1.0, cylinder="x", asphere=((4, 2e-5),)),
+        "ellipsoid, K = -0.5": Surface(-11.0, 1.0, 20.0, figure=Figure(conic=-0.5)),
+        "paraboloid, K = -1": Surface(-8.0, 1.0, 20.0, figure=Figure(conic=-1.0)),
+        "hyperboloid, K = -50": Surface(-8.0, 1.0, 20.0, figure=Figure(conic=-50.0)),
+        "oblate, K = 2": Surface(-25.0, 1.0, 20.0, figure=Figure(conic=2.0)),
+        "even asphere": Surface(
+            -20.0, 1.0, 20.0, figure=Figure(asphere=((4, 2e-5), (6, -3e-7), (8, 4e-9), (10, -1e-11)))
+        ),
+        "odd asphere with r^2": Surface(
+            INF, 1.0, 20.0, figure=Figure(asphere=((2, -0.01), (3, -4e-4), (4, 2e-5), (5, 1e-6)))
+        ),
+        "asphere that turns back": Surface(
+            -30.0, 1.0, 20.0, figure=Figure(conic=-1.0, asphere=((4, 1e-4), (6, -8e-7)))
+        ),
+        "cylinder": Surface(-11.0, 1.0, 20.0, figure=Cylinder(cylinder="y")),
+        "acylinder": Surface(-20.0, 1.0, 20.0, figure=Cylinder(conic=-1.0, cylinder="x", asphere=((4, 2e-5),))),
     }
     for name, surface in steep.items():
         lens = _lens("singlet", plano, surface, _stop(60.0))

@@ -253,12 +253,12 @@ def _unit(v: Vector) -> Vector:
 
 def _weights(s: Surface) -> tuple[int, int]:
     """The weights of x^2 and y^2 in the squared height at which the sag is taken."""
-    return (1, 0) if s.cylinder == "x" else (0, 1) if s.cylinder == "y" else (1, 1)
+    return (1, 0) if s.figure.axis == "x" else (0, 1) if s.figure.axis == "y" else (1, 1)
 
 
 def _shape(s: Surface) -> tuple[Any, Any]:
     radius = mpf(float(s.radius_mm))
-    return (mpf(0) if mp.isinf(radius) else 1 / radius), 1 + mpf(float(s.conic))
+    return (mpf(0) if mp.isinf(radius) else 1 / radius), 1 + mpf(float(s.figure.conic))
 
 
 def _meet(s: Surface, p: Vector, d: Vector, sense: int) -> Vector | None:
@@ -266,7 +266,7 @@ def _meet(s: Surface, p: Vector, d: Vector, sense: int) -> Vector | None:
     t = _meet_conic(s, p, d, sense)
     if t is None:
         return None
-    if s.asphere:
+    if s.figure.asphere:
         t = _newton(s, p, d, t)
         if t is None:
             return None
@@ -315,7 +315,7 @@ def _newton(s: Surface, p: Vector, d: Vector, t: Any) -> Any:
 def _sag(s: Surface, u: Any) -> Any:
     c, k1 = _shape(s)
     r = sqrt(u)
-    polynomial = sum((mpf(float(a)) * r**power for power, a in s.asphere), mpf(0))
+    polynomial = sum((mpf(float(a)) * r**power for power, a in s.figure.asphere), mpf(0))
     return c * u / (1 + sqrt(1 - k1 * c * c * u)) + polynomial
 
 
@@ -327,7 +327,9 @@ def _normal(s: Surface, q: Vector) -> Vector:
     r = sqrt(u)
     # Slope over r, which stays finite on the axis but for a term of power 1.
     slope = c / sqrt(1 - k1 * c * c * u)
-    slope += sum((power * mpf(float(a)) * r ** (power - 2) for power, a in s.asphere if r > 0 or power >= 2), mpf(0))
+    slope += sum(
+        (power * mpf(float(a)) * r ** (power - 2) for power, a in s.figure.asphere if r > 0 or power >= 2), mpf(0)
+    )
     return slope * wx * q[0], slope * wy * q[1], mpf(-1)
 
 

@@ -52,7 +52,7 @@ def row_of(file: Path) -> Row | None:
         lens = read_any(file)
         match, profiles, _ = found_for(lens)
         row |= {"profile": match.profile.model, "match": match.certainty, "f_number": lens.f_number}
-        row["aspheres"] = sum(bool(s.asphere or s.conic) for s in lens.surfaces)
+        row["aspheres"] = sum(bool(s.figure.asphere or s.figure.conic) for s in lens.surfaces)
         began = time.process_time()
         found = verify(lens)
     except NeurolensError as error:

@@ -42,6 +42,7 @@ from experiments.table_faults import (
 )
 from experiments.table_figures import Measures, measure
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.lens.figures import SPHERE
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.verify import found_for
@@ -64,21 +65,22 @@ def broken(lens: Lens, some: random.Random) -> Iterator[tuple[str, str, Lens]]:
     """Kind, what the sentence must hold that names the fault, and the broken table."""
     rows = lens.surfaces
     curved = [k for k, s in enumerate(rows) if math.isfinite(s.radius_mm) and not s.stop]
-    aspheric = [k for k, s in enumerate(rows) if s.asphere or s.conic]
+    aspheric = [k for k, s in enumerate(rows) if s.figure.asphere or s.figure.conic]
     k = some.choice(curved)
     yield "sign of a radius", f"sign of the radius of surface {k} ", changed(lens, k, radius_mm=-rows[k].radius_mm)
     for k in some.sample(aspheric, len(aspheric)):
-        yield "asphere dropped", f"at surface {k} ", changed(lens, k, asphere=(), conic=0.0)
+        yield "asphere dropped", f"at surface {k} ", changed(lens, k, figure=SPHERE)
     if len(aspheric) > 1:
-        plain = [replace(s, asphere=(), conic=0.0) for s in rows]
+        plain = [replace(s, figure=SPHERE) for s in rows]
         yield SEVERAL, "(no single change)", replace(lens, surfaces=tuple(plain))
-    for k in [k for k in some.sample(aspheric, len(aspheric)) if rows[k].asphere][:1]:
-        n = some.randrange(len(rows[k].asphere))
-        (power, a), factor = rows[k].asphere[n], some.choice((0.1, 10.0))
+    for k in [k for k in some.sample(aspheric, len(aspheric)) if rows[k].figure.asphere][:1]:
+        n = some.randrange(len(rows[k].figure.asphere))
+        (power, a), factor = rows[k].figure.asphere[n], some.choice((0.1, 10.0))
         where, back = f"of the coefficient of power {power} of surface {k} ", "10 times" if factor < 1 else "a tenth"
         for kind, word, value in (("sign", "sign", -a), ("exponent", f"({back})", a * factor)):
-            terms = (*rows[k].asphere[:n], (power, value), *rows[k].asphere[n + 1 :])
-            yield f"{kind} of an asphere's term", f"{word} {where}", changed(lens, k, asphere=terms)
+            terms = (*rows[k].figure.asphere[:n], (power, value), *rows[k].figure.asphere[n + 1 :])
+            figure = replace(rows[k].figure, asphere=terms)
+            yield f"{kind} of an asphere's term", f"{word} {where}", changed(lens, k, figure=figure)
     pairs = [(a, b) for a, b in pairwise(glasses(lens)) if float(rows[a].n_d) != float(rows[b].n_d)]
     for a, b in some.sample(pairs, min(1, len(pairs))):
         yield "glasses swapped", f"glasses after surfaces {a} and {b} ", swapped(lens, a, b)

@@ -59,13 +59,13 @@ def measure(path: Path, count: int) -> dict[str, Any]:
     lens = lab.lens_of(path, focus_m=math.inf)
     rays, focal_mm = camera_rays(lens, count)
     error, differ = errors_um(lens, rays, focal_mm)
-    centred = sum(s.asphere != () and shapes.centred(s) is not None for s in lens.surfaces)
+    centred = sum(s.figure.asphere != () and shapes.centred(s) is not None for s in lens.surfaces)
     powers = None
     if centred:
         with patch.object(shapes, "centred", lambda surface: None):
             powers = float(np.quantile(errors_um(lens, rays, focal_mm)[0], 0.99))
     return {
-        "name": path.stem, "aspheres": sum(bool(s.asphere) for s in lens.surfaces), "centred": centred,
+        "name": path.stem, "aspheres": sum(bool(s.figure.asphere) for s in lens.surfaces), "centred": centred,
         "powers_um": powers, "median_um": float(np.median(error)), "p99_um": float(np.quantile(error, 0.99)),
         "worst_um": float(error.max()), "rays": len(error), "status_differs": differ,
     }  # fmt: skip

@@ -113,12 +113,12 @@ def table_of(lens: Lens) -> tuple[Face, ...]:
     if float(glass.index_of(lens.media[0], WAVELENGTH_NM)) != 1:
         raise Unavailable("the lens is not in air")
     for s in lens.surfaces:
-        terms = {p: float(a) for p, a in s.asphere}
-        if s.cylinder or s.focal_mm or any(p % 2 for p in terms):
+        terms = {p: float(a) for p, a in s.figure.asphere}
+        if s.figure.axis or s.figure.power or any(p % 2 for p in terms):
             raise Unavailable("the lens has more than conics and even aspheres")
         even = tuple(terms.get(p, 0.0) for p in range(2, max(terms, default=0) + 1, 2))
         n, rim = float(glass.index_of(s, WAVELENGTH_NM)), s.semi_diameter_mm
-        faces.append(Face(float(s.radius_mm), float(s.conic), even, float(s.thickness_mm), n, rim, s.stop))
+        faces.append(Face(float(s.radius_mm), float(s.figure.conic), even, float(s.thickness_mm), n, rim, s.stop))
     return tuple(faces)
 
 

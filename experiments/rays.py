@@ -172,7 +172,7 @@ def ours(name: str, task: Task, compiled: bool) -> list[Peer]:
         for dtype in (torch.float64, torch.float32)
     ]
     if compiled:
-        slow = any(s.asphere for s in lens.surfaces)
+        slow = any(s.figure.asphere for s in lens.surfaces)
         run = too_long if slow else in_torch(compile_tracing(whole_trace), torch.float32)
         rows.append(exact("torch, compiled", "float32", run, (20000,)))
     rows += [exact("C", "float32", as_c(ray_alone))]

@@ -86,11 +86,11 @@ def changes(lens: Lens) -> Iterator[Change]:
     for k, s in enumerate(lens.surfaces):
         if math.isfinite(s.radius_mm):
             yield Change(f"the sign of the radius of surface {k}", changed(lens, k, radius_mm=-s.radius_mm))
-        for n, (power, a) in enumerate(s.asphere):
+        for n, (power, a) in enumerate(s.figure.asphere):
             for factor, what in _OF_TERMS:
-                asphere = (*s.asphere[:n], (power, factor * a), *s.asphere[n + 1 :])
+                asphere = (*s.figure.asphere[:n], (power, factor * a), *s.figure.asphere[n + 1 :])
                 said = f"{what} of the coefficient of power {power} of surface {k}"
-                yield Change(said, changed(lens, k, asphere=asphere))
+                yield Change(said, changed(lens, k, figure=replace(s.figure, asphere=asphere)))
         fields = ["radius_mm", "thickness_mm"] + ["n_d"] * (s.glass is None)
         for field in fields:
             old = float(getattr(s, field))
@@ -145,13 +145,13 @@ def _best(tried: Sequence[Change], profile: Profile, focal_mm: float) -> Tried:
 
 def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float, rounds: int = _ROUNDS) -> Tried:
     """The terms of powers 4 to 10 at a surface for which the figures are best, by damped least squares."""
-    terms, rim = dict(lens.surfaces[k].asphere), lens.surfaces[k].semi_diameter_mm
+    terms, rim = dict(lens.surfaces[k].figure.asphere), lens.surfaces[k].semi_diameter_mm
 
     def with_sags(sags: Array) -> Change:
         """Terms that are so many mm deep at the rim, beside those of the table."""
         more = {p: terms.get(p, 0.0) + float(sag) / rim**p for p, sag in zip(_POWERS, sags, strict=True)}
-        asphere = tuple(sorted((terms | more).items()))
-        return Change(f"an asphere is missing at surface {k}", changed(lens, k, asphere=asphere))
+        figure = replace(lens.surfaces[k].figure, asphere=tuple(sorted((terms | more).items())))
+        return Change(f"an asphere is missing at surface {k}", changed(lens, k, figure=figure))
 
     sags = np.zeros(len(_POWERS))
     best = _best([with_sags(sags)], profile, focal_mm)

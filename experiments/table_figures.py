@@ -1,4 +1,4 @@
-"""Figures of many tables of one lens at once, by a few rays each: distortion, blur, fields of focus, colour, lengths.
+"""Curves of many tables of one lens at once, by a few rays each: distortion, blur, fields of focus, colour, lengths.
 
 No ray is aimed: chief rays start in the middle of the stop and are followed both ways, to the scene and to the film.
 The tables differ in numbers alone, which are arrays [T, 1] here beside rays [T, R]; the surface step is the tracer's.
@@ -21,7 +21,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.verify import heights_of, ideal_heights, shapes
 from neurolens.trace.arithmetic import NUMPY
-from neurolens.trace.shapes import Figure, without_rim
+from neurolens.trace.shapes import Curve, without_rim
 from neurolens.trace.surfaces import Medium, Rays, cross, medium
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ class Tables:
     """Tables of one lens as arrays: [S] lists of [T, 1] curvatures, conics, gaps; [S + 1] media; terms of aspheres."""
 
     lenses: tuple[Lens, ...]
-    figures: tuple[Figure, ...]
+    figures: tuple[Curve, ...]
     gap_mm: tuple[Array, ...]
     media: tuple[Medium, ...]
 
@@ -95,15 +95,15 @@ def _indices(lenses: Sequence[Lens], nm: float) -> list[Array]:
     return [_column(index_of(m, nm) for m in row) for row in zip(*(lens.media for lens in lenses), strict=True)]
 
 
-def _figure(row: Sequence[Any]) -> Figure:
-    curvature, conic = _column(s.curvature for s in row), _column(s.conic for s in row)
-    powers = sorted({int(p) for s in row for p, _ in s.asphere})
+def _figure(row: Sequence[Any]) -> Curve:
+    curvature, conic = _column(s.curvature for s in row), _column(s.figure.conic for s in row)
+    powers = sorted({int(p) for s in row for p, _ in s.figure.asphere})
     if not powers and not conic.any():
-        return Figure(curvature, plain=True)
+        return Curve(curvature, plain=True)
     even = all(p % 2 == 0 for p in powers)
-    each = [dict(s.asphere) for s in row]
+    each = [dict(s.figure.asphere) for s in row]
     terms = [_column(a.get(p, 0.0) for a in each) for p in range(2, max(powers, default=0) + 1, 2 if even else 1)]
-    return without_rim(Figure(curvature, 1 + conic, terms=terms, even=even))
+    return without_rim(Curve(curvature, 1 + conic, terms=terms, even=even))
 
 
 class ChiefRays(NamedTuple):

@@ -28,6 +28,7 @@ from experiments import lab
 from experiments.fused_speed import Case
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.scalars import lower
+from neurolens.lens.figures import SPHERE
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, cauchy, index_of
 from neurolens.lens.prescription import Lens, Medium, Surface
 from neurolens.study.speed import FUSED_BATCHES, Call, Candidate, CompiledSource, Unavailable, program_candidate
@@ -60,7 +61,7 @@ extern "C" void run(size_t n, float fz, float sr, void **a)
 
 def by_figures(surface: Surface) -> Surface:
     """The surface as a sphere with its glass by n_d and V_d."""
-    surface = replace(surface, conic=0.0, asphere=(), cylinder=None, across=None)
+    surface = replace(surface, figure=SPHERE)
     if surface.glass is None:
         return surface
     d, f, c = (float(index_of(surface, nm)) for nm in (LINE_D_NM, LINE_F_NM, LINE_C_NM))

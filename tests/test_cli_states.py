@@ -68,7 +68,7 @@ def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureF
     (index, nanometres), *_ = row["coating"]["layers"]
     assert index * nanometres == pytest.approx(550 / 4, rel=0.1) and row["absorption_per_mm"] == 0.01
     assert main(["lens", str(path)]) == 0
-    assert "asphere 4-6, K -1.1, coating quarter-wave, absorbs 0.01/mm" in capsys.readouterr().out
+    assert "asphere 4-6, conic -1.1, coating quarter-wave, absorbs 0.01/mm" in capsys.readouterr().out
 
 
 # render

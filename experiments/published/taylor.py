@@ -168,7 +168,7 @@ def refract(t: Truncated, lens: Lens, k: int, ray: RaySeries, before: float, aft
     The height (mm) counts in the direction of travel, from the scene's side negative sag.
     """
     surface = lens.surfaces[k]
-    if surface.cylinder is not None or any(power % 2 for power, _ in surface.asphere):
+    if surface.figure.axis is not None or any(power % 2 for power, _ in surface.figure.asphere):
         raise InputError(lens.path, f"surfaces[{k}]", "(cylinder or odd powers)", "a surface with a Taylor series")
     height, met = t.constant(0.0), ray
     for _ in range(t.degree // 2 + 1):  # each round makes two more degrees right
@@ -190,11 +190,11 @@ def refract(t: Truncated, lens: Lens, k: int, ray: RaySeries, before: float, aft
 
 def _sag(t: Truncated, surface: Surface, r2: Series) -> tuple[Series, Series]:
     """Height in the direction of travel (towards the scene) at squared radii, and its derivative by them."""
-    c, bend = float(surface.curvature), (1 + float(surface.conic)) * float(surface.curvature) ** 2
+    c, bend = float(surface.curvature), (1 + float(surface.figure.conic)) * float(surface.curvature) ** 2
     root = t.power(t.constant(1.0) - bend * r2, 0.5)
     sag = c * t.times(r2, t.power(t.constant(1.0) + root, -1.0))
     slope = c / 2 * t.power(root, -1.0)
-    for power, a in surface.asphere:
+    for power, a in surface.figure.asphere:
         sag = sag + float(a) * t.power(r2, power // 2)
         slope = slope + float(a) * (power // 2) * t.power(r2, power // 2 - 1)
     return -sag, -slope

@@ -310,7 +310,7 @@ def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm:
     rows = np.array([_row(s, k, n, spread, marginal, chief) for k, s in enumerate(lens.surfaces)])
     bend = petzval_curvature(lens, wavelength_nm)
     lagrange = n[0] * (marginal.before[0] * chief.y[0] - chief.before[0] * marginal.y[0])
-    odd = tuple(k for k, s in enumerate(lens.surfaces) if any(p in (1, 3) and a for p, a in s.asphere))
+    odd = tuple(k for k, s in enumerate(lens.surfaces) if any(p in (1, 3) and a for p, a in s.figure.powers))
     radius = math.inf if bend == 0 else 1 / bend
     return Seidel(wavelength_nm, image_height_mm, lagrange, radius, rows, rows.sum(0), SUMS, odd)
 
@@ -352,8 +352,8 @@ def _row(s: Surface, k: int, n: list[float], spread: list[float], m: PathOfRay, 
     inverse, inverse2 = 1 / after - 1 / before, 1 / after**2 - 1 / before**2
     s5 = -a_bar * (a_bar**2 * y * inverse2 - y_bar * (2 * a_bar * y - a * y_bar) * c * inverse)
     # What the surface departs from the sphere of its vertex curvature, per r^4.
-    conic = (1 + float(s.conic)) * float(s.curvature) ** 3 - c**3
-    g = (conic + 8 * float(dict(s.asphere).get(4, 0.0))) * (after - before)
+    conic = (1 + float(s.figure.conic)) * float(s.curvature) ** 3 - c**3
+    g = (conic + 8 * float(dict(s.figure.powers).get(4, 0.0))) * (after - before)
     dispersion = spread[k + 1] / after - spread[k] / before
     return [
         -(a**2) * y * bend + g * y**4,

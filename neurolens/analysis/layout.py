@@ -112,7 +112,7 @@ def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
     sections = (
         Section(
             *(float(z), float(s.radius_mm), s.semi_diameter_mm, float(s.n_d), s.stop),
-            *(_profile(s, float(z), scene.axis), s.focal_mm is not None),
+            *(_profile(s, float(z), scene.axis), s.figure.power != 0),
         )
         for s, z in zip(lens.surfaces, lens.vertices_mm[:-1], strict=True)
     )
@@ -122,7 +122,7 @@ def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
 
 def _profile(s: Surface, vertex_mm: float, axis: str) -> Array | None:
     """Points [65, 2] of (z, height) from rim to rim of a surface that is no sphere; None for spheres and planes."""
-    if not (s.conic or s.asphere or s.cylinder) or math.isinf(s.semi_diameter_mm):
+    if s.figure.plain or math.isinf(s.semi_diameter_mm):
         return None
     height = torch.linspace(-s.semi_diameter_mm, s.semi_diameter_mm, 65, dtype=torch.float64)
     place = (height, torch.zeros_like(height)) if axis == "x" else (torch.zeros_like(height), height)

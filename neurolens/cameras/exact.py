@@ -228,9 +228,8 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
     waves = {lens.reference_nm, *wavelength_nm, *(wavelength_between(wavelength_nm, share) for share in shares)}
     rows: list[Any] = [[float(index_of(lens.object_medium, w)) for w in sorted(waves)]]
     for s in lens.surfaces:
-        numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, s.conic, *(index_of(s, w) for w in sorted(waves)))
-        more = s.across, s.focal_mm, [(p, float(a)) for p, a in s.asphere]
-        rows.append([[float(v) for v in numbers], s.stop, s.cylinder, *more])
+        numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, *(index_of(s, w) for w in sorted(waves)))
+        rows.append([[float(v) for v in numbers], s.stop, s.figure.record()])
     return fingerprint_of([_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
 
 

@@ -168,7 +168,7 @@ examples:
         data = result.to_dict()
         if self.out is None:
             return data, None
-        across = f"_{self.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
+        across = f"_{self.axis}" if scene.lens.anamorphic else ""
         path = self.out / f"{scene.lens.lens_id}_{what}{across}.{self.format}"
         warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
         if what == "layout":

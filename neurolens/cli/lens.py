@@ -293,15 +293,8 @@ def _surfaces(surfaces: list[dict[str, Any]]) -> str:
 
 def _surface_words(row: dict[str, Any]) -> str:
     """Properties of a row of `study.describe.glass_table` besides radius and glass; empty for a sphere."""
-    powers = sorted(map(int, row["asphere"]))
-    span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
-    (radius, conic), other = row["across"] or (None, None), "x" if row["cylinder"] == "y" else "y"
     words = [
-        span,
-        f"K {row['conic']:.4g}" if row["conic"] else "",
-        f"cylinder {row['cylinder']}" if row["cylinder"] and not row["across"] else "",
-        f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius:.4f} mm along {other}" if radius else "",
-        f"ideal lens, f {row['focal_mm']:.4g} mm" if row["focal_mm"] else "",
+        row["figure"],
         f"coating {row['coating']['name']}" if row["coating"] else "",
         f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
     ]

@@ -62,7 +62,7 @@ def aspheres(camera: Any) -> list[int]:
     """The surfaces of a camera's lens that are round aspheres. Raises InputError: there is none."""
     lens = getattr(camera, "lens", None)
     surfaces = lens.surfaces if lens is not None else ()
-    found = [k for k, s in enumerate(surfaces) if s.cylinder is None and (s.asphere or s.conic)]
+    found = [k for k, s in enumerate(surfaces) if s.figure.aspheric and not s.figure.axis]
     if not found:
         raise InputError(
             camera.name, "ring_height", "(no asphere)", "the file of a lens with aspheres, to have grooves"

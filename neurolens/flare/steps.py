@@ -31,7 +31,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, same_medium
 from neurolens.trace.arithmetic import TINY, Graphs
 from neurolens.trace.films import Layers, reflectance
-from neurolens.trace.shapes import Centred, Figure, figure_of, is_plain
+from neurolens.trace.shapes import Centred, Curve, traced_curve
 from neurolens.trace.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
 from neurolens.trace.tracegraph import transmitted
 from neurolens.trace.transmission import path_mm
@@ -40,7 +40,7 @@ Action = Literal["T", "R"]
 STATE = 8  # rows of a ray: x, y, z (mm, this step's frame), direction, power, `worst` (largest r^2 / R^2 at a rim)
 CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "absorbed_per_mm")
 DEGREE = 10  # the degree of a coating's reflectance
-FIGURE = ("stretch", "start_c", "start_cz", "last_step_mm")  # see `shapes.Figure`; `across` and the terms follow
+CURVE = ("stretch", "start_c", "start_cz", "last_step_mm")  # see `shapes.Curve`; `across` and the terms follow
 ACROSS = 3
 PLAIN = len(CALL) + DEGREE + 1  # how many numbers of the call a sphere has
 # Actions: refract light that travels to the film (0) or back (1), reflect such light (2, 3); sense of the light before.
@@ -52,11 +52,11 @@ _MASKS: dict[str, Floats] = {}  # masks of stops, which compiled code points at 
 
 
 class Shape(NamedTuple):
-    """What a compiled function knows about a `shapes.Figure`, whose numbers are passed with each call."""
+    """What a compiled function knows about a `shapes.Curve`, whose numbers are passed with each call."""
 
     terms: int = 0
     even: bool = True
-    centred: bool = False
+    centred: bool | None = None  # and whether by Chebyshev's polynomials
     steps: int = 0
     bent: tuple[bool, bool] = (True, True)
     crossed: bool = False
@@ -85,19 +85,19 @@ class Kind(NamedTuple):
 def step_graph(kind: Kind) -> Graph:
     """The graph of one step: its input `state` [8] becomes the output `after` [8], in the frame of the next step.
 
-    The input `call` holds `CALL`, then the coefficients of a coating's reflectance, lowest first, then `FIGURE` and the
+    The input `call` holds `CALL`, then the coefficients of a coating's reflectance, lowest first, then `CURVE` and the
     terms of the polynomial (`_terms`), as many as the shape has.
     """
     g, shape = Graph(), kind.shape
     o = Graphs(g, finite=True)  # films average over rays, also over those that are lost and have no power
-    count = PLAIN + (0 if shape is None else len(FIGURE) + ACROSS * shape.crossed + shape.terms)
+    count = PLAIN + (0 if shape is None else len(CURVE) + ACROSS * shape.crossed + shape.terms)
     state, call = g.input("state", STATE), g.input("call", count, per_call=True)
     shift, curvature, per_rim2, n1, n2, n_step, absorbed = (call[k] for k in range(len(CALL)))
     power, worst = state[6], state[7]
     rays = Rays(state[0], state[1], state[2] + shift, state[3], state[4], state[5])
-    figure = Figure(curvature, plain=True) if shape is None else _figure(shape, call)
+    curve = Curve(curvature, plain=True) if shape is None else _curve(shape, call)
     # Indices are relative to the medium before the surface, so that directions there are unit vectors.
-    met = meet(o, rays, figure, -1, _UNIT)
+    met = meet(o, rays, curve, -1, _UNIT)
     normal = normal_at(o, met, curvature)
     # Glass ends at the near half of a sphere.
     tests = [*met.tests, (TINY, normal[2])]
@@ -178,40 +178,40 @@ def reflectance_fit(
     return tuple(np.polynomial.polynomial.polyfit(1 - c, exact, DEGREE, w=1 / (exact + _FAINT)).tolist())
 
 
-def _figure(shape: Shape, call: Value) -> Figure:
+def _curve(shape: Shape, call: Value) -> Curve:
     more = ACROSS * shape.crossed
-    stretch, c, cz, last_step, *rest = (call[PLAIN + k] for k in range(len(FIGURE) + more + shape.terms))
-    figure = Figure(call[CALL.index("curvature")], stretch, bent=shape.bent)
+    stretch, c, cz, last_step, *rest = (call[PLAIN + k] for k in range(len(CURVE) + more + shape.terms))
+    curve = Curve(call[CALL.index("curvature")], stretch, bent=shape.bent)
     if not shape.terms and not shape.crossed:
-        return figure
+        return curve
     other: Any = rest[1] if shape.crossed else 0.0
     start = c if shape.bent[0] else other, c if shape.bent[1] else other, cz
     terms = rest[more:]
-    centred = Centred(terms[0], terms[1::2], terms[2::2]) if shape.centred else None
-    return figure._replace(
+    centred = None if shape.centred is None else Centred(terms[0], terms[1::2], terms[2::2], shape.centred)
+    return curve._replace(
         terms=terms, centred=centred, even=shape.even, start=start, steps=shape.steps, last_step=last_step,
         across=(rest[0], rest[2]) if shape.crossed else (), turned=shape.turned,
     )  # fmt: skip
 
 
-def figure_numbers(figure: Figure, turn: float) -> list[Any]:
-    """The numbers `FIGURE`, across and terms; `turn` is -1.0 for light that travels towards +z in the lens frame."""
-    cx, cy, cz = figure.start or (0.0, 0.0, 0.0)
-    c, other = (cx, cy) if figure.bent[0] else (cy, cx)
-    across = [turn * figure.across[0], turn * other, figure.across[1]] if figure.across else []
-    return [figure.stretch, turn * c, turn * cz, figure.last_step, *across, *_terms(figure, turn)]
+def curve_numbers(curve: Curve, turn: float) -> list[Any]:
+    """The numbers `CURVE`, across and terms; `turn` is -1.0 for light that travels towards +z in the lens frame."""
+    cx, cy, cz = curve.start or (0.0, 0.0, 0.0)
+    c, other = (cx, cy) if curve.bent[0] else (cy, cx)
+    across = [turn * curve.across[0], turn * other, curve.across[1]] if curve.across else []
+    return [curve.stretch, turn * c, turn * cz, curve.last_step, *across, *_terms(curve, turn)]
 
 
-def _terms(figure: Figure, turn: float) -> list[float]:
+def _terms(curve: Curve, turn: float) -> list[float]:
     """The numbers of a polynomial: terms; of a centred one the scale, and in turn those of its sag and its slope."""
-    if figure.centred is None:
-        return [turn * v for v in figure.terms]
-    scale, *both = figure.centred
-    return [scale, *(turn * v for pair in zip(*both, strict=True) for v in pair)]
+    if curve.centred is None:
+        return [turn * v for v in curve.terms]
+    scale, sag, slope, _ = curve.centred
+    return [scale, *(turn * v for pair in zip(sag, slope, strict=True) for v in pair)]
 
 
-def _sort(figure: Figure) -> tuple[bool, bool]:
-    return figure.even, figure.centred is not None
+def _sort(curve: Curve) -> tuple[bool, bool | None]:
+    return curve.even, curve.centred and curve.centred.chebyshev
 
 
 class Stack:
@@ -234,13 +234,13 @@ class Stack:
         lens.require_glass("reflections, of which flare is made")
         self.lens = lens
         # All aspheres of a sort get the degree of the highest one, so that they share a function.
-        self._figures = {k: figure_of(s, float) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
-        figures = self._figures.values()
-        most: dict[tuple[bool, bool], int] = {}
-        for f in figures:
+        self._curves = {k: traced_curve(s, float) for k, s in enumerate(lens.surfaces) if not s.figure.plain}
+        curves = self._curves.values()
+        most: dict[tuple[bool, bool | None], int] = {}
+        for f in curves:
             most[_sort(f)] = max(most.get(_sort(f), 0), len(_terms(f, 1.0)))
-        self._terms = {k: most[_sort(f)] if f.terms else 0 for k, f in self._figures.items()}
-        self.width = PLAIN + len(FIGURE) + ACROSS + max(most.values(), default=0)
+        self._terms = {k: most[_sort(f)] if f.terms else 0 for k, f in self._curves.items()}
+        self.width = PLAIN + len(CURVE) + ACROSS + max(most.values(), default=0)
         kinds = {place: self.kind(*place) for place in sorted(places)}
         self._kinds = tuple(dict.fromkeys(kinds.values()))
         self.functions = np.full((len(lens.surfaces), len(ACTIONS)), -1, np.int32)
@@ -276,7 +276,7 @@ class Stack:
 
     def kind(self, k: int, which: int) -> Kind:
         """What a step does at surface k by the action of this number."""
-        lens, s, f = self.lens, self.lens.surfaces[k], self._figures.get(k)
+        lens, s, f = self.lens, self.lens.surfaces[k], self._curves.get(k)
         return Kind(
             ACTIONS[which][0],
             None if f is None else Shape(self._terms[k], *_sort(f), f.steps, f.bent, bool(f.across), f.turned),
@@ -301,9 +301,9 @@ class Stack:
                 step = (n[after] - n[before]) * (n[after] + n[before])
                 row = gap, -sense * float(s.curvature), 1 / s.semi_diameter_mm**2, n[before], n[after], step, a[before]
                 numbers[k, which, : len(CALL)] = row
-                if k in self._figures:
-                    figure = figure_numbers(self._figures[k], -sense)
-                    numbers[k, which, PLAIN : PLAIN + len(figure)] = figure
+                if k in self._curves:
+                    curve = curve_numbers(self._curves[k], -sense)
+                    numbers[k, which, PLAIN : PLAIN + len(curve)] = curve
                 if s.coating and s.coating.layers and ACTIONS[which][0] == "R":
                     numbers[k, which, len(CALL) : PLAIN] = numbers[k, which - 2, len(CALL) : PLAIN]
                 elif s.coating and s.coating.layers:

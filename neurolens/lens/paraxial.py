@@ -109,7 +109,7 @@ def system_of(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian
     check_light(lens, light)
     curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
     index = [index_of(medium, light) for medium in lens.media]
-    ideal = [0.0 if s.focal_mm is None else 1 / s.focal_mm for s in lens.surfaces]
+    ideal = [s.figure.power for s in lens.surfaces]
     return System(curvature, [s.thickness_mm for s in lens.surfaces[:-1]], index, ideal)
 
 
@@ -182,8 +182,7 @@ def light_of(lens: Lens) -> dict[str, Any]:
 
 def is_pinhole(lens: Lens) -> bool:
     """Test whether no surface bends light: a hole, perhaps behind plane filters."""
-    flat = all(s.radius_mm in (math.inf, -math.inf) and not (s.asphere or s.across) for s in lens.surfaces)
-    return flat and not lens.ideal
+    return all(math.isinf(s.radius_mm) and not s.figure.bends for s in lens.surfaces)
 
 
 def _pinhole(lens: Lens, system: System) -> FirstOrder:

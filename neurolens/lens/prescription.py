@@ -13,6 +13,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import lens_id_of
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.figures import SPHERE, Figure
 
 VISIBLE_NM = (400.0, 700.0)
 LINE_D_NM = 587.5618  # helium, yellow: where first-order data stand
@@ -44,22 +45,16 @@ class Surface:
         V_d: Abbe number of that medium; None where unknown (constant index) or air.
         material: name of the glass in the source, for people only.
         stop: whether this row is the aperture stop.
-        conic: Schwarzschild's K (0 sphere, -1 paraboloid): c r^2 / (1 + sqrt(1 - (1 + K) c^2 r^2)).
-        asphere: (power, coefficient) pairs, sorted by power, added to the conic: sum of A_p r^p, A_p in mm^(1 - p).
-            Odd powers and p = 2 (which adds 2 A_2 to the curvature at the vertex) are allowed.
-        cylinder: None, or the transverse axis, "x" or "y", along which a cylinder is curved (straight along the other).
-        across: of a cylinder bent along the other axis, too: that radius (mm), and None where the curve is turned about
-            a line parallel to it at this radius (a toroid), or the conic constant of a biconic, which has no asphere.
-        focal_mm: of an ideal thin lens in air, a plane that refracts nothing: slopes change by -x / f and -y / f.
+        figure: its shape besides the radius (`lens.figures`); a sphere, or a plane, by default.
         glass: name in the glass catalogue (`neurolens.lens.glass`); its dispersion rules over n_d and V_d.
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
         coating: the thin films on the surface, None where bare.
-        followed_mm: distance from the axis from which on an asphere continues smoothly instead of by its polynomial;
+        followed_mm: distance from the axis from which on a figure continues smoothly instead of by its polynomial;
             only `aiming.without_rims` sets it, for questions that ignore rims (`shapes.followed_mm`).
 
-    `radius_mm`, `thickness_mm`, `n_d`, `conic` and the coefficients of `asphere` may be 0-d tensors where gradients
-    with respect to them are wanted.
+    `radius_mm`, `thickness_mm`, `n_d` and the values of `figure` may be 0-d tensors where gradients with respect to
+    them are wanted.
     """
 
     radius_mm: Any
@@ -69,11 +64,7 @@ class Surface:
     V_d: float | None = None
     material: str | None = None
     stop: bool = False
-    conic: Any = 0.0
-    asphere: tuple[tuple[int, Any], ...] = ()
-    cylinder: str | None = None
-    across: tuple[float, float | None] | None = None
-    focal_mm: float | None = None
+    figure: Figure = SPHERE
     glass: str | None = None
     absorption_per_mm: float = 0.0
     coating: Coating | None = None
@@ -86,9 +77,7 @@ class Surface:
 
     def vertex_curvature(self, meridian: str) -> Any:
         """Curvature at the vertex along "x" or "y" in 1/mm: 1 / radius + 2 A_2, and 0 where a cylinder is straight."""
-        if self.cylinder not in (None, meridian):
-            return 0.0 if self.across is None else 1.0 / self.across[0]
-        return self.curvature + sum(2 * a for p, a in self.asphere if p == 2)
+        return self.figure.vertex_curvature(self.curvature, meridian)
 
     @property
     def semi_diameter_mm(self) -> float:
@@ -209,18 +198,20 @@ class Lens:
     @property
     def anamorphic(self) -> bool:
         """Whether any surface is a cylinder, toroid or biconic: the lens is then not round about its axis."""
-        return any(s.cylinder is not None for s in self.surfaces)
+        return any(s.figure.axis for s in self.surfaces)
 
     @property
     def ideal(self) -> list[int]:
         """The surfaces that are ideal thin lenses."""
-        return [k for k, s in enumerate(self.surfaces) if s.focal_mm is not None]
+        return [k for k, s in enumerate(self.surfaces) if s.figure.power]
 
     def require_glass(self, what: str) -> None:
         """Raise InputError for a lens with ideal surfaces, of which there is no `what`."""
         for k in self.ideal:
             expected = f"surfaces of glass: an ideal lens has no {what}"
-            raise InputError(self.path, f"surface {k}, focal_mm", self.surfaces[k].focal_mm, expected)
+            raise InputError(
+                self.path, f"surface {k}, focal_mm", self.surfaces[k].figure.record()["focal_mm"], expected
+            )
 
     @property
     def dispersive(self) -> bool:
@@ -274,10 +265,9 @@ class Lens:
         surfaces = (
             replace(
                 s,
-                asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
+                figure=s.figure.scaled(factor),
                 absorption_per_mm=s.absorption_per_mm / factor,
-                across=s.across and (s.across[0] * factor, s.across[1]),
-                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "focal_mm", "followed_mm"),
+                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "followed_mm"),
             )
             for s in self.surfaces
         )
@@ -318,7 +308,7 @@ def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = N
     first = surfaces[k - 1] if k else in_front
     before = (first.n_d, first.V_d, first.glass) if first else (1.0, None, None)
     s = surfaces[k]
-    return before == (s.n_d, s.V_d, s.glass) and s.focal_mm is None
+    return before == (s.n_d, s.V_d, s.glass) and not s.figure.power
 
 
 def _terms(m: Surface | Medium) -> list[int]:
@@ -338,11 +328,7 @@ def _figures(s: Surface) -> list[Any]:
         s.stop,
     ]
     more = {
-        "conic": float(s.conic),
-        "asphere": [(p, float(a)) for p, a in s.asphere],
-        "cylinder": s.cylinder,
-        "across": s.across,
-        "focal_mm": s.focal_mm,
+        **s.figure.record(),
         "glass": s.glass,
         "cauchy": _terms(s),
         "absorption_per_mm": float(s.absorption_per_mm),

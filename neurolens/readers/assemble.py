@@ -1,13 +1,13 @@
 """What a file says otherwise than a lens does, or leaves open: Forbes's aspheres, stop, f-number, film and rims.
 
-Forbes's aspheres become even powers of the height, as lenses have them (G. W. Forbes, Opt. Express 15, 5218, 2007).
-With u the height over a normalisation radius and x = u^2,
+Forbes's mild aspheres (Qbfs) become even powers of the height (G. W. Forbes, Opt. Express 15, 5218, 2007); the strong
+ones are a figure of their own (`lens.figures.Qcon`). With u the height over a normalisation radius and x = u^2,
 
-- Qcon: sag = conic + u^4 sum a_m Qcon_m(x), Jacobi's P_m^(0,4)(2 x - 1): exactly even powers;
-- Qbfs: sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x), whose slopes along the normal are
-  orthonormal (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic, Thorlabs's ASL5040-UV is sharp).
-  The cosine is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens
-  model's powers do not reach that are refused.
+    sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x),
+
+whose slopes along the normal are orthonormal (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic,
+Thorlabs's ASL5040-UV is sharp). The cosine is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it.
+Conics so steep that the lens model's powers do not reach that are refused.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ _SLIGHTLY = 0.1  # of a rim's diameter
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
 
 CLOSE_MM, WORST_MM = 1e-11, 1e-9  # of sag, in the unit of the heights: what is aimed at, and what steep conics get
-MAX_TERMS = MAX_POWER // 2 - 1  # of either kind, m from 0
 _DIGITS = 80
 _SAMPLES = 101
 _ROUNDING_MM = 2e-8  # of sag: what rounding the coefficients to float64 may change; float32 carries what passes this
@@ -154,7 +153,7 @@ def check_rows(lens: Lens) -> None:
             raise InputError(file, f"surface {k}, radius", s.radius_mm, "a number other than 0, or a plane")
         if not math.isfinite(s.thickness_mm):
             raise InputError(file, f"surface {k}, thickness", s.thickness_mm, "a finite length")
-        for power in (p for p, _ in s.asphere if not 2 <= p <= MAX_POWER):
+        for power in (p for p, _ in s.figure.powers if not 2 <= p <= MAX_POWER):
             raise InputError(file, f"surface {k}, asphere, power", power, f"a power from 2 to {MAX_POWER}")
     if not 1 <= lens.object_medium.n_d <= MAX_INDEX:
         raise InputError(file, "object, index", lens.object_medium.n_d, index)
@@ -276,25 +275,15 @@ def narrowed(lens: Lens, draft: Draft) -> Lens:
     return found
 
 
-def qcon_terms(a: Sequence[float], radius: float, rim: float) -> Terms:
-    """Return the powers of the height of a Qcon departure with their coefficients.
+def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, conic: float = 0.0) -> Terms:
+    """Return the powers of the height of a Qbfs departure from a conic, with their coefficients.
 
     Args:
         a: a_0, a_1, ... radius: normalisation radius. rim: height up to which the surface is used.
 
     Raises:
-        ValueError: float64 cannot hold the coefficients.
+        ValueError: a conic that is too steep; coefficients that float64 cannot hold.
     """
-    in_x = [Decimal(0)] * (len(a) + 2)
-    with localcontext(Context(prec=_DIGITS)):
-        for m, value in enumerate(a):
-            for k in range(m + 1):
-                in_x[k + 2] += (-1) ** (m + k) * math.comb(m, k) * math.comb(m + k + 4, m) * Decimal(value)
-        return _powers(in_x, radius, rim)
-
-
-def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, conic: float = 0.0) -> Terms:
-    """Return the terms of a Qbfs departure from a conic; see `qcon_terms`. ValueError where the conic is too steep."""
     with localcontext(Context(prec=_DIGITS)):
         s2, k = (Decimal(curvature) * Decimal(radius)) ** 2, Decimal(conic)
         reach = (Decimal(rim) / Decimal(radius)) ** 2

@@ -432,7 +432,7 @@ def _private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[st
 
 
 def shape_of(block: Block) -> dict[str, Any]:
-    """Return the radius, conic, asphere and what bends it across of a surface, for `Surface`.
+    """Return the radius and the figure of a surface, for `Block.row`.
 
     YTO is a curve in y (curvature CUY, K, A y^4, ...) turned about an axis along y at 1 / CUX; XTO likewise in x; a
     cylinder where one of both is zero. AAS with its two conics K and KX is a biconic.

@@ -14,16 +14,15 @@ from typing import Any
 
 from neurolens.base.errors import InputError, printable
 from neurolens.base.settings import WAVELENGTH_NM, within
+from neurolens.lens.figures import MOST_Q_TERMS, figure_of
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import (
-    MAX_TERMS,
     UNKNOWN,
     finish,
     first_order,
     narrowed,
     pupil_of,
     qbfs_terms,
-    qcon_terms,
     smaller_stop,
     stop_aperture,
     with_likely_rims,
@@ -58,7 +57,7 @@ class Block:
         return 1 / self.curvature if self.curvature else math.inf
 
     def rotational(self, asphere: Iterable[tuple[int, float]] = ()) -> dict[str, Any]:
-        """Return the fields of `Surface` for a surface of revolution; the conic of a plane has no effect."""
+        """Return radius and figure of a surface of revolution, for `row`; the conic of a plane has no effect."""
         conic = self.conic if self.curvature else 0.0
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
@@ -76,20 +75,21 @@ class Block:
     def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
         """A surface of Forbes's kind, made as by `rotational`: coefficients from m = 0, a normalisation radius."""
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
-        if len(values) > MAX_TERMS:
-            raise self.start.error(name, f"({len(values)} terms)", f"at most {MAX_TERMS} terms")
+        if len(values) > MOST_Q_TERMS:
+            raise self.start.error(name, f"({len(values)} terms)", f"at most {MOST_Q_TERMS} terms")
+        if qcon:
+            return self.rotational() | {"qcon": values, "norm_mm": radius}
         try:
-            base = self.curvature, rim, self.conic
-            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, *base)
+            terms = qbfs_terms(values, radius, self.curvature, rim, self.conic)
         except ValueError as error:
             found = f"(curvature {self.curvature:g}, rim {rim:g})"
             raise self.start.error(name, found, str(error)) from None
         return self.rotational(terms)
 
     def row(self, shape: dict[str, Any]) -> Row:
-        """The row of a surface whose fields of shape are given."""
-        diameter = 2 * self.semi_diameter
-        surface = Surface(thickness_mm=self.thickness, diameter_mm=diameter, stop=self.stop, **shape, **self.medium)
+        """The row of a surface of this `radius_mm` and figure, by the keys of `figures.figure_of`."""
+        lengths = shape["radius_mm"], self.thickness, 2 * self.semi_diameter
+        surface = Surface(*lengths, stop=self.stop, figure=figure_of(shape), **self.medium)
         return Row(surface, self.aperture, self.name)
 
 
@@ -372,7 +372,7 @@ def _without_dummies(draft: Draft) -> Draft:
     if len(draft.rows) > MAX_SURFACES:
         raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
     rows, surfaces, medium = draft.rows, [row.surface for row in draft.rows], Medium(**draft.object_medium)
-    flat = [math.isinf(s.radius_mm) and not s.stop and not s.asphere for s in surfaces]
+    flat = [math.isinf(s.radius_mm) and not s.stop and not s.figure.bends for s in surfaces]
     idle = [flat[k] and not row.aperture and same_medium(surfaces, k, medium) for k, row in enumerate(rows)]
     dropped = [k for k in range(len(rows)) if idle[k]]
     kept = [k for k in range(len(rows)) if k not in dropped]

@@ -30,6 +30,7 @@ from typing import Any, Literal
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import parse_json
 from neurolens.lens import paraxial
+from neurolens.lens.figures import Figure, figure_of
 from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, first_order
 from neurolens.readers.draft import MAX_STATES, Draft, Row, State, lens_of
@@ -158,14 +159,13 @@ def _surface(row: Table, is_last: bool) -> Surface:
         raise row.error("shape", shape, f"one of {', '.join(SHAPES)}")
     key = "aspheric_coefficients"
     terms = row.powers(key, 'an object such as {"4": 1e-6}') if given.get(key) else ()
+    figure = {"conic": row.optional("conic", above=None) or 0.0, "asphere": [(p, a) for p, a in terms if a]}
     return Surface(
         radius_mm=radius or math.inf,
         thickness_mm=thickness,
         diameter_mm=diameter,
         stop=stop,
-        conic=row.optional("conic", above=None) or 0.0,
-        asphere=tuple((p, a) for p, a in terms if a),
-        cylinder=SHAPES[shape],
+        figure=figure_of(figure | {"cylinder": SHAPES[shape]}),
         **_glass(row),
     )
 
@@ -366,7 +366,7 @@ def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str])
         thickness_mm=row.number("d_next", unit="mm"),
         diameter_mm=2 * row.number("r", unit="mm", above=0),
         stop=stop,
-        **shape,
+        figure=figure_of(shape),
         **(_medium(row) if "mat2" in row or not stop else {key: getattr(before, key) for key in _MEDIUM if before}),
     )
 
@@ -409,7 +409,7 @@ def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str)
             diameter_mm=2 * row.number("semi_aperture", unit="mm", above=0),
             n_d=ior or 1.0,  # the stop stands in air
             stop=ior == 0,
-            conic=row.number("conic_constant") if "conic_constant" in row else 0.0,
+            figure=Figure(row.number("conic_constant") if "conic_constant" in row else 0.0),
         )
         surfaces.append(surface)
     return _draft_of(file, "ISET", surfaces, _line(data.get("name")), notes=[_line(data.get("description"))])
@@ -469,7 +469,7 @@ def _blender_surface(row: Table) -> Surface:
         n_d=index,
         V_d=abbe if index != 1 and abbe > 0 else None,
         stop=kind == "stop",
-        **shape,
+        figure=figure_of(shape),
     )
 
 

@@ -20,6 +20,8 @@ from neurolens.base.tomlfile import format_value, read_toml
 from neurolens.lens import designs
 from neurolens.lens import glass as catalogue
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.figures import KEYS as FIGURE_KEYS
+from neurolens.lens.figures import read_figure
 from neurolens.lens.glass import by_figures, check_against_table, index_at
 from neurolens.lens.prescription import Coating, Configuration, Lens, Medium, Surface
 from neurolens.readers.source import MAX_INDEX, MAX_SURFACES, Table
@@ -44,9 +46,7 @@ LENS_KEYS = (
 )  # fmt: skip
 MEDIUM_KEYS = ("n_d", "V_d", "glass", "material")
 # Numbers of a surface stand in columns; texts and tables go last, as a column of glass names needs no right edge.
-COLUMNS = (
-    *("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", "cylinder", "across_mm", "across_conic", "focal_mm"),
-)
+COLUMNS = ("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", *FIGURE_KEYS)
 SURFACE_KEYS = (*COLUMNS, "conic", "asphere", "glass", "material", "absorption_per_mm", "coating", "stop")
 STATE_NUMBERS = ("efl_mm", "half_field_deg", "f_number", "stop_diameter_mm", "object_distance_mm")
 CONFIGURATION_KEYS = ("name", *STATE_NUMBERS, "thickness_mm")
@@ -143,7 +143,7 @@ def _surfaces(table: Table, in_front: Medium) -> tuple[Surface, ...]:
     if len(stops) != 1:
         found = f"(stop = true on surfaces {', '.join(map(str, stops))})" if stops else "(no stop)"
         raise table.error("surfaces", found, "exactly one row with stop = true")
-    if (terms := sum(len(s.asphere) for s in surfaces)) > MAX_TERMS:
+    if (terms := sum(len(s.figure.powers) for s in surfaces)) > MAX_TERMS:
         raise table.error("surfaces", f"({terms} aspheric coefficients)", f"at most {MAX_TERMS}")
     return tuple(surfaces)
 
@@ -158,7 +158,7 @@ def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surfa
         thickness_mm=row.number("thickness_mm", unit="mm"),
         diameter_mm=row.number("diameter_mm", unit="mm", above=0) if "diameter_mm" in row else math.nan,
         **_glass(row),
-        **_shape(row),
+        figure=read_figure(row),
     )
     check_against_table(surface, row.file, row.where)
     if "coating" not in row:
@@ -194,50 +194,6 @@ def _glass(row: Table) -> dict[str, Any]:
         known = catalogue.find(name, row.file, f"{row.where}glass")
         medium = {"V_d": known.V_d, **medium, "n_d": medium["n_d"] if "n_d" in row else known.n_d}
     return medium
-
-
-def _shape(row: Table) -> dict[str, Any]:
-    shape: dict[str, Any] = {"conic": row.number("conic")} if "conic" in row else {}
-    if "cylinder" in row:
-        shape["cylinder"] = row.text("cylinder")
-        if shape["cylinder"] not in ("x", "y"):
-            raise row.error("cylinder", shape["cylinder"], 'the axis along which it is curved: "x" or "y"')
-    shape |= _across(row) | _ideal(row)
-    if "asphere" in row:
-        shape["asphere"] = row.powers("asphere", "a table such as { 4 = 1e-6, 6 = 2e-9 }")
-    return shape
-
-
-def _across(row: Table) -> dict[str, Any]:
-    """Read the second section of a toroid or a biconic; an infinite radius leaves a cylinder."""
-    for key in (k for k in ("across_mm", "across_conic") if k in row):
-        if "cylinder" not in row:
-            raise row.error("cylinder", "(missing)", f'the axis of the curve that {key} goes with: "x" or "y"')
-    if "across_mm" not in row:
-        if "across_conic" in row:
-            raise row.error("across_mm", "(missing)", "the radius that across_conic goes with")
-        return {}
-    radius = row.number("across_mm", unit="mm", finite=False)
-    if "across_conic" in row and "asphere" in row:
-        raise row.error("asphere", row.data["asphere"], "none: a biconic has no polynomial (a toroid has)")
-    if not abs(radius) > 0:
-        raise row.error("across_mm", radius, "a radius of curvature other than 0, or inf")
-    conic = row.number("across_conic") if "across_conic" in row else None
-    return {"across": (radius, conic)} if math.isfinite(radius) else {}
-
-
-def _ideal(row: Table) -> dict[str, Any]:
-    if "focal_mm" not in row:
-        return {}
-    focal = row.number("focal_mm", unit="mm")
-    shaped = [key for key in ("conic", "asphere", "cylinder", "coating") if key in row]
-    if shaped or not math.isinf(row.number("radius_mm", finite=False)):
-        key = shaped[0] if shaped else "radius_mm"
-        expected = "a plane in air (radius_mm = inf, nothing else), as focal_mm makes it an ideal thin lens"
-        raise row.error(key, row.data.get(key), expected)
-    if focal == 0:
-        raise row.error("focal_mm", focal, "a focal length other than 0")
-    return {"focal_mm": focal}
 
 
 def _coatings(table: Table) -> dict[str, Coating]:
@@ -372,19 +328,15 @@ def _rows(lens: Lens) -> str:
 def _cells(s: Surface) -> dict[str, str]:
     """Return the texts of a surface's figures by key; those that say nothing are left out."""
     bare = float(s.n_d) == 1 and s.V_d is None and s.material is None and not s.absorption_per_mm
-    across = s.across or (None, None)
     values: dict[str, Any] = {
         **{key: float(getattr(s, key)) for key in ("radius_mm", "thickness_mm", "diameter_mm")},
         "n_d": None if bare else float(s.n_d),
         "V_d": None if s.V_d is None else float(s.V_d),
-        "across_mm": across[0],
-        "across_conic": across[1],
-        "conic": float(s.conic) or None,
-        "asphere": {str(p): float(a) for p, a in s.asphere} or None,
+        **s.figure.cells(),
         "absorption_per_mm": s.absorption_per_mm or None,
         "coating": s.coating and s.coating.name,
         "stop": s.stop or None,
-        **{key: getattr(s, key) for key in ("cylinder", "focal_mm", "glass", "material")},
+        **{key: getattr(s, key) for key in ("glass", "material")},
     }
     return {key: format_value(value) for key, value in values.items() if value is not None}
 

@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
+from neurolens.lens.figures import Figure, figure_of
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.draft import INFINITE, MAX_STATES, Draft, Row, State, lens_of
 from neurolens.readers.glasses import same_glass
@@ -168,7 +169,7 @@ def _flaresim_surface(line: Line, words: list[str]) -> Surface:
         n_d=index,
         V_d=abbe if glass and abbe > 0 else None,
         stop=stop,
-        **shape,
+        figure=figure_of(shape),
     )
 
 
@@ -294,7 +295,7 @@ def _bend(file: Bench, line: Line, words: list[str]) -> None:
         raise line.error("[aspherical data]", f"({len(values) - 1} coefficients)", f"at most {len(powers)}")
     asphere = tuple((p, a) for p, a in zip(powers, values[1:], strict=False) if a)
     conic = values[0] if values and not math.isinf(surface.radius_mm) else 0.0
-    file.surfaces[k] = replace(surface, conic=conic, asphere=asphere)
+    file.surfaces[k] = replace(surface, figure=Figure(conic, asphere))
 
 
 def _complete(file: Bench) -> None:

@@ -413,7 +413,7 @@ def _set_field(file: File) -> None:
 
 
 def shape_of(block: Block) -> dict[str, Any]:
-    """Return the radius, conic, asphere and what else describes the shape of a surface, for `Surface`.
+    """Return the radius and the figure of a surface, for `Block.row`.
 
     Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i; the extended ones have XDAT in the place of
     PARM, and powers of r over a normalisation radius. Q-type: XDAT 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV,

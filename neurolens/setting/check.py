@@ -144,7 +144,7 @@ def _edges(lens: Lens) -> Check:
     edges = {
         k: float(a.thickness_mm) + sag_mm(b, b.semi_diameter_mm, 0.0) - sag_mm(a, a.semi_diameter_mm, 0.0)
         for k, (a, b) in enumerate(zip(lens.surfaces, lens.surfaces[1:], strict=False))
-        if a.n_d != 1 and not a.cylinder and not b.cylinder
+        if a.n_d != 1 and not a.figure.axis and not b.figure.axis
     }
     thin = [str(k) for k, edge in edges.items() if edge < -_TINY_MM]
     doubt = f"the edge of the element behind surface {', '.join(thin)} has a negative thickness" if thin else ""
@@ -189,7 +189,7 @@ def _blur(lens: Lens, data: FirstOrder) -> Check:
     doubt = ""
     if blur > BLUR_LIMIT and lens.refractions > SIMPLE:
         doubt = f"the image on the axis is blurred to {100 * blur:.2g}% of the focal length"
-        if not any(s.asphere or s.conic for s in lens.surfaces):
+        if not any(s.figure.aspheric for s in lens.surfaces):
             doubt += " (are aspheres missing?)"
     return Check("axial blur, RMS over focal length", blur, None, doubt)
 

@@ -380,7 +380,7 @@ def rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
     last, shift = len(lens.surfaces) - 1, 0.0
     while last > 1 and film_z - float(lens.vertices_mm[last]) < _CLOSE * lens.surfaces[last].semi_diameter_mm:
         plates = lens.surfaces[last - 1 : last + 1]
-        if not all(math.isinf(s.radius_mm) and not (s.asphere or s.across or s.focal_mm) for s in plates):
+        if not all(math.isinf(s.radius_mm) and not s.figure.bends for s in plates):
             break
         shift += float(lens.surfaces[last - 1].thickness_mm)
         last -= 2

@@ -93,12 +93,14 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
     }
 
 
-_AS_FILED = ("diameter_mm", "material", "stop", "cylinder", "across", "focal_mm", "glass", "absorption_per_mm")
+_AS_FILED = ("diameter_mm", "material", "stop", "glass", "absorption_per_mm")
+_ROUND = {"conic": 0.0, "asphere": {}, "cylinder": None, "across": None, "focal_mm": None}
 
 
 def glass_table(lens: Lens) -> list[dict[str, Any]]:
     """The prescription row by row, every figure of it: n_d and V_d are the catalogue's where a glass rules; asphere is
-    {power: coefficient}; coating None or {name, layers: [[index, thickness in nm, V_d if known], ...]}.
+    {power: coefficient}; figure says in words what it is; coating None or {name, layers: [[index, thickness in nm, V_d
+    if known], ...]}.
     """
     rows = []
     for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True)):
@@ -106,7 +108,9 @@ def glass_table(lens: Lens) -> list[dict[str, Any]]:
         row.update(surface=k, z_mm=float(z), radius_mm=float(s.radius_mm), thickness_mm=float(s.thickness_mm))
         glass = None if s.glass is None else glass_of(s.glass)
         row.update(n_d=float(s.n_d if glass is None else glass.n_d), V_d=s.V_d if glass is None else float(glass.V_d))
-        row.update(conic=float(s.conic), asphere={str(power): float(a) for power, a in s.asphere})
+        figure = s.figure.record()
+        figure["asphere"] = {str(power): a for power, a in figure.get("asphere", ())}
+        row |= _ROUND | figure | {"figure": s.figure.words()}
         layers = s.coating and {"name": s.coating.name, "layers": [list(layer) for layer in s.coating.layers]}
         rows.append(row | {"coating": layers})
     return rows
@@ -225,14 +229,14 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
         refractions, aspheres, cylinders, states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks
         "read"), doubts, and checks: a list of {state, quantity, computed, stated, doubt}.
     """
-    data, cylinders = first_order(lens), sum(s.cylinder is not None for s in lens.surfaces)
+    data, cylinders = first_order(lens), sum(s.figure.axis is not None for s in lens.surfaces)
     return {
         **{key: getattr(lens, key) for key in _STATED},
         "maker": maker_of(lens.designer),
         "year": year_of(lens.source),
         **{key: float(getattr(data, key)) for key in ("efl_mm", "back_focus_mm", "f_number")},
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if cylinders else None,
-        "aspheres": sum(s.conic != 0 or bool(s.asphere) for s in lens.surfaces),
+        "aspheres": sum(s.figure.aspheric for s in lens.surfaces),
         "cylinders": cylinders,
         "states": len(lens.configurations),
         "verdict": "read" if checks is None else verdict(checks),

@@ -19,6 +19,8 @@ from neurolens.base import status as st
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.graph.ir import Graph, Value
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Units
+from neurolens.trace.arithmetic import NUMPY, TINY, Graphs
+from neurolens.trace.shapes import curve_of, depth, polynomials
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Surface
@@ -266,15 +268,15 @@ def tilt_series(front: Surface) -> Array | None:
 
     None: not round, no glass behind it, or no short series fits.
     """
-    if front.cylinder or front.across is not None or front.focal_mm is not None or float(front.n_d) == 1.0:
+    figure = front.figure
+    if figure.axis or figure.power or float(front.n_d) == 1.0:
         return None
-    c, bend = float(front.curvature), (1 + float(front.conic)) * float(front.curvature) ** 2
-    if not front.asphere and not front.conic:
-        return np.array([c])
+    if figure.plain:
+        return np.array([float(front.curvature)])
+    curve = curve_of(front)
 
     def exact(h2: Array) -> Array:
-        rise = c / np.sqrt(np.maximum(1 - bend * h2, 1e-6))
-        rise = rise + sum(int(p) * float(a) * h2 ** (int(p) / 2 - 1) for p, a in front.asphere)
+        rise = depth(NUMPY, curve, h2, order=1, steepest=1e-6).slope
         return np.asarray(rise / np.sqrt(1 + rise * rise * h2))
 
     with np.errstate(all="ignore"):
@@ -288,42 +290,43 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
     Beyond the end of a conic finite, without meaning.
     """
     g = position.graph
-    axes = {None: (0, 1), "x": (0,), "y": (1,)}[surface.cylinder]
+    axes = {None: (0, 1), "x": (0,), "y": (1,)}[surface.figure.axis]
     h2 = g.quadratic(position, [tuple((i, i) for i in axes)])
-    c, bend = float(surface.curvature), (1 + float(surface.conic)) * float(surface.curvature) ** 2
-    powers = {int(p): float(a) for p, a in surface.asphere}
+    c, bend = float(surface.curvature), (1 + float(surface.figure.conic)) * float(surface.curvature) ** 2
+    curve = curve_of(surface)
 
     def exact(square: Array) -> Array:
-        z = c * square / (1 + np.sqrt(np.maximum(1 - bend * square, 0.0)))
-        return np.asarray(z + sum(a * square ** (p / 2) for p, a in powers.items()))
+        return np.asarray(depth(NUMPY, curve, square, order=0, steepest=TINY).sag)
 
-    if form.sag_terms and surface.across is None:
+    if form.sag_terms and surface.figure.across is None:
         series = _series_in(exact, (_FRONT_REACH * surface.semi_diameter_mm) ** 2, _SAG_MM)
         if series is not None and len(series) <= form.sag_terms:
             return g.series(h2, series)
     # c h^2 / (1 + root) has no cancellation and no case for a paraboloid.
-    other, square, sum_ = surface.across, 1.0 - h2 * bend, h2 * c
+    other, square, sum_ = surface.figure.across, 1.0 - h2 * bend, h2 * c
     if other is not None and other[1] is not None:
-        a2 = g.square(position[int(surface.cylinder == "x")])
+        a2 = g.square(position[int(surface.figure.axis == "x")])
         square, sum_ = square - a2 * ((1 + other[1]) / other[0] ** 2), sum_ + a2 * (1 / other[0])
     z = sum_ / (square.maximum(0.0).sqrt() + 1.0)
     if other is not None and other[1] is None:
-        return _turned(position, _with_powers(z, h2, surface), surface)
-    return _with_powers(z, h2, surface)
+        return _turned(position, _with_polynomial(z, h2, surface), surface)
+    return _with_polynomial(z, h2, surface)
 
 
 def _turned(position: Value, curve: Value, surface: Surface) -> Value:
     """z of a toroid from that of its curve; see `trace.shapes.sag_mm`."""
-    assert surface.across is not None
-    c, a2 = 1 / surface.across[0], position.graph.square(position[int(surface.cylinder == "x")])
+    assert surface.figure.across is not None
+    c, a2 = 1 / surface.figure.across[0], position.graph.square(position[int(surface.figure.axis == "x")])
     way = 1.0 - curve * c
     return (curve * (way + 1.0) + a2 * c) / ((way * way - a2 * (c * c)).maximum(0.0).sqrt() + 1.0)
 
 
-def _with_powers(z: Value, h2: Value, surface: Surface) -> Value:
-    powers = {int(p): float(a) for p, a in surface.asphere}
+def _with_polynomial(z: Value, h2: Value, surface: Surface) -> Value:
+    powers, curve = {int(p): float(a) for p, a in surface.figure.powers}, curve_of(surface)
     if not powers:
         return z
+    if curve.centred is not None:  # those that float32 does not carry
+        return z + polynomials(Graphs(z.graph), curve, h2, order=0)[0] * h2
     rim, even = surface.semi_diameter_mm, all(p % 2 == 0 for p in powers)
     h, step = (h2 * rim**-2, 2) if even else ((h2 * rim**-2).sqrt(), 1)
     terms = np.zeros(max(powers) // step + 1)

@@ -126,10 +126,8 @@ def export_inverse(
     base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.front
     shape = front and {
         "curvature": float(front.curvature),
-        "conic": float(front.conic),
-        "asphere": [[int(p), float(a)] for p, a in front.asphere],
-        "cylinder": front.cylinder,
-        "across": front.across,
+        **{"conic": 0.0, "asphere": [], "cylinder": None, "across": None},
+        **front.figure.record(),
         "index": front_index(model),
     }
     facts = {"steps": STEPS, "tolerance": TOLERANCE, "direction": model.direction, "front": shape}

@@ -28,6 +28,7 @@ from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
+from neurolens.lens.figures import figure_of
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.surrogates.assemble import ONNX, model_graph
 from neurolens.surrogates.axes import Axis, state_graph, weights
@@ -370,9 +371,9 @@ def packed_lens(lens: Lens) -> dict[str, Any]:
         row = {}
         for f in fields(surface):
             value = getattr(surface, f.name)
-            if f.default is MISSING or value != f.default:
+            if f.name != "figure" and (f.default is MISSING or value != f.default):
                 row[f.name] = _plain(value)
-        rows.append(row)
+        rows.append(row | _plain(surface.figure.record()))
     return {**{k: _plain(getattr(lens, k)) for k in _LENS}, "path": Path(lens.path).name, "surfaces": rows}
 
 
@@ -397,10 +398,10 @@ def unpacked_lens(packed: dict[str, Any]) -> Lens:
         values = {f.name: row[f.name] for f in fields(Surface) if f.name in row}
         for key in ("radius_mm", "thickness_mm", "diameter_mm"):
             values[key] = float(values[key])  # "inf" too
-        if "asphere" in values:
-            values["asphere"] = tuple((int(p), float(a)) for p, a in values["asphere"])
-            if len(values["asphere"]) > _MAX_TERMS or any(not 0 <= p <= _MAX_POWER for p, _ in values["asphere"]):
-                raise ValueError(f"an asphere of more than {_MAX_TERMS} terms, or of powers beyond {_MAX_POWER}")
+        long = any(len(v) > _MAX_TERMS for v in row.values() if isinstance(v, list))
+        if long or any(not 0 <= p <= _MAX_POWER for p, _ in row.get("asphere", ())):
+            raise ValueError(f"an asphere of more than {_MAX_TERMS} terms, or of powers beyond {_MAX_POWER}")
+        values["figure"] = figure_of(row)
         if values.get("coating"):
             name, layers = values["coating"]
             values["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers))

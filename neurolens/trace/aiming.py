@@ -45,7 +45,7 @@ class Bundle(NamedTuple):
 
 def without_rims(lens: Lens) -> Lens:
     """Return the lens with every surface, the stop too, open as far as it goes; aspheres continue beyond their rims."""
-    ends = (followed_mm(s) if s.asphere else math.inf for s in lens.surfaces)
+    ends = (followed_mm(s) if s.figure.powers else math.inf for s in lens.surfaces)
     rows = (replace(s, diameter_mm=math.inf, followed_mm=end) for s, end in zip(lens.surfaces, ends, strict=True))
     return replace(lens, aperture=None, surfaces=tuple(rows))
 

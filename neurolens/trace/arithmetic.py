@@ -114,6 +114,15 @@ class Arithmetic:
             total = total * x + c
         return total + x * 0.0 if is_number(total) else total
 
+    def chebyshev(self, x: Any, coefficients: Sequence[Any]) -> Any:
+        """Return the sum of Chebyshev's polynomials with these coefficients, lowest first, by Clenshaw's recurrence."""
+        later: Any = 0.0
+        latest: Any = 0.0
+        for c in coefficients[:0:-1]:
+            later, latest = self.fma(x, later, c - latest, 2.0), later
+        total = self.fma(x, later, coefficients[0] - latest)
+        return total + x * 0.0 if is_number(total) else total
+
 
 class Graphs(Arithmetic):
     """The arithmetic of a graph's values.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import NUMPY
-from neurolens.trace.shapes import figure_of
+from neurolens.trace.shapes import traced_curve
 from neurolens.trace.surfaces import Hit, Rays, Test, cross, media, nearest_approach, rim_tests
 
 Array = NDArray[np.float64]
@@ -68,7 +68,7 @@ def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bo
             return [*tests, (0.5, lens.aperture.inside(met.x, met.y, surface.semi_diameter_mm))]
 
         met, bent, found = cross(
-            NUMPY, surface, figure_of(surface, float), r, sense, before, after, entering=k == order[0], rim=rim
+            NUMPY, surface, traced_curve(surface, float), r, sense, before, after, entering=k == order[0], rim=rim
         )
         here = status[left]
         for tests, reason in found:

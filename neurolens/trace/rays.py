@@ -24,7 +24,7 @@ from neurolens.lens import glass
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.arithmetic import is_number, times
 from neurolens.trace.films import TensorPassage
-from neurolens.trace.shapes import centred, figure_of, is_deep, start_of
+from neurolens.trace.shapes import centred, is_deep, start_of, traced_curve
 from neurolens.trace.surfaces import (
     Hit,
     Medium,
@@ -202,7 +202,8 @@ def _differentiated(value: Any) -> bool:
 def _parameters(lens: Lens) -> list[Any]:
     found: list[Any] = []
     for s in lens.surfaces:
-        found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.conic, s.absorption_per_mm, *(a for _, a in s.asphere))
+        found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.absorption_per_mm, s.figure.conic)
+        found += (a for _, a in s.figure.powers)
         found += (figure for layer in (s.coating.layers if s.coating else ()) for figure in layer)
     return found
 
@@ -229,7 +230,7 @@ class Tracing:
         self.o = Tensors(guard or freeze, rays.x.dtype)
         self.wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
         self.media = media(lens, self.wavelength_nm)  # media[k] lies before surface k as light travels to the film
-        self.figures = [figure_of(s) for s in lens.surfaces]
+        self.curves = [traced_curve(s) for s in lens.surfaces]
         self.medium = self.media[0 if sense > 0 else -1]
         self.vertex: Any = 0.0
         self._entering: int | None = entering
@@ -266,12 +267,12 @@ class Tracing:
         r, self.vertex = self.rays._replace(z=self.rays.z + (self.vertex - vertex)), vertex
         met_media = (self.media[k], self.media[k + 1]) if self.sense > 0 else (self.media[k + 1], self.media[k])
         crossed = cross(
-            self.o, surface, self.figures[k], r, self.sense, *met_media,
+            self.o, surface, self.curves[k], r, self.sense, *met_media,
             entering=k == self._entering, reflected=reflected, rim=self._rim(surface),
         )  # fmt: skip
         for tests, reason in crossed.tests:
             self.tests.require(tests, k, reason)
-        if self.figures[k].flat:
+        if self.curves[k].flat:
             # A sphere's square root turns NaN and overflow into a miss; a plane would pass them.
             self.tests.end(radius2(self.o, crossed.met))
         self.rays, self._entering = crossed.bent.rays, None

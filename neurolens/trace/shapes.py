@@ -14,13 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from fractions import Fraction
 from functools import lru_cache
 from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from neurolens.lens.figures import Centred, Figure, figure_of, number_of
 from neurolens.lens.prescription import Surface
 from neurolens.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
 
@@ -36,16 +36,13 @@ TURN = 0.25
 FARTHEST = 1.5  # rim radii up to which figures are followed at most
 # Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
 DEEP = 0.25
-# Slopes at the rim of an asphere's powers, all of one sign, from which on they are summed about the middle of the zone.
-# Float32 loses 6e-8 rad for each 1; below 180 no lens that ships gains by it (`python -m experiments precision`).
-CANCELS = 100.0
 _UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
 Quadric = tuple[Any, Any, Any]
 
 
-class Figure(NamedTuple):
-    """A surface's shape; lengths in mm, as numbers, 0-d tensors or values of a graph.
+class Curve(NamedTuple):
+    """A surface's shape, as rays meet it; lengths in mm, as numbers, 0-d tensors or values of a graph.
 
     Attributes:
         curvature, stretch: c and 1 + K of the conic.
@@ -80,15 +77,6 @@ class Figure(NamedTuple):
         return self.plain and is_number(self.curvature) and self.curvature == 0
 
 
-class Centred(NamedTuple):
-    """Sums of A_p h^(p - 2) and of p A_p h^(p - 2) by powers, lowest first, of t = scale h^2 - 1 (scale h - 1 where odd
-    ones occur), which runs from -1 on the axis to 1 at the rim; float32 has the scale exactly."""
-
-    scale: Any
-    sag: Sequence[Any]
-    slope: Sequence[Any]
-
-
 class Beyond(NamedTuple):
     """The continuation of a curve beyond the height up to which its figures are followed.
 
@@ -101,92 +89,57 @@ class Beyond(NamedTuple):
     length: float  # in which the second derivative dies away
 
 
-def is_plain(surface: Surface) -> bool:
-    """Test whether a surface is a sphere or a plane."""
-    conic = not is_number(surface.conic) or surface.conic != 0
-    return not (conic or surface.asphere or surface.cylinder)
-
-
-def curve_of(shape: Surface, number: Callable[[Any], Any] = float) -> Figure:
-    """Return the figure of a shape by its own numbers; `number` turns fields that are tensors into numbers."""
-    c, k = number(shape.curvature), number(shape.conic)
-    powers = {int(n): number(a) for n, a in shape.asphere}
-    if is_number(k) and k == 0 and not powers and not shape.cylinder:
-        return Figure(c, plain=True)
+def curve_of(surface: Surface, number: Callable[[Any], Any] = float) -> Curve:
+    """Return the curve of a surface by its own numbers; `number` turns fields that are tensors into numbers."""
+    figure, c, k = surface.figure, number(surface.curvature), number(surface.figure.conic)
+    powers = {int(n): number(a) for n, a in figure.powers}
+    if is_number(k) and k == 0 and not powers and not figure.axis:
+        return Curve(c, plain=True)
     even = all(n % 2 == 0 for n in powers)
     numbers = all(is_number(a) for a in powers.values())  # derivatives by coefficients are taken in powers
-    return Figure(
+    return Curve(
         c,
         1 + k,
-        bent=(shape.cylinder != "y", shape.cylinder != "x"),
+        bent=(figure.axis != "y", figure.axis != "x"),
         terms=[powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1)],
         even=even,
-        centred=centred(shape) if powers and numbers else None,
-        across=(1 / shape.across[0], 1 + (shape.across[1] or 0.0)) if shape.across else (),
-        turned=bool(shape.across and shape.across[1] is None),
+        centred=centred(surface) if powers and numbers else None,
+        across=(1 / figure.across[0], 1 + (figure.across[1] or 0.0)) if figure.across else (),
+        turned=bool(figure.across and figure.across[1] is None),
     )
 
 
 def centred(surface: Surface) -> Centred | None:
-    """Return the polynomial of an asphere about the middle of its zone; None where float32 carries its powers.
-
-    The powers of Forbes's polynomials of n terms exceed their sum by 6^n, those about the middle by 2.4^n.
-    """
-    return _centred(tuple((int(p), _number(a)) for p, a in surface.asphere if p >= 2), float(_extent_mm(surface)))
+    """Return the polynomial of a surface about the middle of its zone; None where float32 carries its powers."""
+    return surface.figure.centred(float(_extent_mm(surface)))
 
 
-def cancelling(surface: Surface) -> float:
-    """Sizes of the slopes that an asphere sums at its rim, over their sum or 1; float32 loses 6e-8 rad for each 1."""
-    found, rim = centred(surface), float(_extent_mm(surface))
-    slopes = found.slope if found else [p * _number(a) * rim ** (p - 2) for p, a in surface.asphere]
-    return sum(map(abs, slopes)) * rim / max(1.0, abs(sum(slopes)) * rim)
-
-
-@lru_cache(maxsize=4096)
-def _centred(asphere: tuple[tuple[int, float], ...], rim_mm: float) -> Centred | None:
-    down = 1 if any(p % 2 for p, _ in asphere) else 2
-    with np.errstate(all="ignore"):
-        reach = float(sum(p * abs(a) * np.float64(rim_mm) ** (p - 1) for p, a in asphere))
-        scale = float(np.float32(2 / np.float64(rim_mm) ** down))
-    if not (CANCELS < reach < 1e30 and 0 < scale < math.inf):
-        return None
-    # Exact, but for one rounding of each coefficient.
-    terms = [((p - 2) // down, p, Fraction(a) / Fraction(scale) ** ((p - 2) // down)) for p, a in asphere]
-    powers = range(max(j for j, _, _ in terms) + 1)
-    sag, slope = (
-        tuple(float(sum(a * math.comb(j, k) * (p if sloping else 1) for j, p, a in terms if j >= k)) for k in powers)
-        for sloping in (False, True)
-    )
-    return Centred(scale, sag, slope) if 2 * rim_mm * sum(map(abs, slope)) < reach else None
-
-
-def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
-    """Return the figure of a surface with the start of its iteration; arguments as of `curve_of`."""
-    figure = curve_of(surface, number)
-    if not figure.terms and not figure.across:
-        return figure
+def traced_curve(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Curve:
+    """Return the curve of a surface with the start of its iteration; arguments as of `curve_of`."""
+    curve = curve_of(surface, number)
+    if not curve.terms and not curve.across:
+        return curve
     start, steps = start_of(surface)
     beyond = None if surface.followed_mm == math.inf else _end_of(surface)
-    return figure._replace(start=start, steps=steps, last_step=LAST_STEP * _extent_mm(surface), beyond=beyond)
+    return curve._replace(start=start, steps=steps, last_step=LAST_STEP * _extent_mm(surface), beyond=beyond)
 
 
-def without_rim(figure: Figure) -> Figure:
-    """Return a figure whose iteration starts from the quadric of its vertex."""
-    if not figure.terms and not figure.across:
-        return figure
-    c, (other, _) = figure.curvature, figure.across or (0.0, 1.0)
-    start = (c if figure.bent[0] else other), (c if figure.bent[1] else other), c * figure.stretch
-    return figure._replace(start=start, steps=STEPS[-1][1], last_step=math.inf)
+def without_rim(curve: Curve) -> Curve:
+    """Return a curve whose iteration starts from the quadric of its vertex."""
+    if not curve.terms and not curve.across:
+        return curve
+    c, (other, _) = curve.curvature, curve.across or (0.0, 1.0)
+    start = (c if curve.bent[0] else other), (c if curve.bent[1] else other), c * curve.stretch
+    return curve._replace(start=start, steps=STEPS[-1][1], last_step=math.inf)
 
 
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
     """Return the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
-    asphere = tuple((p, _number(a)) for p, a in surface.asphere)
-    curve = _number(surface.curvature), _number(surface.conic), asphere, _extent_mm(surface)
-    (c, other, cz), steps = _fitted(*curve, surface.across)
-    if not surface.across:
-        return (c * (surface.cylinder != "y"), c * (surface.cylinder != "x"), cz), steps
-    return ((other, c, cz) if surface.cylinder == "y" else (c, other, cz)), steps
+    figure = figure_of(surface.figure.record())  # of numbers
+    (c, other, cz), steps = _fitted(number_of(surface.curvature), figure, _extent_mm(surface))
+    if not figure.across:
+        return (c * (figure.axis != "y"), c * (figure.axis != "x"), cz), steps
+    return ((other, c, cz) if figure.axis == "y" else (c, other, cz)), steps
 
 
 def followed_mm(surface: Surface) -> float:
@@ -200,9 +153,9 @@ def followed_mm(surface: Surface) -> float:
 
 def _profile(surface: Surface, height: Any) -> tuple[Any, Any]:
     """First and second derivative by the height of a surface's meridional curve (of a cylinder: across its lines)."""
-    curve = replace(surface, cylinder=None, across=None)
+    own = replace(surface, figure=_round(surface.figure))
     step = 1e-4 * height
-    before, slope = (sag_and_derivatives(curve, h, 0 * h)[1] for h in (height - step, height))
+    before, slope = (sag_and_derivatives(own, h, 0 * h)[1] for h in (height - step, height))
     return slope, (slope - before) / step
 
 
@@ -220,26 +173,22 @@ def _end_of(surface: Surface) -> Beyond:
     return Beyond(surface.followed_mm, slope, bend, length)
 
 
-def _number(value: Any) -> float:
-    return float(value.detach() if hasattr(value, "detach") else value)
+def _round(figure: Figure) -> Figure:
+    """The figure of revolution that has the curve of the radius."""
+    return Figure(figure.conic, figure.asphere) if figure.axis else figure
 
 
 @lru_cache(maxsize=4096)
-def _fitted(
-    curvature: float,
-    conic: float,
-    asphere: tuple[tuple[int, float], ...],
-    rim_mm: float,
-    across: tuple[float, float | None] | None,
-) -> tuple[tuple[float, float, float], int]:
+def _fitted(curvature: float, figure: Figure, rim_mm: float) -> tuple[tuple[float, float, float], int]:
     """Return the fit along the curve, across it and along z, by linear least squares: each point's error is that of
     its height along the axis, times 2."""
+    across = figure.across
     if not math.isfinite(rim_mm):
-        start = (curvature, 1 / across[0], 0.0) if across else (curvature, curvature, curvature * (1 + conic))
+        start = (curvature, 1 / across[0], 0.0) if across else (curvature, curvature, curvature * (1 + figure.conic))
         return start, STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
-    bent = "y" if across else None
-    same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere, cylinder=bent, across=across)
+    placed = figure_of(figure.record() | {"cylinder": "y"}) if across else _round(figure)
+    same = Surface(radius_mm, 0.0, 2 * rim_mm, figure=placed)
     turns = np.linspace(0, math.pi / 2, 9) if across else np.zeros(1)
     h, turn = (v.ravel() for v in np.meshgrid(rim_mm * np.arange(1, 25) / 24, turns))
     a, h = h * np.sin(turn), h * np.cos(turn)
@@ -267,16 +216,16 @@ class Depth(NamedTuple):
     cos2: Any
 
 
-def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2, steepest: float = STEEPEST) -> Depth:
-    """Return the depth of a figure's curve at squared distances h2 (mm^2); held finite where its conic ends.
+def depth(o: Arithmetic, curve: Curve, h2: Any, order: int = 2, steepest: float = STEEPEST) -> Depth:
+    """Return the depth of a curve at squared distances h2 (mm^2); held finite where its conic ends.
 
     `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything. `steepest`: least squared cosine of the
     conic's slope.
     """
-    if figure.beyond is None:
-        return _followed(o, figure, h2, order, steepest)
-    end, slope, bend, length = figure.beyond
-    inside = _followed(o, figure, o.least(h2, o.like(h2, end * end)), order, steepest)
+    if curve.beyond is None:
+        return _followed(o, curve, h2, order, steepest)
+    end, slope, bend, length = curve.beyond
+    inside = _followed(o, curve, o.least(h2, o.like(h2, end * end)), order, steepest)
     h = o.held_root(h2, end * end)
     d = h - end
     left = (d / -length).exp()
@@ -286,46 +235,46 @@ def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2, steepest: floa
     return Depth(inside.sag + rise, inside.slope * (end / h) + turned / h, turn, inside.cos2)
 
 
-def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int, steepest: float) -> Depth:
-    """Return the depth by a figure's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
-    sag, slope = _polynomials(o, figure, h2, order)
-    c = figure.curvature
+def _followed(o: Arithmetic, curve: Curve, h2: Any, order: int, steepest: float) -> Depth:
+    """Return the depth by a curve's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
+    sag, slope = polynomials(o, curve, h2, order)
+    c = curve.curvature
     if is_number(c) and c == 0:
         return Depth(times(h2, sag), slope + o.like(h2, 0.0), 0.0, None)
-    even = is_number(figure.stretch) and figure.stretch == 0  # a paraboloid
-    cos2 = o.like(h2, 1.0) if even else o.fma(h2, -(figure.stretch * c * c), 1.0)
+    even = is_number(curve.stretch) and curve.stretch == 0  # a paraboloid
+    cos2 = o.like(h2, 1.0) if even else o.fma(h2, -(curve.stretch * c * c), 1.0)
     cos = o.held_root(cos2, steepest)
     if order == 1:
         return Depth(0.0, c / cos + slope, 0.0, cos2)
     both = c / o.fma(cos, cos, cos)  # one division for both c h^2 / (1 + cos) and c / cos
     inverse = o.fma(both, cos, both)
-    turn = times(inverse * inverse * inverse, figure.stretch) if order else 0.0
+    turn = times(inverse * inverse * inverse, curve.stretch) if order else 0.0
     return Depth(o.fma(both, cos, sag) * h2, inverse + slope, turn, cos2)
 
 
-def _polynomials(o: Arithmetic, figure: Figure, h2: Any, order: int) -> tuple[Any, Any]:
+def polynomials(o: Arithmetic, curve: Curve, h2: Any, order: int) -> tuple[Any, Any]:
     """sum A_p h^(p - 2) and sum p A_p h^(p - 2), by powers of h^2 or, where odd ones occur, of h, or centred ones."""
-    if not figure.terms:
+    if not curve.terms:
         return 0.0, 0.0
     # The root is kept from 0, where its derivative is infinite.
-    h, down = (h2, 2) if figure.even else (o.held_root(h2), 1)
-    if figure.centred is not None:
-        h = o.fma(h, figure.centred.scale, -1.0)
-        return 0.0 if order == 1 else o.horner(h, figure.centred.sag), o.horner(h, figure.centred.slope)
-    slopes = [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
-    return 0.0 if order == 1 else o.horner(h, figure.terms), o.horner(h, slopes)
+    h, down = (h2, 2) if curve.even else (o.held_root(h2), 1)
+    if curve.centred is not None:
+        h, sum_ = o.fma(h, curve.centred.scale, -1.0), o.chebyshev if curve.centred.chebyshev else o.horner
+        return 0.0 if order == 1 else sum_(h, curve.centred.sag), sum_(h, curve.centred.slope)
+    slopes = [a * float(2 + down * k) for k, a in enumerate(curve.terms)]
+    return 0.0 if order == 1 else o.horner(h, curve.terms), o.horner(h, slopes)
 
 
-def toroid(c: Any, curve: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
+def toroid(c: Any, section: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
     """(c (a^2 + z^2) - c g^2) / 2 - z + g, which is 0 on a toroid; its gradient; its second derivative along p.
 
     In any arithmetic that has operators.
 
     Args:
-        c: 1 / radius of rotation. curve: the sag g(h), its slope over h, and the change of that over h by h.
+        c: 1 / radius of rotation. section: the sag g(h), its slope over h, and the change of that over h by h.
         at, p: point and direction: across the curve, along it, along z.
     """
-    (g, slope, turn), (a, h, z), (pa, ph, pz) = curve, at, p
+    (g, slope, turn), (a, h, z), (pa, ph, pz) = section, at, p
     way = 1 - g * c
     value = (a * a + z * z) * c * 0.5 - z + g * (way + 1) * 0.5
     bend = (pa * pa + pz * pz) * c + ph * ph * ((slope + turn * h * h) * way - slope * slope * h * h * c)
@@ -353,29 +302,29 @@ def biconic(
     return sag - z, (sa, sh, -1.0), bend * over, square
 
 
-def height2(o: Arithmetic, figure: Figure, x: Any, y: Any) -> Any:
+def height2(o: Arithmetic, curve: Curve, x: Any, y: Any) -> Any:
     """Return the squared distance from the axis, or from a cylinder's plane of symmetry."""
-    if all(figure.bent):
+    if all(curve.bent):
         return o.dot((x, y), (x, y))
-    return x * x if figure.bent[0] else y * y
+    return x * x if curve.bent[0] else y * y
 
 
-def sag(o: Arithmetic, figure: Figure, x: Any, y: Any) -> tuple[Any, Any]:
+def sag(o: Arithmetic, curve: Curve, x: Any, y: Any) -> tuple[Any, Any]:
     """Return the depth at points, and what is at least 0 where the surface exists; None where that is everywhere."""
-    h2 = height2(o, figure, x, y)
-    if not figure.across:
-        curve = depth(o, figure, h2, order=0, steepest=TINY)
-        return curve.sag, curve.cos2
-    (c, stretch), a = figure.across, y if figure.bent[0] else x
+    h2 = height2(o, curve, x, y)
+    if not curve.across:
+        found = depth(o, curve, h2, order=0, steepest=TINY)
+        return found.sag, found.cos2
+    (c, stretch), a = curve.across, y if curve.bent[0] else x
     a2 = a * a
-    if not figure.turned:
-        square = 1 - (h2 * (figure.stretch * figure.curvature**2) + a2 * (stretch * c * c))
-        return (h2 * figure.curvature + a2 * c) / (1 + o.held_root(square)), square
-    curve = depth(o, figure, h2, order=0, steepest=TINY)
-    way = 1 - c * curve.sag  # to the line that the curve is turned about, over the radius there
+    if not curve.turned:
+        square = 1 - (h2 * (curve.stretch * curve.curvature**2) + a2 * (stretch * c * c))
+        return (h2 * curve.curvature + a2 * c) / (1 + o.held_root(square)), square
+    found = depth(o, curve, h2, order=0, steepest=TINY)
+    way = 1 - c * found.sag  # to the line that the curve is turned about, over the radius there
     square = way * way - a2 * (c * c)
-    z = (curve.sag * (1 + way) + a2 * c) / (1 + o.held_root(square))
-    return z, square if curve.cos2 is None else o.least(curve.cos2, square)
+    z = (found.sag * (1 + way) + a2 * c) / (1 + o.held_root(square))
+    return z, square if found.cos2 is None else o.least(found.cos2, square)
 
 
 def sag_mm(shape: Surface, x: Any, y: Any, *, held: bool = False) -> Any:
@@ -402,20 +351,20 @@ def sag_and_derivatives(shape: Surface, x: Any, y: Any) -> tuple[Any, Any, Any]:
     return z, figure.bent[0] * x * slope, figure.bent[1] * y * slope
 
 
-def crossed(o: Arithmetic, figure: Figure, at: Quadric, p: Quadric) -> tuple[Any, Quadric, Any, Any]:
+def crossed(o: Arithmetic, curve: Curve, at: Quadric, p: Quadric) -> tuple[Any, Quadric, Any, Any]:
     """Return a function that is 0 on a toroid or biconic and grows with -z.
 
     Returns its value at points, its gradient, its second derivative along p, and what is positive where the surface
     exists.
     """
-    (c, stretch), swapped = figure.across, not figure.bent[1]
+    (c, stretch), swapped = curve.across, not curve.bent[1]
     (a, h, z), (pa, ph, pz) = ((v[swapped], v[not swapped], v[2]) for v in (at, p))
-    if figure.turned:
-        curve = depth(o, figure, h * h)
-        value, gradient, bend = toroid(c, curve[:3], (a, h, z), (pa, ph, pz))
-        exists = -gradient[2] if curve.cos2 is None else o.least(curve.cos2, -gradient[2])
+    if curve.turned:
+        found = depth(o, curve, h * h)
+        value, gradient, bend = toroid(c, found[:3], (a, h, z), (pa, ph, pz))
+        exists = -gradient[2] if found.cos2 is None else o.least(found.cos2, -gradient[2])
     else:
-        along = figure.curvature, figure.stretch
+        along = curve.curvature, curve.stretch
         place, way = (a, h, z), (pa, ph, pz)
         value, gradient, bend, exists = biconic(
             along, (c, stretch), place, way, lambda square: o.held_root(square, STEEPEST)
@@ -426,7 +375,7 @@ def crossed(o: Arithmetic, figure: Figure, at: Quadric, p: Quadric) -> tuple[Any
 
 def is_deep(surface: Surface) -> bool:
     """Test whether a sphere's depth at its rim tells heights as exactly as their squares do."""
-    if not is_number(surface.radius_mm) or not is_plain(surface):
+    if not is_number(surface.radius_mm) or not surface.figure.plain:
         return False
     return DEEP < rim_sine(surface) <= 1
 

@@ -26,7 +26,7 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
 from neurolens.trace.shapes import (
     STEEPEST,
-    Figure,
+    Curve,
     Quadric,
     crossed,
     curve_of,
@@ -126,19 +126,19 @@ def nearest_approach(o: Arithmetic, r: Rays, inverse_n2: Any) -> Quadric:
     return o.fma(e, r.dx, r.x, -1), o.fma(e, r.dy, r.y, -1), o.fma(e, r.dz, r.z, -1)
 
 
-def meet(o: Arithmetic, r: Rays, figure: Figure, sense: int, before: Medium, entering: bool = False) -> Hit:
+def meet(o: Arithmetic, r: Rays, curve: Curve, sense: int, before: Medium, entering: bool = False) -> Hit:
     """Meet a surface at the point next to its vertex.
 
     `entering` marks the first surface met, where rays may arrive at more than 90 degrees.
     """
-    if figure.flat:
+    if curve.flat:
         return _meet_plane(o, r, sense)
     nearest = nearest_approach(o, r, before.inverse_n2)
-    if figure.plain:
-        return _meet_sphere(o, r, nearest, figure.curvature, sense, before, entering)
-    if figure.start is not None:
-        return _meet_asphere(o, r, nearest, figure, sense, before)
-    return _meet_conic(o, r, nearest, figure, sense, before)
+    if curve.plain:
+        return _meet_sphere(o, r, nearest, curve.curvature, sense, before, entering)
+    if curve.start is not None:
+        return _meet_asphere(o, r, nearest, curve, sense, before)
+    return _meet_conic(o, r, nearest, curve, sense, before)
 
 
 def _meet_plane(o: Arithmetic, r: Rays, sense: int) -> Hit:
@@ -168,9 +168,9 @@ def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int,
     return Hit(x, y, z, q, q2, [(TINY, q2), (times(z, curvature), 1.0)])
 
 
-def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Hit:
-    c = figure.curvature
-    kind = (c * figure.bent[0], c * figure.bent[1], c * figure.stretch)
+def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, before: Medium) -> Hit:
+    c = curve.curvature
+    kind = (c * curve.bent[0], c * curve.bent[1], c * curve.stretch)
     q2, denominator, t = _meet_quadric(o, r, m, kind, sense, before)
     x, y, z = _along(o, m, t, r)
     nx, ny, nz = times(x, -kind[0]), times(y, -kind[1]), o.fma(z, -kind[2], 1.0)
@@ -214,39 +214,39 @@ def _along(o: Arithmetic, m: Quadric, t: Any, r: Rays) -> Quadric:
     return o.fma(t, r.dx, m[0]), o.fma(t, r.dy, m[1]), o.fma(t, r.dz, m[2])
 
 
-def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Hit:
+def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, before: Medium) -> Hit:
     """Iterate along the rays, from the quadric that fits the asphere best.
 
     Only the last step carries the derivative (implicit function theorem), so that gradients cost no memory for
     iterations.
     """
-    assert figure.start is not None
+    assert curve.start is not None
     still = Rays(*(o.fixed(v) for v in r))
     nearest = (o.fixed(m[0]), o.fixed(m[1]), o.fixed(m[2]))
     with o.constant():
         glass_before = Medium(*(o.fixed(v) for v in before))
-        missed, _, t = _meet_quadric(o, still, nearest, figure.start, sense, glass_before)
-        for n in range(figure.steps + o.polish - 1):
-            step = _toward(o, _along(o, nearest, t, still), still, figure, sense)
-            if n == figure.steps - 1:
+        missed, _, t = _meet_quadric(o, still, nearest, curve.start, sense, glass_before)
+        for n in range(curve.steps + o.polish - 1):
+            step = _toward(o, _along(o, nearest, t, still), still, curve, sense)
+            if n == curve.steps - 1:
                 deciding = step
             t = t + step
         if o.guard:
             t = o.select(o.abs(t), _FARTHEST, t, 0.0)  # rays that meet nothing, as backwards: no NaN in the normal
     at = _along(o, m, o.fixed(t), r)
-    step, p = _last_step(o, at, r, figure), (r.dx, r.dy, r.dz)
+    step, p = _last_step(o, at, r, curve), (r.dx, r.dy, r.dz)
     x, y, z = _along(o, at, step, r)
-    if figure.across:
-        _, (nx, ny, nz), _, exists = crossed(o, figure, (x, y, z), p)
+    if curve.across:
+        _, (nx, ny, nz), _, exists = crossed(o, curve, (x, y, z), p)
         scale = times(o.inverse_root(o.dot((nx, ny, nz), (nx, ny, nz))), -1)
         q = o.dot((nx, ny, nz), p) * times(scale, sense)
     else:
-        _, slope, _, exists = depth(o, figure, height2(o, figure, x, y), order=1)
-        nx, ny = (v * -slope if bent else o.like(v, 0.0) for v, bent in zip((x, y), figure.bent, strict=True))
+        _, slope, _, exists = depth(o, curve, height2(o, curve, x, y), order=1)
+        nx, ny = (v * -slope if bent else o.like(v, 0.0) for v, bent in zip((x, y), curve.bent, strict=True))
         scale = o.inverse_root(o.fma(ny, ny, o.fma(nx, nx, 1.0)))
         nz, q = 1.0, o.fma(ny, r.dy, o.fma(nx, r.dx, r.dz)) * times(scale, sense)
     length = times(o.abs(deciding if o.polish else step), before.n)
-    tests = [(length, figure.last_step), (TINY, q)]
+    tests = [(length, curve.last_step), (TINY, q)]
     if exists is not None:
         tests.append((STEEPEST, exists))
     # How far a ray misses is of use only where crossings are learnt from.
@@ -257,19 +257,19 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int
     return Hit(x, y, z, q, q2, tests, (nx * scale, ny * scale, times(scale, nz)))
 
 
-def _toward(o: Arithmetic, at: Quadric, r: Rays, figure: Figure, sense: int) -> Any:
+def _toward(o: Arithmetic, at: Quadric, r: Rays, curve: Curve, sense: int) -> Any:
     """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
 
     Newton's own is lost where a ray all but touches the surface, for there two meetings lie close together; the
     parabola has both.
     """
     p, (x, y, z) = (r.dx, r.dy, r.dz), at
-    if figure.across:
-        value, gradient, bend, _ = crossed(o, figure, at, p)
+    if curve.across:
+        value, gradient, bend, _ = crossed(o, curve, at, p)
         rate, lack = o.dot(gradient, p), 2.0 * value
     else:
-        sag, slope, turn, _ = depth(o, figure, height2(o, figure, x, y), order=2)
-        bent = (*map(float, figure.bent), 0.0)
+        sag, slope, turn, _ = depth(o, curve, height2(o, curve, x, y), order=2)
+        bent = (*map(float, curve.bent), 0.0)
         along = _weighted(o, at, p, bent)
         rate = o.fma(slope, along, -r.dz)
         # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its slope.
@@ -279,13 +279,13 @@ def _toward(o: Arithmetic, at: Quadric, r: Rays, figure: Figure, sense: int) -> 
     return lack / times(o.fma(rate, -sense, root), sense)
 
 
-def _last_step(o: Arithmetic, at: Quadric, r: Rays, figure: Figure) -> Any:
+def _last_step(o: Arithmetic, at: Quadric, r: Rays, curve: Curve) -> Any:
     """Return Newton's step, which by then is Euler's."""
-    if figure.across:
-        value, gradient, *_ = crossed(o, figure, at, (r.dx, r.dy, r.dz))
+    if curve.across:
+        value, gradient, *_ = crossed(o, curve, at, (r.dx, r.dy, r.dz))
         return -value / o.nonzero(o.dot(gradient, r[3:]))
-    sag, slope, *_ = depth(o, figure, height2(o, figure, at[0], at[1]), order=0)
-    along = _weighted(o, at, r[3:], (*map(float, figure.bent), 0.0))
+    sag, slope, *_ = depth(o, curve, height2(o, curve, at[0], at[1]), order=0)
+    along = _weighted(o, at, r[3:], (*map(float, curve.bent), 0.0))
     return (at[2] - sag) / o.nonzero(o.fma(slope, along, -r.dz))
 
 
@@ -325,9 +325,9 @@ def reflect(o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int) -> Ray
     return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense) for p, n in zip(r[3:], normal, strict=True)))
 
 
-def through_ideal(o: Arithmetic, r: Rays, met: Hit, focal_mm: float) -> Rays:
-    """Rays in air behind an ideal thin lens: slopes change by -x / f and -y / f, so that points become points."""
-    towards = o.abs(r.dz) * (1 / focal_mm)
+def through_ideal(o: Arithmetic, r: Rays, met: Hit, power: float) -> Rays:
+    """Rays in air behind an ideal thin lens of power 1 / f: slopes change by -x / f and -y / f."""
+    towards = o.abs(r.dz) * power
     dx, dy = o.fma(towards, met.x, r.dx, -1), o.fma(towards, met.y, r.dy, -1)
     scale = o.inverse_root(o.dot((dx, dy, r.dz), (dx, dy, r.dz)))
     return Rays(*met[:3], dx * scale, dy * scale, r.dz * scale)
@@ -347,7 +347,7 @@ class SurfaceStep(NamedTuple):
 def cross(
     o: Arithmetic,
     surface: Surface,
-    figure: Figure,
+    curve: Curve,
     r: Rays,
     sense: int,
     before: Medium,
@@ -358,16 +358,16 @@ def cross(
     rim: Callable[[Hit], list[Test]] | None = None,
 ) -> SurfaceStep:
     """Take rays through a surface, or back from it where they are `reflected`; `rim` replaces the tests of the rim."""
-    met = meet(o, r, figure, sense, before, entering)
+    met = meet(o, r, curve, sense, before, entering)
     tests = [(met.tests, st.MISSED), ((rim or rim_tests(o, surface))(met), st.RIM)]
     if reflected:
-        return SurfaceStep(met, Outgoing(reflect(o, r, met, figure.curvature, sense), met.q, met.q2, []), tests)
-    if surface.focal_mm is not None:
-        bent = Outgoing(through_ideal(o, r, met, surface.focal_mm), met.q, met.q2, [])
+        return SurfaceStep(met, Outgoing(reflect(o, r, met, curve.curvature, sense), met.q, met.q2, []), tests)
+    if surface.figure.power:
+        bent = Outgoing(through_ideal(o, r, met, surface.figure.power), met.q, met.q2, [])
     elif before is after:
         bent = Outgoing(Rays(*met[:3], *r[3:]), met.q, met.q2, [])
     else:
-        bent = refract(o, r, met, figure.curvature, sense, before, after)
+        bent = refract(o, r, met, curve.curvature, sense, before, after)
     return SurfaceStep(met, bent, [*tests, (bent.tests, st.TOTAL_REFLECTION)])
 
 
@@ -394,9 +394,9 @@ def meet_front(
     """
     # Before the lens light travels towards +z, or from the side and beyond: the sense is that of the camera ray's end.
     rays = Rays(x, y, z, -dx, -dy, -dz)
-    figure = Figure(0.0, plain=True) if shape is None else without_rim(curve_of(shape))
+    curve = Curve(0.0, plain=True) if shape is None else without_rim(curve_of(shape))
     with np.errstate(all="ignore"):
-        met = meet(NUMPY, rays, figure, 1, AIR, entering=True)
+        met = meet(NUMPY, rays, curve, 1, AIR, entering=True)
         passed = np.logical_and.reduce([low <= high for low, high in met.tests])
         return np.where(passed, met.x, math.nan), np.where(passed, met.y, math.nan)
 

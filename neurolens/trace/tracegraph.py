@@ -15,7 +15,7 @@ from neurolens.graph.ir import Graph, Value
 from neurolens.lens.glass import ANY_WAVELENGTH_NM, absorption_of, cauchy, glass_of, index_at, index_of, stated_nm
 from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Graphs, is_number, times
-from neurolens.trace.shapes import figure_of
+from neurolens.trace.shapes import traced_curve
 from neurolens.trace.surfaces import Hit, Medium, Rays, Test, cross, media, radius2
 from neurolens.trace.transmission import Passage, Shares, times_film
 
@@ -70,7 +70,7 @@ def exact_graph(
         # Behind a plane z is the number 0, and a sum of two numbers would lose its label.
         r = r._replace(z=step if r.z.node.kind == "constant" else r.z + step)
         rim = opening if surface.stop or not whole else None
-        met, bent, found = cross(o, surface, figure_of(surface, float), r, -1, before, after, rim=rim)
+        met, bent, found = cross(o, surface, traced_curve(surface, float), r, -1, before, after, rim=rim)
         tests += [(test, st.blocked(k, reason)) for some, reason in found for test in some]
         if surface.stop:
             at_stop = g.concat(met.x, met.y)

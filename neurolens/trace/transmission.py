@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from neurolens.lens.glass import absorption_of
 from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Arithmetic, times
-from neurolens.trace.shapes import is_plain
 from neurolens.trace.surfaces import Hit, Medium, Rays, nearest_approach, normal_at
 
 Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
@@ -175,7 +174,7 @@ class Passage:
             depth = path_mm(self._o, r, met, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
         surface = self.lens.surfaces[k]
-        self._skew = self._skew if is_plain(surface) and surface.focal_mm is None else None
+        self._skew = self._skew if surface.figure.plain and not surface.figure.power else None
         coated = bool(surface.coating and surface.coating.layers)
         if before is after and not coated and not reflected:
             return
@@ -199,7 +198,7 @@ class Passage:
         assert self._last is not None
         last, other, q = self._last
         pair = self.lens.surfaces[last], self.lens.surfaces[k]
-        if all(is_plain(s) for s in pair):
+        if all(s.figure.plain for s in pair):
             gap = self.lens.vertices_mm[k] - self.lens.vertices_mm[last]
             near = nearest_approach(self._o, r, before.inverse_n2)
             curvatures = pair[0].curvature, pair[1].curvature

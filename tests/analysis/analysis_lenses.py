@@ -8,6 +8,7 @@ from shipped import tabled
 
 from neurolens.analysis.bundles import Pattern
 from neurolens.analysis.fields import Scene
+from neurolens.lens.figures import Figure
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.states import set_lens
 
@@ -38,7 +39,7 @@ def cartesian(stop_mm: float = 10.0, n: float = 1.5, f: float = 100.0) -> Scene:
     rows = [
         Surface(INF, 0.0, 2 * stop_mm, stop=True),
         Surface(INF, 12.0, 3 * stop_mm, n),
-        Surface(-f * (n - 1), f, 3 * stop_mm, conic=-n * n),
+        Surface(-f * (n - 1), f, 3 * stop_mm, figure=Figure(conic=-n * n)),
     ]
     return scene(rows, half_field_deg=2.0)
 

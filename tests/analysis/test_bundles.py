@@ -18,6 +18,7 @@ from neurolens.analysis.layout import layout_profile
 from neurolens.analysis.spots import diffraction_image, diffraction_mtf, fans, mtf, psf, spots, working_f_number
 from neurolens.base.errors import InputError
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.figures import Cylinder
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.pupils import camera_rays
 from neurolens.trace.rays import trace
@@ -84,7 +85,11 @@ def test_a_cartesian_lens_is_perfect_on_the_axis() -> None:
 
 
 def test_a_cylinder_focuses_one_meridian_only() -> None:
-    rows = [Surface(INF, 0.0, 10, stop=True), Surface(50.0, 0.0, 30, 1.5, cylinder="y"), Surface(INF, 100.0, 30)]
+    rows = [
+        Surface(INF, 0.0, 10, stop=True),
+        Surface(50.0, 0.0, 30, 1.5, figure=Cylinder(cylinder="y")),
+        Surface(INF, 100.0, 30),
+    ]
     lens = Lens("cylinder", "", tuple(rows), 10.0, half_field_deg=5.0, film_z_mm=100.0)
     along = bundle(Scene(lens, axis="y"), [0.0], [587.5618], points([0.1, 0.0], [0.0, 0.1]))
     assert along.tangential_mm[0, 0].tolist() == pytest.approx([0, 0], abs=1e-4)

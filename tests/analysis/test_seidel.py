@@ -16,6 +16,7 @@ from neurolens.analysis.bundles import bundle, points
 from neurolens.analysis.field_curves import colour, curvature, distortion, seidel
 from neurolens.analysis.fields import Scene
 from neurolens.base.errors import InputError
+from neurolens.lens.figures import Figure
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.aiming import without_rims
@@ -24,11 +25,11 @@ from neurolens.trace.rays import trace
 D = 587.5618
 ASPHERE = scene(
     [
-        Surface(40.0, 6.0, 30, 1.6, 55.0, conic=-0.7, asphere=((2, 1e-4), (4, 2e-6), (6, 1e-9))),
+        Surface(40.0, 6.0, 30, 1.6, 55.0, figure=Figure(conic=-0.7, asphere=((2, 1e-4), (4, 2e-6), (6, 1e-9)))),
         Surface(-90.0, 4.0, 30, 1.7, 30.0),
-        Surface(-200.0, 3.0, 30, conic=2.0),
+        Surface(-200.0, 3.0, 30, figure=Figure(conic=2.0)),
         Surface(INF, 5.0, 10, stop=True),
-        Surface(-120.0, 3.0, 30, 1.5, 60.0, asphere=((4, -3e-6),)),
+        Surface(-120.0, 3.0, 30, 1.5, 60.0, figure=Figure(asphere=((4, -3e-6),))),
         Surface(-60.0, 50.0, 30),
     ]
 )
@@ -160,7 +161,11 @@ def test_an_anamorphic_lens_is_refused() -> None:
 
 
 def test_odd_powers_are_named() -> None:
-    rows = [Surface(INF, 0, 10, stop=True), Surface(50, 5, 20, 1.5, asphere=((3, 1e-5),)), Surface(-50, 45, 20)]
+    rows = [
+        Surface(INF, 0, 10, stop=True),
+        Surface(50, 5, 20, 1.5, figure=Figure(asphere=((3, 1e-5),))),
+        Surface(-50, 45, 20),
+    ]
     assert seidel(scene(rows), image_height_mm=1.0).odd_powers == (1,)
 
 

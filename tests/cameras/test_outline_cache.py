@@ -14,6 +14,7 @@ from neurolens.cameras import exact
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import ExactCamera, kept_outline, search_key
 from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.lens.figures import Cylinder, Figure
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.setting.states import set_lens
@@ -67,8 +68,9 @@ def test_whatever_the_search_reads_is_in_the_key() -> None:
 
     others = [
         changed(0, radius_mm=float(lens.surfaces[0].radius_mm) * (1 + 1e-15)),
-        changed(3, thickness_mm=1.0), changed(2, diameter_mm=9.0), changed(0, conic=0.1), changed(1, cylinder="x"),
-        changed(0, asphere=((4, 1e-9),)), changed(0, n_d=1.7, glass=None), changed(0, V_d=30.0, glass=None),
+        changed(3, thickness_mm=1.0), changed(2, diameter_mm=9.0), changed(0, figure=Figure(0.1)),
+        changed(0, figure=Figure(asphere=((4, 1e-9),))), changed(1, figure=Cylinder(cylinder="x")),
+        changed(0, n_d=1.7, glass=None), changed(0, V_d=30.0, glass=None),
         changed(0, glass="N-BK7"), set_lens(lens, f_number=4.0), replace(lens, film_z_mm=90.0),
     ]  # fmt: skip
     keys = [key(lens), *map(key, others), key(lens, (400.0, 650.0)), key(lens, (400.0, 700.0), "float64")]

@@ -15,6 +15,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.pupil_outline import Passes, PupilOutline, PupilTable, outline_of
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.figures import Cylinder
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
@@ -263,7 +264,7 @@ def test_blades_and_cylinders_are_held() -> None:
     # Area of a regular pentagon over that of its circle: 5/2 sin(72 deg) / pi; Willi 2021, Table 6.3: 76.6%.
     assert passed.mean() == pytest.approx(2.5 * math.sin(math.radians(72)) / math.pi, abs=0.01)
     rows = (
-        Surface(40.0, 3.0, 16.0, 1.5, cylinder="x"),
+        Surface(40.0, 3.0, 16.0, 1.5, figure=Cylinder(cylinder="x")),
         Surface(math.inf, 1.0, 16.0),
         Surface(math.inf, 1.0, 9.0, stop=True),
         Surface(60.0, 3.0, 14.0, 1.6),

@@ -48,9 +48,9 @@ def numbers(rays: Rays) -> np.ndarray:
 
 
 def with_power(lens: Lens, k: int, power: int, more: float) -> Lens:
-    terms = dict(lens.surfaces[k].asphere)
+    terms = dict(lens.surfaces[k].figure.asphere)
     terms[power] = terms.get(power, 0.0) + more
-    surface = replace(lens.surfaces[k], asphere=tuple(sorted(terms.items())))
+    surface = replace(lens.surfaces[k], figure=replace(lens.surfaces[k].figure, asphere=tuple(sorted(terms.items()))))
     return replace(lens, surfaces=(*lens.surfaces[:k], surface, *lens.surfaces[k + 1 :]))
 
 

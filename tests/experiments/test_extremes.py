@@ -16,6 +16,7 @@ from experiments import extremes
 from experiments.__main__ import main
 from experiments.extremes import failures, measure, trace_reference
 from neurolens.base import status as st
+from neurolens.lens.figures import Cylinder, Figure
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.rays import trace
 
@@ -70,7 +71,7 @@ def one(surface: Surface) -> Lens:
 def test_reference_images_the_points_of_cartesian_ovals() -> None:
     """A hyperboloid of K = -n^2 sends rays from within the glass, parallel to the axis, to one point (Descartes)."""
     n, r = 1.5, -20.0
-    lens = one(Surface(r, 1.0, 40.0, conic=-(n**2)))
+    lens = one(Surface(r, 1.0, 40.0, figure=Figure(conic=-(n**2))))
     focus = -r / (n - 1)
     for height in (0.0, 3.0, 19.0):
         out = trace_reference(lens, [0.6 * height, 0.8 * height, -30.0, 0, 0, 1], [n, 1.0], "film")
@@ -82,18 +83,18 @@ def test_reference_images_the_points_of_cartesian_ovals() -> None:
 
 def test_reference_meets_aspheres_and_cylinders_where_they_are() -> None:
     shapes = [
-        Surface(-20.0, 1.0, 20.0, 1.5, asphere=((3, 1e-3), (4, 2e-5))),
-        Surface(math.inf, 1.0, 20.0, 1.5, asphere=((2, 0.01),)),
-        Surface(15.0, 1.0, 20.0, 1.5, conic=-0.7, cylinder="x"),
+        Surface(-20.0, 1.0, 20.0, 1.5, figure=Figure(asphere=((3, 1e-3), (4, 2e-5)))),
+        Surface(math.inf, 1.0, 20.0, 1.5, figure=Figure(asphere=((2, 0.01),))),
+        Surface(15.0, 1.0, 20.0, 1.5, figure=Cylinder(conic=-0.7, cylinder="x")),
     ]
     for s in shapes:
         out = trace_reference(one(s), [1.0, 2.0, -5.0, 0.3, -0.2, 1.0], [1.0, 1.5], "film")
         assert out.point is not None
         x, y, z = (mpmath.mpf(v) for v in out.point)
-        h = abs(x) if s.cylinder else mpmath.sqrt(x * x + y * y)
+        h = abs(x) if s.figure.axis else mpmath.sqrt(x * x + y * y)
         c = 0 if math.isinf(s.radius_mm) else 1 / mpmath.mpf(s.radius_mm)
-        sag = c * h**2 / (1 + mpmath.sqrt(1 - (1 + mpmath.mpf(s.conic)) * c**2 * h**2))
-        assert abs(sag + sum(mpmath.mpf(a) * h**p for p, a in s.asphere) - z) < 1e-13
+        sag = c * h**2 / (1 + mpmath.sqrt(1 - (1 + mpmath.mpf(s.figure.conic)) * c**2 * h**2))
+        assert abs(sag + sum(mpmath.mpf(a) * h**p for p, a in s.figure.asphere) - z) < 1e-13
 
 
 def test_reference_names_what_ends_a_ray() -> None:

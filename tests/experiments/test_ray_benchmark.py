@@ -5,6 +5,7 @@ import pytest
 
 from experiments import rays
 from experiments.ray_peers import PEERS, Found, Peer, Task, table_of
+from neurolens.lens.figures import Cylinder, Figure, Ideal
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.study.speed import Unavailable
 
@@ -74,9 +75,12 @@ def test_errors_are_those_that_were_made() -> None:
 
 
 def test_a_lens_that_others_cannot_describe_is_refused() -> None:
-    for more in ({"cylinder": "x"}, {"asphere": ((3, 1e-5),)}, {"focal_mm": 50.0}):
+    for figure in (Cylinder(cylinder="x"), Figure(asphere=((3, 1e-5),)), Ideal(focal_mm=50.0)):
         lens = Lens(
-            "odd", "test", (Surface(50.0, 5.0, 20.0, n_d=1.5, **more), Surface(-50.0, 45.0, 20.0, stop=True)), 2.0
+            "odd",
+            "test",
+            (Surface(50.0, 5.0, 20.0, n_d=1.5, figure=figure), Surface(-50.0, 45.0, 20.0, stop=True)),
+            2.0,
         )
         with pytest.raises(Unavailable, match="even aspheres"):
             table_of(lens)

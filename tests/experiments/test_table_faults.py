@@ -23,6 +23,7 @@ from experiments.table_faults import (
 from experiments.table_figures import SHARES, Tables, chief_rays, measure
 from neurolens.analysis import field_curves
 from neurolens.analysis.fields import Scene
+from neurolens.lens.figures import SPHERE
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.profiles import Profile
 from neurolens.photographs.verify import compare, found_for
@@ -81,7 +82,7 @@ def test_chief_rays_and_foci_without_aiming_are_those_of_the_scene(
 
 
 def test_the_residual_is_that_of_the_comparison() -> None:
-    lens = changed(set_lens(read_lens(SONNAR)), 10, asphere=())
+    lens = changed(set_lens(read_lens(SONNAR)), 10, figure=SPHERE)
     (found,) = measure([lens], measured(), 55.0).figures.distortion
     expected = compare(lens, measured(), 55.0).distortion_percent
     assert expected is not None and found == pytest.approx(expected.rms, rel=1e-3) and found > 0.5
@@ -120,17 +121,18 @@ def test_changes_that_fit_alike_are_one_of_these() -> None:
 
 
 def test_a_wrong_exponent_and_a_wrong_sign_of_an_asphere_are_named() -> None:
-    ((power, a), *rest) = read_lens(SONNAR).surfaces[8].asphere
-    found = checked(asphere={8: ((power, 10 * a), *rest)})
+    figure = read_lens(SONNAR).surfaces[8].figure
+    ((power, a), *rest) = figure.asphere
+    found = checked(figure={8: replace(figure, asphere=((power, 10 * a), *rest))})
     assert found.change == "the exponent (a tenth) of the coefficient of power 4 of surface 8"
-    found = checked(asphere={8: ((power, -a), *rest)})
+    found = checked(figure={8: replace(figure, asphere=((power, -a), *rest))})
     assert found.change == "the sign of the coefficient of power 4 of surface 8"
 
 
 def test_a_dropped_asphere_is_missed_at_its_surface_and_all_dropped_ones_are_found() -> None:
-    found = checked(asphere={10: ()})
+    found = checked(figure={10: SPHERE})
     assert found.change is not None and re.match(r"an asphere is missing at surface 10\b", found.change)
-    rows = tuple(replace(s, asphere=()) for s in set_lens(read_lens(SONNAR)).surfaces)
+    rows = tuple(replace(s, figure=replace(s.figure, asphere=())) for s in set_lens(read_lens(SONNAR)).surfaces)
     assert alarm(measure([replace(set_lens(read_lens(SONNAR)), surfaces=rows)], measured(), 55.0).figures)[0] > 5
 
 

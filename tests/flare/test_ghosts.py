@@ -17,6 +17,7 @@ from neurolens.flare.layers import FlareJob, axis_irradiance
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.figures import Biconic, Qcon, Toroid
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.settings import FlareSettings
@@ -52,13 +53,22 @@ def exact(lens: Lens, rays: np.ndarray, pair: Pair, wavelength_nm: float) -> tup
     return place.numpy(), found.power.numpy(), (found.status == st.PASSED).numpy()
 
 
+def forbes() -> Lens:
+    """A triplet with a short Qcon at its front and one of 20 terms at its back."""
+    lens = lens_of("cooke_triplet_50")
+    first, *middle, last = lens.surfaces
+    short = Qcon(qcon=(-0.02, 3e-3), norm_mm=first.semi_diameter_mm)
+    long = Qcon(qcon=(3e-5,) * 20, norm_mm=last.semi_diameter_mm)
+    return replace(lens, surfaces=(replace(first, figure=short), *middle, replace(last, figure=long)))
+
+
 def toric() -> Lens:
     """A triplet with an aspheric toroid at its front and a biconic at its back."""
     lens = lens_of("cooke_triplet_50")
     first, *middle, last = lens.surfaces
-    ends = (first.radius_mm * 1.2, None), (last.radius_mm * 0.9, -0.6)
-    front = replace(first, cylinder="x", asphere=((4, -1e-6),), across=ends[0])
-    return replace(lens, surfaces=(front, *middle, replace(last, cylinder="y", conic=0.3, across=ends[1])))
+    toroid = Toroid(cylinder="x", asphere=((4, -1e-6),), across_mm=first.radius_mm * 1.2)
+    biconic = Biconic(cylinder="y", conic=0.3, across_mm=last.radius_mm * 0.9, across_conic=-0.6)
+    return replace(lens, surfaces=(replace(first, figure=toroid), *middle, replace(last, figure=biconic)))
 
 
 # The letter F.
@@ -71,6 +81,7 @@ CASES = {
     "coated": lambda: coated(double_gauss(), "broadband"),
     "aspheres": lambda: lens_of("phone_lens_6"),
     "aspheres that cancel": lambda: lens_of("fujifilm_fujinon_xf_35mm_f1_4_r"),
+    "Forbes": forbes,
     "cylinders": lambda: lens_of("schneider_anamorphic_31"),
     "toroids": toric,
     "absorbing": lambda: replace(

@@ -57,15 +57,15 @@ def zmx(lens: Lens) -> str:
 
 
 def _zmx_shape(s: Surface, k: int) -> list[str]:
-    terms = dict(s.asphere)
+    terms = dict(s.figure.asphere)
     curvature = 0.0 if math.isinf(s.radius_mm) else 1 / s.radius_mm
-    conic = [f"  CONI {s.conic!r}"] if s.conic else []
-    if s.cylinder == "y":
+    conic = [f"  CONI {s.figure.conic!r}"] if s.figure.conic else []
+    if s.figure.axis == "y":
         return ["  TYPE TOROIDAL", f'  CURV {curvature!r} 0 0 0 0 ""', "  PARM 1 0", *conic]
-    if s.cylinder == "x" and k % 2:
+    if s.figure.axis == "x" and k % 2:
         return ["  TYPE TOROIDAL", "  CURV 0.0", f"  PARM 1 {s.radius_mm!r}"]
-    if s.cylinder == "x":
-        return ["  TYPE BICONICX", "  CURV 0.0", f"  PARM 1 {s.radius_mm!r}", f"  PARM 2 {s.conic!r}"]
+    if s.figure.axis == "x":
+        return ["  TYPE BICONICX", "  CURV 0.0", f"  PARM 1 {s.radius_mm!r}", f"  PARM 2 {s.figure.conic!r}"]
     if not terms:
         return ["  TYPE STANDARD", f'  CURV {curvature!r} 0 0 0 0 ""', *conic]
     for kind, powers in (("EVENASPH", range(2, 17, 2)), ("ODDASPHE", range(1, 9))):
@@ -98,22 +98,22 @@ def seq(lens: Lens) -> str:
 
 
 def _seq_row(s: Surface) -> str:
-    radius = 0.0 if math.isinf(s.radius_mm) or s.cylinder == "x" else s.radius_mm
+    radius = 0.0 if math.isinf(s.radius_mm) or s.figure.axis == "x" else s.radius_mm
     glass = "" if s.n_d == 1 else f" {s.n_d!r}" if s.V_d is None else f" {s.n_d!r}:{s.V_d!r}"
     return f"S {radius!r} {s.thickness_mm!r}{glass}"
 
 
 def _seq_shape(s: Surface) -> list[str]:
-    if s.cylinder:
-        if s.conic:
+    if s.figure.axis:
+        if s.figure.conic:
             raise CannotSay("conic cylinder")
-        return ["  YTO", *([f"  CUX {1 / s.radius_mm!r}"] if s.cylinder == "x" else [])]
+        return ["  YTO", *([f"  CUX {1 / s.radius_mm!r}"] if s.figure.axis == "x" else [])]
     letters = {4 + 2 * k: letter for k, letter in enumerate("ABCDEFGHJ")}
-    if any(p not in letters for p, _ in s.asphere):
-        raise CannotSay(s.asphere)
-    if s.asphere:
-        return ["  ASP", f"  K {s.conic!r}; " + "; ".join(f"{letters[p]} {a!r}" for p, a in s.asphere)]
-    return ["  CON", f"  K {s.conic!r}"] if s.conic else []
+    if any(p not in letters for p, _ in s.figure.asphere):
+        raise CannotSay(s.figure.asphere)
+    if s.figure.asphere:
+        return ["  ASP", f"  K {s.figure.conic!r}; " + "; ".join(f"{letters[p]} {a!r}" for p, a in s.figure.asphere)]
+    return ["  CON", f"  K {s.figure.conic!r}"] if s.figure.conic else []
 
 
 def osl(lens: Lens) -> str:
@@ -125,12 +125,12 @@ def osl(lens: Lens) -> str:
     ]
     lines += ['DES "somebody"', "UNI 1.0", 'SNO1 "a note; with // marks"', "AIR", "TH 1.0e+20", "NXT // SRF 1"]
     for k, s in enumerate(lens.surfaces, start=1):
-        if s.cylinder or s.V_d is not None or any(p not in (4, 6, 8, 10) for p, _ in s.asphere):
+        if s.figure.axis or s.V_d is not None or any(p not in (4, 6, 8, 10) for p, _ in s.figure.asphere):
             raise CannotSay(s)
         medium = "AIR" if s.n_d == 1 else f"GLA {s.n_d!r}"
         radius = [] if math.isinf(s.radius_mm) else [f"CV {1 / s.radius_mm!r}" if k % 2 else f"RD {s.radius_mm!r}"]
-        shape = [f"CC {s.conic!r}"] if s.conic else []
-        shape += [f"{ {4: 'AD', 6: 'AE', 8: 'AF', 10: 'AG'}[p] } {a!r}" for p, a in s.asphere]
+        shape = [f"CC {s.figure.conic!r}"] if s.figure.conic else []
+        shape += [f"{ {4: 'AD', 6: 'AE', 8: 'AF', 10: 'AG'}[p] } {a!r}" for p, a in s.figure.asphere]
         lines += [medium, *radius, f"TH {s.thickness_mm!r}; AP {'CHK ' if k % 3 else ''}{s.semi_diameter_mm!r}"]
         lines += [*shape, *(["AST"] if s.stop else []), "NXT"]
     return "\n".join([*lines, "AIR", "WV 0.58756 0.48613 0.65627", f"END {len(lens.surfaces) + 1}", ""])
@@ -150,7 +150,13 @@ def _table(lens: Lens, stop_index: str) -> str:
     rows = []
     for s in lens.surfaces:
         flat = math.isinf(s.radius_mm)
-        if s.cylinder or s.conic or s.asphere or s.V_d is not None or (s.stop and not (flat and s.n_d == 1)):
+        if (
+            s.figure.axis
+            or s.figure.conic
+            or s.figure.asphere
+            or s.V_d is not None
+            or (s.stop and not (flat and s.n_d == 1))
+        ):
             raise CannotSay(s)
         n = stop_index if s.stop else repr(s.n_d)
         rows.append(f"{0.0 if flat else s.radius_mm!r}\t{s.thickness_mm!r}  {n} {s.diameter_mm!r} # a row\n")
@@ -168,9 +174,13 @@ def js(lens: Lens) -> str:
             "V_d": s.V_d,
             "diameter_mm": s.diameter_mm,
             "stop": s.stop,
-            "conic": s.conic,
-            "aspheric_coefficients": {str(p): a for p, a in s.asphere},
-            "shape": f"cyl-{s.cylinder}" if s.cylinder else "asphere" if s.asphere or s.conic else "sphere",
+            "conic": s.figure.conic,
+            "aspheric_coefficients": {str(p): a for p, a in s.figure.asphere},
+            "shape": f"cyl-{s.figure.axis}"
+            if s.figure.axis
+            else "asphere"
+            if s.figure.asphere or s.figure.conic
+            else "sphere",
         }
         for s in lens.surfaces
     ]
@@ -196,25 +206,27 @@ def optical_bench(lens: Lens) -> str:
     """The text of the Optical Bench, for one state."""
     head = ["[descriptive data]", f"title\t{lens.name}", "[constants]"]
     gaps, rows, aspheres = [], [], []
-    odd = any(p % 2 for s in lens.surfaces for p, _ in s.asphere)
-    squares = any(p == 2 for s in lens.surfaces for p, _ in s.asphere)
+    odd = any(p % 2 for s in lens.surfaces for p, _ in s.figure.asphere)
+    squares = any(p == 2 for s in lens.surfaces for p, _ in s.figure.asphere)
     if odd and squares:
         raise CannotSay("odd powers and the 2nd")
     powers = [*([2] if squares else []), *(range(3, 41) if odd else range(4, 41, 2))]
     head += ["AsphericalOddCount\t19"] * odd + ["AsphericalA2"] * squares
     for k, s in enumerate(lens.surfaces):
-        if s.cylinder or (s.stop and not math.isinf(s.radius_mm)):
+        if s.figure.axis or (s.stop and not math.isinf(s.radius_mm)):
             raise CannotSay(s)
         radius = "AS" if s.stop else "Infinity" if math.isinf(s.radius_mm) else repr(s.radius_mm)
         gap = f"d{k + 1}" if k % 3 == 1 else repr(s.thickness_mm)
         gaps += [f"d{k + 1}\t{s.thickness_mm!r}"] * (k % 3 == 1)
         medium = ("", "") if s.n_d == 1 else (repr(s.n_d), "" if s.V_d is None else repr(s.V_d))
         rows.append(f"{k + 1}\t{radius}\t{gap}\t{medium[0]}\t{s.diameter_mm!r}\t{medium[1]}")
-        if s.conic or s.asphere:
-            terms = dict(s.asphere)
-            if not set(terms) <= set(powers) or (s.conic and s.stop):
+        if s.figure.conic or s.figure.asphere:
+            terms = dict(s.figure.asphere)
+            if not set(terms) <= set(powers) or (s.figure.conic and s.stop):
                 raise CannotSay(s)
-            aspheres.append(f"{k + 1}\t{radius}\t{s.conic!r}\t" + "\t".join(repr(terms.get(p, 0.0)) for p in powers))
+            aspheres.append(
+                f"{k + 1}\t{radius}\t{s.figure.conic!r}\t" + "\t".join(repr(terms.get(p, 0.0)) for p in powers)
+            )
     n = first_order(lens).f_number
     head += ["[variable distances]", f"F-Number\t{n!r}", "Magnification\t0", "d0\tInfinity", *gaps]
     return "\n".join([*head, "[lens data]", *rows, "[aspherical data]", *aspheres, "[figure]", "anything", ""])
@@ -224,10 +236,10 @@ def flaresim(lens: Lens) -> str:
     """A .lens file with semi-diameters, as the format has them."""
     rows = []
     for s in lens.surfaces:
-        if s.conic or s.asphere or (s.stop and not math.isinf(s.radius_mm)):
+        if s.figure.conic or s.figure.asphere or (s.stop and not math.isinf(s.radius_mm)):
             raise CannotSay(s)
         radius = "stop" if s.stop else "0" if math.isinf(s.radius_mm) else repr(s.radius_mm)
-        kind = {None: "", "x": "cyl_y", "y": "cyl_x"}[s.cylinder]
+        kind = {None: "", "x": "cyl_y", "y": "cyl_x"}[s.figure.axis]
         rows.append(f"  {radius} {s.thickness_mm!r} {s.n_d!r} {s.V_d or 0.0!r} {s.semi_diameter_mm!r} 1 {kind} # row")
     return "\n".join(["# A comment", f"name: {lens.name}", "focal_length: 0", "", "surfaces:", *rows, ""])
 
@@ -238,19 +250,19 @@ def camera_toml(lens: Lens) -> str:
     text = f'[lens]\nname = "{lens.name}"\nfocal_length = {first_order(lens).efl_mm!r}\nmax_fstop = '
     text += f'{first_order(lens).f_number!r}\ncoating = "multi"\n'
     for s in lens.surfaces:
-        terms = dict(s.asphere)
+        terms = dict(s.figure.asphere)
         if any(p % 2 or p < 4 for p in terms) or (s.stop and not math.isinf(s.radius_mm)):
             raise CannotSay(s)
-        curved = bool(terms or s.conic)
-        if curved and s.cylinder:
+        curved = bool(terms or s.figure.conic)
+        if curved and s.figure.axis:
             raise CannotSay(s)
-        kind = "stop" if s.stop else "aspheric" if curved else kinds[s.cylinder]
+        kind = "stop" if s.stop else "aspheric" if curved else kinds[s.figure.axis]
         text += f'[[surface]]\ntype = "{kind}"\nradius = {0.0 if math.isinf(s.radius_mm) else s.radius_mm!r}\n'
         text += f"thickness = {s.thickness_mm!r}\nior = {s.n_d!r}\naperture = {s.diameter_mm!r}\n"
         text += f"abbe_v = {s.V_d or 0.0!r}\n"
         if curved:
             listed = [terms.get(p, 0.0) for p in range(4, max(terms, default=2) + 1, 2)]
-            text += f"conic = {s.conic!r}\naspheric_coeffs = {listed!r}\n"
+            text += f"conic = {s.figure.conic!r}\naspheric_coeffs = {listed!r}\n"
     return text
 
 

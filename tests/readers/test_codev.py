@@ -11,9 +11,10 @@ from shipped import singlet_mm
 
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.lens import glass as catalogue
+from neurolens.lens.figures import Figure, Qcon
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.readers.assemble import qbfs_terms, qcon_terms
+from neurolens.readers.assemble import qbfs_terms
 from neurolens.readers.codev import read_seq
 from neurolens.readers.source import ReadOptions
 
@@ -164,7 +165,9 @@ def test_units_and_defocus(tmp_path: Path) -> None:
 def test_surface_types(block: str, shape: tuple[Any, ...], tmp_path: Path) -> None:
     s = read(swapped("  CIR 8", f"  {block}\n  CIR 8"), tmp_path).surfaces[0]
     wanted = shape if len(shape) > 4 else (*shape, None)
-    assert (pytest.approx(s.radius_mm), s.conic, pytest.approx(dict(s.asphere)), s.cylinder, s.across) == wanted
+    f = s.figure
+    found = pytest.approx(s.radius_mm), f.conic, pytest.approx(dict(f.powers)), f.axis, f.record().get("across")
+    assert found == wanted
 
 
 @pytest.mark.parametrize(("kind", "names"), [("QBF", "QB"), ("QCN", "QC")])
@@ -173,7 +176,8 @@ def test_q_types_are_the_sums_of_forbes(kind: str, names: str, tmp_path: Path) -
     terms = "".join(f"; SCO {names}{4 + 2 * m} {a}" for m, a in enumerate(values))
     with pytest.warns(AssumedWarning, match=rf"lens\.seq: line 12: SPS {kind}: coefficient {names}n is taken"):
         s = read(swapped("  CIR 8", f"  SPS {kind} 9.0{terms}\n  CIR 8"), tmp_path).surfaces[0]
-    assert s.asphere == (qbfs_terms(values, 9.0, 1 / 50, 8.0) if kind == "QBF" else qcon_terms(values, 9.0, 8.0))
+    q = Figure(asphere=qbfs_terms(values, 9.0, 1 / 50, 8.0)) if kind == "QBF" else Qcon(qcon=values, norm_mm=9.0)
+    assert s.figure == q
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from lens_formats import DRAWN, optical_bench, plain, swapped
 from shipped import tabled
 
 from neurolens.base.errors import AssumedWarning, InputError
+from neurolens.lens.figures import Toroid
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import kind_of, read_any
@@ -120,7 +121,7 @@ def test_optical_bench_states_field_and_aspheres(tmp_path: Path) -> None:
     ]
     assert dict(lens.configurations[1].thickness_mm)[1] == 3.0 and lens.surfaces[1].thickness_mm == 2.0
     assert lens.half_field_deg == 20 and lens.image_radius_mm == 18 and lens.f_number == 4
-    assert lens.surfaces[0].conic == -0.5 and lens.surfaces[0].asphere == ((4, 1e-6), (8, 2e-10))
+    assert lens.surfaces[0].figure.conic == -0.5 and lens.surfaces[0].figure.asphere == ((4, 1e-6), (8, 2e-10))
     assert lens.surfaces[-1].thickness_mm == pytest.approx(first_order(lens).back_focus_mm)
 
 
@@ -147,7 +148,7 @@ def test_optical_bench_powers(constant: str, powers: tuple[int, ...], tmp_path: 
     text = swapped("[variable", f"[constants]\n{constant}\n[variable", ZOOM)
     text = swapped("-0.5\t1E-06\t\t2e-10", "0\t1e-9\t2e-9\t3e-9\t4e-11", text)
     lens, _ = read_text(text, ".txt", tmp_path)
-    assert tuple(p for p, _ in lens.surfaces[0].asphere) == powers
+    assert tuple(p for p, _ in lens.surfaces[0].figure.asphere) == powers
 
 
 @pytest.mark.parametrize(
@@ -192,7 +193,7 @@ def test_collection_mistakes(suffix: str, old: str, new: str, said: str, tmp_pat
 def test_a_toric_row_is_a_circle_along_y_turned_about_y(tmp_path: Path) -> None:
     lens, _ = read_text(swapped(" 1  # row", " 1 toric 95.5 # row", DRAWN[".lens"](GAUSS)), ".lens", tmp_path)
     first, plain_first = lens.surfaces[0], GAUSS.surfaces[0]
-    assert first == replace(plain_first, radius_mm=95.5, cylinder="y", across=(plain_first.radius_mm, None))
+    assert first == replace(plain_first, radius_mm=95.5, figure=Toroid(cylinder="y", across_mm=plain_first.radius_mm))
 
 
 def test_optical_bench_oddities(tmp_path: Path) -> None:
@@ -201,7 +202,7 @@ def test_optical_bench_oddities(tmp_path: Path) -> None:
     lens, assumed = read_text(text, ".txt", tmp_path)
     assert len(assumed) == 1 and "the last medium is glass" in assumed[0]
     assert [s.radius_mm for s in lens.surfaces[3:]] == [math.inf, math.inf] and lens.surfaces[-1].n_d == 1
-    assert lens.surfaces[0].conic == -0.5
+    assert lens.surfaces[0].figure.conic == -0.5
 
 
 def test_near_state_of_a_camera_file(tmp_path: Path) -> None:

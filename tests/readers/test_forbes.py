@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from neurolens.readers.assemble import CLOSE_MM, MAX_TERMS, _qbfs_sum, qbfs_terms, qcon_terms
+from neurolens.lens.figures import MOST_Q_TERMS, Qcon
+from neurolens.readers.assemble import CLOSE_MM, _qbfs_sum, qbfs_terms
 
 mpmath = pytest.importorskip("mpmath")
 mp = mpmath.mp.clone()
@@ -18,7 +19,7 @@ def sag(terms: tuple[tuple[int, float], ...], h: float) -> float:
 @pytest.mark.parametrize("rim", [5.0, 5.4])
 def test_qcon_is_its_jacobi_polynomial(rim: float) -> None:
     a = [0.3, -0.05, 0.02, -7e-3, 1e-3, 2e-4]
-    terms = qcon_terms(a, 5.0, rim)
+    terms = Qcon(qcon=tuple(a), norm_mm=5.0).powers
     assert [p for p, _ in terms] == list(range(4, 16, 2))
     for k in range(11):
         h = rim * k / 10
@@ -75,4 +76,4 @@ def test_what_powers_cannot_follow_is_refused() -> None:
     with pytest.raises(ValueError, match="inside the conic"):
         qbfs_terms([0.1], 10.0, 0.1, 10.0)
     with pytest.raises(ValueError, match="fewer terms"):
-        qcon_terms([10.0] * MAX_TERMS, 10.0, 10.0)
+        qbfs_terms([10.0] * MOST_Q_TERMS, 10.0, 0.0, 10.0)

@@ -207,7 +207,7 @@ def test_terms_of_an_asphere_begin_with_the_square(tmp_path: Path) -> None:
     front = {**FRONT, "type": "Aspheric", "c": 0.0, "k": -1.0, "ai": terms, "ai2": terms[0], "ai6": terms[2]}
     del front["roc"]
     lens = read_any(written(tmp_path, {**DEEPLENS, "surfaces": [STOP, front, REAR]}))
-    assert lens.surfaces[1].asphere == ((2, 0.5 / RADIUS), (6, 1e-7)) and lens.surfaces[1].conic == -1
+    assert lens.surfaces[1].figure.asphere == ((2, 0.5 / RADIUS), (6, 1e-7)) and lens.surfaces[1].figure.conic == -1
     assert first_order(lens).efl_mm == pytest.approx(FOCAL, rel=1e-12)
 
 

@@ -12,6 +12,7 @@ from shipped import singlet_mm
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.lens import glass as catalogue
+from neurolens.lens.figures import Ideal
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.source import ReadOptions
@@ -174,7 +175,9 @@ def test_surface_types(block: str, shape: tuple[Any, ...], tmp_path: Path) -> No
     lens = read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
     s = lens.surfaces[0]
     wanted = shape if len(shape) > 4 else (*shape, None)
-    assert (pytest.approx(s.radius_mm), s.conic, pytest.approx(dict(s.asphere)), s.cylinder, s.across) == wanted
+    f = s.figure
+    found = pytest.approx(s.radius_mm), f.conic, pytest.approx(dict(f.powers)), f.axis, f.record().get("across")
+    assert found == wanted
 
 
 QED = """\
@@ -207,9 +210,9 @@ def test_a_qbfs_asphere_on_a_conic_focuses_all_zones(tmp_path: Path) -> None:
     assert lens.reference_nm == 405.0
     assert first_order(lens).efl_mm == pytest.approx(40.0, rel=0.01)
     s, n = lens.surfaces[0], catalogue.find("fused silica").index(405.0)
-    terms = {p: float(a) for p, a in s.asphere}
+    terms = {p: float(a) for p, a in s.figure.powers}
     for h in (1.0, 6.0, 12.0, 18.0, 22.8):
-        root = math.sqrt(1 - (1 + s.conic) * (h / s.radius_mm) ** 2)
+        root = math.sqrt(1 - (1 + s.figure.conic) * (h / s.radius_mm) ** 2)
         z = h * h / s.radius_mm / (1 + root) + sum(a * h**p for p, a in terms.items())
         slope = math.atan(h / s.radius_mm / root + sum(p * a * h ** (p - 1) for p, a in terms.items()))
         u = slope - math.asin(math.sin(slope) / n)  # a ray parallel to the axis, refracted towards it
@@ -222,7 +225,7 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
     front = 'TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""'
     text = swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75\n  PARM 2 1").replace("GLAS N-BK7", "COMM N-BK7")
     lens = read(text.replace("CURV -2.0E-2", "CURV 0.0"), tmp_path)
-    assert lens.surfaces[0].focal_mm == 75 and first_order(lens).efl_mm == pytest.approx(75, rel=1e-14)
+    assert lens.surfaces[0].figure == Ideal(focal_mm=75) and first_order(lens).efl_mm == pytest.approx(75, rel=1e-14)
     with pytest.raises(InputError, match="surface 1 of the file, focal_mm: got 75.0, expected air on both sides"):
         read(swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75"), tmp_path)
 

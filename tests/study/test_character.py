@@ -18,6 +18,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.cli import lens as lens_list
 from neurolens.cli import main
+from neurolens.lens.figures import Ideal
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.any_format import lens_files, read_any
 from neurolens.study import describe as char
@@ -28,7 +29,7 @@ ALIKE = 1e-4  # of two samplings of a pupil's outline
 
 
 def ideal(*front: Surface) -> Lens:
-    stop = Surface(math.inf, FOCAL_MM, 2 * RADIUS_MM, stop=True, focal_mm=FOCAL_MM)
+    stop = Surface(math.inf, FOCAL_MM, 2 * RADIUS_MM, stop=True, figure=Ideal(focal_mm=FOCAL_MM))
     return Lens("ideal", "", (*front, stop), FOCAL_MM / (2 * RADIUS_MM), half_field_deg=FIELD_DEG)
 
 
@@ -182,7 +183,7 @@ def test_no_image_no_character() -> None:
     with pytest.raises(InputError):
         char.character(flat)
     assert char.character_or_none(flat) == (None, None)
-    spread = Lens("diverging", "", (Surface(math.inf, 50.0, 10.0, stop=True, focal_mm=-50.0),), 5.0)
+    spread = Lens("diverging", "", (Surface(math.inf, 50.0, 10.0, stop=True, figure=Ideal(focal_mm=-50.0)),), 5.0)
     assert char.character_or_none(spread) == (None, None)
 
 

@@ -14,6 +14,7 @@ from lens_models import LENSES, prepared
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.lens.figures import Cylinder, Figure, Qcon
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Surface
 from neurolens.readers.lensfile import read_lens
@@ -90,7 +91,8 @@ FRONTS = {
     "sphere": Surface(60.0, 2.0, 70.0, 1.6, 50.0),
     "concave": Surface(-80.0, 2.0, 60.0, 1.8, 30.0),
     "plane": Surface(math.inf, 2.0, 40.0, 1.5, 60.0),
-    "asphere": Surface(50.0, 2.0, 60.0, 1.7, 40.0, conic=-0.6, asphere=((4, 2e-6), (6, -1e-10))),
+    "asphere": Surface(50.0, 2.0, 60.0, 1.7, 40.0, figure=Figure(conic=-0.6, asphere=((4, 2e-6), (6, -1e-10)))),
+    "Qcon": Surface(50.0, 2.0, 60.0, 1.7, 40.0, figure=Qcon(qcon=(0.5, -0.1, 0.02), norm_mm=30.0)),
 }
 
 
@@ -121,9 +123,9 @@ def test_leaving_the_front_glass_is_snells_law(name: str) -> None:
 def test_fronts_that_no_series_tells_are_left_alone() -> None:
     sphere = FRONTS["sphere"]
     for other in (
-        replace(sphere, cylinder="x"),
+        replace(sphere, figure=Cylinder(cylinder="x")),
         replace(sphere, n_d=1.0, V_d=None),
-        replace(sphere, asphere=((3, 1e-3),)),
+        replace(sphere, figure=replace(sphere.figure, asphere=((3, 1e-3),))),
     ):
         assert tilt_series(other) is None
     assert tilt_series(sphere) is not None

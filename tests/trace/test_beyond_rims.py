@@ -7,6 +7,7 @@ import pytest
 import torch
 from shipped import SOME, tabled
 
+from neurolens.lens.figures import Cylinder, Figure, Toroid
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
@@ -18,7 +19,7 @@ from neurolens.trace.surfaces import Rays
 INF = math.inf
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"  # four aspheres up to r^20
 # A term in r^20 that is 0.1 mm at the rim of 5 mm, and 330 mm at 1.5 times the rim.
-STEEP = Surface(40.0, 4.0, 10.0, 1.5, asphere=((4, 1e-5), (20, 0.1 / 5.0**20)))
+STEEP = Surface(40.0, 4.0, 10.0, 1.5, figure=Figure(asphere=((4, 1e-5), (20, 0.1 / 5.0**20))))
 
 
 def curve(surface: Surface, height: torch.Tensor) -> torch.Tensor:
@@ -35,9 +36,11 @@ def curve(surface: Surface, height: torch.Tensor) -> torch.Tensor:
     "surface",
     [
         STEEP,
-        Surface(-8.0, 4.0, 14.0, 1.5, conic=0.2, asphere=((3, 1e-4), (6, 1e-7))),  # its conic ends at 7.3 mm
-        Surface(INF, 4.0, 10.0, 1.5, asphere=((4, 1e-4),), cylinder="y"),
-        Surface(40.0, 4.0, 10.0, 1.5, asphere=((12, 1e-10),), cylinder="y", across=(60.0, None)),
+        Surface(
+            -8.0, 4.0, 14.0, 1.5, figure=Figure(conic=0.2, asphere=((3, 1e-4), (6, 1e-7)))
+        ),  # its conic ends at 7.3 mm
+        Surface(INF, 4.0, 10.0, 1.5, figure=Cylinder(asphere=((4, 1e-4),), cylinder="y")),
+        Surface(40.0, 4.0, 10.0, 1.5, figure=Toroid(asphere=((12, 1e-10),), cylinder="y", across_mm=60.0)),
     ],
 )
 def test_aspheres_continue_with_slope_and_curvature_and_become_cones(surface: Surface) -> None:
@@ -50,7 +53,7 @@ def test_aspheres_continue_with_slope_and_curvature_and_become_cones(surface: Su
     # No step in slope or curvature: third derivatives times the steps between them are all that is left.
     assert float(slope.diff().abs().max()) < 1.5 * step * float(bend.abs().max())
     assert float(bend.diff().abs().max()) < 0.1 * float(bend.abs().max()) + 1e-4
-    if surface.across is None:
+    if surface.figure.across is None:
         far = curve(surface, torch.tensor([10.0, 10.1, 20.0, 20.1], dtype=torch.float64) * rim)
         slopes = (far[1] - far[0], far[3] - far[2])
         assert float(slopes[0]) == pytest.approx(float(slopes[1]), rel=1e-6)
@@ -59,7 +62,7 @@ def test_aspheres_continue_with_slope_and_curvature_and_become_cones(surface: Su
 
 
 def test_a_rim_where_the_conic_ends() -> None:
-    surface = Surface(-5.0, 4.0, 10.0, 1.5, asphere=((4, 1e-5),))
+    surface = Surface(-5.0, 4.0, 10.0, 1.5, figure=Figure(asphere=((4, 1e-5),)))
     height = 5 * torch.tensor([0.0, 0.5, 0.9, 0.999], dtype=torch.float64)
     lens = Lens("", "", (surface, Surface(INF, 50.0, 1e3, stop=True)), 4.0)
     zero = torch.zeros_like(height)

@@ -64,7 +64,7 @@ def test_etendue_on_the_front_of_a_fisheye(name: str) -> None:
     """
     lens = focused(name)
     front = lens.surfaces[0]
-    assert not front.asphere and not front.conic
+    assert not front.figure.asphere and not front.figure.conic
     leaves, out = film_to_scene(lens, 1500, film=1.3)
     d = torch.stack(out[3:]).detach()
     u = torch.linalg.cross(d.T, torch.tensor([[0.6, -0.8, 0.0]]).double().expand(len(out.x), 3))
@@ -84,7 +84,7 @@ def test_etendue_into_glass_counts_the_index(name: str) -> None:
     """Between a plane in the scene and one in the glass after a surface: coordinates n dx, n dy."""
     table = focused(name)
     inside = [k for k, s in enumerate(table.surfaces) if float(s.n_d) != 1 or s.glass]
-    for k in (inside[0], inside[-1], *(k for k in inside if table.surfaces[k].asphere)):
+    for k in (inside[0], inside[-1], *(k for k in inside if table.surfaces[k].figure.asphere)):
         cut = replace(table, surfaces=(*table.surfaces[:k], replace(table.surfaces[k], thickness_mm=5.0)))
         start = from_scene(cut, 200, generator(), slope=0.1, wide=0.5)
         passed = trace(cut, start, towards="film").status == st.PASSED

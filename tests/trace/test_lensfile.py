@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from shipped import PATHS, SOME
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.lens.figures import Cylinder, Figure, figure_of
 from neurolens.lens.prescription import Coating, Configuration, Lens, Surface
 from neurolens.readers.lensfile import format_lens, read_lens, write_lens
 from neurolens.trace.shapes import sag_mm
@@ -264,8 +265,8 @@ def test_a_focused_lens_keeps_its_film(tmp_path: Path) -> None:
 
 def test_every_kind_of_surface_comes_back(tmp_path: Path) -> None:
     film = Coating("mine", ((1.38, 99.6), (2.1, 12.5, 22.0)))
-    asphere = replace(PLATE, radius_mm=40.0, conic=-1.5, asphere=((3, -1e-5), (4, 1e-7)), coating=film)
-    cylinder = replace(PLATE, radius_mm=-80.0, cylinder="x", conic=0.25)
+    asphere = replace(PLATE, radius_mm=40.0, figure=Figure(conic=-1.5, asphere=((3, -1e-5), (4, 1e-7))), coating=film)
+    cylinder = replace(PLATE, radius_mm=-80.0, figure=Cylinder(cylinder="x", conic=0.25))
     grey = replace(PLATE, absorption_per_mm=0.23)
     back = Surface(math.inf, 40.0, 9.0, stop=True)
     focus = Configuration("near", None, ((0, 2.5),), f_number=2.9, stop_diameter_mm=8.5, object_distance_mm=750.0)
@@ -289,12 +290,27 @@ def test_a_design_on_two_glasses_comes_back(tmp_path: Path, name: str) -> None:
     assert sum(s.coating is not None for s in lens.surfaces) == 2
 
 
+def test_hashes_of_lens_files_stay() -> None:
+    """Cards of models name the hash of their lens: that of every figure is what it was when figures were six fields."""
+    shapes: list[tuple[float, dict[str, Any]]] = [
+        (30.0, {}),
+        (-30.0, {"conic": 1.2, "asphere": [(3, 1e-4), (4, 1e-5)]}),
+        (25.0, {"conic": -0.7, "cylinder": "y"}),
+        (-18.0, {"cylinder": "x", "conic": -0.6, "asphere": [(2, 1e-3)], "across": (30.0, None)}),
+        (25.0, {"cylinder": "y", "across": (14.0, 0.4)}),
+        (math.inf, {"focal_mm": 40.0}),
+    ]
+    rows = tuple(Surface(radius, 5.0, 20.0, 1.5, figure=figure_of(shape)) for radius, shape in shapes)
+    known = "bb920500f3b2d54865066b2e1159186796a8a30d0ab0c7c7914ac0ef79af60eb"
+    assert Lens("n", "s", rows, 2.0).sha256 == known
+
+
 @pytest.mark.parametrize(
     "change",
     [
-        {"conic": 0.1},
-        {"asphere": ((4, 1e-9),)},
-        {"cylinder": "y"},
+        {"figure": Figure(0.1)},
+        {"figure": Figure(asphere=((4, 1e-9),))},
+        {"figure": Cylinder(cylinder="y")},
         {"absorption_per_mm": 0.01},
         {"coating": Coating("c", ((1.38, 100.0),))},
     ],
@@ -341,7 +357,7 @@ def test_sag_of_a_sphere(radius_mm: float) -> None:
 
 def test_an_asphere_may_not_cross_its_neighbour_between_axis_and_rim(tmp_path: Path) -> None:
     # Its sag h^4 / 100 - h^6 / 1500 is 0 on the axis, 0.33 mm at 3.2 mm, and below 0 again at 4 mm.
-    bump = replace(PLATE, asphere=((4, 1e-2), (6, -1e-2 / 15)), thickness_mm=0.25, diameter_mm=8.0)
+    bump = replace(PLATE, figure=Figure(asphere=((4, 1e-2), (6, -1e-2 / 15))), thickness_mm=0.25, diameter_mm=8.0)
     lens = Lens("n", "s", (bump, replace(AIR, diameter_mm=8.0), replace(AIR, stop=True)), 2.0)
     write_lens(lens, tmp_path / "bump.toml")
     with pytest.raises(InputError, match="overlap"):
@@ -350,7 +366,12 @@ def test_an_asphere_may_not_cross_its_neighbour_between_axis_and_rim(tmp_path: P
 
 def test_a_rim_beyond_the_end_of_a_conic(tmp_path: Path) -> None:
     # The ellipsoid K = 3 of radius 10 mm ends 5 mm from its axis.
-    lens = Lens("n", "s", (replace(PLATE, radius_mm=10.0, conic=3.0, diameter_mm=10.1), replace(AIR, stop=True)), 2.0)
+    lens = Lens(
+        "n",
+        "s",
+        (replace(PLATE, radius_mm=10.0, figure=Figure(conic=3.0), diameter_mm=10.1), replace(AIR, stop=True)),
+        2.0,
+    )
     write_lens(lens, tmp_path / "end.toml")
     with pytest.raises(InputError, match="surface 0, diameter_mm"):
         read_lens(tmp_path / "end.toml")

@@ -16,6 +16,7 @@ from shipped import tabled
 from experiments.extreme_cases import from_film, from_scene, generator
 from experiments.extremes import both_precisions
 from neurolens.base import status as st
+from neurolens.lens.figures import Figure
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
@@ -66,8 +67,7 @@ def constant_index(rows: list[dict[str, Any]]) -> Lens:
             2 * number(r, "sd", "semi_diameter_mm", default=number(r, "diameter_mm", default=0.0) / 2),
             number(r, "n", "n_d", default=1.0),
             stop=r["stop"],
-            conic=number(r, "k", "conic", default=0.0),
-            asphere=asphere(r),
+            figure=Figure(conic=number(r, "k", "conic", default=0.0), asphere=asphere(r)),
         )
         for r in rows
     )

@@ -88,7 +88,7 @@ def test_exact_rays_near_the_axis_meet_in_focus(name: str, focus_m: float) -> No
     f = first_order(lens).efl_mm
     # The angle at the film is small enough that spherical aberration leaves no trace: that of an r^3 only falls with
     # the height, not with its square.
-    cubic = any(power == 3 for s in lens.surfaces for power, _ in s.asphere)
+    cubic = any(power == 3 for s in lens.surfaces for power, _ in s.figure.asphere)
     found, slope = near_axis(lens, lens.film_z_mm, "scene", height=1e-9 if cubic else 1e-5)
     if math.isinf(focus_m):
         assert abs(found) > 1e5 * f

@@ -12,6 +12,7 @@ from shipped import WHOLE, turned
 from experiments.extreme_cases import Case, disc, unit
 from experiments.extremes import measure
 from neurolens.base import status as st
+from neurolens.lens.figures import SPHERE, Cylinder
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.rays import Rays, trace
 from neurolens.trace.shapes import sag_mm
@@ -36,16 +37,16 @@ def surfaces(draw: Any, cylinders: bool = True) -> Surface:
     if kind == "sphere":
         return surface
     if kind == "cylinder":
-        return replace(surface, cylinder=draw(hs.sampled_from(["x", "y"])))
+        return replace(surface, figure=Cylinder(cylinder=draw(hs.sampled_from(["x", "y"]))))
     # 1 - (1 + K) (h / R)^2 stays positive to the rim.
     conic = draw(numbers(-4.0, 0.8 * (ratio * ratio - 1)).filter(lambda k: k < 20)) if ratio > 1.1 else -0.5
-    surface = replace(surface, conic=conic)
+    surface = replace(surface, figure=replace(surface.figure, conic=conic))
     if kind == "conic":
         return surface
     powers = draw(hs.sets(hs.sampled_from([2, 3, 4, 5, 6, 8, 10]), min_size=1, max_size=3))
     share = {2: 0.02, 3: 0.02}
     terms = tuple((p, draw(numbers(-1, 1)) * share.get(p, 0.01) * rim / rim**p) for p in sorted(powers))
-    return replace(surface, asphere=terms)
+    return replace(surface, figure=replace(surface.figure, asphere=terms))
 
 
 @hs.composite
@@ -171,7 +172,7 @@ def test_a_plane_without_glass_changes_nothing(lens: Lens, seed: int) -> None:
     """A wide window of nothing before the lens, and cutting a gap in two, leave every ray as it was."""
     start = bundle(lens, seed, "film")
     window = replace(lens.surfaces[0], radius_mm=math.inf, thickness_mm=1.0, diameter_mm=1e4, n_d=1.0, V_d=None)
-    window = replace(window, conic=0.0, asphere=(), cylinder=None, stop=False)
+    window = replace(window, figure=SPHERE, stop=False)
     longer = replace(lens, surfaces=(window, *lens.surfaces))
     out, other = results(lens, start), results(longer, Rays(*start[:2], start.z + 1.0, *start[3:]))
     same = torch.where(out.status == 0, 0, out.status + 4) == other.status

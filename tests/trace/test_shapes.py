@@ -1,5 +1,6 @@
 """Conics, cylinders and aspheres: perfect foci, known points, equal shapes; the graph of a lens agrees."""
 
+import json
 import math
 from dataclasses import replace
 from typing import Any
@@ -13,10 +14,13 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
 from neurolens.graph.scalars import lower
+from neurolens.lens.figures import figure_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.trace.rays import Rays, Traced, trace
-from neurolens.trace.shapes import sag_mm
+from neurolens.trace.shapes import sag_and_derivatives, sag_mm, traced_curve
+from neurolens.trace.surfaces import AIR, meet, normal_at
+from neurolens.trace.tensors import Tensors
 from neurolens.trace.tracegraph import exact_graph
 
 PRECISIONS = [torch.float64, torch.float32]
@@ -29,7 +33,7 @@ def lens_of(*surfaces: Surface) -> Lens:
 
 
 def surface(radius_mm: float, diameter_mm: float = 20.0, n_d: float = GLASS, **shape: Any) -> Surface:
-    return Surface(radius_mm, 5.0, diameter_mm, n_d, **shape)
+    return Surface(radius_mm, 5.0, diameter_mm, n_d, figure=figure_of(shape))
 
 
 def rays_of(points: Tensor, directions: Tensor) -> Rays:
@@ -85,6 +89,9 @@ SHAPES = {
     "on a plane": surface(math.inf, asphere=((4, 2e-5), (6, -5e-8))),
     "corrector": surface(math.inf, asphere=((2, -0.004), (4, 4e-5))),
     "dome": surface(10.2, conic=-0.1, asphere=((4, 1e-6),)),
+    "ideal": surface(math.inf, n_d=1.0, focal_mm=40.0),
+    "Qcon": surface(30.0, conic=-0.5, qcon=(0.3, -0.1, 0.03, -8e-3, 2e-3, 1e-3), norm_mm=10.0),
+    "Qcon of 20 terms": surface(-60.0, qcon=tuple(1e-3 * (-1) ** m for m in range(20)), norm_mm=11.0),
     "cylinder x": surface(25.0, cylinder="x"),
     "cylinder y": surface(-25.0, cylinder="y", conic=-0.7),
     "acylinder": surface(25.0, cylinder="y", asphere=((4, 3e-5),)),
@@ -143,6 +150,77 @@ def test_a_deep_asphere_lets_in_light_from_110_degrees() -> None:
     out = first_point(lens_of(dome), rays)
     assert (out.status != st.blocked(0, st.MISSED)).all()
     assert (torch.stack(out.path[0][:3], 1) - points).abs().max() < 1e-12
+
+
+def definition(s: Surface, mp: Any) -> Any:
+    """The sag of a surface at (x, y) from the definition of its figure, in the digits of `mp`."""
+    data, c = s.figure.record(), mp.mpf(1) / mp.mpf(s.radius_mm) if math.isfinite(s.radius_mm) else mp.mpf(0)
+
+    def conic(c: Any, k: Any, h: Any) -> Any:
+        return c * h * h / (1 + mp.sqrt(1 - (1 + mp.mpf(k)) * (c * h) ** 2))
+
+    def curve(h: Any) -> Any:
+        u = h / data.get("norm_mm", 1)
+        strong = u**4 * sum(mp.mpf(a) * mp.jacobi(m, 0, 4, 2 * u * u - 1) for m, a in enumerate(data.get("qcon", ())))
+        powers = sum(mp.mpf(a) * h**p for p, a in data.get("asphere", ()))
+        return conic(c, data.get("conic", 0.0), h) + powers + strong
+
+    def sag(x: Any, y: Any) -> Any:
+        if "cylinder" not in data:
+            return curve(mp.sqrt(x * x + y * y))
+        h, a = (abs(x), y) if data["cylinder"] == "x" else (abs(y), x)
+        if "across" not in data:
+            return curve(h)
+        radius, k = data["across"]
+        if k is None:  # a circle about a point of the line, through the curve
+            way = mp.mpf(radius) - curve(h)
+            return radius - mp.sign(way) * mp.sqrt(way * way - a * a)
+        ca, kh = 1 / mp.mpf(radius), data.get("conic", 0.0)
+        root = mp.sqrt(1 - (1 + mp.mpf(kh)) * (c * h) ** 2 - (1 + mp.mpf(k)) * (ca * a) ** 2)
+        return (c * h * h + ca * a * a) / (1 + root)
+
+    return sag
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_sag_slope_and_normal_in_50_digits(name: str) -> None:
+    mp = pytest.importorskip("mpmath").mp.clone()
+    mp.dps = 50
+    s, places = SHAPES[name], [(0.0, 0.3), (2.0, -1.0), (-5.0, 4.0), (3.0, 8.0), (-9.0, -2.5)]
+    sag, (x, y) = definition(s, mp), np.array(places).T
+    exact = np.array(
+        [[float(sag(*at)), *(float(mp.diff(sag, at, n)) for n in ((1, 0), (0, 1)))]
+         for at in ((mp.mpf(a), mp.mpf(b)) for a, b in places)]
+    ).T  # fmt: skip
+    assert np.abs(np.stack(sag_and_derivatives(s, x, y)) - exact).max() < 1e-13
+    rays = Rays(*(torch.from_numpy(v) for v in (x, y, 0 * x - 1, 0 * x, 0 * x, 0 * x + 1)))
+    o = Tensors(False, torch.float64)
+    met = meet(o, rays, traced_curve(s), 1, AIR)
+    found = torch.stack(normal_at(o, met, s.curvature)).numpy()
+    normal = np.stack([-exact[1], -exact[2], 0 * x + 1])
+    assert np.abs(met.z.numpy() - exact[0]).max() < 1e-13
+    assert np.abs(found - normal / np.linalg.norm(normal, axis=0)).max() < 1e-13
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_figure_scales_and_comes_back_from_its_numbers(name: str) -> None:
+    s, (x, y) = SHAPES[name], np.array([[0.5, 4.0, -6.0], [-0.2, 5.0, 7.0]])
+    assert figure_of(s.figure.record()) == s.figure and figure_of(json.loads(json.dumps(s.figure.record()))) == s.figure
+    twice = replace(s, radius_mm=2 * s.radius_mm, diameter_mm=2 * s.diameter_mm, figure=s.figure.scaled(2.0))
+    np.testing.assert_allclose(sag_mm(twice, 2 * x, 2 * y), 2 * sag_mm(s, x, y), rtol=0, atol=1e-13)
+    assert s.figure.bounds(s.semi_diameter_mm) and all(low <= v <= high for _, v, low, high, _ in s.figure.bounds(10.0))
+
+
+@pytest.mark.parametrize("name", [n for n in SHAPES if not SHAPES[n].figure.axis])
+def test_seidel_terms_are_those_of_the_series(name: str) -> None:
+    mp = pytest.importorskip("mpmath").mp.clone()
+    mp.dps = 50
+    s = SHAPES[name]
+    series = mp.taylor(lambda h: definition(s, mp)(mp.mpf(0), h), mp.mpf(0), 4, direction=1)
+    c, k = float(s.curvature), float(s.figure.conic)
+    assert float(s.vertex_curvature("y")) == pytest.approx(float(2 * series[2]), rel=1e-14, abs=1e-30)
+    fourth = (1 + k) * c**3 / 8 + dict(s.figure.powers).get(4, 0.0)
+    assert fourth == pytest.approx(float(series[4]), rel=1e-10, abs=1e-20)
 
 
 @pytest.mark.parametrize("s", [surface(math.inf, asphere=((4, 0.0),)), surface(1e15, conic=1.0, asphere=((2, 0.0),))])
@@ -246,13 +324,15 @@ BEFORE_FILM: dict[str, tuple[float, dict[str, Any]]] = {
     "toroid": (13.0, {"cylinder": "y", "across": (-30.0, None)}),
     "aspheric toroid": (-16.0, {"cylinder": "x", "conic": -1.2, "asphere": ((4, 2e-5),), "across": (14.0, None)}),
     "biconic": (14.0, {"cylinder": "x", "conic": -1.2, "across": (12.0, 0.2)}),
-    "ideal": (math.inf, {"n_d": 1.0, "V_d": None, "focal_mm": -30.0}),
+    "Qcon": (20.0, {"conic": -1.2, "qcon": (-0.3, 0.05, -0.02, 4e-3), "norm_mm": 9.0}),
+    "ideal": (math.inf, {"focal_mm": -30.0}),
 }
 
 
 def lens_before_film(radius_mm: float, shape: dict[str, Any]) -> Lens:
     """A plane stop, a plane into glass, and the surface, as light comes from the film; the rim at 10 mm."""
-    front = Surface(radius_mm, 9.0, 20.0, **{"n_d": 1.6, "V_d": 40.0} | shape)
+    glass: dict[str, Any] = {} if "focal_mm" in shape else {"n_d": 1.6, "V_d": 40.0}
+    front = Surface(radius_mm, 9.0, 20.0, figure=figure_of(shape), **glass)
     return Lens("one", "", (front, Surface(math.inf, 3.0, 40.0), Surface(math.inf, 30.0, 30.0, stop=True)), 2.0)
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from shipped import NAMES, SOME, tabled, whole
 
+from neurolens.lens.figures import SPHERE, Figure
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.check import (
@@ -181,7 +182,7 @@ def test_mistakes_that_circulated_are_found() -> None:
     rows[6] = replace(rows[6], n_d=1.576, V_d=42.5)
     assert "the focal length is 86" in said(replace(swapped, surfaces=tuple(rows)))
     # A dropped asphere: here the power goes with it.
-    assert "the focal length is" in said(changed("canon_aspheric_50", 4, asphere=()))
+    assert "the focal length is" in said(changed("canon_aspheric_50", 4, figure=SPHERE))
     # Semi-diameters in the column of diameters.
     lens = tabled("laikin_double_gauss_50")
     half = replace(
@@ -218,7 +219,7 @@ def test_states_are_checked_too() -> None:
 def test_axial_beam_and_blur_of_a_parabolic_front() -> None:
     """An ellipsoid of eccentricity 1/n focuses a parallel beam in its glass without aberration (Descartes)."""
     n = 1.5
-    rows = (Surface(20.0, 60.0 + 1e-9, 24.0, n, conic=-1 / n**2, stop=True), Surface(INF, 1e-9, 24.0))
+    rows = (Surface(20.0, 60.0 + 1e-9, 24.0, n, figure=Figure(conic=-1 / n**2), stop=True), Surface(INF, 1e-9, 24.0))
     lens = Lens("ellipsoid", "", rows, 2.0)
     assert axial_blur_mm(lens) < 1e-9  # the focus lies n R / (n - 1) = 60 mm behind the vertex
     assert axial_beam(lens) == (pytest.approx(12.0), None)

@@ -18,6 +18,7 @@ from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.exact import ExactCamera
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.loworder import with_film_derivatives
+from neurolens.lens.figures import Figure
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
@@ -129,8 +130,11 @@ def test_camera_rays_that_start_away_from_the_lens_are_lost() -> None:
 
 def with_parameters(values: Tensor) -> Lens:
     """A doublet with radius, thickness and index of its first element, conic and terms behind it, from a tensor [6]."""
-    shape = {"conic": values[3], "asphere": ((4, 1e-5 * values[4]), (6, 1e-8 * values[5]))}
-    first = Surface(values[0], values[1], 22, values[2], V_d=60.0), Surface(-45.0, 2.0, 22, 1.65, V_d=35.0, **shape)
+    figure = Figure(values[3], ((4, 1e-5 * values[4]), (6, 1e-8 * values[5])))
+    first = (
+        Surface(values[0], values[1], 22, values[2], V_d=60.0),
+        Surface(-45.0, 2.0, 22, 1.65, V_d=35.0, figure=figure),
+    )
     return Lens("doublet", "", (*first, Surface(-200.0, 3.0, 22), Surface(math.inf, 50.0, 14, stop=True)), 4.0)
 
 
@@ -197,7 +201,7 @@ def test_no_nan_gradient_where_most_rays_are_lost(towards: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "shape", [{}, {"radius_mm": math.inf}, {"conic": -0.4}, {"conic": -0.4, "asphere": ((4, -2e-5), (6, 1e-8))}]
+    "shape", [{}, {"radius_mm": math.inf}, {"figure": Figure(-0.4)}, {"figure": Figure(-0.4, ((4, -2e-5), (6, 1e-8)))}]
 )
 def test_a_ray_that_runs_backwards_spoils_no_gradient(shape: dict[str, Any]) -> None:
     """At the first surface its cosine of incidence is below 0, for which Fresnel's shares are 0 / 0 on the axis."""
@@ -240,7 +244,7 @@ def test_a_plane_given_as_a_tensor_has_a_gradient() -> None:
 
 
 def asphere() -> Lens:
-    front = Surface(30.0, 6.0, 24.0, 1.6, conic=-0.6, asphere=((4, -1e-5), (6, 2e-8)))
+    front = Surface(30.0, 6.0, 24.0, 1.6, figure=Figure(conic=-0.6, asphere=((4, -1e-5), (6, 2e-8))))
     return Lens("asphere", "", (front, Surface(-80.0, 2.0, 24.0), Surface(math.inf, 40.0, 16.0, stop=True)), 2.0)
 
 

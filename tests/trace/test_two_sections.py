@@ -18,6 +18,7 @@ from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.lens.figures import Biconic, Cylinder, Figure, Ideal, Qcon, Toroid, figure_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens, write_lens
@@ -34,7 +35,7 @@ BICONIC: dict[str, Any] = {"cylinder": "x", "conic": -0.7, "across": (34.0, 0.6)
 
 def singlet(radius_mm: float, **shape: Any) -> Lens:
     """One curved surface, a plane back and a stop behind, too wide to clip."""
-    front = Surface(radius_mm, 6.0, 24.0, GLASS, **shape)
+    front = Surface(radius_mm, 6.0, 24.0, GLASS, figure=figure_of(shape))
     return Lens("one", "", (front, Surface(math.inf, 1.0, 60.0), Surface(math.inf, 40.0, 60.0, stop=True)), 2.0)
 
 
@@ -60,12 +61,12 @@ def test_equal_sections_are_a_surface_of_revolution(axis: str, conic: float, oth
 
 def test_sections_have_their_closed_forms() -> None:
     h = np.linspace(-11, 11, 23)
-    curve = {"radius_mm": -19.0, "conic": -0.8, "asphere": ((2, 1e-3), (4, 3e-5), (5, 1e-7))}
-    toroid = Surface(thickness_mm=1.0, diameter_mm=24.0, cylinder="x", across=(34.0, None), **curve)
-    own = Surface(thickness_mm=1.0, diameter_mm=24.0, **curve)
+    curve: dict[str, Any] = {"conic": -0.8, "asphere": ((2, 1e-3), (4, 3e-5), (5, 1e-7))}
+    toroid = Surface(-19.0, 1.0, 24.0, figure=Toroid(cylinder="x", across_mm=34.0, **curve))
+    own = Surface(-19.0, 1.0, 24.0, figure=Figure(**curve))
     assert np.allclose(sag_mm(toroid, h, 0 * h), sag_mm(own, h, 0 * h), rtol=0, atol=1e-15)
     assert np.allclose(sag_mm(toroid, 0 * h, h), 34 - np.sqrt(34**2 - h * h), rtol=0, atol=1e-14)
-    biconic = Surface(25.0, 1.0, 24.0, **BICONIC)
+    biconic = Surface(25.0, 1.0, 24.0, figure=figure_of(BICONIC))
     for x, y, radius, conic in ((h, 0 * h, 25.0, -0.7), (0 * h, h, 34.0, 0.6)):
         wanted = h * h / radius / (1 + np.sqrt(1 - (1 + conic) * (h / radius) ** 2))
         assert np.allclose(sag_mm(biconic, x, y), wanted, rtol=0, atol=1e-15)
@@ -153,7 +154,7 @@ FOCAL = 50.0
 
 
 def ideal(focal_mm: float = FOCAL) -> Lens:
-    return Lens("ideal", "", (Surface(math.inf, 70.0, 40.0, stop=True, focal_mm=focal_mm),), 2.0)
+    return Lens("ideal", "", (Surface(math.inf, 70.0, 40.0, stop=True, figure=Ideal(focal_mm=focal_mm)),), 2.0)
 
 
 def cone(point: Tensor, dtype: torch.dtype) -> Rays:
@@ -199,8 +200,8 @@ def test_an_ideal_lens_is_reversible_and_keeps_areas_of_height_and_slope() -> No
 
 
 def test_ideal_lenses_add_up_to_first_order() -> None:
-    first = Surface(math.inf, 20.0, 30.0, focal_mm=80.0)
-    pair = Lens("two", "", (first, Surface(math.inf, 40.0, 30.0, stop=True, focal_mm=-120.0)), 4.0)
+    first = Surface(math.inf, 20.0, 30.0, figure=Ideal(focal_mm=80.0))
+    pair = Lens("two", "", (first, Surface(math.inf, 40.0, 30.0, stop=True, figure=Ideal(focal_mm=-120.0))), 4.0)
     data = first_order(pair)
     assert 1 / data.efl_mm == pytest.approx(1 / 80 - 1 / 120 + 20 / (80 * 120), rel=1e-14)
     assert data.back_focus_mm == pytest.approx(data.efl_mm * (1 - 20 / 80), rel=1e-14)
@@ -219,10 +220,23 @@ def test_what_an_ideal_lens_has_not_is_refused_by_name() -> None:
         seidel(Scene(lens))
 
 
+@pytest.mark.parametrize("qcon", [(0.1, -0.02), (1e-3,) * 20])
+def test_a_front_of_forbes_in_a_model(qcon: tuple[float, ...]) -> None:
+    front = Surface(-25.0, 6.0, 24.0, GLASS, figure=Qcon(qcon=qcon, norm_mm=12.0))
+    h = np.linspace(-12, 12, 97)
+    wanted = sag_mm(front, 0.6 * h, 0.8 * h)
+    for form, tolerance in ((Form(sag_terms=0), 1e-13), (Form(), 2e-6)):
+        g = Graph()
+        g.outputs["z"] = sag(g.input("xy", 2), front, form)
+        found = evaluate(g, {"xy": torch.from_numpy(np.stack([0.6 * h, 0.8 * h]))})["z"]
+        assert np.abs(found.numpy() - wanted).max() < tolerance
+
+
 ROWS = {
     "toroid": 'cylinder = "y", across_mm = 40.0, conic = -1.0, asphere = { 4 = 1e-6 }, n_d = 1.6',
     "biconic": 'cylinder = "x", across_mm = -40.0, across_conic = 0.5, n_d = 1.6',
     "ideal": "focal_mm = 60.0",
+    "Qcon": "conic = -0.5, qcon = [0.06, -0.02, 4e-3], norm_mm = 9.0, n_d = 1.6",
 }
 FILE = """schema = 1
 name = "one"
@@ -250,7 +264,13 @@ def test_lens_files_hold_them(name: str, tmp_path: Path) -> None:
     again = tmp_path / "again.toml"
     write_lens(lens, again)
     assert read_lens(again).surfaces == lens.surfaces
-    assert lens.surfaces[0].across == {"toroid": (40.0, None), "biconic": (-40.0, 0.5), "ideal": None}[name]
+    wanted = {
+        "toroid": Toroid(-1.0, ((4, 1e-6),), cylinder="y", across_mm=40.0),
+        "biconic": Biconic(cylinder="x", across_mm=-40.0, across_conic=0.5),
+        "ideal": Ideal(focal_mm=60.0),
+        "Qcon": Qcon(-0.5, qcon=(0.06, -0.02, 4e-3), norm_mm=9.0),
+    }
+    assert lens.surfaces[0].figure == wanted[name] and read_lens(again).sha256 == lens.sha256
     assert lens.ideal == ([0] if name == "ideal" else [])
 
 
@@ -265,6 +285,14 @@ def test_lens_files_hold_them(name: str, tmp_path: Path) -> None:
         ("focal_mm = 0.0", "focal_mm: got 0.0, expected a focal length other than 0"),
         ("focal_mm = 60.0, n_d = 1.5", "focal_mm: got 60.0, expected air on both sides of an ideal lens"),
         ("focal_mm = 60.0, conic = 1.0", "conic: got 1.0, expected a plane in air"),
+        ("qcon = 3, norm_mm = 9", "qcon: got 3, expected 1 to 20 coefficients"),
+        (f"qcon = {[1e-9] * 21}, norm_mm = 9", "qcon: got .*, expected 1 to 20 coefficients"),
+        ("qcon = [1e-3]", r"norm_mm: got \(missing\), expected a finite number above 0 in mm"),
+        ("qcon = [1e-3, true], norm_mm = 9", r"qcon\[1\]: got True, expected a finite number"),
+        ("qcon = [1e-3], norm_mm = 9, asphere = { 4 = 1e-6 }", "asphere: got .*, expected none beside qcon"),
+        ('qcon = [1e-3], norm_mm = 9, cylinder = "x"', "cylinder: got 'x', expected none beside qcon"),
+        ("qcon = [1e-3], norm_mm = 4", "norm_mm: got 2.5, expected a size from 0 to 2: rim radius over it"),
+        ("norm_mm = 4", "norm_mm: got 4, expected qcon beside it"),
     ],
 )
 def test_bad_rows_are_named(row: str, message: str, tmp_path: Path) -> None:
@@ -274,4 +302,4 @@ def test_bad_rows_are_named(row: str, message: str, tmp_path: Path) -> None:
 
 def test_an_infinite_radius_across_leaves_a_cylinder(tmp_path: Path) -> None:
     lens = read_lens(lens_file(tmp_path, 'cylinder = "x", across_mm = inf, across_conic = 2.0'))
-    assert lens.surfaces[0] == Surface(50.0, 4.0, 20.0, cylinder="x")
+    assert lens.surfaces[0] == Surface(50.0, 4.0, 20.0, figure=Cylinder(cylinder="x"))

@@ -22,6 +22,7 @@ from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.shading import urgent
+from neurolens.lens.figures import Figure
 from neurolens.lens.prescription import VISIBLE_NM, Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
@@ -271,9 +272,8 @@ def test_bad_input_is_one_line_and_no_page(
 
 def test_a_paraboloid_has_a_path() -> None:
     """The cosine of its slope holds no distance until the asphere's terms come: a constant, which no graph carries."""
-    rows = (
-        Surface(30.0, 5.0, 16.0, 1.5, 60.0, conic=-1.0, asphere=((4, 1e-7),), stop=True), Surface(-200.0, 55.0, 16.0)
-    )  # fmt: skip
+    figure = Figure(conic=-1.0, asphere=((4, 1e-7),))
+    rows = (Surface(30.0, 5.0, 16.0, 1.5, 60.0, figure=figure, stop=True), Surface(-200.0, 55.0, 16.0))
     lens = set_lens(Lens("paraboloid", "", rows, 4.0, half_field_deg=5.0))
     text, outputs = pages.path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM)
     assert "lens_path" in text and len(outputs) > 4

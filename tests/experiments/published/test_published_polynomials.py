@@ -18,6 +18,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate, monomials
 from neurolens.graph.ir import Graph
+from neurolens.lens.figures import Figure
 from neurolens.lens.glass import LINE_D_NM
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.model import Encoding
@@ -99,11 +100,11 @@ ASPHERIC = Lens(
     "aspheric",
     "made up",
     (
-        Surface(21.0, 5.0, 24.0, 1.62, conic=-0.8, asphere=((4, 2e-6), (6, 1e-9))),
+        Surface(21.0, 5.0, 24.0, 1.62, figure=Figure(conic=-0.8, asphere=((4, 2e-6), (6, 1e-9)))),
         Surface(-160.0, 3.0, 22.0),
         Surface(math.inf, 4.0, 10.0, stop=True),
         Surface(-30.0, 2.0, 16.0, 1.7),
-        Surface(55.0, 40.0, 18.0, conic=2.0),
+        Surface(55.0, 40.0, 18.0, figure=Figure(conic=2.0)),
     ),
     f_number=2.8,
 )
@@ -221,7 +222,7 @@ def test_symmetry_is_exact() -> None:
 
 
 def test_odd_aspheres_are_refused() -> None:
-    surface = replace(ASPHERIC.surfaces[0], asphere=((3, 1e-5),))
+    surface = replace(ASPHERIC.surfaces[0], figure=replace(ASPHERIC.surfaces[0].figure, asphere=((3, 1e-5),)))
     lens = replace(ASPHERIC, surfaces=(surface, *ASPHERIC.surfaces[1:]))
     with pytest.raises(InputError, match="Taylor"):
         expand(lens, encoding_of(lens), LINE_D_NM, 3)
