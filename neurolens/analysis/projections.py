@@ -324,6 +324,7 @@ class RayTable:
         """The table of this shape with the least squares of distances from rays [N, 6] of pixels, by weights [N]."""
         height, width = self.grid.shape[:2]
         rows = NdBSpline.design_matrix(self._place(pixel), self._knots, 3)
+        rows.resize(len(pixel), height * width)  # it ends with the last value that is used
         weighed = rows.multiply(weight[:, None]).T.tocsc()
         normal = weighed @ rows
         bend = [diags([1.0, -2.0, 1.0], [0, 1, 2], (n - 2, n)) for n in (height, width)]
