@@ -61,7 +61,7 @@ def table_of(
     ("name", "film", "focus_m", "near_m", "f_number", "degrees", "central_px"),
     [
         ("isshiki_fisheye_10", (18.0, 18.0), 1.0, 0.3, 90.0, np.linspace(4, 50, 12), 10),
-        ("nikon_zoom_14_24", (36.0, 24.0), math.inf, 0.3, 22.0, np.linspace(3, 38, 12), 5),
+        ("nikon_zoom_14_24", (36.0, 24.0), math.inf, 0.3, 22.0, np.linspace(3, 38, 12), 1),
         ("nikon_af_s_nikkor_800mm_f5_6e_fl_ed_vr", (36.0, 24.0), math.inf, 6.0, 90.0, np.linspace(0.1, 0.8, 12), 0),
     ],
     ids=["fisheye", "wide", "telephoto"],
