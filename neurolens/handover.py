@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.analysis import projections
@@ -25,8 +26,19 @@ from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
 from neurolens.base.records import plain
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.field import DIM, Array, Complex, Field, spectrum_of, traced_light
-from neurolens.render.stmap import Plates, blocks
+from neurolens.cameras.field import (
+    DIM,
+    Array,
+    Complex,
+    Field,
+    centroids_m,
+    diagonal_points,
+    film_points,
+    lit_points,
+    spectrum_of,
+    traced_light,
+)
+from neurolens.render.stmap import Plates, blocks, in_pixels
 
 FAR_M = 1e6  # stands for infinity where a program takes no other number
 LENSFUN_TYPES = {"equidistant": "fisheye"}  # other names are ours
@@ -40,9 +52,13 @@ _LEAST = 1e-5  # singular value over the largest: below it coefficients grow unt
 SIDE = 2049  # of NVIDIA's exit picture
 _NEAR = 1.0  # pictures beyond the edge, so that what is read between pixels is right up to it
 _TRIED = 3  # each of so many is tried
-_FITTED, _HELD_OUT = (61, 41), (50, 34)  # points over the film
+_HELD_OUT = 50, 34  # points over the film, to which nothing is fitted
 _ALONG = 2049  # from its centre to its corner
 _BESIDE_PX = 2.0  # about where a ratio is sharpest
+OPENCV = [1, -1, 1]  # from x right, y up, z towards the scene
+CENTRAL_PX = 0.5  # if one centre leaves more anywhere, the rays of all pixels are written, too
+_CELLS, _TABLE_PX = (12, 24, 48), 0.01  # of a table's longer side; what it may leave
+_LIT = 161, 121  # points over the film, where the lit part of the picture is looked for
 AtStop = Callable[[float | None], Camera]
 Report = Callable[[float], None]
 
@@ -123,18 +139,6 @@ def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
     scale = powers.max(0)
     found = np.linalg.lstsq(powers / scale, light[lit] - 1, rcond=None)[0] / scale
     return tuple(found.tolist()), float(np.abs(powers @ found + 1 - light[lit]).max())
-
-
-def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
-    """Points from the axis, without it, to the film's corner, or where the light ends, mm."""
-    return np.linspace(0, min(field.end_mm, math.hypot(*film_mm) / 2), count)[1:].astype(np.complex128)
-
-
-def lit_points(field: Field, film_mm: tuple[float, float], count: tuple[int, int] = _FITTED) -> Complex:
-    """Points spread over a film that light reaches, mm."""
-    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, n) * side for n, side in zip(count, film_mm, strict=True)))
-    points = np.asarray(x + 1j * y, np.complex128).reshape(-1)
-    return points[field.lit(points)]
 
 
 # The two lookup pictures of NVIDIA's schema OmniLensDistortionLutAPI, by which a USD camera has a lens's projection.
@@ -358,7 +362,7 @@ def fitted_projection(
     ring = fitted.sharp_rad[:, None] + _BESIDE_PX / fitted.focal_px[0] * np.linspace(-1, 1, 33)
     ring = ring[(ring > 0) & (ring < fitted.widest_rad)]
     beside = field.point(np.stack([np.sin(ring), 0 * ring, np.cos(ring)]))
-    points = np.concatenate([lit_points(field, film_mm, _HELD_OUT), film_points(field, film_mm, _ALONG), beside])
+    points = np.concatenate([lit_points(field, film_mm, _HELD_OUT), diagonal_points(field, film_mm, _ALONG), beside])
     points = points[field.relative_light(points) >= DIM]  # the field traces no places beyond
     left = projections.residual(fitted, *_shown(field, size, film_mm, points))
     rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
@@ -383,8 +387,12 @@ def fitted_projection(
 
 def _shown(field: Field, size: tuple[int, int], film_mm: tuple[float, float], point: Complex) -> tuple[Any, Any]:
     """Unit directions [N, 3] and pixels [N, 2], in OpenCV's frame, of points of the picture."""
-    pixel = np.stack([(point.real / film_mm[0] + 0.5) * size[0], (0.5 - point.imag / film_mm[1]) * size[1]], 1)
-    return field.directions(point).T * [1, -1, 1], pixel - 0.5
+    return field.directions(point).T * OPENCV, _pixels(point, size, film_mm)
+
+
+def _pixels(point: Complex, size: tuple[int, int], film_mm: tuple[float, float]) -> Array:
+    """The same pixels."""
+    return np.stack([(point.real / film_mm[0] + 0.5) * size[0], (0.5 - point.imag / film_mm[1]) * size[1]], 1) - 0.5
 
 
 def write_projection(out: Path, fitted: projections.Projection, data: dict[str, Any]) -> list[str]:
@@ -421,3 +429,80 @@ def _block(fitted: projections.Projection) -> dict[str, Any]:
             "linear_cde": [fitted.focal_px[0], 0.0, 0.0],
         }
     return {"camera_model": fitted.kind, **size, "focal_px": list(fitted.focal_px), **fitted.named}
+
+
+# Rays of pixels, for programs that take a camera without a centre.
+
+
+def sight(camera: Camera, field: Field, point: Complex, near_m: float) -> Array:
+    """Lines of sight [N, 6] of picture points, in OpenCV's frame about the entrance pupil on the axis.
+
+    Each leads through the centroids of the light at infinity and near: the point of it that is nearest to the origin
+    (m), and a unit direction. NaN where the picture is dark.
+    """
+    way, at = (centroids_m(camera, field, point, d) for d in (math.inf, near_m))
+    return np.concatenate([at - (at * way).sum(0) * way, way]).T * (OPENCV * 2)
+
+
+def pupil_mm(camera: Camera, field: Field, near_m: float, angle_deg: Array) -> Array:
+    """Distances [N] before the film at which rays of a round lens meet the axis, by their angle to it."""
+    angle = np.radians(angle_deg)
+    point = field.point(np.stack([np.sin(angle), 0 * angle, np.cos(angle)]))
+    x, _, z, dx, _, dz = sight(camera, field, point, near_m).T
+    return np.asarray(np.mean(field.frame.pupil_mm) + 1e3 * (z - x * dz / dx))
+
+
+def ray_table(
+    camera: Camera, field: Field, size: tuple[int, int], film_mm: tuple[float, float], focus_m: float, near_m: float
+) -> tuple[projections.RayTable, list[dict[str, float]]]:
+    """The lines of sight of a picture as a table, and by distance what it leaves at points that it was not fitted to.
+
+    Its cells are halved until it leaves at most `_TABLE_PX` at infinity, in focus and near, or until the longer side
+    has the most of `_CELLS`.
+    """
+    pixel_mm = film_mm[0] / size[0], film_mm[1] / size[1]
+
+    def bright(point: Complex) -> NDArray[np.bool_]:
+        return field.lit(point) & (field.relative_light(point) >= DIM)
+
+    tried = np.concatenate([lit_points(field, film_mm, _HELD_OUT), diagonal_points(field, film_mm, _HELD_OUT[0])])
+    tried = tried[bright(tried)]
+    seen = {d: centroids_m(camera, field, tried, d) for d in dict.fromkeys((math.inf, focus_m, near_m))}
+    pixel = _pixels(lit_points(field, film_mm, _LIT), size, film_mm)
+    first = np.maximum(np.floor(pixel.min(0) - np.array(size) / _LIT), 0).astype(int)
+    last = np.minimum(np.ceil(pixel.max(0) + np.array(size) / _LIT), np.array(size) - 1).astype(int)
+    for cells in _CELLS:
+        counts = np.ceil(cells * (last - first + 1) / (last - first + 1).max()).astype(int)
+        shape = counts[1] + 3, counts[0] + 3, 6
+        table = projections.RayTable(size, tuple(first.tolist()), tuple(last.tolist()), np.zeros(shape))
+        sides = (np.linspace(a - 0.5, b + 0.5, 2 * n + 1) for a, b, n in zip(first, last, counts, strict=True))
+        pixel = np.stack([c.reshape(-1) for c in np.meshgrid(*sides)], 1)
+        x, y = ((pixel + 0.5) / size - 0.5).T * np.array(film_mm)[:, None]
+        lit = bright(point := x - 1j * y)
+        rays = sight(camera, field, point[lit], near_m)
+        table = table.fitted(pixel[lit], rays, field.relative_light(point[lit]))
+        at, way = (c.T for c in np.split(table(_pixels(tried, size, film_mm)) * (OPENCV * 2), 2, axis=1))
+        left = []
+        for distance_m, place in seen.items():
+            # Where the ray meets the sphere on which the centroids lie: its point is at right angles to its direction.
+            reach = np.sqrt((place**2).sum(0) - (at**2).sum(0))
+            told = way if math.isinf(distance_m) else at + reach * way
+            left.append({"distance_m": distance_m, **in_pixels(field.point(place) - field.point(told), pixel_mm)})
+        if max(row["worst_px"] for row in left) <= _TABLE_PX:
+            break
+    return table, left
+
+
+def noncentral_pays(parallax: Sequence[Mapping[str, float]]) -> bool:
+    """Whether one centre leaves more than `CENTRAL_PX` at one of these distances."""
+    return any(row["worst_px"] > CENTRAL_PX for row in parallax)
+
+
+def write_ray_table(
+    out: Path, table: projections.RayTable, left: list[dict[str, float]], about: str, field: Field
+) -> str:
+    """Write NAME.noncentral.yaml; its name."""
+    path = out.with_name(f"{out.name}.noncentral.yaml")
+    values = {"table": table, "left": left, "before_film_mm": float(np.mean(field.frame.pupil_mm))}
+    atomic_write_text(path, html("handover.noncentral.yaml.jinja", about=f"{about}, neurolens {__version__}", **values))
+    return str(path)

@@ -9,8 +9,9 @@ x' = x / z, y' = y / z, r^2 = x'^2 + y'^2, t the angle to z, and the pixel c + (
     f-theta         the same with d = sum of a_i t^i in pixels, fy = 1, fx the c of NVIDIA's linear transformation
 
 A lens centred on its axis has p1 = p2 = 0 and its principal point in the picture's middle: neither is fitted. One
-without cylinders has fx = fy. Sources: OpenCV, modules calib3d and fisheye; Kannala and Brandt 2006, IEEE PAMI 28(8);
-NVIDIA, documentation of NCore, sensor models.
+without cylinders has fx = fy. All of these have one centre; `RayTable` has a ray of its own for every pixel. Sources:
+OpenCV, modules calib3d and fisheye; Kannala and Brandt 2006, IEEE PAMI 28(8); NVIDIA, documentation of NCore, sensor
+models; Schoeps et al. 2020, "Why Having 10,000 Parameters in Your Camera Model Is Better Than Twelve", CVPR.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import NdBSpline  # type: ignore[import-untyped]
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
+from scipy.sparse import diags, eye, kron  # type: ignore[import-untyped]
+from scipy.sparse.linalg import spsolve  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
 
@@ -48,6 +52,7 @@ _NOT_FOLDED = 179.0, 89.9  # degrees to which a fold is looked for, about the le
 _ANGLES = 4097  # that are tried for it
 _STEP = 1e-30  # of derivatives along the imaginary axis, which are exact
 _BINS = 5  # fields of a report
+_SMOOTH = 1e-9  # weight of a table's bending over that of its points: it leads on where the picture is dark
 
 
 @dataclass(frozen=True)
@@ -279,3 +284,50 @@ def inverse_polynomial(projection: Projection) -> tuple[float, ...]:
     powers = radius.max() ** np.arange(1, 6)
     rows = radius[:, None] ** np.arange(1, 6) / powers
     return tuple((np.linalg.lstsq(rows, angle, rcond=None)[0] / powers).tolist())
+
+
+@dataclass(frozen=True)
+class RayTable:
+    """A camera without a centre: rays of pixels, between control values by uniform cubic B-splines along both sides.
+
+    It is the model "noncentral-generic" of Schoeps et al.; they count pixels from the first one's corner.
+
+    Attributes:
+        size: of the picture in pixels.
+        first, last: columns and rows of the outermost pixels that have rays.
+        grid: [H, W, 6] control values of a point of the ray (m) and of its direction; the outermost lie beyond.
+    """
+
+    size: tuple[int, int]
+    first: tuple[int, int]
+    last: tuple[int, int]
+    grid: Array
+
+    def __call__(self, pixel: Array) -> Array:
+        """Points (m) and unit directions [N, 6] of the rays of pixels [N, 2]."""
+        rays = np.asarray(NdBSpline(self._knots, self.grid, 3)(self._place(pixel)))
+        rays[:, 3:] /= np.linalg.norm(rays[:, 3:], axis=1, keepdims=True)
+        return rays
+
+    @property
+    def _knots(self) -> tuple[Array, Array]:
+        rows, columns = (np.arange(n + 4.0) - 2 for n in self.grid.shape[:2])
+        return rows, columns
+
+    def _place(self, pixel: Array) -> Array:
+        """Rows and columns of the grid at pixels."""
+        first, end = np.array(self.first) - 0.5, np.array(self.last) + 0.5
+        cells = np.array(self.grid.shape[1::-1]) - 3
+        return np.ascontiguousarray((1 + cells * (pixel - first) / (end - first))[:, ::-1])
+
+    def fitted(self, pixel: Array, rays: Array, weight: Array) -> RayTable:
+        """The table of this shape with the least squares of distances from rays [N, 6] of pixels, by weights [N]."""
+        height, width = self.grid.shape[:2]
+        rows = NdBSpline.design_matrix(self._place(pixel), self._knots, 3)
+        rows.resize(len(pixel), height * width)  # it ends with the last value that is used
+        weighed = rows.multiply(weight[:, None]).T.tocsc()
+        normal = weighed @ rows
+        bend = [diags([1.0, -2.0, 1.0], [0, 1, 2], (n - 2, n)) for n in (height, width)]
+        along = kron(bend[0].T @ bend[0], eye(width)) + kron(eye(height), bend[1].T @ bend[1])
+        normal = normal + _SMOOTH * normal.diagonal().max() * along
+        return replace(self, grid=spsolve(normal.tocsc(), weighed @ rays).reshape(height, width, 6))

@@ -9,13 +9,13 @@ The object is a plane across the axis for the rectilinear projection, a sphere a
 at the distance in focus unless another is asked for. Undistorted places are those of an ideal camera: a point at the
 lens's paraxial entrance pupil, whose picture has the lens's paraxial size on the axis (chief rays; of a lens with
 cylinders, in each of its meridians). A point nearer or farther than the object is seen from elsewhere than the
-entrance pupil's centre, for that moves with the field: `Field.parallax_mm` says by how much its place is wrong.
+entrance pupil's centre, for that moves with the field: `shown_at` says where the picture has it instead.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ _ROUND, _OTHER = (513, 1), (97, 64)  # radii and azimuths of the tables
 BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
 _FINER = 64, 4  # rings (and azimuths) of the map back over those of the map there, of round cameras and of others
 _EDGE = 16  # points on each side of the film
+_SPREAD = 61, 41  # points over a film
 _TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
 _HALVINGS = 24
 DIM = 2e-3  # of the light on the axis, nine stops below it: from there on places go straight on
@@ -195,6 +196,15 @@ def _undistorted(direction: Array, frame: Frame, target: str) -> Complex:
     return found
 
 
+def _directions(place: Complex, frame: Frame, target: str) -> Array:
+    """Unit vectors [3, N] of undistorted places."""
+    place = place.real / frame.reach_mm[0] + 1j * (place.imag / frame.reach_mm[1])
+    rho = np.abs(place)
+    angle = np.arctan(rho) if target == RECTILINEAR else PROJECTIONS[target].angle(rho)
+    turn = place / np.where(rho > 0, rho, 1.0)
+    return np.stack([np.sin(angle) * turn.real, np.sin(angle) * turn.imag, np.cos(angle)])
+
+
 def is_round(camera: Any) -> bool:
     """Test whether points at some azimuths, none of which is another's mirror image, have the same places and light."""
     corner = math.hypot(*camera.film_mm) / 2
@@ -285,8 +295,7 @@ class Field:
         end_mm: radius of the tables: the film's corner, or where the light ends.
         field_deg: widest angle to the axis of light that arrives within it.
         light: [R, A] on the rings of `ideal`, over that on the axis.
-        parallax_mm: by how much undistorted places of points at other distances (m from the film) are wrong, the worst
-            of the film's edge.
+        distance_m: from the film to the object.
         spectrum: wavelengths in nm and weights.
     """
 
@@ -297,8 +306,13 @@ class Field:
     end_mm: float
     field_deg: float
     light: Array
-    parallax_mm: dict[float, float]
+    distance_m: float
     spectrum: Spectrum
+
+    @property
+    def round(self) -> bool:
+        """Whether it is the same at all azimuths."""
+        return self.light.shape[1] == 1
 
     def lit(self, point: Complex) -> NDArray[np.bool_]:
         """Test whether light arrives at picture points."""
@@ -313,12 +327,7 @@ class Field:
 
     def directions(self, point: Complex) -> Array:
         """Unit vectors [3, N] (z towards the scene) of picture points, from the ideal camera's point."""
-        place = self.ideal(point)
-        place = place.real / self.frame.reach_mm[0] + 1j * (place.imag / self.frame.reach_mm[1])
-        rho = np.abs(place)
-        angle = np.arctan(rho) if self.target == RECTILINEAR else PROJECTIONS[self.target].angle(rho)
-        turn = place / np.where(rho > 0, rho, 1.0)
-        return np.stack([np.sin(angle) * turn.real, np.sin(angle) * turn.imag, np.cos(angle)])
+        return _directions(self.ideal(point), self.frame, self.target)
 
     def point(self, direction: Array) -> Complex:
         """Picture points of directions [3, N], those back again: NaN where the ideal camera sees nothing."""
@@ -350,16 +359,16 @@ def field_of(
         raise InputError(camera.name, "distance_m", distance, f"more than {nearest:.4g} m, the entrance pupil's")
     rings, azimuths = _ROUND if is_round(camera) else _OTHER
 
-    def at(points: Complex, distance_m: float) -> tuple[Complex, Light]:
-        traced = traced_light(camera, points, spectrum, frame, target, distance_m)
+    def at(points: Complex) -> tuple[Complex, Light]:
+        traced = traced_light(camera, points, spectrum, frame, target, distance)
         return np.where(traced.light > 0, traced.place, np.nan), traced
 
     corner = math.hypot(*camera.film_mm) / 2
-    end = corner if azimuths > 1 else end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)
+    end = corner if azimuths > 1 else end_of_light(lambda r: at(np.array([r + 0j]))[1].light[0] > 0, corner)
     points = (np.linspace(0, end, rings)[:, None] * turns(azimuths)).reshape(-1)
-    place, found = at(points, distance)
+    place, found = at(points)
     edge = film_edge(camera.film_mm)
-    edge_place, _ = at(edge / BEYOND, distance)
+    edge_place, _ = at(edge / BEYOND)
     widest = math.degrees(float(np.where(found.light > 0, found.angle, 0.0).max()))
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
@@ -371,21 +380,43 @@ def field_of(
         fold = end * (int(np.argmin(rising)) + 1) / (rings - 1)
         raise InputError(camera.name, "film_mm", camera.film_mm, f"no picture beyond {fold:.4g} mm, where it folds")
     ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths)
-    others = [] if math.isinf(distance) else [d for d in (math.inf, 2 * distance, distance / 2) if d > 2 * nearest]
-    moved = {d: np.abs(at(edge / BEYOND, d)[0] - edge_place) for d in others}
-    parallax = {d: float(np.nanmax(m, initial=0.0)) for d, m in moved.items()}
     light = light / light[0].mean()
-    return Field(ideal, _inverted(ideal), frame, target, end, widest, light, parallax, spectrum)
+    return Field(ideal, _inverted(ideal), frame, target, end, widest, light, distance, spectrum)
 
 
-def parallax_mm(camera: Any, field: Field, point: Complex, distances_m: Sequence[float]) -> dict[float, Complex]:
-    """By distance from the film (m), how far lit picture points [N] are from where the field puts what they show."""
+def shown_at(camera: Any, field: Field, point: Complex, distance_m: float) -> Complex:
+    """Where the field, of one centre, has what picture points [N] show at this distance from the film; NaN: dark."""
+    seen = traced_light(camera, point, field.spectrum, field.frame, field.target, distance_m)
+    found: Complex = np.where(seen.light > 0, field.picture(seen.place), np.nan)
+    return found
 
-    def moved(distance_m: float) -> Complex:
-        seen = traced_light(camera, point, field.spectrum, field.frame, field.target, distance_m)
-        return (field.picture(seen.place) - point)[(seen.light > 0) & np.isfinite(seen.place)]
 
-    return {d: moved(d) for d in distances_m}
+def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
+    """Points from the axis, without it, to the film's corner, or where the light ends, mm."""
+    return np.linspace(0, min(field.end_mm, math.hypot(*film_mm) / 2), count)[1:].astype(np.complex128)
+
+
+def diagonal_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
+    """The same points on the way to a corner, where also a picture that is not round has them."""
+    return film_points(field, film_mm, count) * (complex(*film_mm) / math.hypot(*film_mm))
+
+
+def lit_points(field: Field, film_mm: tuple[float, float], count: tuple[int, int] = _SPREAD) -> Complex:
+    """Points spread over a film that light reaches, mm."""
+    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, n) * side for n, side in zip(count, film_mm, strict=True)))
+    points = np.asarray(x + 1j * y, np.complex128).reshape(-1)
+    return points[field.lit(points)]
+
+
+def centroids_m(camera: Any, field: Field, point: Complex, distance_m: float) -> Array:
+    """Places [3, N] of the light of picture points on a sphere about the entrance pupil, which is their origin.
+
+    Frame: x right, y up, z towards the scene. The sphere cuts the axis at this distance from the film; unit directions
+    at infinity; NaN where the picture is dark.
+    """
+    traced = traced_light(camera, point, field.spectrum, field.frame, "equidistant", distance_m)
+    radius = 1.0 if math.isinf(distance_m) else distance_m - 1e-3 * float(np.mean(field.frame.pupil_mm))
+    return np.where(traced.light > 0, radius * _directions(traced.place, field.frame, "equidistant"), np.nan)
 
 
 def film_edge(film_mm: tuple[float, float]) -> Complex:

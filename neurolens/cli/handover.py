@@ -15,10 +15,10 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
 from neurolens.base.progress import Progress
-from neurolens.base.settings import setting
+from neurolens.base.settings import setting, setting_of
 from neurolens.cameras.contract import Camera
 from neurolens.cli import arguments as cli
-from neurolens.cli.stmap import Maker, StMap, TracedFrame
+from neurolens.cli.stmap import Maker, Projection, StMap, TracedFrame, one_centre
 from neurolens.render.pictures import read_channels, standard_attributes
 from neurolens.render.stmap import illumination_map
 
@@ -35,10 +35,11 @@ class Handover(StMap):
       shot.opentrackio.json        a sample of OpenTrackIO 1.0.1
       shot.lensfun.xml             a profile of lensfun: distortion, lateral colour, light by aperture
       shot.opencv.yaml, .json ...  projections of OpenCV, nerfstudio and NVIDIA, see neurolens projection
+      shot.noncentral.yaml         the ray of each pixel, where one centre leaves more than half a pixel
       README.md                    how to start, what each file leaves in pixels, what its standard cannot say
 
-    With --frames there is one of each map, sample and projection a frame; cameras are animated. What a standard has no
-    place for is not written, and said. Needs the extra "train" (scipy)."""
+    With --frames there is one of each map, sample, projection and table of rays a frame; cameras are animated. What a
+    standard has no place for is not written, and said. Needs the extra "train" (scipy)."""
 
     kept = "files that were written are whole; the same command goes on"
     epilog = f"""{cli.CAMERAS_HELP}
@@ -49,6 +50,7 @@ examples:
   neurolens handover isshiki_fisheye_10 --film 18x18 --width 2000 --projection equidistant -o fisheye/"""
 
     out: Path = cli.output_path("FOLDER", "folder of the files, which is made")
+    noncentral: bool = setting_of(Projection, "noncentral", False)
     fps: Fraction = setting(
         Fraction(24), "frames a second, as 24 or 24000/1001 (default: 24)", kind=lambda text: _rate(text), metavar="N"
     )
@@ -106,9 +108,12 @@ class _Writer:
     def files(self, data: dict[str, Any], progress: Progress) -> list[str]:
         """Write all; their names."""
         names, command, shot = [], self.command, self.shot
+        tables = command.noncentral or any(standards.noncentral_pays(row["parallax"]) for row in data["frames"])
         with progress.stage("fit projections, OpenTrackIO") as report:
             for k in range(len(self.frames)):
                 names += self._of_frame(k)
+                if tables:
+                    names.append(self._ray_table(k))
                 report((k + 1) / len(self.frames))
         entries = self._entries(progress)
         exits, _ = read_channels(command.out / f"shot.exit{shot.frames[0].name}.exr", "RG")
@@ -146,6 +151,15 @@ class _Writer:
             if left.worst_px >= self.fits.get(kind, row)["worst_px"]:
                 self.fits[kind] = row
         return names
+
+    def _ray_table(self, k: int) -> str:
+        """Write the table of rays of a frame; its name."""
+        command, frame = self.command, self.frames[k]
+        field, near_m = frame.fields[""], command.near_m(frame.fields[""].frame)
+        table, left = standards.ray_table(frame.camera, field, command.picture, command.film, frame.focus_m, near_m)
+        self._worse("noncentral_px", max(row["worst_px"] for row in left))
+        name = command.out / f"shot{self.shot.frames[k].name}"
+        return standards.write_ray_table(name, table, left, self.shot.about, field)
 
     def _worse(self, name: str, value: float | None) -> None:
         if value is not None:
@@ -190,8 +204,11 @@ def _rate(text: str) -> Fraction:
 
 def _text(data: dict[str, Any]) -> str:
     names = {"ST maps, there and back": "maps_px", "NVIDIA's lookup pictures": "exit_px"}
+    names |= {"ray of each pixel, at any distance": "noncentral_px"}
     names |= {"OpenTrackIO": "opentrackio_px", "lensfun": "lensfun_px", "lensfun, colours": "colour_px"}
     rows = [(name, f"{data['left'][key]:.2g}") for name, key in names.items() if key in data["left"]]
     rows += [(kind, f"{fit['worst_px']:.2g}") for kind, fit in data["projections"].items()]
     heading = f"{data['camera']}: {len(data['files'])} files are written; README.md in their folder explains them"
-    return f"{heading}\n{cli.table(('left at most', 'pixels'), rows)}"
+    first = data["frames"][0]
+    told = f"{cli.table(('left at most, of what is in focus', 'pixels'), rows)}"
+    return f"{heading}\n{told}\n{one_centre(first['parallax'], first['before_film_mm'])}"

@@ -20,19 +20,28 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.settings import positive, setting, wavelengths_nm
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.field import Complex, Field, field_of, frame_of, parallax_mm, spectrum_of
+from neurolens.cameras.field import Field, Frame, diagonal_points, field_of, frame_of, lit_points, shown_at, spectrum_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
 from neurolens.lens.shot import Runtime, Shot
 from neurolens.render.film import PixelGrid
 from neurolens.render.pictures import read_channels, standard_attributes, write_channels
 from neurolens.render.settings import size_by_shape
-from neurolens.render.stmap import Plates, illumination_map, plates_of, redistort_map, undistort_map, worst_px
+from neurolens.render.stmap import (
+    Plates,
+    illumination_map,
+    in_pixels,
+    plates_of,
+    redistort_map,
+    undistort_map,
+    worst_px,
+)
 
 Maker = Callable[[Field, Plates, Callable[[float], None]], dict[str, FloatArray]]
 _LARGEST = 16384  # pixels a side
 LIGHT_NM = (400.0, 700.0)
 _SEEN = 17, 11  # points of the film, whose parallax is told
+_NEAR_M = 0.3  # and how far from the film, or 1.5 times as far as the entrance pupil
 # Dominant wavelengths of the primaries of Rec. 709 (and sRGB), for light of D65.
 _CHANNELS_NM = (611.4, 549.1, 464.2)
 _NAMES = ("red", "green", "blue")
@@ -106,6 +115,32 @@ class PictureCommand(cli.Reporting):
         return cli.camera(self.camera, shot, progress), shot
 
 
+@dataclass(frozen=True, kw_only=True)
+class FieldCommand(PictureCommand):
+    """A command about the place of things in the picture of a lens, which says what one centre leaves of it."""
+
+    near: float | None = setting(
+        None, "distance from the film to the nearest thing that is seen, of which is told what one centre leaves "
+        f"(default: {_NEAR_M:g}, or 1.5 times the entrance pupil's)",
+        kind=positive("a distance in metres"), metavar="M",
+    )  # fmt: skip
+
+    def near_m(self, frame: Frame) -> float:
+        """The nearest distance, which is checked against the entrance pupil's."""
+        pupil = 1e-3 * max(frame.pupil_mm)
+        if self.near is not None and self.near <= pupil:
+            self.refuse("--near", self.near, f"more than {pupil:.4g} m, the distance of the entrance pupil")
+        return self.near or max(_NEAR_M, 1.5 * pupil)
+
+    def parallax(self, camera: Camera, field: Field) -> list[dict[str, float]]:
+        """By distance, at infinity and near, by how much things are elsewhere than the field's one centre has them."""
+        point = np.concatenate([lit_points(field, self.film, _SEEN), diagonal_points(field, self.film)])
+        point = point[field.lit(point)]
+        pixel = self.film[0] / self.picture[0], self.film[1] / self.picture[1]
+        distances = [d for d in (math.inf, self.near_m(field.frame)) if d != field.distance_m]
+        return [{"distance_m": d, **in_pixels(shown_at(camera, field, point, d) - point, pixel)} for d in distances]
+
+
 @dataclass(frozen=True)
 class TracedFrame:
     """One frame: its number in file names ("" for a single one), focus, camera, and fields by their maps' names."""
@@ -122,7 +157,7 @@ class TracedFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StMap(PictureCommand):
+class StMap(FieldCommand):
     """Write ST maps of a lens (or model, or any other camera) for compositing, float32 OpenEXR:
 
       SHOT.undistort.exr     makes the undistorted picture from that of the lens (the plate)
@@ -187,6 +222,7 @@ examples:
             for digits, state in states:
                 camera, shot = self.make(state, progress)
                 frame = frame_of(camera)
+                self.near_m(frame)
                 fields = {
                     name: field_of(
                         camera, shot.focus_m, self.projection, frame=frame, distance_m=self.distance,
@@ -240,8 +276,6 @@ examples:
         for frame in frames:
             field = frame.fields[""]
             moved, missed = worst_px(field, plates)
-            pixel = min(plates.pixel_mm)
-            parallax = [{"distance_m": d, "px": mm / pixel} for d, mm in field.parallax_mm.items()]
             row: dict[str, Any] = {"frame": frame.index, "focus_m": frame.focus_m}
             row |= _ideal(field, plates)
             row |= {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
@@ -250,7 +284,7 @@ examples:
             x, y = field.frame.pupil_mm
             nearer = 1.0 if math.isinf(plane) else (plane - x) / (plane - y)
             row |= {"plane_m": plane / 1e3, "pixel_aspect_of_one_pinhole": row["pixel_aspect"] * nearer}
-            rows.append(row | {"parallax": parallax})
+            rows.append(row | {"parallax": self.parallax(frame.camera, field)})
         return {
             "camera": str(self.camera),
             "picture_px": list(plates.picture),
@@ -300,29 +334,40 @@ def _stmap_text(data: dict[str, Any]) -> str:
         x, y = (cli.number(v, 6) for v in first["before_film_mm"])
         line = f"pixel aspect ratio {first['pixel_aspect']:.5g}; entrance pupil of the x meridian {x} mm, of the y "
         line += f"meridian {y} mm before the film"
-        if first["parallax"]:  # the plane is not at infinity
+        if math.isfinite(first["plane_m"]):
             plane, aspect = cli.number(first["plane_m"], 3), f"{first['pixel_aspect_of_one_pinhole']:.5g}"
             line += f"; a pinhole at the latter shows what is {plane} m from the film with {aspect}"
         lines.append(line)
-    if first["parallax"]:
-        told = [f"{p['px']:.2g} pixels at {cli.number(p['distance_m'], 3)}" for p in first["parallax"]]
-        lines.append(f"parallax of the pupil, worst of the picture, by metres from the film: {', '.join(told)}")
+    lines.append(one_centre(first["parallax"], first["before_film_mm"]))
     return "\n".join([*lines, *data["files"]])
 
 
+def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) -> str:
+    """What one centre leaves of things at other distances, as a sentence."""
+    told = [
+        f"{cli.number(p['rms_px'], 2)} pixels RMS, {cli.number(p['worst_px'], 2)} at most, {_where(p['distance_m'])}"
+        for p in parallax
+    ]
+    before = " x ".join(dict.fromkeys(cli.number(v, 4) for v in before_film_mm))
+    return f"the entrance pupil moves with the field: one centre, {before} mm before the film, leaves {'; '.join(told)}"
+
+
 @dataclass(frozen=True, kw_only=True)
-class Projection(PictureCommand):
+class Projection(FieldCommand):
     """Fit a lens (or model, or any other camera) with a projection of other programs, and say what it leaves in
     pixels:
 
       opencv            fx fy cx cy, k1 k2 p1 p2 k3      opencv-rational   and k4 k5 k6
       kannala-brandt    OpenCV's fisheye, k1 k2 k3 k4    f-theta           NVIDIA's polynomials, both ways
 
-    Directions are those of the light's centroid at this stop, from the lens's entrance pupil to what is in focus; what
-    things at infinity and at --near are off by, since that pupil moves with the field, is told as parallax. With
-    -o NAME: NAME.yaml for OpenCV's FileStorage, NAME.json for nerfstudio (its camera block; cx, cy from the corner of
-    the first pixel, OpenCV's from its centre), NVIDIA's names for f-theta. A projection that turns back within the
-    field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (scipy)."""
+    Directions are those of the light's centroid at this stop, from the lens's entrance pupil to what is in focus. That
+    pupil moves with the field, so one centre is wrong for things at other distances: the command says by how many
+    pixels, at infinity and at --near. With -o NAME it writes NAME.yaml for OpenCV's FileStorage and NAME.json for
+    nerfstudio (its camera block; cx, cy from the corner of the first pixel, OpenCV's from its centre), with NVIDIA's
+    names for f-theta; and, where one centre leaves more than half a pixel, NAME.noncentral.yaml: the ray of each pixel,
+    as the model noncentral_generic of camera_calibration (Schoeps et al. 2020). `neurolens rays` writes rays over the
+    whole pupil, with their light. A projection that turns back within the field is said; a planar one beyond 85
+    degrees is refused. Needs the extra "train" (scipy)."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 
@@ -333,45 +378,52 @@ examples:
     projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta"] = setting(
         ..., "the projection to fit", old=("model",)
     )
-    near: float = setting(
-        0.3, "distance from the film to the nearest thing that is seen, whose parallax is told (default: 0.3)",
-        kind=positive("a distance in metres"), metavar="M",
-    )  # fmt: skip
+    noncentral: bool = setting(
+        False, "write the ray of each pixel, too, however little one centre leaves (default: above half a pixel)"
+    )
     out: Path | None = cli.output_path("NAME", "write NAME.json and, for OpenCV's, NAME.yaml", None)
 
     def run(self) -> int:
         """Trace, fit, write."""
-        from neurolens.handover import film_points, fitted_projection, lit_points, write_projection
+        from neurolens import handover
 
         out, progress = self.out, self.progress()
+        if out is None and self.noncentral:
+            self.refuse("--noncentral", "(without -o)", "-o NAME, which names the file")
         if out is not None and out.suffix in (".json", ".yaml"):  # the name of a file that will be written
             out = out.with_suffix("")
-        camera, shot = self.make(self.state, progress)
+        camera, shot = self.make(self.state, progress, None)
+        near_m, spectrum = self.near_m(frame := frame_of(camera)), spectrum_of(camera, LIGHT_NM)
         with progress.stage(f"trace the field of {self.camera}"):
-            field = field_of(camera, shot.focus_m, "equidistant", spectrum=spectrum_of(camera, LIGHT_NM))
+            field = field_of(camera, shot.focus_m, "equidistant", frame=frame, spectrum=spectrum)
         with progress.stage(f"fit {self.projection}"):
-            fitted, left, data = fitted_projection(self.projection, field, self.picture, self.film, str(self.camera))
-        distances = [d for d in (math.inf, self.near) if d > 1e-3 * max(field.frame.pupil_mm) and d != shot.focus_m]
-        points = np.concatenate([lit_points(field, self.film, _SEEN), film_points(field, self.film)])
-        pixel = self.film[0] / self.picture[0], self.film[1] / self.picture[1]
+            fitted, left, data = handover.fitted_projection(
+                self.projection, field, self.picture, self.film, str(self.camera)
+            )
         with progress.stage("trace other distances"):
-            moved = parallax_mm(camera, field, points[field.lit(points)], distances)
-        data["parallax"] = [{"distance_m": d, **_in_pixels(mm, pixel)} for d, mm in moved.items() if mm.size]
-        data["files"] = write_projection(out, fitted, data) if out is not None else []
+            data["parallax"] = self.parallax(camera, field)
+            if field.round:
+                ends = np.array([row["to_deg"] for row in data["by_field"]])
+                pupil = handover.pupil_mm(camera, field, near_m, ends)
+                for row, mm in zip(data["by_field"], pupil.tolist(), strict=True):
+                    row["pupil_before_film_mm"] = mm
+        files = []
+        if out is not None and (self.noncentral or handover.noncentral_pays(data["parallax"])):
+            with progress.stage("fit the ray of each pixel"):
+                table, data["noncentral"] = handover.ray_table(
+                    camera, field, self.picture, self.film, shot.focus_m, near_m
+                )
+            files = [handover.write_ray_table(out, table, data["noncentral"], str(self.camera), field)]
+        if out is not None:
+            files = handover.write_projection(out, fitted, data) + files
         if not left.sound:
             told = f"turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}"
             warn(f"{self.projection} {told}")
-        return self.answer(data, lambda: _projection_text(data))
+        return self.answer(data | {"files": files}, lambda: _projection_text(data | {"files": files}))
 
 
 def _where(distance_m: float) -> str:
     return "at infinity" if math.isinf(distance_m) else f"{distance_m:g} m from the film"
-
-
-def _in_pixels(moved_mm: Complex, pixel_mm: tuple[float, float]) -> dict[str, float]:
-    """Root mean square and worst of displacements."""
-    px = np.hypot(moved_mm.real / pixel_mm[0], moved_mm.imag / pixel_mm[1])
-    return {"rms_px": float(np.sqrt(np.mean(px**2))), "worst_px": float(px.max())}
 
 
 def _projection_text(data: dict[str, Any]) -> str:
@@ -380,23 +432,22 @@ def _projection_text(data: dict[str, Any]) -> str:
     radii = f"scale {focal}" if data["model"] == "f-theta" else f"focal length {focal}"
     at = f"{data['worst_at_deg']:.3g} degrees, where {100 * data['light_at_worst']:.3g}% of the axis's light arrives"
     worst = f"at most {data['worst_px']:.3g} (at {at})"
-    spans = [[f"{v:.3g}" for v in row.values()] for row in data["by_field"]]
+    header, rows = ["field, degrees", "RMS px", "worst px"], list[tuple[str, ...]]()
+    for span in data["by_field"]:
+        start, end, *others = (f"{v:.4g}" if k[:5] == "pupil" else f"{v:.3g}" for k, v in span.items())
+        rows.append((f"{start} to {end}", *others))
+    if "pupil_before_film_mm" in data["by_field"][0]:
+        header.append("entrance pupil at its end, mm before the film")
     lines = [
         f"{data['camera']}, {data['model']}: {radii}, centre {centre} pixels",
         numbers,
-        f"leaves {data['rms_px']:.3g} pixels RMS, {worst}",
-        cli.table(("field, degrees", "RMS px", "worst px"), [(f"{a} to {b}", rms, most) for a, b, rms, most in spans]),
+        f"leaves {data['rms_px']:.3g} pixels RMS, {worst} of what is in focus",
+        cli.table(header, rows),
+        one_centre(data["parallax"], data["before_film_mm"]),
     ]
-    lines[2] += " of what is in focus"
-    if data["parallax"]:
-        told = [
-            f"{_where(p['distance_m'])} {p['rms_px']:.2g} RMS, {p['worst_px']:.2g} at most" for p in data["parallax"]
-        ]
-        before = " x ".join(dict.fromkeys(cli.number(v, 4) for v in data["before_film_mm"]))
-        lines.append(
-            f"parallax in pixels, for the entrance pupil moves with the field, but a projection has one centre, here "
-            f"{before} mm before the film: {'; '.join(told)}"
-        )
+    if "noncentral" in data:
+        most = (cli.number(max(row[k] for row in data["noncentral"]), 2) for k in ("rms_px", "worst_px"))
+        lines.append("the ray of each pixel leaves {} pixels RMS, {} at most, at all these distances".format(*most))
     if data["model"] == "kannala-brandt" and data["field_deg"] >= 90:
         lines.append("OpenCV's own functions end at 90 degrees, for they divide by z")
     return "\n".join([*lines, *data["files"]])

@@ -128,6 +128,12 @@ def blocks(size: tuple[int, int], pixel_mm: tuple[float, float], report: Report)
         report(rows.stop / height)
 
 
+def in_pixels(moved_mm: Complex, pixel_mm: tuple[float, float]) -> dict[str, float]:
+    """Root mean square and worst of displacements in mm, those that are NaN left out."""
+    px = np.hypot(moved_mm.real / pixel_mm[0], moved_mm.imag / pixel_mm[1])
+    return {"rms_px": float(np.sqrt(np.nanmean(px**2))), "worst_px": float(np.nanmax(px))}
+
+
 def worst_px(field: Field, plates: Plates) -> tuple[float, float]:
     """The farthest that distortion moves a point, and the largest error of going to the undistorted picture and back.
 
