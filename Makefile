@@ -68,8 +68,8 @@ test-whole:
 # Blender as a module wants one Python and, to 5.0, numpy 1: an environment of its own. On Debian without a desktop it also needs
 # libxkbcommon0 libsm6 libxi6 libxxf86vm1 libxfixes3 libgl1 libegl1.
 test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
-	PYTHONPATH=. $(BIN)/python tests/blender/expect.py build/blender
-	NEUROLENS_BLENDER_SHOTS=build/blender $(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/blender tests/blender
+	PYTHONPATH=. $(BIN)/python tests/programs/blender/expect.py build/blender
+	NEUROLENS_BLENDER_SHOTS=build/blender $(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/programs/blender tests/programs/blender
 
 # A browser is not for pip to bring; without one this says so. onnxruntime-web comes of npm, once, into build/web.
 test-web: $(INSTALLED)
@@ -79,11 +79,11 @@ test-web: $(INSTALLED)
 	else echo "no npm: models are not run in onnxruntime-web"; fi; \
 	ort=build/web/node_modules/onnxruntime-web/dist; \
 	NEUROLENS_BROWSER="$(CHROMIUM)" NEUROLENS_ORT="$$(test -d $$ort && echo $$ort)" \
-	    $(BIN)/python -m pytest -q -rs tests/view
+	    $(BIN)/python -m pytest -q -rs tests/programs/view
 
 test-shading: $(INSTALLED)
 	$(BIN)/python -m pip install -c constraints.txt -e '.[shading]' --no-build-isolation
-	NEUROLENS_SHADING=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -rs tests/surrogates/test_languages.py
+	NEUROLENS_SHADING=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -rs tests/models/test_languages.py
 
 docs: $(INSTALLED) $(VENV)/.docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/docs

@@ -17,8 +17,7 @@ from pygments.lexers.special import TextLexer
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "pages"
-PACKAGES = ("base", "graph", "lens", "trace", "setting", "readers", "analysis", "surrogates", "cameras", "shaders",
-            "render", "flare", "study", "plan")  # fmt: skip
+ROOMS = ("base", "graph", "optics", "models", "cameras", "pictures", "programs", "studies")
 sys.path.insert(0, str(ROOT))
 
 project = html_title = "neurolens"
@@ -71,13 +70,14 @@ def _commands() -> str:
 
 
 def _write_api(folder: Path) -> None:
-    """One page a package, with the docstrings of its modules, and an index of these pages."""
+    """One page a room, with the docstrings of its modules, and an index of these pages."""
     shutil.rmtree(folder, ignore_errors=True)  # modules that are gone
     folder.mkdir()
-    index = ["# API", "Modules by package. What is not listed there is private."]
-    for package in PACKAGES:
-        path = ROOT / "neurolens" / package
-        names = [f"neurolens.{package}.{module.stem}" for module in sorted(path.glob("[!_]*.py"))]
+    index = ["# API", "Modules by room. What is not listed there is private."]
+    for package in ROOMS:
+        files = sorted((ROOT / "neurolens" / package).rglob("[!_]*.py"))
+        parts = [file.relative_to(ROOT).with_suffix("").parts for file in files]
+        names = [".".join(names) for names in parts if "extension" not in names]  # Blender loads that
         parts = [f"# neurolens.{package}", *(_module(name) for name in names)]
         (folder / f"{package}.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
         index.append(f"- [neurolens.{package}]({package}.md)")
@@ -85,7 +85,7 @@ def _write_api(folder: Path) -> None:
 
 
 def _module(name: str) -> str:
-    return f"## {name.rpartition('.')[2]}\n\n```{{eval-rst}}\n.. automodule:: {name}\n```"
+    return f"## {name.split('.', 2)[2]}\n\n```{{eval-rst}}\n.. automodule:: {name}\n```"
 
 
 def _prepare(app: Any, document: str, content: list[str]) -> None:

@@ -17,8 +17,8 @@ from typing import Any
 
 from experiments import lab
 from experiments.make_models import errors_by_kind
-from neurolens.analysis.plots import FIELD_COLOURS, drawing, plain_log_ticks
 from neurolens.base.files import atomic_write_text
+from neurolens.optics.analysis.plots import FIELD_COLOURS, drawing, plain_log_ticks
 
 PAGES = lab.ROOT / "docs" / "pages"
 BLUE, ORANGE, GREEN, RED, *_ = FIELD_COLOURS

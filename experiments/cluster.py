@@ -103,7 +103,7 @@ def _result(out: Path) -> str:
     if out.is_dir():
         files = sorted((out / "records").iterdir())
         return "".join(f"{file.name}{file.read_text()}" for file in files)
-    from neurolens.render.pictures import read_channels
+    from neurolens.pictures.render.pictures import read_channels
 
     planes, _ = read_channels(out)
     return "".join(key + planes[key].tobytes().hex() for key in sorted(planes))

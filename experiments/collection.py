@@ -34,14 +34,14 @@ import numpy as np
 
 from experiments import lab
 from experiments.lab import Row
-from neurolens.analysis.fields import Scene
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress, Report
-from neurolens.lens.glass import index_of
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.readers.any_format import read_any
+from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.lens.glass import index_of
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers.any_format import read_any
 
 SCRIPT = Path(__file__).with_name("ray_optics.py")
 KEPT = lab.ROOT / "runs" / "collection" / "ray_optics.json"

@@ -1,4 +1,4 @@
-"""Make tests/render/cornell_reference.csv: the Cornell box of experiments/scenes/cornell.toml rendered by Mitsuba 3.
+"""Make tests/pictures/render/cornell_reference.csv: the Cornell box of experiments/scenes/cornell.toml by Mitsuba 3.
 
 python experiments/cornell_reference.py                     # a minute
 
@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from neurolens.render.scene import load_scene
+from neurolens.pictures.render.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 TARGET = ROOT / "tests" / "render" / "cornell_reference.csv"

@@ -24,14 +24,14 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.cli import main
-from neurolens.defocus.kernels import kernel_at, own_plate
-from neurolens.defocus.picture import Gathered, defocus
-from neurolens.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
-from neurolens.lens.shot import Shot
-from neurolens.render.pictures import read_exr, write_png
-from neurolens.render.renderer import render
-from neurolens.render.scene import load_scene
-from neurolens.study.scenes import flip, rel_mse
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.defocus.kernels import kernel_at, own_plate
+from neurolens.pictures.defocus.picture import Gathered, defocus
+from neurolens.pictures.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
+from neurolens.pictures.render.pictures import read_exr, write_png
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import load_scene
+from neurolens.studies.scenes import flip, rel_mse
 
 LENS = "leica_summilux_m_50mm_f1_4"
 SCENES = ("room", "garden", "lights", "chess", "studio", "lamps")

@@ -19,10 +19,10 @@ import numpy as np
 from experiments import lab
 from experiments.plans import suited
 from neurolens.cameras.build import make_camera
-from neurolens.lens.shot import Shot
-from neurolens.render.colour import SRGB
-from neurolens.render.renderer import render
-from neurolens.render.scene import Scene, load_scene
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.colour import SRGB
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import Scene, load_scene
 
 SCENES = ("garden", "room", "lights")
 LENSES = {

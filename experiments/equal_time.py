@@ -24,16 +24,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from experiments import lab
 from experiments.lab import Row
-from neurolens.analysis.plots import drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.readers.lensfile import read_lens
-from neurolens.render.renderer import render
-from neurolens.render.scene import CameraSettings, load_scene
-from neurolens.study import scenes
-from neurolens.study.scenes import EPS, flip
-from neurolens.surrogates.model import Domain
+from neurolens.models.model import Domain
+from neurolens.optics.analysis.plots import drawing, plain_log_ticks
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import CameraSettings, load_scene
+from neurolens.studies import scenes
+from neurolens.studies.scenes import EPS, flip
 
 Floats = NDArray[np.float64]
 Passes = tuple[list[Floats], list[float]]  # pictures [H, W, 3] and seconds, in the order of `Counts.jobs`

@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import camera_rays
-from neurolens.study.speed import EAGER_BATCHES, Call, Candidate, Unavailable, eager_arguments
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import FilmRays
-from neurolens.trace.rays import Traced, compile_tracing, trace
+from neurolens.models.model import Domain
+from neurolens.models.pairs import FilmRays
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.setting.pupils import camera_rays
+from neurolens.optics.trace.rays import Traced, compile_tracing, trace
+from neurolens.studies.speed import EAGER_BATCHES, Call, Candidate, Unavailable, eager_arguments
 
 COMPILED = "exact compiled"
 COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from experiments import lab
 from neurolens.base import status as st
-from neurolens.lens import glass
-from neurolens.lens.figures import Cylinder, Figure
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
-from neurolens.trace.rays import Rays, Towards, trace
+from neurolens.optics.lens import glass
+from neurolens.optics.lens.figures import Cylinder, Figure
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.rays import Rays, Towards, trace
 
 INF = math.inf
 DOUBLE_GAUSS, FISHEYE = "laikin_double_gauss_50", "shimizu_fisheye_220"

@@ -27,9 +27,9 @@ from torch import Tensor
 from experiments import lab
 from experiments.extreme_cases import Case, all_cases
 from neurolens.base import status as st
-from neurolens.lens import glass
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.trace.rays import Rays, Traced, trace
+from neurolens.optics.lens import glass
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.trace.rays import Rays, Traced, trace
 
 EPS32 = 2.0**-23
 _NEIGHBOURS = (256, 16384)  # rays tried within the tolerance of one in dispute; more where those do not settle it

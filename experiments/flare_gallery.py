@@ -22,8 +22,8 @@ from experiments import lab
 from neurolens import cli
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import atomic_write_text
-from neurolens.render.colour import SRGB, in_gamut, linear_to_srgb
-from neurolens.render.pictures import read_exr, read_layers
+from neurolens.pictures.render.colour import SRGB, in_gamut, linear_to_srgb
+from neurolens.pictures.render.pictures import read_exr, read_layers
 
 OPTIONS = [lab.ONLY, lab.out(lab.RESULTS / "flare", "folder for pictures and page")]
 _SHOULDER, _MOST_BYTES, _QUALITIES = 0.6, 700_000, (93, 88, 82, 75)

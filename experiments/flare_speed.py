@@ -28,11 +28,11 @@ import torch
 from experiments import lab
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.flare.ghosts import GhostTracer
-from neurolens.flare.lights import Light, light_rays
-from neurolens.lens.prescription import Lens
-from neurolens.render.pictures import write_exr
-from neurolens.trace.rays import Rays, follow, turning
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace.rays import Rays, follow, turning
+from neurolens.pictures.flare.ghosts import GhostTracer
+from neurolens.pictures.flare.lights import Light, light_rays
+from neurolens.pictures.render.pictures import write_exr
 
 LENSES = ("laikin_double_gauss_50", "brendel_tessar_100", "ikemori_retrofocus_14", "ogawa_zoom_70_200", "phone_lens_6")
 GOAL_NS = 57.0  # a tenth of what the public CPU tracer was said to take on one quiet core (10 surfaces, all pairs)

@@ -17,10 +17,10 @@ import numpy as np
 from experiments import lab
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import make_camera
-from neurolens.lens.shot import Shot
-from neurolens.render.renderer import render
-from neurolens.render.scene import load_scene
-from neurolens.study.scenes import Image, to_srgb
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import load_scene
+from neurolens.studies.scenes import Image, to_srgb
 
 SCENE = lab.SCENES / "chess.toml"
 _GAP = 6  # pixels between the pictures

@@ -26,17 +26,17 @@ from neurolens.cameras.onnxlens import open_session
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
-from neurolens.lens.prescription import Lens
-from neurolens.study.experiment import LensChoice
-from neurolens.study.rays import ray_errors
-from neurolens.study.speed import Call, Candidate, model_candidate, program_candidate
-from neurolens.surrogates.assemble import ALL, RAY_ONLY
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import FilmRays, PairSettings, domain_of, make_pairs
-from neurolens.surrogates.source import Fix, fixed_models, fused_program
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.models.assemble import ALL, RAY_ONLY
+from neurolens.models.export import export_onnx
+from neurolens.models.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.models.model import LensModel
+from neurolens.models.pairs import FilmRays, PairSettings, domain_of, make_pairs
+from neurolens.models.source import Fix, fixed_models, fused_program
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace.tracegraph import exact_graph
+from neurolens.studies.experiment import LensChoice
+from neurolens.studies.rays import ray_errors
+from neurolens.studies.speed import Call, Candidate, model_candidate, program_candidate
 
 WITHIN_UM = 1.0
 AVX2 = (*FLAGS, "-mno-avx512f")  # what is not fixed is compiled a second time, without AVX-512

@@ -252,7 +252,7 @@ def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memor
 def _other_pixels(place: Path) -> Iterator[str]:
     """The fault of a damaged file that was accepted: its pixels are not those of the good one (`fuzz_kinds.RIGHT`)."""
     if (told := place / RIGHT).exists():
-        from neurolens.render.pictures import read_channels
+        from neurolens.pictures.render.pictures import read_channels
 
         (right, _), (found, _) = (read_channels(place / name) for name in told.read_text().split())
         if right.keys() != found.keys() or any(not np.array_equal(right[n], found[n]) for n in right):

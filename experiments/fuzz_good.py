@@ -71,7 +71,7 @@ def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple
 
 def _plates(folder: Path) -> None:
     """Plates with two lights."""
-    from neurolens.render.pictures import write_exr
+    from neurolens.pictures.render.pictures import write_exr
 
     plate = np.full((*PLATE[::-1], 3), 0.1)
     plate[2, 3] = plate[5, 8:10] = 50.0
@@ -122,7 +122,7 @@ def _right(folder: Path, done: Callable[[Words], None]) -> None:
 
 def _pack(folder: Path) -> None:
     """The extension with one lens, as a zip and as a user folder."""
-    from neurolens.blender import Form, PackedLens, add_lens, write_pack
+    from neurolens.programs.blender import Form, PackedLens, add_lens, write_pack
 
     form = Form("polynomial", "ols-36", "shader", 1.0, 21.6, 1.8, 0.7)
     lens = PackedLens("gauss", "Gauss", 50.0, 1.8, "US 2 1973", b"PNG", [form])

@@ -394,8 +394,8 @@ def chosen(seed: int, case: int, only: str = "") -> tuple[Chance, str]:
 
 def build() -> Parser:
     """The command line, and `read EXPERIMENT`: an experiment with its lens, domain and scenes; nothing runs."""
-    from neurolens.render.scene import load_scene
-    from neurolens.study.experiment import read_experiment
+    from neurolens.pictures.render.scene import load_scene
+    from neurolens.studies.experiment import read_experiment
 
     def read(args: argparse.Namespace) -> int:
         experiment = read_experiment(args.file)
@@ -416,9 +416,9 @@ def shorten() -> None:
     """Replace steps that take long and read no further file: a survey's processes, a shader's pupil, the models of the
     library, the field of the good lens of plates, which is made once."""
     from neurolens.base.tasks import Here
-    from neurolens.blender import Form
     from neurolens.cameras.onnxlens import load_model
     from neurolens.cli import blender, flare, models, train
+    from neurolens.programs.blender import Form
 
     def form_of(file: Path, **_: Any) -> Form:
         card = load_model(file).card

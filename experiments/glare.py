@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.flare.ghosts import coated
-from neurolens.flare.layers import axis_irradiance
-from neurolens.flare.lights import front_sphere
-from neurolens.flare.photons import Photons, PhotonTracer
-from neurolens.flare.steps import Floats
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.render.settings import Scatter
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.pictures.flare.ghosts import coated
+from neurolens.pictures.flare.layers import axis_irradiance
+from neurolens.pictures.flare.lights import front_sphere
+from neurolens.pictures.flare.photons import Photons, PhotonTracer
+from neurolens.pictures.flare.steps import Floats
+from neurolens.pictures.render.settings import Scatter
 
 LENS, HALF_MM = "laikin_double_gauss_50", (18.0, 12.0)
 COATINGS = ("bare", "single-layer", "multi-layer")

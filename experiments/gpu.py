@@ -41,13 +41,13 @@ from neurolens.graph.program import (
 )
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_glsl
-from neurolens.study.rays import ray_errors
-from neurolens.surrogates.file import read_model
-from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.pairs import FilmRays, PairSet, sample_domain, trace_pairs
-from neurolens.surrogates.source import fused_program
-from neurolens.trace.surfaces import Rays
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.models.file import read_model
+from neurolens.models.model import LensModel, Prediction
+from neurolens.models.pairs import FilmRays, PairSet, sample_domain, trace_pairs
+from neurolens.models.source import fused_program
+from neurolens.optics.trace.surfaces import Rays
+from neurolens.optics.trace.tracegraph import exact_graph
+from neurolens.studies.rays import ray_errors
 
 LENSES = {
     "thorlabs_lb1471_biconvex_50": ("ols-64", "mlp-16x2"),

@@ -50,8 +50,8 @@ from neurolens.graph.c import Signature
 from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import Cuda
-from neurolens.lens.shot import Shot
-from neurolens.torch import LensCamera, step_by_step
+from neurolens.optics.lens.shot import Shot
+from neurolens.programs.torch import LensCamera, step_by_step
 
 MODELS = {**LENSES, "laikin_double_gauss_50": ("ols-36", "mlp-16x2")}
 LENS, CAMERA = "lens", "whole camera"
@@ -470,7 +470,7 @@ def collected(running: Mapping[str, subprocess.Popen[str]], folder: Path, until:
 
 
 def gradient_row(known: gpu.Subject, form: str, device: torch.device, size: int, rounds: int) -> lab.Row:
-    """Rays of `neurolens.torch` and their gradients by film points, random numbers and wavelengths."""
+    """Rays of `neurolens.programs.torch` and their gradients by film points, random numbers and wavelengths."""
     name = known.name
     spec = lab.LENSES / f"{name}.toml" if form == EXACT else lab.MODELS / f"{name}.{form}.onnx"
     shot = shot_of(known)
@@ -653,7 +653,7 @@ def page_of(found: lab.Row) -> str:
     parts += ["![Error against rays a second](gpu_day.png)", "## Lenses", lab.table(_LENSES, _of(rows, LENS))]
     parts += ["Not measured: " + "; ".join(found["failed"])] if found.get("failed") else []
     parts += ["## Whole cameras", lab.table(_CAMERAS, _of(rows, CAMERA))]
-    parts += ["## Gradients (`neurolens.torch`)", lab.table(_GRADIENTS, found.get("gradients", []))]
+    parts += ["## Gradients (`neurolens.programs.torch`)", lab.table(_GRADIENTS, found.get("gradients", []))]
     timed = [row for row in found.get("torch", []) if row["seconds"]]
     left = ", ".join(f"{r['lens']} {r['form']}" for r in found.get("torch", []) if not r["seconds"])
     parts += ["## Lenses in torch", lab.table(_TORCH, timed) if timed else ""]

@@ -22,12 +22,12 @@ from PIL import Image
 import neurolens
 from experiments import lab
 from neurolens.cameras.build import make_camera
-from neurolens.hosts import LIGHT_NM
-from neurolens.lens.shot import Shot
-from neurolens.mitsuba import require_mitsuba
-from neurolens.render.colour import linear_to_srgb
-from neurolens.render.renderer import render
-from neurolens.render.scene import Scene, scene_from_tables
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.colour import linear_to_srgb
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import Scene, scene_from_tables
+from neurolens.programs.hosts import LIGHT_NM
+from neurolens.programs.mitsuba import require_mitsuba
 
 MODEL = "laikin_double_gauss_50.ols-60"
 FILM, FOCUS, F_NUMBER, NM = (36.0, 24.0), 1.5, 1.8, 550.0

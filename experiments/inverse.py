@@ -25,12 +25,9 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.graph.derive import solve, with_jacobian
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.study.experiment import LensChoice
-from neurolens.surrogates.cores import Array
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inverse import (
+from neurolens.models.cores import Array
+from neurolens.models.fit import ModelSettings, fit_model, prepare
+from neurolens.models.inverse import (
     STEPS,
     TOLERANCE,
     InverseModel,
@@ -40,10 +37,13 @@ from neurolens.surrogates.inverse import (
     scene_system,
     stop_system,
 )
-from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
-from neurolens.surrogates.terms import pinned_threads
-from neurolens.trace.surfaces import front_rays
+from neurolens.models.model import Domain, LensModel
+from neurolens.models.pairs import PairSettings, domain_of, make_pairs
+from neurolens.models.terms import pinned_threads
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace.surfaces import front_rays
+from neurolens.studies.experiment import LensChoice
 
 PUBLISHED_STEPS = (3, 5, 10, 20)
 # A residual beyond this (in stop radii; of the front's radius, in radians) counts as diverged, not just missed.

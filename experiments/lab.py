@@ -29,9 +29,9 @@ from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import plain
 from neurolens.base.settings import whole
-from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"
@@ -421,13 +421,13 @@ def cpu_ns(calls: Mapping[str, Callable[[], int]], rounds: int, report: Report |
 def race_rows(
     rows: Mapping[str, Row], field: Sequence[Any], domain: Any, rounds: int, over: Callable[[str], Row], report: Report
 ) -> list[Row]:
-    """Race candidates (`neurolens.study.speed`) named as the rows are, and give each row its times and its ratios.
+    """Race candidates (`neurolens.studies.speed`) named as the rows are, and give each row its times and its ratios.
 
     Args:
         over: for the name of a row, the candidates that its least time is compared with, by the words of the row for
             them: `speedup` then holds how many times as fast it is.
     """
-    from neurolens.study.speed import race
+    from neurolens.studies.speed import race
 
     timed = race(field, domain, rounds=rounds, report=report)
     for name, row in rows.items():

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurolens.graph.c import Signature, literal
 from neurolens.graph.program import Program
-from neurolens.surrogates.source import WRITERS
+from neurolens.models.source import WRITERS
 
 Rows = dict[str, NDArray[np.float32]]
 GROUP = 64

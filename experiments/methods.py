@@ -18,16 +18,16 @@ from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import plain
 from neurolens.cameras.model import load_model
-from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import image_radius_mm
-from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
-from neurolens.study.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
-from neurolens.study.rays import REFERENCE_RADIUS_MM
-from neurolens.study.speed import EXACT, Race, model_candidates, race
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.models.export import export_onnx
+from neurolens.models.fit import NETWORKS, ModelSettings, Prepared, prepare
+from neurolens.models.model import Domain
+from neurolens.models.pairs import PairSettings, make_pairs
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.setting.pupils import image_radius_mm
+from neurolens.studies.experiment import DomainChoice, EvaluationChoice, LensChoice
+from neurolens.studies.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
+from neurolens.studies.rays import REFERENCE_RADIUS_MM
+from neurolens.studies.speed import EXACT, Race, model_candidates, race
 
 GROUPS = {
     "paraxial": "what renderers use today",

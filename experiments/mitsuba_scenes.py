@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.mitsuba.sensor import matrix
-from neurolens.render.colour import table
-from neurolens.render.scene import Scene, scene_from_tables
+from neurolens.pictures.render.colour import table
+from neurolens.pictures.render.scene import Scene, scene_from_tables
+from neurolens.programs.mitsuba.sensor import matrix
 
 _SKIPPED = ("type", "integrator", "sensor")
 # Centres and edges of faces from -1 to 1; edge_u x edge_v is the outward normal.

@@ -22,18 +22,18 @@ import numpy as np
 
 from experiments import lab
 from experiments.mitsuba_scenes import our_scene, with_our_spectra
-from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.ideal import Pinhole
-from neurolens.lens.shot import Shot
-from neurolens.mitsuba import require_mitsuba
-from neurolens.mitsuba.sensor import libraries
-from neurolens.render.renderer import render
-from neurolens.render.scene import Scene
-from neurolens.render.settings import FilmSettings
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import Scene
+from neurolens.pictures.render.settings import FilmSettings
+from neurolens.programs import mitsuba
+from neurolens.programs.mitsuba import require_mitsuba
+from neurolens.programs.mitsuba.sensor import libraries
 
 FOCAL_MM = 50.0
 FOCUS_M, F_NUMBER = 3.9, 2.0

@@ -22,15 +22,15 @@ import torch
 
 from experiments import lab
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.photographs.rims import fit_rims, with_fitted_rims
-from neurolens.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, verify
-from neurolens.readers.any_format import read_any
-from neurolens.readers.lensfile import write_lens
-from neurolens.setting.check import DARK, axial_beam, corner_illumination, film_edge_mm
-from neurolens.setting.rims import derive_rims, narrowed_rims
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.photographs.rims import fit_rims, with_fitted_rims
+from neurolens.optics.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, verify
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.readers.lensfile import write_lens
+from neurolens.optics.setting.check import DARK, axial_beam, corner_illumination, film_edge_mm
+from neurolens.optics.setting.rims import derive_rims, narrowed_rims
+from neurolens.optics.setting.states import set_lens
 
 _LIST = lab.ROOT / "experiments" / "named_lenses.toml"
 _NAMED = re.compile(r"(?P<patent>[^(]+?),?\s*(?P<example>Example\s+\w+)?(?P<master>\s+ML)?\s*\((?P<product>.+)\)$")

@@ -37,7 +37,7 @@ OPTIONS = [
 
 def run(args: argparse.Namespace) -> int:
     """Render, write the table; 1 where a goal is missed."""
-    from neurolens.shaders.blender_shader import shader_of
+    from neurolens.cameras.shaders.blender_shader import shader_of
 
     python = osl_speed.checked_python(args.blender_python, "osl-noise")
     text = shader_of(osl_speed.SHADERS[osl_speed.POLYNOMIAL], quiet=args.quiet).text

@@ -26,9 +26,9 @@ from typing import Any
 from experiments import lab, osl_in_blender
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
-from neurolens.blender import Form
 from neurolens.cli.blender import form_of
-from neurolens.lens.paraxial import first_order
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.programs.blender import Form
 
 PYTHON = lab.ROOT / ".venv-blender" / "bin" / "python"
 _GAUSS = "laikin_double_gauss_50"
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _shaders(quiet: bool) -> tuple[dict[str, str | None], dict[str, int]]:
     """Texts by camera, None for Blender's own, and the operations of ours."""
-    from neurolens.shaders.blender_shader import shader_of
+    from neurolens.cameras.shaders.blender_shader import shader_of
 
     made = {name: shader_of(file, quiet=quiet) for name, file in SHADERS.items()}
     own: dict[str, str | None] = {BUILT_IN: None, DEPTH: None, THIN: THIN_LENS}

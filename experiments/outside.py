@@ -21,7 +21,7 @@ from experiments import lab
 from neurolens.base import status as st
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.onnxlens import OnnxLens, load_model
-from neurolens.lens.glass import ANY_WAVELENGTH_NM
+from neurolens.optics.lens.glass import ANY_WAVELENGTH_NM
 
 _BATCH = 1 << 12  # of one film plane and stop
 # Bounds are tested in float32, a few roundings of which may fall either side.

@@ -25,12 +25,12 @@ from experiments import lab
 from experiments.lab import Row
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
-from neurolens.lens.prescription import Lens
-from neurolens.photographs.profiles import Profile, database
-from neurolens.photographs.rims import at_focal_length, fit_rims
-from neurolens.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, light_curves, verify
-from neurolens.readers.any_format import read_any
-from neurolens.setting.rims import RimRule, derive_rims
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.photographs.profiles import Profile, database
+from neurolens.optics.photographs.rims import at_focal_length, fit_rims
+from neurolens.optics.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, light_curves, verify
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.rims import RimRule, derive_rims
 
 PERCENTILES = (10, 25, 50, 75, 90)
 BANDS = ("red", "blue")

@@ -42,11 +42,11 @@ from experiments.table_faults import (
 )
 from experiments.table_figures import Measures, measure
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.lens.figures import SPHERE
-from neurolens.lens.prescription import Lens
-from neurolens.photographs.profiles import Profile
-from neurolens.photographs.verify import found_for
-from neurolens.readers.any_format import read_any
+from neurolens.optics.lens.figures import SPHERE
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.photographs.profiles import Profile
+from neurolens.optics.photographs.verify import found_for
+from neurolens.optics.readers.any_format import read_any
 
 SEVERAL = "all of several aspheres dropped"  # which no single change mends
 _GROUPS = {"certain": "primes, certain match", "likely": "primes, likely match",

@@ -18,8 +18,8 @@ import numpy as np
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.flare.lights import Light, light_rays
-from neurolens.flare.photons import PhotonTracer
+from neurolens.pictures.flare.lights import Light, light_rays
+from neurolens.pictures.flare.photons import PhotonTracer
 
 LENS, ZOOM, DISTANCE_MM = "nikon_zoom_80_200", "80", 3600.0
 # x, y of the light in mm, most reflections, and his time where he states it.

@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter  # type: ignore[import-untyped]
 
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
-from neurolens.plan import footprints as prints
-from neurolens.plan.footprints import Footprints, Places
-from neurolens.plan.probe import COUNTED, parts_of, spectrum_seen
-from neurolens.render.renderer import render
-from neurolens.render.scene import Scene
-from neurolens.render.settings import FilmSettings
-from neurolens.study.scenes import seen_depths_m
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import Scene
+from neurolens.pictures.render.settings import FilmSettings
+from neurolens.studies.plan import footprints as prints
+from neurolens.studies.plan.footprints import Footprints, Places
+from neurolens.studies.plan.probe import COUNTED, parts_of, spectrum_seen
+from neurolens.studies.scenes import seen_depths_m
 
 Array = NDArray[np.float64]
 _PUPILS = 18, 64, 160  # squared: pupil samples of a fresh footprint, and where those leave its error unsure

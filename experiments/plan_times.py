@@ -19,10 +19,10 @@ import numpy as np
 from experiments import lab
 from neurolens.cameras.build import as_c, ideal_as
 from neurolens.cameras.contract import Camera
-from neurolens.plan import plan as plans
-from neurolens.plan.candidates import EXACT, camera_of
-from neurolens.render.renderer import render
-from neurolens.render.scene import Scene, load_scene
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import Scene, load_scene
+from neurolens.studies.plan import plan as plans
+from neurolens.studies.plan.candidates import EXACT, camera_of
 
 SCENES, LENS, MODEL, PLAIN = ("garden", "room", "lights"), "laikin_double_gauss_50", "ols-36", "thick + ST map"
 _COUNTED = 95.0  # percentile of squared differences above which the rarest lights are left to chance

@@ -24,19 +24,19 @@ from neurolens.cameras.build import ideal_as, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.reduced import Warped
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Shot
-from neurolens.plan import candidates as choices
-from neurolens.plan import footprints as prints
-from neurolens.plan import plan as plans
-from neurolens.plan.probe import COUNTED, LIGHT, Probe, effects_of, probe
-from neurolens.readers.lensfile import read_lens
-from neurolens.render.scene import Scene, load_scene
-from neurolens.setting.pupils import image_radius_mm
-from neurolens.setting.states import set_lens
-from neurolens.study.experiment import near_limit_m
-from neurolens.surrogates.terms import pinned_threads
+from neurolens.models.terms import pinned_threads
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.pupils import image_radius_mm
+from neurolens.optics.setting.states import set_lens
+from neurolens.pictures.render.scene import Scene, load_scene
+from neurolens.studies.experiment import near_limit_m
+from neurolens.studies.plan import candidates as choices
+from neurolens.studies.plan import footprints as prints
+from neurolens.studies.plan import plan as plans
+from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe, effects_of, probe
 
 LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200@135mm", "horimoto_fisheye_16", "phone_lens_6", "cooke_anamorphic_42",

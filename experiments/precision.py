@@ -3,8 +3,8 @@
 Rays of 550 nm from points of the film, up to 21.6 mm from the axis, to points of the exit pupil, the lens focused at
 infinity, are rounded to float32 first, so that both precisions trace the same ones; those that pass count. The error is
 that of the scene ray's direction as a distance on the film: the focal length times the difference of direction cosines.
-Where polynomials of a lens are summed about the middle of their zones (`trace/shapes.py`), the same rays go through its
-powers, too, to show what that is worth.
+Where polynomials of a lens are summed about the middle of their zones (`optics/trace/shapes.py`), the same rays go
+through its powers, too, to show what that is worth.
 Exit code 1 where a lens with aspheres misses the goal. Writes precision.md and precision.json.
 """
 
@@ -22,10 +22,10 @@ import torch
 from experiments import lab
 from experiments.extremes import both_precisions
 from neurolens.base import status as st
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.trace import shapes
-from neurolens.trace.rays import Rays, trace
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace import shapes
+from neurolens.optics.trace.rays import Rays, trace
 
 GOAL_UM = 0.2  # 99th percentile, on the film
 FILM_MM = 21.6

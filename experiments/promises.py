@@ -24,13 +24,13 @@ from experiments.lab import Row
 from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import load_model
-from neurolens.render.renderer import render
-from neurolens.render.scene import load_scene
-from neurolens.study.speed import EXACT, Race, exact_c_candidate, model_candidate, program_candidate, race
-from neurolens.surrogates.fit import ModelSettings, prepare
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
-from neurolens.surrogates.source import fused_program
+from neurolens.models.fit import ModelSettings, prepare
+from neurolens.models.model import Domain
+from neurolens.models.pairs import PairSettings, domain_of, make_pairs
+from neurolens.models.source import fused_program
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import load_scene
+from neurolens.studies.speed import EXACT, Race, exact_c_candidate, model_candidate, program_candidate, race
 
 COMPILED = "exact compiled"
 LENS, SCENE = "laikin_double_gauss_50", lab.SCENES / "room.toml"

@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.trace.rays import trace
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.setting.pupils import camera_rays, pupil_plane_z_mm
+from neurolens.optics.trace.rays import trace
 
 Array = NDArray[np.float64]
 # Of the hull film points and points across; of Wu's search film points, rays of a fan, planes; pixels along the film's

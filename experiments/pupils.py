@@ -24,12 +24,12 @@ from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Shot
-from neurolens.plan.costs import cycles_ns
-from neurolens.shaders.blender_shader import lens_of
-from neurolens.shaders.osl import osl_program
-from neurolens.shaders.pupil_fit import light_lost
+from neurolens.cameras.shaders.blender_shader import lens_of
+from neurolens.cameras.shaders.osl import osl_program
+from neurolens.cameras.shaders.pupil_fit import light_lost
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
+from neurolens.studies.plan.costs import cycles_ns
 
 
 @dataclass(frozen=True)
@@ -268,9 +268,9 @@ SHADERS = lab.columns(
 _SHADERS_TEXT = """\
 By `python -m experiments pupils --shaders`: share of the samples that pass the lens, from film points that have light
 at that stop, all over film, focus and wavelength; light that no sample has, in the worst zone of film and stop;
-operations of a ray through a round stop; what they make a ray cost in Cycles under a white sky (`plan/costs.py`)
-for each that passes, the stop open; CPU to make the shader. The pupil of the biconvex lens folds far off the axis: one
-wide disc holds it."""
+operations of a ray through a round stop; what they make a ray cost in Cycles under a white sky
+(`studies/plan/costs.py`) for each that passes, the stop open; CPU to make the shader. The pupil of the biconvex lens
+folds far off the axis: one wide disc holds it."""
 
 
 def shaders(args: argparse.Namespace) -> None:

@@ -25,8 +25,8 @@ from torch.nn import functional as F
 from torch.quasirandom import SobolEngine
 
 from experiments import lab
-from neurolens.lens.shot import Shot
-from neurolens.torch import LensCamera
+from neurolens.optics.lens.shot import Shot
+from neurolens.programs.torch import LensCamera
 
 LENS, MODEL = "lenses/leica_summilux_m_50mm_f1_4.toml", "models/leica_summilux_m_50mm_f1_4.ols-64.onnx"
 FOCUS, NM, HALF, SIZE = 0.7, 550.0, 0.2, (144, 96)

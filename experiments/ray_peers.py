@@ -33,11 +33,11 @@ import torch
 from numpy.typing import NDArray
 
 from experiments.tracer_race import Hand, by_figures, compiled
-from neurolens.lens import glass
-from neurolens.lens.prescription import Lens
-from neurolens.study.speed import Unavailable
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import FilmRays
+from neurolens.models.model import Domain
+from neurolens.models.pairs import FilmRays
+from neurolens.optics.lens import glass
+from neurolens.optics.lens.prescription import Lens
+from neurolens.studies.speed import Unavailable
 
 Numbers = NDArray[np.float64]
 WAVELENGTH_NM = glass.LINE_D_NM

@@ -44,23 +44,23 @@ import torch
 from experiments import lab
 from experiments.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Peer, Prepared, Task, table_of
 from experiments.tracer_race import has_avx512
-from neurolens.analysis.plots import drawing, plain_log_ticks
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxlens import BATCH
 from neurolens.graph.compiler import FLAGS, find_compiler, has_compiler
 from neurolens.graph.ir import pruned
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import camera_rays
-from neurolens.study.speed import CompiledSource, Unavailable
-from neurolens.surrogates.file import read_model
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.source import fused_program
-from neurolens.surrogates.terms import pinned_threads
-from neurolens.trace.rays import compile_tracing, trace
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.models.file import read_model
+from neurolens.models.model import Domain
+from neurolens.models.source import fused_program
+from neurolens.models.terms import pinned_threads
+from neurolens.optics.analysis.plots import drawing, plain_log_ticks
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.setting.pupils import camera_rays
+from neurolens.optics.trace.rays import compile_tracing, trace
+from neurolens.optics.trace.tracegraph import exact_graph
+from neurolens.studies.speed import CompiledSource, Unavailable
 
 COUNT, SEED, LEAST_S = 100_000, 36, 0.004  # rays, their seed, and the least time of a sample
 CASES = {  # lens: its models

@@ -26,10 +26,10 @@ from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.lens.shot import Runtime, Shot
-from neurolens.render.renderer import render
-from neurolens.render.scene import Scene, load_scene
-from neurolens.render.settings import FilmSettings
+from neurolens.optics.lens.shot import Runtime, Shot
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import Scene, load_scene
+from neurolens.pictures.render.settings import FilmSettings
 
 PINHOLE, THIN, STOP = "pinhole", "thin lens", "stop only"
 EXACT_GRAPH, EXACT_C = "exact, onnxruntime", "exact, C"

@@ -22,13 +22,13 @@ from experiments.plans import suited
 from neurolens.base.progress import Report
 from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.plan import footprints as prints
-from neurolens.plan.candidates import shot_fits
-from neurolens.plan.costs import glsl_operations, ns_a_ray
-from neurolens.plan.probe import COUNTED, LIGHT, Probe, probe
-from neurolens.render.scene import load_scene
-from neurolens.study.experiment import near_limit_m
-from neurolens.surrogates.terms import pinned_threads
+from neurolens.models.terms import pinned_threads
+from neurolens.pictures.render.scene import load_scene
+from neurolens.studies.experiment import near_limit_m
+from neurolens.studies.plan import footprints as prints
+from neurolens.studies.plan.candidates import shot_fits
+from neurolens.studies.plan.costs import glsl_operations, ns_a_ray
+from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe, probe
 
 # All kinds: wide to long, f/1 to f/5.4, simple and not, from plastic, a zoom's default state.
 LENSES = (

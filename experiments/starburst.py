@@ -16,15 +16,15 @@ import numpy as np
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.flare.canvas import Raster
-from neurolens.flare.diffraction import far_field, outline_spectrum, star, starburst_picture
-from neurolens.flare.exit_pupil import Array, ExitPupil, coverage, exit_pupil, outline
-from neurolens.flare.layers import FlareJob
-from neurolens.flare.lights import Light
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
+from neurolens.pictures.flare.canvas import Raster
+from neurolens.pictures.flare.diffraction import far_field, outline_spectrum, star, starburst_picture
+from neurolens.pictures.flare.exit_pupil import Array, ExitPupil, coverage, exit_pupil, outline
+from neurolens.pictures.flare.layers import FlareJob
+from neurolens.pictures.flare.lights import Light
 
 LENS, NM, FILM_MM = "laikin_double_gauss_50", 550.0, (36.0, 24.0)
 STOPS, LARGE = (1.8, 4.0, 8.0, 16.0, 45.0), (960, 640)

@@ -30,10 +30,10 @@ from neurolens.base.records import plain, versions
 from neurolens.base.settings import add_options, whole
 from neurolens.cli.arguments import Reporting, check_ids, check_written, named_lens
 from neurolens.graph.scalars import MOST_WEIGHTS
-from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
-from neurolens.study.pages import DASH, Column, Record, number, show
-from neurolens.study.plots import Kinds, trade_plot
-from neurolens.surrogates.pairs import PairSettings
+from neurolens.models.pairs import PairSettings
+from neurolens.studies.experiment import DomainChoice, EvaluationChoice, LensChoice
+from neurolens.studies.pages import DASH, Column, Record, number, show
+from neurolens.studies.plots import Kinds, trade_plot
 
 DEFAULT_LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200", "schaefter_primoplan_100", "horimoto_fisheye_16", "phone_lens_6"
@@ -168,7 +168,7 @@ _LOOK: Kinds = {
 }
 
 NOTES = (
-    "Errors on held-out rays at full aperture, as `neurolens.study.rays` defines them, of the exported float32 "
+    "Errors on held-out rays at full aperture, as `neurolens.studies.rays` defines them, of the exported float32 "
     "graph. Micrometres are film-equivalent and at an image radius of 21.6 "
     "mm, the position's at the front surface likewise; pixels are the frame's width over 4000. False pass: blocked "
     "rays over rays that the model passes; false block: lost rays over rays that the lens passes. Coefficients: of "

@@ -28,7 +28,7 @@ from experiments import lab
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.cli import main
-from neurolens.render.pictures import read_channels
+from neurolens.pictures.render.pictures import read_channels
 
 OPTIONS = [
     lab.count("kills", 100, "random moments, over all cases (default 100)"),

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.table_figures import Measures, measure
-from neurolens.analysis.fields import Result
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.photographs.profiles import Profile
-from neurolens.photographs.rims import at_focal_length
+from neurolens.optics.analysis.fields import Result
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.photographs.profiles import Profile
+from neurolens.optics.photographs.rims import at_focal_length
 
 Array = NDArray[np.float64]
 

@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.lens.glass import LINE_C_NM, LINE_F_NM, index_of
-from neurolens.lens.paraxial import System
-from neurolens.lens.prescription import Lens
-from neurolens.photographs.profiles import Profile
-from neurolens.photographs.verify import heights_of, ideal_heights, shapes
-from neurolens.trace.arithmetic import NUMPY
-from neurolens.trace.shapes import Curve, without_rim
-from neurolens.trace.surfaces import Medium, Rays, cross, medium
+from neurolens.optics.lens.glass import LINE_C_NM, LINE_F_NM, index_of
+from neurolens.optics.lens.paraxial import System
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.photographs.profiles import Profile
+from neurolens.optics.photographs.verify import heights_of, ideal_heights, shapes
+from neurolens.optics.trace.arithmetic import NUMPY
+from neurolens.optics.trace.shapes import Curve, without_rim
+from neurolens.optics.trace.surfaces import Medium, Rays, cross, medium
 
 Array = NDArray[np.float64]
 

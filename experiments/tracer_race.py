@@ -28,13 +28,13 @@ from experiments import lab
 from experiments.fused_speed import Case
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.scalars import lower
-from neurolens.lens.figures import SPHERE
-from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, cauchy, index_of
-from neurolens.lens.prescription import Lens, Medium, Surface
-from neurolens.study.speed import FUSED_BATCHES, Call, Candidate, CompiledSource, Unavailable, program_candidate
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import FilmRays, domain_of, sample_domain
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.models.model import Domain
+from neurolens.models.pairs import FilmRays, domain_of, sample_domain
+from neurolens.optics.lens.figures import SPHERE
+from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, cauchy, index_of
+from neurolens.optics.lens.prescription import Lens, Medium, Surface
+from neurolens.optics.trace.tracegraph import exact_graph
+from neurolens.studies.speed import FUSED_BATCHES, Call, Candidate, CompiledSource, Unavailable, program_candidate
 
 REFERENCE = lab.ROOT.parent / "shared" / "data" / "reference_tracer"
 CASES = (

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from experiments import lab
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
-from neurolens.blender import extension_library
 from neurolens.cli.keys import _frames as frames_of
-from neurolens.render.primitives import Mesh, Rays
+from neurolens.pictures.render.primitives import Mesh, Rays
+from neurolens.programs.blender import extension_library
 
 OPTIONS = (
     lab.option("stage", type=Path, metavar="STAGE", help="USD file"),

@@ -29,16 +29,16 @@ from experiments.promises import read_index
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.cameras.model import load_model
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.prescription import Lens
-from neurolens.readers.any_format import lens_files
-from neurolens.study.describe import read_quietly
-from neurolens.study.experiment import DomainChoice, LensChoice
-from neurolens.study.measure import onnx_predictor
-from neurolens.study.rays import SEED, false_shares, relative_illumination
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import FilmRays, make_pairs, sample_domain, trace_pairs
+from neurolens.models.fit import ModelSettings, fit_model, prepare
+from neurolens.models.model import Domain, LensModel
+from neurolens.models.pairs import FilmRays, make_pairs, sample_domain, trace_pairs
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers.any_format import lens_files
+from neurolens.studies.describe import read_quietly
+from neurolens.studies.experiment import DomainChoice, LensChoice
+from neurolens.studies.measure import onnx_predictor
+from neurolens.studies.rays import SEED, false_shares, relative_illumination
 
 # By how many stops the lens is closed, and its blades.
 OPENINGS: dict[str, tuple[int, Aperture | None]] = {

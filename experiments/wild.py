@@ -32,16 +32,16 @@ from experiments.languages import RUN, Given, Missing, Rows
 from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.model import load_model
+from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
+from neurolens.cameras.shaders.source import camera_program
 from neurolens.graph import program as arithmetic
 from neurolens.graph.program import RAY, SCENE_RAY, STOP, Program
-from neurolens.lens.prescription import VISIBLE_NM, Lens
-from neurolens.lens.shot import Shot
-from neurolens.setting.pupils import camera_rays
-from neurolens.shaders.lens_source import lens_program, pupil_planes_mm
-from neurolens.shaders.source import camera_program
-from neurolens.study.speed import CompiledSource
-from neurolens.surrogates.source import fused_program
-from neurolens.trace.rays import trace
+from neurolens.models.source import fused_program
+from neurolens.optics.lens.prescription import VISIBLE_NM, Lens
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.setting.pupils import camera_rays
+from neurolens.optics.trace.rays import trace
+from neurolens.studies.speed import CompiledSource
 
 LENS, MODEL = "laikin_double_gauss_50", "laikin_double_gauss_50.ols-36.onnx"
 CHUNK = 1 << 17  # rays of one film plane and stop

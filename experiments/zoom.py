@@ -16,18 +16,18 @@ from statistics import median_high
 from experiments import lab
 from experiments.lab import Row
 from neurolens import __version__
-from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
-from neurolens.readers.lensfile import read_lens
-from neurolens.study.experiment import near_limit_m, wavelengths_nm
-from neurolens.study.plots import AXIS_LABELS, error_axes, error_line
-from neurolens.study.rays import ray_errors
-from neurolens.study.train import fit_and_measure_states
-from neurolens.surrogates.axes import Axis
-from neurolens.surrogates.fit import ModelSettings, StateSettings, StateSpace, axes_of, fit_model, prepare
-from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.terms import pinned_threads
+from neurolens.models.axes import Axis
+from neurolens.models.fit import ModelSettings, StateSettings, StateSpace, axes_of, fit_model, prepare
+from neurolens.models.pairs import PairSettings, make_pairs
+from neurolens.models.terms import pinned_threads
+from neurolens.optics.analysis.plots import FIELD_COLOURS, INK, drawing
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.studies.experiment import near_limit_m, wavelengths_nm
+from neurolens.studies.plots import AXIS_LABELS, error_axes, error_line
+from neurolens.studies.rays import ray_errors
+from neurolens.studies.train import fit_and_measure_states
 
 # Coefficients per vector, rays of a node, rays of a single fit's test.
 TERMS, RAYS, TESTS = 64, 15_000, 8_000

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -30,14 +28,6 @@ __all__ = [
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
-class _Front(ModuleType):
-    """The package, in which a call is not hidden by the folder of its name, as neurolens.render."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name not in __all__ or not isinstance(value, ModuleType):  # Python sets a folder that it has imported
-            super().__setattr__(name, value)
-
-
 if not TYPE_CHECKING:  # to which any name would be one
 
     def __getattr__(name: str) -> Any:
@@ -49,6 +39,3 @@ if not TYPE_CHECKING:  # to which any name would be one
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-sys.modules[__name__].__class__ = _Front

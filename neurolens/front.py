@@ -13,8 +13,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from html import escape
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -30,14 +28,14 @@ from neurolens.cameras.onnxlens import LensRays, OnnxLens
 from neurolens.cli import arguments as cli
 from neurolens.cli import command
 from neurolens.cli.calls import Answer, call, command_of, parameters, signature_of
-from neurolens.hosts import rays
-from neurolens.lens.shot import Dispersion, Shot, Vignetting
-from neurolens.surrogates.file import read_model
+from neurolens.models.file import read_model
+from neurolens.optics.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.programs.hosts import rays
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import Camera as MadeCamera
-    from neurolens.lens.prescription import Lens as Prescription
-    from neurolens.trace.rays import Towards
+    from neurolens.optics.lens.prescription import Lens as Prescription
+    from neurolens.optics.trace.rays import Towards
 
 _LENS = "laikin_double_gauss_50"
 EXAMPLES = {  # of each name: its docstring has it, and a test runs it
@@ -62,7 +60,7 @@ EXAMPLES = {  # of each name: its docstring has it, and a test runs it
 
 
 class Call:
-    """A function of the front. Where a folder has its name, as neurolens.render, it leads to that folder's modules."""
+    """A function of the front."""
 
     def __init__(self, name: str, run: Callable[..., Any], doc: str, signature: inspect.Signature) -> None:
         self._run, self.__name__, self.__doc__, self.__signature__ = run, name, doc, signature
@@ -72,12 +70,6 @@ class Call:
             return self._run(*given, **named)
         except ModuleNotFoundError as error:  # as a command says it, with the extra that brings the package
             raise (NeurolensError(missing(error)) if missing(error) else error) from None
-
-    def __getattr__(self, name: str) -> Any:
-        folder = f"neurolens.{self.__name__}"
-        if name.startswith("__") or find_spec(folder) is None:
-            raise AttributeError(name)
-        return getattr(import_module(folder), name)
 
     def __repr__(self) -> str:
         return f"neurolens.{self.__name__}{self.__signature__}"
@@ -177,7 +169,7 @@ class Lens(_Chosen):
 
     @cached_property
     def _tabled(self) -> Prescription:
-        from neurolens.readers.any_format import read_any
+        from neurolens.optics.readers.any_format import read_any
 
         return read_any(self._read.file)
 
@@ -222,12 +214,12 @@ class Lens(_Chosen):
             towards: "scene" for camera rays, which run towards -z, or "film".
 
         Raises:
-            InputError: another shape; as `neurolens.trace.rays.trace`.
+            InputError: another shape; as `neurolens.optics.trace.rays.trace`.
         """
         import torch
 
-        from neurolens.trace.rays import trace
-        from neurolens.trace.surfaces import Rays
+        from neurolens.optics.trace.rays import trace
+        from neurolens.optics.trace.surfaces import Rays
 
         if (array := np.array(rays, np.float64)).ndim != 2 or len(array) != 6:
             raise InputError("Lens.trace", "rays", f"({array.shape})", "an array (6, N)")
@@ -334,7 +326,7 @@ def fit(lens: str | os.PathLike[str], within_um: float | None = None, **options:
     Raises:
         InputError: a setting that models do not have; no model within the error.
     """
-    from neurolens.study.pages import CLOSE_UM, to_use
+    from neurolens.studies.pages import CLOSE_UM, to_use
 
     state = {key: value for key, value in _settings(lens).items() if key != "focus_m"}  # a model holds any focus
     kept = {f"lens.{key}": state.pop(key) for key in ("zoom", "f_number", "focal_length_mm") if key in state}

@@ -71,12 +71,12 @@ def quick_races() -> Iterator[None]:
         # What is compiled and searched for one test is there for the next, in both processes.
         patch.setattr(compiler, "_KEPT", 4096)
         patch.setattr("neurolens.cameras.exact._KEPT", 4096)
-        patch.setattr("neurolens.study.speed.CompiledSource.__init__.__defaults__", (flags, False))
-        patch.setattr("neurolens.study.speed.program_candidate.__defaults__", (None, flags, False))
+        patch.setattr("neurolens.studies.speed.CompiledSource.__init__.__defaults__", (flags, False))
+        patch.setattr("neurolens.studies.speed.program_candidate.__defaults__", (None, flags, False))
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
-        patch.setattr("neurolens.study.speed.POOL", 16384)
-        patch.setattr("neurolens.study.speed._SAMPLES", 1)
-        patch.setattr("neurolens.plan.costs._STRIP_PATHS", 12_000)
+        patch.setattr("neurolens.studies.speed.POOL", 16384)
+        patch.setattr("neurolens.studies.speed._SAMPLES", 1)
+        patch.setattr("neurolens.studies.plan.costs._STRIP_PATHS", 12_000)
         yield
 
 
@@ -91,4 +91,4 @@ def scene(tmp_path: Path) -> Path:
 @pytest.fixture
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings without the plots of their report, which take longer to draw than small models to fit."""
-    monkeypatch.setattr("neurolens.study.train._draw", lambda *_: [])
+    monkeypatch.setattr("neurolens.studies.train._draw", lambda *_: [])

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.lens.prescription import Lens
-from neurolens.setting.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
-from neurolens.trace.rays import trace
-from neurolens.trace.surfaces import Rays
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.setting.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
 

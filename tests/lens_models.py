@@ -17,18 +17,18 @@ import onnx
 from experiments.published import PublishedSettings, fit_any
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
-from neurolens.lens import paraxial
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.lens.shot import Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
-from neurolens.surrogates.card import CARD_KEY, MODEL_KEY, read_card
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import ModelSettings, Prepared, as_model, fit_model, prepare
-from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.network import fit_network
-from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
-from neurolens.surrogates.source import at_wavelength
+from neurolens.models.card import CARD_KEY, MODEL_KEY, read_card
+from neurolens.models.export import export_onnx
+from neurolens.models.fit import ModelSettings, Prepared, as_model, fit_model, prepare
+from neurolens.models.model import Domain, LensModel
+from neurolens.models.network import fit_network
+from neurolens.models.pairs import PairSettings, domain_of, make_pairs
+from neurolens.models.source import at_wavelength
+from neurolens.optics.lens import paraxial
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 
 LENSES = Path(__file__).parents[1] / "lenses"
 GAUSS, FISHEYE, COLOURLESS = "laikin_double_gauss_50", "horimoto_fisheye_16", "muller_fisheye_100"

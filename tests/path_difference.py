@@ -2,8 +2,8 @@
 
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, bundle, points
-from neurolens.analysis.spots import path_to_chief_mm
+from neurolens.optics.analysis.bundles import Bundle, bundle, points
+from neurolens.optics.analysis.spots import path_to_chief_mm
 
 
 def opd_mm(rays: Bundle) -> Tensor:

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from neurolens.base.errors import NeurolensWarning
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
-from neurolens.trace.rays import Rays
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.rays import Rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 # The lenses by name, made by `python -m experiments named-lenses`, have tests of their own: test_named_lenses.py.

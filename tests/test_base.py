@@ -349,7 +349,7 @@ def test_torch_keeps_compiled_code_in_a_folder_of_this_user_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its own choice is a folder in the shared temporary one, whoever made it: planted code ran."""
-    trace = pytest.importorskip("neurolens.trace.rays")
+    trace = pytest.importorskip("neurolens.optics.trace.rays")
     places = pytest.importorskip("torch._inductor.runtime.cache_dir_utils")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "")

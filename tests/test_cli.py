@@ -19,11 +19,11 @@ from shipped import whole
 
 from neurolens.cli import build_parser, main
 from neurolens.cli.train import Train
-from neurolens.render.pictures import read_exr
-from neurolens.surrogates.card import read_card
+from neurolens.models.card import read_card
+from neurolens.pictures.render.pictures import read_exr
 
 ROOT = Path(__file__).parents[1]
-# A singlet, a fisheye, an asphere that is the stop, cylinders, a nearly telecentric lens; tests/trace has them all.
+# A singlet, a fisheye, an asphere that is the stop, cylinders, a nearly telecentric lens; tests/optics has all.
 DESCRIBED = (
     *("thorlabs_lb1471_biconvex_50", "brendel_tessar_100", "edmund_asphere_30"),
     *("isshiki_fisheye_10", "nikon_zoom_80_200"),
@@ -327,7 +327,7 @@ def test_an_interrupt_says_what_is_kept(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("neurolens.frames.render", interrupted)
+    monkeypatch.setattr("neurolens.pictures.frames.render", interrupted)
     assert main(["render", str(scene), "--camera", "thin", "-o", str(tmp_path / "a.exr"), "--quiet"]) == 130
     assert "no picture was written" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.exr"))
@@ -339,7 +339,7 @@ def test_what_ends_a_training_says_what_is_kept(
 ) -> None:
     """Without a handler SIGTERM and SIGHUP would end this process."""
     before = signal.signal(number, signal.SIG_DFL)
-    monkeypatch.setattr("neurolens.study.train.run_experiment", lambda *_, **__: signal.raise_signal(number))
+    monkeypatch.setattr("neurolens.studies.train.run_experiment", lambda *_, **__: signal.raise_signal(number))
     try:
         code = main(["train", "--lens", str(GAUSS), "--output", str(tmp_path / "run"), "--quiet"])
     finally:

@@ -18,7 +18,7 @@ from shipped import whole
 
 from neurolens.cli import main
 from neurolens.cli.keys import frames_of
-from neurolens.render.pictures import read_exr, read_layers, write_exr
+from neurolens.pictures.render.pictures import read_exr, read_layers, write_exr
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def test_a_full_disk_keeps_what_it_can_and_says_what_is_lost(
     def said(writers: list[str], *more: object) -> str:
         with monkeypatch.context() as patch:
             for writer in writers:
-                patch.setattr(f"neurolens.render.{writer}", full)
+                patch.setattr(f"neurolens.pictures.render.{writer}", full)
             assert main([*map(str, (*common, *more))]) == 2
         assert np.all(read_exr(out)[0] == 7)
         first, _, why = capsys.readouterr().err.splitlines()[-1].partition("; ")
@@ -175,9 +175,11 @@ def test_a_picture_beyond_memory_is_one_line(
 ) -> None:
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", tmp_path / "a.exr")
     with monkeypatch.context() as patch:
-        patch.setattr("neurolens.render.film.os.sysconf", lambda _: 590)
+        patch.setattr("neurolens.pictures.render.film.os.sysconf", lambda _: 590)
         assert "64, 36" in (line := failure(capsys, *common)) and "2122 pixels" in line
-    monkeypatch.setattr("neurolens.render.film.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
+    monkeypatch.setattr(
+        "neurolens.pictures.render.film.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, ""))
+    )
     assert "out of memory" in failure(capsys, *common)
 
 

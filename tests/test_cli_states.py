@@ -14,8 +14,8 @@ from lens_models import edited
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cli import main
 from neurolens.cli.arguments import Parser
-from neurolens.render.pictures import read_exr, write_exr
-from neurolens.surrogates.card import MODEL_KEY
+from neurolens.models.card import MODEL_KEY
+from neurolens.pictures.render.pictures import read_exr, write_exr
 
 LENSES = Path(__file__).parents[1] / "lenses"
 ANAMORPHIC, NIKON = LENSES / "cooke_anamorphic_42.toml", LENSES / "nikon_zoom_70_200.toml"
@@ -77,7 +77,7 @@ def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_place_that_cannot_be_written_is_found_before_the_render(
     scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurolens.frames.render", lambda *_, **__: pytest.fail("rendered for nothing"))
+    monkeypatch.setattr("neurolens.pictures.frames.render", lambda *_, **__: pytest.fail("rendered for nothing"))
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", _NOWHERE, "--quiet")
     assert str(_NOWHERE) in line and ".tmp" not in line
     with pytest.raises(OSError, match=str(_NOWHERE)) as refused:

@@ -17,9 +17,9 @@ from urllib.parse import unquote
 import pytest
 from shipped import WHOLE
 
-from neurolens.readers import lensfile
-from neurolens.render.scene import SceneSettings
-from neurolens.study.experiment import Experiment
+from neurolens.optics.readers import lensfile
+from neurolens.pictures.render.scene import SceneSettings
+from neurolens.studies.experiment import Experiment
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs" / "pages"

@@ -7,9 +7,9 @@ import pytest
 from film_light import film_light
 from shipped import disc_irradiance, focused, pinhole
 
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.setting.states import set_lens
 
 
 @pytest.mark.parametrize("radius_mm", [0.01, 3.0, 25.0])

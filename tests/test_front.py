@@ -22,7 +22,7 @@ from neurolens.cli import _FIRST, build_parser, command, main
 from neurolens.cli.arguments import Reporting
 from neurolens.cli.calls import signature_of
 from neurolens.front import EXAMPLES
-from neurolens.lens.glass import index_of
+from neurolens.optics.lens.glass import index_of
 
 ROOT = Path(__file__).parents[1]
 GAUSS, MODEL = "laikin_double_gauss_50", "laikin_double_gauss_50.ols-36"
@@ -216,16 +216,6 @@ def test_the_package_is_imported_at_once_and_its_names_when_they_are_asked_for()
         "nl.stmap, nl.lens; assert 'torch' not in sys.modules; print(took)"
     )
     assert min(float(run(code)) for _ in range(2)) < 0.05
-
-
-def test_a_call_stands_beside_the_folder_of_its_name() -> None:
-    code = (
-        "import neurolens.render.film as film, neurolens.lens.shot, neurolens as nl\n"
-        "assert film.PixelGrid and nl.lens.shot.Shot and callable(nl.render) and callable(nl.lens)\n"
-        "from neurolens.render import job; assert nl.render.job is job\n"
-        "assert not hasattr(nl.render, 'nothing') and not hasattr(nl, 'nothing') and not hasattr(nl.stmap, 'shot')"
-    )
-    run(code)
 
 
 def test_without_torch_a_lens_says_what_to_install_and_models_run() -> None:

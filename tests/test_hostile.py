@@ -23,12 +23,12 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular
 from neurolens.base.settings import apply_overrides
 from neurolens.base.tomlfile import read_toml
-from neurolens.lens import glass as catalogue
-from neurolens.readers.any_format import read_any
-from neurolens.readers.json_lens import image_and_field, read_json_lens
-from neurolens.render import images, pictures
-from neurolens.render.colour import illuminant, read_spectrum
-from neurolens.render.mesh import read_file
+from neurolens.optics.lens import glass as catalogue
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.readers.json_lens import image_and_field, read_json_lens
+from neurolens.pictures.render import images, pictures
+from neurolens.pictures.render.colour import illuminant, read_spectrum
+from neurolens.pictures.render.mesh import read_file
 
 ROOT = Path(__file__).parents[1]
 SECONDS = 10  # each takes less than one, and took from ten to more than a hundred
@@ -293,8 +293,8 @@ def test_a_light_too_far_for_millimetres_is_refused(tmp_path: Path, capsys: pyte
 
 
 def test_a_lens_without_light_on_its_axis_has_no_exposure() -> None:
-    from neurolens.flare.layers import axis_irradiance
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.setting.states import set_lens
+    from neurolens.pictures.flare.layers import axis_irradiance
 
     lens = set_lens(read_any(ROOT / "lenses" / "brendel_tessar_100.toml"))
     with pytest.raises(InputError, match="no ray passes on the axis"):

@@ -13,10 +13,10 @@ from command_line import failure
 from lens_models import edited
 
 from experiments.__main__ import main as experiment
-from neurolens.blender import Form
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
-from neurolens.surrogates.card import CARD_KEY
+from neurolens.models.card import CARD_KEY
+from neurolens.programs.blender import Form
 
 HOSTILE = Path(__file__).parents[2] / "shared" / "data" / "cases" / "hostile"
 ROOT = Path(__file__).parents[1]

@@ -17,14 +17,14 @@ from neurolens.base.errors import ModelError
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.cli import main
 from neurolens.cli import models as models_command
-from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
-from neurolens.study.check import check_states, promises_of, space_of_card
-from neurolens.study.measure import FreshRays, fresh_rays, measure, onnx_predictor
-from neurolens.surrogates.file import read_model
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import FilmRays, PairSettings, make_pairs, sample_domain
+from neurolens.models.file import read_model
+from neurolens.models.model import Domain
+from neurolens.models.pairs import FilmRays, PairSettings, make_pairs, sample_domain
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
+from neurolens.studies.check import check_states, promises_of, space_of_card
+from neurolens.studies.measure import FreshRays, fresh_rays, measure, onnx_predictor
 
 ROOT = Path(__file__).parents[1]
 MODELS = ROOT / "models"

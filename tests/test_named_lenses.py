@@ -7,8 +7,8 @@ import re
 import pytest
 from shipped import LENSES, NAMED, focused, tabled
 
-from neurolens.lens.paraxial import first_order
-from neurolens.photographs.verify import DOUBTFUL_PERCENT, verify
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.photographs.verify import DOUBTFUL_PERCENT, verify
 
 _FOCAL, _F_NUMBER = re.compile(r"([\d.]+)(?:-[\d.]+)? ?mm"), re.compile(r"f/([\d.]+)")
 

@@ -118,7 +118,7 @@ SMALLER = {
 }
 # Lines that this test leaves out, and why; `neurolens demo` takes 4 minutes, and is a name alone.
 LEFT_OUT = {
-    "neurolens blender build": "18 s for the shaders of one lens; tests/blender/test_command.py runs it without them",
+    "neurolens blender build": "18 s for the shaders; tests/programs/blender/test_command.py runs it without them",
     "python -m experiments": "measurements of minutes to days; they are parsed above",
 }
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from neurolens.cli import main
-from neurolens.render.pictures import read_exr, read_metadata
+from neurolens.pictures.render.pictures import read_exr, read_metadata
 
 ROOT = Path(__file__).parents[1]
 LENS = ROOT / "lenses" / "cooke_triplet_50.toml"

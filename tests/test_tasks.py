@@ -25,8 +25,8 @@ from neurolens.base.files import noted_files, read_bytes
 from neurolens.base.lensname import Named
 from neurolens.base.tasks import Failed, Here, Processes, Shared, run_each
 from neurolens.cli import main
-from neurolens.frames import Frame
-from neurolens.render.pictures import read_channels
+from neurolens.pictures.frames import Frame
+from neurolens.pictures.render.pictures import read_channels
 
 Client = pytest.importorskip("distributed", reason="needs the extra dask").Client
 
@@ -42,7 +42,12 @@ if __name__ == "__main__":
     sys.stdin.read()
 """
 
-IMPORTED = ("neurolens.frames.farm", "neurolens.render.renderer", "neurolens.study.survey", "neurolens.flare.layers")
+IMPORTED = (
+    "neurolens.pictures.frames.farm",
+    "neurolens.pictures.render.renderer",
+    "neurolens.studies.survey",
+    "neurolens.pictures.flare.layers",
+)
 
 
 class Cluster:
@@ -226,7 +231,7 @@ def test_paths_of_a_frame_move_with_it() -> None:
 def framed(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, bytes]]:
     """Renders two frames of several tiles each; the channels by file."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("neurolens.frames.farm._PATHS_OF_FEW", 300)
+    monkeypatch.setattr("neurolens.pictures.frames.farm._PATHS_OF_FEW", 300)
     frames = ("--frames", "1:2", "--key", "focus=1:1.5,2:3", "--samples", "2", "--quiet", "--camera", "thin")
 
     def run(name: str, *options: str) -> dict[str, bytes]:

@@ -6,10 +6,10 @@ from typing import Any
 import torch
 
 from neurolens.base import status as st
-from neurolens.lens.prescription import Lens
-from neurolens.study.rays import SEED, ZONES, false_shares
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import FilmRays, sample_domain, trace_pairs
+from neurolens.models.model import Domain
+from neurolens.models.pairs import FilmRays, sample_domain, trace_pairs
+from neurolens.optics.lens.prescription import Lens
+from neurolens.studies.rays import SEED, ZONES, false_shares
 
 _BATCH = 65536
 

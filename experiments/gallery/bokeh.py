@@ -18,7 +18,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera
-from neurolens.lens.glass import LINE_D_NM
+from neurolens.optics.lens.glass import LINE_D_NM
 
 Array = NDArray[np.float64]
 

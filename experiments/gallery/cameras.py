@@ -27,19 +27,19 @@ from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArr
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.reduced import Vignetted
-from neurolens.lens.paraxial import film_z_mm, first_order
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.lens.shot import Shot as CameraShot
-from neurolens.lens.shot import StopShape
-from neurolens.readers.lensfile import read_lens
-from neurolens.render.images import make_aperture
-from neurolens.render.scene import Scene
-from neurolens.setting.states import set_lens
-from neurolens.study.measure import fit_and_measure, known_record
-from neurolens.study.scenes import Image
-from neurolens.surrogates.fit import ModelSettings, prepare
-from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, domain_of, make_pairs
+from neurolens.models.fit import ModelSettings, prepare
+from neurolens.models.model import Domain
+from neurolens.models.pairs import PairSettings, domain_of, make_pairs
+from neurolens.optics.lens.paraxial import film_z_mm, first_order
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.lens.shot import Shot as CameraShot
+from neurolens.optics.lens.shot import StopShape
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
+from neurolens.pictures.render.images import make_aperture
+from neurolens.pictures.render.scene import Scene
+from neurolens.studies.measure import fit_and_measure, known_record
+from neurolens.studies.scenes import Image
 
 _CLEAR = 0.95  # rims over the radius of curvature, at most
 _VIGNETTING_RAYS = 50_000

@@ -24,7 +24,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera
-from neurolens.lens.glass import LINE_D_NM
+from neurolens.optics.lens.glass import LINE_D_NM
 
 _RADII = 13
 

@@ -36,15 +36,15 @@ from experiments.gallery.cameras import (
 from experiments.gallery.measures import MEASURES
 from experiments.gallery.settings import Effect, find_effects, read_effect
 from experiments.lab import Row as Record
-from neurolens.analysis.plots import new_figure, style
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import versions
-from neurolens.render.renderer import render
-from neurolens.render.scene import load_scene
-from neurolens.study.plots import rounded_up
-from neurolens.study.scenes import Image, to_srgb
+from neurolens.optics.analysis.plots import new_figure, style
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import load_scene
+from neurolens.studies.plots import rounded_up
+from neurolens.studies.scenes import Image, to_srgb
 
 SCHEMA = 1
 _CAMERAS = 2  # counts changes of what a column's camera is: figures of earlier ones are made again

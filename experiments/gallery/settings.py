@@ -10,8 +10,8 @@ from typing import Any, Literal
 from neurolens.base.errors import InputError
 from neurolens.base.settings import from_dict
 from neurolens.base.tomlfile import read_toml, suggestion
-from neurolens.lens.shot import FocusMode, Vignetting
-from neurolens.surrogates.fit import ModelSettings
+from neurolens.models.fit import ModelSettings
+from neurolens.optics.lens.shot import FocusMode, Vignetting
 
 COLUMNS = ("exact", "surrogate", "thin")
 

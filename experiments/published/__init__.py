@@ -21,11 +21,11 @@ from experiments.published.raylut import fit_table
 from experiments.published.rtf import fit_rtf
 from experiments.published.taylor import fit_taylor
 from neurolens.base.errors import InputError
-from neurolens.surrogates.cores import Core
-from neurolens.surrogates.fit import as_model, fit_model
-from neurolens.surrogates.model import Encoding, Gate, LensModel
-from neurolens.surrogates.targets import ModelSettings, Prepared
-from neurolens.surrogates.terms import pinned_threads
+from neurolens.models.cores import Core
+from neurolens.models.fit import as_model, fit_model
+from neurolens.models.model import Encoding, Gate, LensModel
+from neurolens.models.targets import ModelSettings, Prepared
+from neurolens.models.terms import pinned_threads
 
 __all__ = ["NAMED", "PUBLISHED", "PublishedMethod", "PublishedSettings", "fit_any", "fit_published"]
 

@@ -24,10 +24,10 @@ from experiments.published.data import Outputs, RawData, RawPolynomial, outer_pu
 from experiments.published.polynomials import fit_dense
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
-from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.pairs import PairSet
-from neurolens.surrogates.targets import film_equivalent, targets_of
-from neurolens.surrogates.terms import Exponents, Sweep, forward, further, monomials, replace_terms
+from neurolens.models.cores import ROUND, Composite, CoreValues, Field, Units, stored_as
+from neurolens.models.pairs import PairSet
+from neurolens.models.targets import film_equivalent, targets_of
+from neurolens.models.terms import Exponents, Sweep, forward, further, monomials, replace_terms
 
 # A cell's fit sees this share of its rays' range beyond a cut, so that neighbours meet.
 MARGIN = 0.03

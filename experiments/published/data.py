@@ -13,11 +13,11 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cores import DIRECTION, POSITION, Array, Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.model import Encoding, Gate
-from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.targets import ModelSettings, Prepared, gate_reach, scales_of
-from neurolens.surrogates.terms import Exponents, monomials, ordered, powers, united
+from neurolens.models.cores import DIRECTION, POSITION, Array, Core, CoreValues, Field, Units, stored_as
+from neurolens.models.model import Encoding, Gate
+from neurolens.models.pairs import PairSet, RayPairs
+from neurolens.models.targets import ModelSettings, Prepared, gate_reach, scales_of
+from neurolens.models.terms import Exponents, monomials, ordered, powers, united
 
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
 OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")

@@ -29,10 +29,10 @@ from experiments.published.data import PublishedSettings, RawData, raw_rows
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.model import Gate
-from neurolens.surrogates.pairs import PairSet, sample_domain, trace_pairs
-from neurolens.surrogates.targets import scales_of
+from neurolens.models.cores import ROUND, Core, CoreValues, Field, Units, stored_as
+from neurolens.models.model import Gate
+from neurolens.models.pairs import PairSet, sample_domain, trace_pairs
+from neurolens.models.targets import scales_of
 
 NETWORKS = 3  # whose mean is taken
 BATCH = 128

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.published.data import PARITY, Outputs, RawData, RawPolynomial, parity_exponents, solve_outputs
-from neurolens.surrogates.terms import monomials
+from neurolens.models.terms import monomials
 
 # Rays that decide the choice of terms; the coefficients are fitted on all of them afterwards.
 SELECTION_RAYS = 6000

@@ -26,9 +26,9 @@ from experiments.published.data import RawData
 from experiments.published.rtf import meridian_of, turn, turned_back
 from neurolens.graph.interpret import monomials
 from neurolens.graph.ir import Graph
-from neurolens.surrogates.cores import Core, CoreValues, Field, Units, stored_as
-from neurolens.surrogates.pairs import FilmRays, trace_pairs
-from neurolens.surrogates.targets import scales_of
+from neurolens.models.cores import Core, CoreValues, Field, Units, stored_as
+from neurolens.models.pairs import FilmRays, trace_pairs
+from neurolens.models.targets import scales_of
 
 Array = NDArray[np.float64]
 _NODES_W = (-1.0, 0.0, 1.0)

@@ -28,11 +28,11 @@ from experiments.published.data import RawData, stable_solve
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cores import Core, CoreValues, Field, LightField, Units, stored_as
-from neurolens.surrogates.model import Gate
-from neurolens.surrogates.pairs import FilmRays, trace_pairs
-from neurolens.surrogates.targets import scales_of
-from neurolens.surrogates.terms import Exponents, monomials
+from neurolens.models.cores import Core, CoreValues, Field, LightField, Units, stored_as
+from neurolens.models.model import Gate
+from neurolens.models.pairs import FilmRays, trace_pairs
+from neurolens.models.targets import scales_of
+from neurolens.models.terms import Exponents, monomials
 
 Array = NDArray[np.float64]
 # Positions of the input plane at which the ellipse is fitted, and rays of each.

@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 
 from experiments.published.data import RawPolynomial, raw_polynomial
 from neurolens.base.errors import InputError
-from neurolens.lens.glass import index_of
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.surrogates.model import Encoding
-from neurolens.surrogates.targets import scales_of
-from neurolens.surrogates.terms import ordered
-from neurolens.trace.rays import trace
-from neurolens.trace.surfaces import Rays
+from neurolens.models.model import Encoding
+from neurolens.models.targets import scales_of
+from neurolens.models.terms import ordered
+from neurolens.optics.lens.glass import index_of
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.surfaces import Rays
 
 # Coefficients [M] of `Truncated.exponents`: a power series in several variables, cut beyond a total degree.
 Series = NDArray[np.float64]

@@ -1,9 +1,9 @@
 """HTML, and files of other programs, from the templates of this package, so that no text of a stranger's file runs.
 
-Templates, styles and scripts are files of `templates/` and of `view/page/`. A template puts a style or a script of
-theirs into the page as it is, by `text(name) | safe`. A link needs more than escaping: see `local_url`. Every value of
-HTML and XML is escaped. Templates of other languages (NAME.jinja) take numbers as they are, and refuse a text that no
-filter has quoted: `literal` for Python, USD and JSON, `line` for a line of Markdown or of a comment.
+Templates, styles and scripts are files of `templates/` and of `programs/view/page/`. A template puts a style or a
+script of theirs into the page as it is, by `text(name) | safe`. A link needs more than escaping: see `local_url`.
+Every value of HTML and XML is escaped. Templates of other languages (NAME.jinja) take numbers as they are, and refuse
+a text that no filter has quoted: `literal` for Python, USD and JSON, `line` for a line of Markdown or of a comment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jinja2.filters import do_mark_safe
 
 from neurolens.base.errors import one_line, without_controls
 
-_FOLDERS = [Path(__file__).parents[1] / name for name in ("templates", "view/page")]
+_FOLDERS = [Path(__file__).parents[1] / name for name in ("templates", "programs/view/page")]
 
 
 def html(template: str, **values: Any) -> str:

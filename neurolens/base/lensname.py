@@ -1,7 +1,7 @@
 """Arguments that name a lens: a lens or a model that ships, a file of either, or a camera made from one.
 
 laikin_double_gauss_50              a lens of lenses/, or a model of models/, by its name
-FILE.toml, FILE.zmx, ...            a lens file of any format that `neurolens.readers.any_format` reads
+FILE.toml, FILE.zmx, ...            a lens file of any format that `neurolens.optics.readers.any_format` reads
 MODEL.onnx                          an exported model
 plan.toml                           a file of `neurolens plan`: the camera that it names
 thick:, thin:, pinhole:             before any of these: a kind of camera

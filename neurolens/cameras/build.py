@@ -19,10 +19,10 @@ from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, Th
 from neurolens.cameras.reduced import ReducedDispersion, Vignetted
 from neurolens.cameras.sampling import beyond_circle, refuse
 from neurolens.graph.compiler import has_compiler
-from neurolens.lens.shot import Shot
+from neurolens.optics.lens.shot import Shot
 
 if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
+    from neurolens.optics.lens.prescription import Lens
 
 _FOCAL_MM, _FISHEYE_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
 
@@ -95,8 +95,8 @@ def _ideal(kind: str, shot: Shot) -> Camera:
 
 
 def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
-    from neurolens.readers.any_format import read_any
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.readers.any_format import read_any
+    from neurolens.optics.setting.states import set_lens
 
     if kind != "thin:":
         refuse(f"{kind}{path}", "film_offset_mm", shot.film_offset_mm or None, "left out: set focus_m")
@@ -121,7 +121,7 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
     Raises:
         InputError: a thick lens of one with cylinders, which has two focal lengths; as the cameras.
     """
-    from neurolens.lens.paraxial import first_order, framing_mm
+    from neurolens.optics.lens.paraxial import first_order, framing_mm
 
     if lens.anamorphic and kind == "thick:":
         raise InputError(
@@ -155,8 +155,8 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 
 def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera
-    from neurolens.readers.any_format import read_any
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.readers.any_format import read_any
+    from neurolens.optics.setting.states import set_lens
 
     tabled = read_any(path)
     camera = ExactCamera(tabled, shot, progress=progress)
@@ -171,14 +171,14 @@ def _doubts(lens: Lens) -> list[str]:
     """What a check of the lens against its source doubts; none without torch, which traces its chief rays."""
     if find_spec("torch") is None:
         return []
-    from neurolens.setting.check import check_lens, doubts
+    from neurolens.optics.setting.check import check_lens, doubts
 
     return doubts(check_lens(lens))
 
 
 def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
     """A sentence on a film that is larger than the picture of the lens, where the size of that is known."""
-    from neurolens.setting.pupils import image_radius_mm
+    from neurolens.optics.setting.pupils import image_radius_mm
 
     if lens.image_radius_mm is None and (lens.half_field_deg is None or lens.half_field_deg >= 60):
         return []  # only a long search would tell

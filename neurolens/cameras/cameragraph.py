@@ -18,7 +18,7 @@ from neurolens.graph.derive import derivative
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import FILM_X_Y
-from neurolens.lens.apertures import Aperture
+from neurolens.optics.lens.apertures import Aperture
 
 if TYPE_CHECKING:
     from neurolens.cameras.lenscamera import LensFilm

@@ -27,16 +27,16 @@ from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTab
 from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.lens.glass import LINE_D_NM, check_light, index_of
-from neurolens.lens.paraxial import PupilBounds, chief_reach_mm, first_order
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.lens.shot import Shot
-from neurolens.setting.focusing import at_infinity
-from neurolens.setting.pupils import passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
-from neurolens.setting.states import set_lens
-from neurolens.surrogates.assemble import SCALARS, Form
-from neurolens.trace.surfaces import Rays, media
-from neurolens.trace.tracegraph import exact_graph, light_limits
+from neurolens.models.assemble import SCALARS, Form
+from neurolens.optics.lens.glass import LINE_D_NM, check_light, index_of
+from neurolens.optics.lens.paraxial import PupilBounds, chief_reach_mm, first_order
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.setting.focusing import at_infinity
+from neurolens.optics.setting.pupils import passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.surfaces import Rays, media
+from neurolens.optics.trace.tracegraph import exact_graph, light_limits
 
 
 class ExactRun(LensRun):
@@ -111,7 +111,7 @@ class ExactCamera(LensCamera):
     ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
         import torch
 
-        from neurolens.trace.rays import trace
+        from neurolens.optics.trace.rays import trace
 
         # Light starts a millimetre before the surface, so that it lies ahead; rays that are not finite miss it.
         rays = np.nan_to_num(np.concatenate([position + direction, -direction]), posinf=0, neginf=0)
@@ -138,8 +138,8 @@ class ExactCamera(LensCamera):
         surface the distance from the axis and the path that a surface higher by 1 would add [surfaces, 2, N]."""
         import torch
 
-        from neurolens.trace.aiming import without_rims
-        from neurolens.trace.rays import trace
+        from neurolens.optics.trace.aiming import without_rims
+        from neurolens.optics.trace.rays import trace
 
         lens, outline, waves = without_rims(self.lens), self.film.outline, torch.from_numpy(wavelength_nm.astype("f8"))
         film_z = np.full(waves.numel(), float(self.film.film_z_mm))
@@ -237,7 +237,7 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
 def _code() -> list[str]:
     """Hash the modules that trace and search, and name the libraries that compute."""
     package = Path(__file__).parents[1]
-    folders = ("lens/*.py", "trace/*.py", "setting/*.py", "graph/*.py", "cameras/pupil_*.py")
+    folders = ("optics/lens/*.py", "optics/trace/*.py", "optics/setting/*.py", "graph/*.py", "cameras/pupil_*.py")
     files = [f"{file.name} {sha256_of(file)}" for folder in map(package.glob, folders) for file in sorted(folder)]
     return [*files, np.__version__, onnxruntime.__version__]
 

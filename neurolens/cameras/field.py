@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import PROJECTIONS
-from neurolens.lens import paraxial
+from neurolens.optics.lens import paraxial
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -88,7 +88,7 @@ def frame_of(camera: Any) -> Frame:
     if state["squeeze"] == 1:
         x = y
     elif lens is not None:
-        from neurolens.lens.paraxial import first_order
+        from neurolens.optics.lens.paraxial import first_order
 
         data, film = first_order(lens, meridian="x"), float(camera.settings["film_z_mm"])
         focal, pupil = (data.front_focal_z_mm, data.rear_focal_z_mm), data.entrance_pupil_z_mm

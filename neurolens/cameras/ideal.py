@@ -48,9 +48,9 @@ from neurolens.cameras.sampling import (
 )
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.paraxial import film_z_of_planes_mm
-from neurolens.lens.shot import check_film
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.paraxial import film_z_of_planes_mm
+from neurolens.optics.lens.shot import check_film
 
 _QUADRATURE = 256  # points a side
 

@@ -48,13 +48,13 @@ from neurolens.graph.loworder import with_film_derivatives, with_low_order_deriv
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import Program, row_names
 from neurolens.graph.scalars import lower
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.prescription import LINE_D_NM, Surface
-from neurolens.lens.shot import Runtime
-from neurolens.setting.pupils import GROUPS
-from neurolens.surrogates.assemble import ONNX, SCALARS, Form
-from neurolens.surrogates.inverse import InverseRays
-from neurolens.trace.shapes import sag_and_derivatives
+from neurolens.models.assemble import ONNX, SCALARS, Form
+from neurolens.models.inverse import InverseRays
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.prescription import LINE_D_NM, Surface
+from neurolens.optics.lens.shot import Runtime
+from neurolens.optics.setting.pupils import GROUPS
+from neurolens.optics.trace.shapes import sag_and_derivatives
 
 Array = NDArray[np.float64]
 

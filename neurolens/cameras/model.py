@@ -26,12 +26,12 @@ from neurolens.cameras.sampling import (
     lens_state,
     refuse,
 )
-from neurolens.lens import paraxial
-from neurolens.lens.prescription import Surface
-from neurolens.lens.shot import Shot
-from neurolens.surrogates.assemble import ONNX, SCALARS, Form
-from neurolens.surrogates.card import state_for
-from neurolens.surrogates.inverse import InverseModel, inverse_of
+from neurolens.models.assemble import ONNX, SCALARS, Form
+from neurolens.models.card import state_for
+from neurolens.models.inverse import InverseModel, inverse_of
+from neurolens.optics.lens import paraxial
+from neurolens.optics.lens.prescription import Surface
+from neurolens.optics.lens.shot import Shot
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 

@@ -20,11 +20,11 @@ from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
 from neurolens.graph.ir import Graph, pruned
 from neurolens.graph.onnx import write_onnx
-from neurolens.surrogates.assemble import ONNX, SCALARS, Form, model_graph
-from neurolens.surrogates.axes import state_numbers
-from neurolens.surrogates.card import card_at, default_state
-from neurolens.surrogates.file import ModelFile, read_model
-from neurolens.surrogates.model import LensModel
+from neurolens.models.assemble import ONNX, SCALARS, Form, model_graph
+from neurolens.models.axes import state_numbers
+from neurolens.models.card import card_at, default_state
+from neurolens.models.file import ModelFile, read_model
+from neurolens.models.model import LensModel
 
 
 def open_session(
@@ -175,7 +175,7 @@ class OnnxLens(LensRun):
 
     Attributes:
         file: what the file says.
-        card: see `neurolens.surrogates.card`; its lens and domain are those of `state`.
+        card: see `neurolens.models.card`; its lens and domain are those of `state`.
         axes: what the model's state is made of (zoom in mm, focus in 1/m); none for a model of one state.
         state: a number for every axis.
     """

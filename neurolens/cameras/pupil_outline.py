@@ -24,7 +24,7 @@ from neurolens.cameras.cameragraph import pupil_graph
 from neurolens.cameras.contract import FloatArray
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.surrogates.card import pupil_rows
+from neurolens.models.card import pupil_rows
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,8 @@ from neurolens.cameras.field import (
     turns,
 )
 from neurolens.cameras.sampling import common_light, is_light, stratified
-from neurolens.lens.prescription import LINE_D_NM
-from neurolens.lens.shot import Dispersion, Vignetting
+from neurolens.optics.lens.prescription import LINE_D_NM
+from neurolens.optics.lens.shot import Dispersion, Vignetting
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.cameragraph import concentric_disk
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
-from neurolens.lens.prescription import Surface
-from neurolens.trace.shapes import sag_mm
-from neurolens.trace.surfaces import meet_front
+from neurolens.optics.lens.prescription import Surface
+from neurolens.optics.trace.shapes import sag_mm
+from neurolens.optics.trace.surfaces import meet_front
 
 _BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
 _ANGLES, _LEVELS, _ROOM = 24, 5, 1.01  # see `FrontDiscs`; by which its discs are widened

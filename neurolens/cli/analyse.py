@@ -16,7 +16,7 @@ from neurolens.base.settings import WAVELENGTH_NM, between, said, setting, wavel
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
-    from neurolens.analysis.fields import Scene
+    from neurolens.optics.analysis.fields import Scene
 
 
 WHATS = (
@@ -98,7 +98,7 @@ examples:
             self.refuse("WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
         if self.full and not self.json:
             self.refuse("--full", "(given)", "this option only with --json")
-        from neurolens.analysis.layout import state_text
+        from neurolens.optics.analysis.layout import state_text
 
         began = time.perf_counter()
         scene, doubts = self._scene()
@@ -138,10 +138,10 @@ examples:
 
     def _scene(self) -> tuple[Scene, list[str]]:
         """The lens with its object in its state, and warnings."""
-        from neurolens.analysis.fields import Scene
-        from neurolens.lens.glass import check_light
-        from neurolens.readers.any_format import read_any
-        from neurolens.study.describe import file_doubts, rim_doubts
+        from neurolens.optics.analysis.fields import Scene
+        from neurolens.optics.lens.glass import check_light
+        from neurolens.optics.readers.any_format import read_any
+        from neurolens.studies.describe import file_doubts, rim_doubts
 
         with warned(self.file) as notes:  # glasses that contradict the catalogue, constant indices
             tabled = read_any(self.file)
@@ -154,8 +154,8 @@ examples:
 
     def _one(self, what: str, scene: Scene, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
         """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""
-        from neurolens.analysis.bundles import check_light
-        from neurolens.analysis.layout import state_text
+        from neurolens.optics.analysis.bundles import check_light
+        from neurolens.optics.analysis.layout import state_text
 
         analysis, options = analysis_of(what), dict[str, Any]()
         if what in _OF_FIELDS:
@@ -180,10 +180,10 @@ examples:
 
 def analysis_of(what: str) -> Analysis:
     """The analysis of a name; torch and matplotlib are imported here, not when the command line starts."""
-    from neurolens.analysis import plots
-    from neurolens.analysis.field_curves import colour, curvature, distortion, illumination, seidel
-    from neurolens.analysis.layout import layout_profile, lens_layout
-    from neurolens.analysis.spots import fans, mtf, mtf_over_height, psf, spots
+    from neurolens.optics.analysis import plots
+    from neurolens.optics.analysis.field_curves import colour, curvature, distortion, illumination, seidel
+    from neurolens.optics.analysis.layout import layout_profile, lens_layout
+    from neurolens.optics.analysis.spots import fans, mtf, mtf_over_height, psf, spots
 
     return {
         "layout": Analysis(layout_profile, lens_layout, _layout_text),

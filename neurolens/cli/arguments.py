@@ -29,12 +29,12 @@ from neurolens.base.settings import (
     spelling,
 )
 from neurolens.base.units import as_float
-from neurolens.lens.shot import FocusMode, Shot, StopShape, film_size
+from neurolens.optics.lens.shot import FocusMode, Shot, StopShape, film_size
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import Camera
-    from neurolens.lens.apertures import Aperture
-    from neurolens.lens.prescription import Lens
+    from neurolens.optics.lens.apertures import Aperture
+    from neurolens.optics.lens.prescription import Lens
 
 CAMERAS_HELP = """\
 cameras:
@@ -313,7 +313,7 @@ def more_glasses(files: Sequence[Path]) -> AbstractContextManager[None]:
     """A block in which the catalogues of --glass are known; without any, nothing is imported."""
     if not files:
         return nullcontext()
-    from neurolens.readers import glasses
+    from neurolens.optics.readers import glasses
 
     return glasses.more_glasses(files)
 
@@ -347,7 +347,7 @@ class LensState:
         Raises:
             InputError: shapes that exclude each other, a picture that cannot be read.
         """
-        from neurolens.render.images import make_aperture
+        from neurolens.pictures.render.images import make_aperture
 
         return make_aperture(self.stop)
 
@@ -367,8 +367,8 @@ class LensState:
 
     def set_lens(self, tabled: Lens) -> Lens:
         """The lens of a file in this state; raises InputError as `setting.states.set_lens`."""
-        from neurolens.setting.focusing import best_focused, with_cover_glass
-        from neurolens.setting.states import set_lens
+        from neurolens.optics.setting.focusing import best_focused, with_cover_glass
+        from neurolens.optics.setting.states import set_lens
 
         mode = self.focus_mode or "best"
         lens = set_lens(

@@ -29,16 +29,16 @@ from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model, lens_id_of, maker_of
 from neurolens.base.settings import RANGE, setting
 from neurolens.base.tasks import Failed, Here, Processes, run_each
-from neurolens.blender import Form, PackedLens, add_lens, check_takes, user_folders, write_pack
 from neurolens.cameras.build import ideal_as, make_camera
+from neurolens.cameras.shaders.blender_shader import shader_of
 from neurolens.cli import arguments as cli
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Shot
-from neurolens.readers.any_format import read_any
-from neurolens.readers.lensfile import read_lens
-from neurolens.shaders.blender_shader import shader_of
-from neurolens.surrogates.card import read_card
+from neurolens.models.card import read_card
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.programs.blender import Form, PackedLens, add_lens, check_takes, user_folders, write_pack
 
 _KEPT = 4096  # kept files, of some 30 kB: five a lens
 _SIDE_IN, _DOTS, _MARGIN, _COLOURS = 2.56, 100, 1.08, 64  # of a thumbnail: 256 pixels; its side over the glass's
@@ -195,7 +195,7 @@ def _code() -> list[str]:
 def _squeeze(file: Path, zoom: str | None) -> float:
     """See `cameras.sampling.lens_state`."""
     if not is_model(file):
-        from neurolens.setting.states import set_lens
+        from neurolens.optics.setting.states import set_lens
 
         return squeeze_of(set_lens(read_any(file), zoom=zoom))
     return float(make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
@@ -240,7 +240,7 @@ def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
     file, zoom = task
     with ExitStack() as stack:
         if find_spec("torch") is not None:
-            from neurolens.surrogates.terms import pinned_threads
+            from neurolens.models.terms import pinned_threads
 
             stack.enter_context(pinned_threads())
         try:
@@ -257,7 +257,7 @@ def packed_of(
     Args:
         lens: its prescription, for the thumbnail, where it is at hand.
     """
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.setting.states import set_lens
 
     first, ranged = files[0], zoom == RANGE
     if is_model(first):
@@ -287,7 +287,7 @@ def packed_of(
 
 
 def _character(lens: Lens) -> dict[str, Any]:
-    from neurolens.study.describe import character_or_none
+    from neurolens.studies.describe import character_or_none
 
     figures, discs = character_or_none(lens)
     return {"character": figures, "bokeh": None if discs is None else b64encode(discs).decode()}
@@ -295,7 +295,7 @@ def _character(lens: Lens) -> dict[str, Any]:
 
 def stated_lens(model: Path, lenses: Path) -> Lens | None:
     """The prescription behind a model, scaled or zoomed as the model is, or of its range; None without a lens file."""
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.setting.states import set_lens
 
     facts = read_card(model)["lens"]
     file = lenses / f"{safe_name(facts['id'])}.toml"
@@ -313,7 +313,7 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
         return None
     from neurolens.cameras.exact import ExactCamera
     from neurolens.cameras.field import spectrum_of
-    from neurolens.plan import footprints as prints
+    from neurolens.studies.plan import footprints as prints
 
     film, radii = (2 * radius_mm, 2 * radius_mm), radius_mm * np.array(_RADII)
     points = np.stack([radii, np.zeros_like(radii)])
@@ -375,15 +375,15 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
 
 def thumbnail(lens: Lens) -> bytes | None:
     """The section of a lens as a PNG of 256 by 256 pixels; None where torch or matplotlib is missing."""
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.setting.states import set_lens
 
     if find_spec("torch") is None or find_spec("matplotlib") is None:
         return None
     from PIL import Image
 
-    from neurolens.analysis.fields import Scene
-    from neurolens.analysis.layout import draw_section, layout_profile
-    from neurolens.analysis.plots import new_figure, style
+    from neurolens.optics.analysis.fields import Scene
+    from neurolens.optics.analysis.layout import draw_section, layout_profile
+    from neurolens.optics.analysis.plots import new_figure, style
 
     with style():
         figure = new_figure(_SIDE_IN, _SIDE_IN)

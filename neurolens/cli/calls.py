@@ -39,7 +39,7 @@ class Answer(dict[str, Any]):
     @property
     def rgb(self) -> Any:
         """The OpenEXR picture that was written, linear [H, W, 3] float32; raises InputError without one."""
-        from neurolens.render.pictures import read_exr
+        from neurolens.pictures.render.pictures import read_exr
 
         for file in _files(self, ".exr"):
             return read_exr(file)[0]

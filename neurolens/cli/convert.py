@@ -14,10 +14,10 @@ from neurolens.base.errors import InputError, pip_install, warned
 from neurolens.base.files import atomic_path
 from neurolens.base.settings import group, setting
 from neurolens.cli import arguments as cli
-from neurolens.readers.source import ReadOptions
+from neurolens.optics.readers.source import ReadOptions
 
 if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
+    from neurolens.optics.lens.prescription import Lens
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ examples:
         """Convert one file and print what was read."""
         if self.out.exists() and not self.force:
             raise InputError(self.out, "--output", "(an existing file)", "a new file, or --force to replace it")
-        from neurolens.readers.any_format import read_any
+        from neurolens.optics.readers.any_format import read_any
 
         with warned(self.file) as read:
             lens = read_any(self.file, self.unsaid)
@@ -62,7 +62,7 @@ def _doubts(lens: Lens) -> list[str]:
     """Contradictions between the lens and statements of its file, as sentences."""
     if find_spec("torch") is None:
         return [f"the lens is not checked against its file's statements: that needs torch ({pip_install('train')})"]
-    from neurolens.setting.check import check_lens, doubts
+    from neurolens.optics.setting.check import check_lens, doubts
 
     try:
         with warned():
@@ -77,7 +77,7 @@ def write_checked(lens: Lens, path: Path) -> None:
     Raises:
         InputError: it does not; with the file to be written.
     """
-    from neurolens.readers.lensfile import format_lens, read_lens
+    from neurolens.optics.readers.lensfile import format_lens, read_lens
 
     with atomic_path(path) as temporary:
         temporary.write_text(format_lens(lens), encoding="utf-8")
@@ -92,8 +92,8 @@ def write_checked(lens: Lens, path: Path) -> None:
 
 def _summary(lens: Lens, notes: list[str]) -> dict[str, Any]:
     """Figures of the lens for text and --json; mm."""
-    from neurolens.lens import paraxial
-    from neurolens.readers.assemble import first_order
+    from neurolens.optics.lens import paraxial
+    from neurolens.optics.readers.assemble import first_order
 
     data, efl_mm = first_order(lens), {"x": math.inf, "y": math.inf}
     axis: Literal["x", "y"]
@@ -163,7 +163,7 @@ examples:
 
     def run(self) -> int:
         """Print the requested glasses."""
-        from neurolens.lens import glass as catalogue
+        from neurolens.optics.lens import glass as catalogue
 
         glasses: list[catalogue.Glass] = []
         for name in self.name:

@@ -13,14 +13,14 @@ from neurolens.base.settings import group, positive, setting, setting_of, whole
 from neurolens.cameras.field import frame_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
-from neurolens.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
-from neurolens.defocus.picture import SAMPLES, check_field, defocus
-from neurolens.defocus.plate import DepthSettings, read_plate
-from neurolens.frames import Files
-from neurolens.lens.shot import Dispersion, Runtime, Shot, Vignetting
-from neurolens.render.pictures import standard_attributes, write_channels, write_exr, write_png
-from neurolens.render.sensor import about, expose
-from neurolens.render.settings import SensorSettings
+from neurolens.optics.lens.shot import Dispersion, Runtime, Shot, Vignetting
+from neurolens.pictures.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
+from neurolens.pictures.defocus.picture import SAMPLES, check_field, defocus
+from neurolens.pictures.defocus.plate import DepthSettings, read_plate
+from neurolens.pictures.frames import Files
+from neurolens.pictures.render.pictures import standard_attributes, write_channels, write_exr, write_png
+from neurolens.pictures.render.sensor import about, expose
+from neurolens.pictures.render.settings import SensorSettings
 
 _MOST = 64  # fields along a side
 

@@ -16,16 +16,16 @@ from neurolens.base.lensname import is_model, split_kind
 from neurolens.base.settings import positive, setting
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.onnxlens import load_model
+from neurolens.cameras.shaders.blender_shader import shader_of
+from neurolens.cameras.shaders.source import CAMERA_FRAME, camera_program, model_extras
 from neurolens.cli import arguments as cli
 from neurolens.graph.c import Extras
-from neurolens.lens.paraxial import film_z_mm
-from neurolens.lens.shot import Shot
-from neurolens.shaders.blender_shader import shader_of
-from neurolens.shaders.source import CAMERA_FRAME, camera_program, model_extras
-from neurolens.surrogates import source
+from neurolens.models import source
+from neurolens.optics.lens.paraxial import film_z_mm
+from neurolens.optics.lens.shot import Shot
 
 if TYPE_CHECKING:
-    from neurolens.surrogates.model import LensModel
+    from neurolens.models.model import LensModel
 
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _CAMERA = "camera: what a whole camera is set to"
@@ -144,7 +144,7 @@ examples:
 
     def _write_lens(self, file: Path) -> dict[str, Any]:
         """The exact lens of a file as source code."""
-        from neurolens.shaders.lens_source import write_lens
+        from neurolens.cameras.shaders.lens_source import write_lens
 
         return _about(write_lens(file, self.out, self.to, name=self.name, zoom=self.zoom, progress=self.progress()))
 
@@ -220,8 +220,8 @@ def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
 
 def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[source.Fix, tuple[LensModel, ...]]:
     """What the numbers of --fix fix, by name, and the models that know it."""
-    from neurolens.setting.focusing import best_focus_z_mm
-    from neurolens.setting.states import set_lens
+    from neurolens.optics.setting.focusing import best_focus_z_mm
+    from neurolens.optics.setting.states import set_lens
 
     film_z = fixed.get("film_z", [None])[0]
     stop = fixed.get("stop", [None])[0]
@@ -238,9 +238,9 @@ def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[sourc
 
 def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
     """Write a model as ONNX, with the errors of its card, or with new ones where something was fixed (None)."""
-    from neurolens.study.measure import FRESH, fresh_rays, measure_on
-    from neurolens.surrogates.export import export_onnx
-    from neurolens.surrogates.pairs import PairSettings, make_pairs
+    from neurolens.models.export import export_onnx
+    from neurolens.models.pairs import PairSettings, make_pairs
+    from neurolens.studies.measure import FRESH, fresh_rays, measure_on
 
     if len(models) > 1:
         wavelengths = [m.domain.wavelength_nm[0] for m in models]
@@ -260,7 +260,7 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
 
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
     """Write both inverse maps beside the model's file; returns their files and the share of rays that each finds."""
-    from neurolens.surrogates.export import export_inverse
-    from neurolens.surrogates.inverse import inverse_of
+    from neurolens.models.export import export_inverse
+    from neurolens.models.inverse import inverse_of
 
     return {"inverse": export_inverse(inverse_of(model), out, load_model(out).card["errors"])}

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neurolens import __version__
-from neurolens.analysis.layout import lens_layout
 from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
@@ -27,16 +26,26 @@ from neurolens.cameras.exact import placed_settings
 from neurolens.cameras.field import Field, field_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
-from neurolens.flare.canvas import Raster
-from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
-from neurolens.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
-from neurolens.flare.lights import SUN, KeptLights, Light, SceneLights, highlights, keep, read_lights, with_disc
-from neurolens.frames import Files, flare_channels
-from neurolens.lens.prescription import Lens
-from neurolens.readers.any_format import read_any
-from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted, in_gamut
-from neurolens.render.lights import SUN_RADIUS_RAD
-from neurolens.render.pictures import (
+from neurolens.optics.analysis.layout import lens_layout
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers.any_format import read_any
+from neurolens.pictures.flare.canvas import Raster
+from neurolens.pictures.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
+from neurolens.pictures.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
+from neurolens.pictures.flare.lights import (
+    SUN,
+    KeptLights,
+    Light,
+    SceneLights,
+    highlights,
+    keep,
+    read_lights,
+    with_disc,
+)
+from neurolens.pictures.frames import Files, flare_channels
+from neurolens.pictures.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted, in_gamut
+from neurolens.pictures.render.lights import SUN_RADIUS_RAD
+from neurolens.pictures.render.pictures import (
     read_colour_space,
     read_exr,
     read_metadata,
@@ -44,8 +53,8 @@ from neurolens.render.pictures import (
     write_channels,
     write_png,
 )  # fmt: skip
-from neurolens.render.scene import files_named, load_scene, seen_from
-from neurolens.render.settings import LAYERS, OF_LAYERS, OF_LIGHTS, OF_PICTURE, ColourSpaceName, FlareSettings
+from neurolens.pictures.render.scene import files_named, load_scene, seen_from
+from neurolens.pictures.render.settings import LAYERS, OF_LAYERS, OF_LIGHTS, OF_PICTURE, ColourSpaceName, FlareSettings
 
 _COMMAND = "neurolens flare"
 _QUICK_WIDTH = 480  # pixels at most

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
-from neurolens import handover as standards
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
@@ -19,8 +18,9 @@ from neurolens.base.settings import setting, setting_of
 from neurolens.cameras.contract import Camera
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import Maker, Projection, StMap, TracedFrame, one_centre
-from neurolens.render.pictures import read_channels, standard_attributes
-from neurolens.render.stmap import illumination_map
+from neurolens.pictures.render.pictures import read_channels, standard_attributes
+from neurolens.pictures.render.stmap import illumination_map
+from neurolens.programs import handover as standards
 
 _KINDS = "opencv", "opencv-rational", "kannala-brandt", "f-theta"
 

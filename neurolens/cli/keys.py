@@ -15,7 +15,7 @@ from neurolens.base.files import read_rows
 from neurolens.base.settings import F_NUMBER, FOCAL_MM, group, said, setting, within
 from neurolens.base.tomlfile import reject_unknown
 from neurolens.cli.arguments import floats
-from neurolens.render.scenetables import FARTHEST_M
+from neurolens.pictures.render.scenetables import FARTHEST_M
 
 _MOST = 100_000
 _PLACE_M = (-FARTHEST_M, FARTHEST_M)

@@ -100,9 +100,9 @@ examples:
 
     def _describe(self, file: Path) -> int:
         """Print and draw one lens."""
-        from neurolens.readers.any_format import read_any
-        from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
-        from neurolens.surrogates.pairs import domain_of
+        from neurolens.models.pairs import domain_of
+        from neurolens.optics.readers.any_format import read_any
+        from neurolens.studies.describe import file_doubts, glass_table, layout_profile, lens_facts
 
         began = time.perf_counter()
         with warned(file) as notes:
@@ -128,11 +128,11 @@ examples:
             "breathing_plot": self.breathing and str(self.breathing),
         }
         if self.layout is not None:
-            from neurolens.analysis.layout import lens_layout
+            from neurolens.optics.analysis.layout import lens_layout
 
             lens_layout(layout_profile(lens, domain), self.layout)
         if self.breathing is not None:
-            from neurolens.analysis.field_curves import draw_breathing
+            from neurolens.optics.analysis.field_curves import draw_breathing
 
             figures = draw_breathing(lens, self.breathing)
             data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in figures.items()}
@@ -141,7 +141,7 @@ examples:
 
     def _list(self, paths: tuple[Path, ...], checked: bool) -> int:
         """Print a table of lenses."""
-        from neurolens.readers.any_format import lens_files
+        from neurolens.optics.readers.any_format import lens_files
 
         files = [file for path in paths for file in (lens_files(path) if path.is_dir() else [_file(path)])]
         rows = self._rows(files, checked)
@@ -153,7 +153,7 @@ examples:
         rows = {file: row for file in files if (row := kept_row(file, index))}
         left = [file for file in files if file not in rows]
         if left:
-            from neurolens.study.describe import library_row
+            from neurolens.studies.describe import library_row
 
             with self.progress().stage(f"{len(left)} lenses") as report:
                 for done, file in enumerate(left, start=1):
@@ -164,9 +164,9 @@ examples:
 
     def _derive(self, file: Path) -> int:
         """Print the table of rims; write the lens with derived rims only where -o asks for it."""
-        from neurolens.readers.lensfile import write_lens
-        from neurolens.setting.rims import RimRule, derive_rims, half_field_deg
-        from neurolens.study.describe import read_quietly
+        from neurolens.optics.readers.lensfile import write_lens
+        from neurolens.optics.setting.rims import RimRule, derive_rims, half_field_deg
+        from neurolens.studies.describe import read_quietly
 
         lens = read_quietly(file)
         rule = RimRule(0.5 if self.edge_pupil is None else self.edge_pupil, half_field_deg=self.half_field)

@@ -12,11 +12,11 @@ from neurolens.base.progress import duration
 from neurolens.base.records import plain
 from neurolens.base.settings import positive, setting, setting_of, whole
 from neurolens.cli import arguments as cli
-from neurolens.frames import Files
-from neurolens.lens.shot import Dispersion, Runtime, Shot
-from neurolens.mitsuba import load_scene, render
-from neurolens.mitsuba.sensor import FILM_WIDTH_MM, libraries
-from neurolens.render.pictures import standard_attributes, write_exr, write_png
+from neurolens.optics.lens.shot import Dispersion, Runtime, Shot
+from neurolens.pictures.frames import Files
+from neurolens.pictures.render.pictures import standard_attributes, write_exr, write_png
+from neurolens.programs.mitsuba import load_scene, render
+from neurolens.programs.mitsuba.sensor import FILM_WIDTH_MM, libraries
 
 
 @dataclass(frozen=True, kw_only=True)

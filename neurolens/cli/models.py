@@ -16,10 +16,10 @@ from neurolens.base.lensname import lens_id_of
 from neurolens.base.records import program, reaches, time_of
 from neurolens.base.settings import setting, whole
 from neurolens.cli import arguments as cli
-from neurolens.study.pages import CLOSE_UM, Advice, advice, expected_exact, to_use
+from neurolens.studies.pages import CLOSE_UM, Advice, advice, expected_exact, to_use
 
 if TYPE_CHECKING:
-    from neurolens.study.check import Promise
+    from neurolens.studies.check import Promise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ def _places() -> list[Path]:
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
     """The facts of the cards in a folder, with the times beside them; a file that is no model is left out."""
-    from neurolens.surrogates.card import read_card
+    from neurolens.models.card import read_card
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
     for file in sorted(folder.glob("*.onnx")):
@@ -209,8 +209,8 @@ keeps its own; ./lenses; the project's."""
     def run(self) -> int:
         """Measure, compare, time; 1 where a promise does not hold."""
         from neurolens.cameras.model import load_model
-        from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
-        from neurolens.study.speed import time_model
+        from neurolens.studies.check import check_model, check_states, lens_of_card, space_of_card
+        from neurolens.studies.speed import time_model
 
         model = load_model(self.model)
         space = space_of_card(model.card, model.axes, self.lens, self.model) if model.axes else None

@@ -11,8 +11,8 @@ from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
-    from neurolens.photographs.rims import FittedRims
-    from neurolens.photographs.verify import Comparison, Verified
+    from neurolens.optics.photographs.rims import FittedRims
+    from neurolens.optics.photographs.verify import Comparison, Verified
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,15 +42,15 @@ examples:
 
     def run(self) -> int:
         """Compare, draw, write."""
-        from neurolens.photographs.verify import FREE, plot_verified, verify
-        from neurolens.readers.any_format import read_any
+        from neurolens.optics.photographs.verify import FREE, plot_verified, verify
+        from neurolens.optics.readers.any_format import read_any
 
         tabled = read_any(self.file)
         found = verify(tabled, self.profile)
         if self.out is not None:
             plot_verified(found, self.out, tabled.believed_to_be or tabled.name)
         if self.lens_file is not None:
-            from neurolens.readers.lensfile import write_lens
+            from neurolens.optics.readers.lensfile import write_lens
 
             write_lens(replace(tabled, measured=tuple(found.measured.items())), self.lens_file)
         files = [str(path) for path in (self.out, self.lens_file) if path is not None]
@@ -69,7 +69,7 @@ def _text(found: Verified, name: str, last: list[str]) -> str:
 
 
 def _row(c: Comparison) -> list[str]:
-    from neurolens.photographs.rims import near_f8
+    from neurolens.optics.photographs.rims import near_f8
 
     cells = [f"{c.focal_mm:g}", cli.number(c.distortion_percent and c.distortion_percent.rms, 2)]
     light = c.light_stops
@@ -106,10 +106,10 @@ examples:
 
     def run(self) -> int:
         """Fit, tell, write."""
-        from neurolens.photographs.rims import fit_rims, with_fitted_rims
-        from neurolens.photographs.verify import found_for
-        from neurolens.readers.any_format import read_any
-        from neurolens.readers.lensfile import write_lens
+        from neurolens.optics.photographs.rims import fit_rims, with_fitted_rims
+        from neurolens.optics.photographs.verify import found_for
+        from neurolens.optics.readers.any_format import read_any
+        from neurolens.optics.readers.lensfile import write_lens
 
         tabled = read_any(self.file)
         match, profiles, _ = found_for(tabled, self.profile)

@@ -15,15 +15,15 @@ from neurolens.base.html import html
 from neurolens.base.records import NOISY, plain, program
 from neurolens.base.settings import setting, setting_of
 from neurolens.cli import arguments as cli
-from neurolens.lens.shot import Dispersion, Shot
-from neurolens.study import pages
+from neurolens.optics.lens.shot import Dispersion, Shot
+from neurolens.studies import pages
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
-    from neurolens.lens.prescription import Lens
-    from neurolens.plan import plan as plans
-    from neurolens.plan.candidates import Choice
-    from neurolens.plan.probe import SceneNeeds
+    from neurolens.optics.lens.prescription import Lens
+    from neurolens.studies.plan import plan as plans
+    from neurolens.studies.plan.candidates import Choice
+    from neurolens.studies.plan.probe import SceneNeeds
 
     Shown = tuple[FloatArray, list[plans.CameraPicture]]
 
@@ -93,9 +93,9 @@ model of the shot from it, from scratch. --trade leaves trade.html besides, a pa
         if self.samples is not None and not self.trade:
             self.refuse("--samples", self.samples, "--trade beside it")
         began = os.times()
-        from neurolens.plan import plan as plans
-        from neurolens.readers.any_format import read_any
-        from neurolens.render.scene import load_scene
+        from neurolens.optics.readers.any_format import read_any
+        from neurolens.pictures.render.scene import load_scene
+        from neurolens.studies.plan import plan as plans
 
         lens, scene = read_any(self.lens), load_scene(self.scene)
         folder = self.out or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
@@ -128,8 +128,8 @@ model of the shot from it, from scratch. --trade leaves trade.html besides, a pa
 
 def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
     """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
-    from neurolens.setting.states import set_lens
-    from neurolens.surrogates.card import read_card
+    from neurolens.models.card import read_card
+    from neurolens.optics.setting.states import set_lens
 
     name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
     files = sorted((library() / "models").glob(f"{name}.*.onnx"))
@@ -138,7 +138,7 @@ def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
 
 
 def _text(command: Plan, result: plans.Plan, data: Mapping[str, Any], folder: Path, written: Sequence[str]) -> str:
-    from neurolens.plan.probe import STRAY
+    from neurolens.studies.plan.probe import STRAY
 
     rows = [
         (e.name, cli.number(e.worth, 3), cli.number(e.median, 3), "px" if e.unit == "px" else "of light",
@@ -163,7 +163,7 @@ def _text(command: Plan, result: plans.Plan, data: Mapping[str, Any], folder: Pa
 def _dear(result: plans.Plan, took: float, every: bool) -> list[str]:
     """That a plan took more than its share of the picture that it is for, and why; nothing where it did not, or where
     the time of the picture is not known."""
-    from neurolens.plan.plan import SHARE
+    from neurolens.studies.plan.plan import SHARE
 
     best = result.best
     if best is None or not any(result.work.rest) or took <= SHARE * best.seconds:
@@ -267,8 +267,8 @@ def _cameras(result: plans.Plan, flips: Mapping[str, float]) -> pages.Table:
 
 def _draw_trade(result: plans.Plan, shown: Shown, folder: Path, title: str, samples: int) -> None:
     """Write the page of a trade and its two figures."""
-    from neurolens.plan.plan import plot_trade
-    from neurolens.study.scenes import side_by_side
+    from neurolens.studies.plan.plan import plot_trade
+    from neurolens.studies.scenes import side_by_side
 
     plot_trade(result, folder / "trade.png", title)
     exact, some = shown

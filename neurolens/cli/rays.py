@@ -21,9 +21,9 @@ from neurolens.base.settings import group
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import ALL_KEYS, Frames, frames_group, numbered
 from neurolens.cli.stmap import PictureCommand
-from neurolens.hosts import BYTES_A_RAY, HOSTS, Arrays, Host, RayJob, RaySettings
-from neurolens.render.film import PixelGrid, check_memory
-from neurolens.render.pictures import write_channels
+from neurolens.pictures.render.film import PixelGrid, check_memory
+from neurolens.pictures.render.pictures import write_channels
+from neurolens.programs.hosts import BYTES_A_RAY, HOSTS, Arrays, Host, RayJob, RaySettings
 
 _MOST_LAYERS = 64  # samples of an EXR
 

@@ -25,12 +25,12 @@ from neurolens.base.tasks import Stopping, Unfinished
 from neurolens.cameras.contract import FloatArray
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
-from neurolens.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
-from neurolens.frames.farm import how_to_resume, render_frames
-from neurolens.lens.shot import Dispersion, Runtime, Shot, Vignetting
-from neurolens.render.pictures import write_png
-from neurolens.render.renderer import RenderResult, Watch, merge_tiles, tile_path
-from neurolens.render.settings import FilmSettings, SensorSettings
+from neurolens.optics.lens.shot import Dispersion, Runtime, Shot, Vignetting
+from neurolens.pictures.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
+from neurolens.pictures.frames.farm import how_to_resume, render_frames
+from neurolens.pictures.render.pictures import write_png
+from neurolens.pictures.render.renderer import RenderResult, Watch, merge_tiles, tile_path
+from neurolens.pictures.render.settings import FilmSettings, SensorSettings
 
 _FARMS, _LONG = "farms", "long renders"  # titles in the help
 
@@ -278,7 +278,7 @@ class Demo(cli.Command):
 
     def run(self) -> int:
         """Render and write the page."""
-        from neurolens.study.pages import figures_of
+        from neurolens.studies.pages import figures_of
 
         self.out.mkdir(parents=True, exist_ok=True)
         parser = cli.Parser()

@@ -23,11 +23,11 @@ from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Field, Frame, diagonal_points, field_of, frame_of, lit_points, shown_at, spectrum_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
-from neurolens.lens.shot import Runtime, Shot
-from neurolens.render.film import PixelGrid
-from neurolens.render.pictures import read_channels, standard_attributes, write_channels
-from neurolens.render.settings import size_by_shape
-from neurolens.render.stmap import (
+from neurolens.optics.lens.shot import Runtime, Shot
+from neurolens.pictures.render.film import PixelGrid
+from neurolens.pictures.render.pictures import read_channels, standard_attributes, write_channels
+from neurolens.pictures.render.settings import size_by_shape
+from neurolens.pictures.render.stmap import (
     Plates,
     illumination_map,
     in_pixels,
@@ -385,7 +385,7 @@ examples:
 
     def run(self) -> int:
         """Trace, fit, write."""
-        from neurolens import handover
+        from neurolens.programs import handover
 
         out, progress = self.out, self.progress()
         if out is None and self.noncentral:

@@ -19,7 +19,7 @@ from neurolens.base.records import NOISY, noisy
 from neurolens.base.settings import setting, whole
 from neurolens.base.tasks import Processes, cores
 from neurolens.cli import arguments as cli
-from neurolens.study.pages import advice, ns_text
+from neurolens.studies.pages import advice, ns_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +98,8 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
 
     def _train(self, file: Path, out: Path | None, progress: Progress) -> tuple[Path, dict[str, Any]]:
         """Run one experiment, or that of a lens file, in a folder; the folder and the results."""
-        from neurolens.study.experiment import default_experiment, read_experiment
-        from neurolens.study.train import run_experiment
+        from neurolens.studies.experiment import default_experiment, read_experiment
+        from neurolens.studies.train import run_experiment
 
         folder = Path("runs") / lens_id_of(file) if out is None else out
         cli.check_written(folder, "--output", "DIR")
@@ -196,9 +196,9 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
 
     def run(self) -> int:
         """Survey a folder; 1 where a file met a fault of neurolens."""
-        from neurolens.readers.any_format import collection_of
-        from neurolens.readers.source import MAX_BYTES
-        from neurolens.study.survey import TIME_LIMIT_S, SurveySettings, summary_lines, summary_of, survey
+        from neurolens.optics.readers.any_format import collection_of
+        from neurolens.optics.readers.source import MAX_BYTES
+        from neurolens.studies.survey import TIME_LIMIT_S, SurveySettings, summary_lines, summary_of, survey
 
         if self.out.resolve() == self.folder.resolve():
             self.refuse("--output", str(self.out), "a folder other than that of the lenses")

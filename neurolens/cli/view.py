@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.analysis.fields import Scene
-from neurolens.analysis.layout import layout_profile
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
@@ -18,19 +16,21 @@ from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.base.settings import RANGE, setting, setting_of
 from neurolens.cameras.onnxlens import load_model
+from neurolens.cameras.shaders.lens_source import write_lens
+from neurolens.cameras.shaders.source import model_extras
 from neurolens.cli import arguments as cli
 from neurolens.cli.blender import Build, forms_of, key_of, kind_of, library, squeeze_of
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import VISIBLE_NM, Lens
-from neurolens.readers import lensfile
-from neurolens.readers.any_format import read_any
-from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
-from neurolens.setting.states import set_lens
-from neurolens.shaders.lens_source import write_lens
-from neurolens.shaders.source import model_extras
-from neurolens.surrogates.card import read_card
-from neurolens.surrogates.source import Written, export_source
-from neurolens.view import Form, ViewLens, ghosts_glsl, path_glsl, section_svg, write_page
+from neurolens.models.card import read_card
+from neurolens.models.source import Written, export_source
+from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.analysis.layout import layout_profile
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import VISIBLE_NM, Lens
+from neurolens.optics.readers import lensfile
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.pupils import image_radius_mm, pupil_plane_z_mm
+from neurolens.optics.setting.states import set_lens
+from neurolens.programs.view import Form, ViewLens, ghosts_glsl, path_glsl, section_svg, write_page
 
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")

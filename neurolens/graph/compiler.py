@@ -125,7 +125,7 @@ def _end(child: subprocess.Popen[str]) -> None:
 
 
 def c_source(file: str, **constants: object) -> str:
-    """The text of a .c file of this package ("flare/area.c"), after a #define for each constant that Python knows."""
+    """The text of a .c file ("pictures/flare/area.c"), after a #define for each constant that Python knows."""
     defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
     return defines + (Path(__file__).parents[1] / file).read_text(encoding="utf-8")
 

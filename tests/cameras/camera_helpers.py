@@ -15,9 +15,9 @@ from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.reduced import Vignetted
-from neurolens.lens.shot import Shot
-from neurolens.setting.pupils import camera_rays as start
-from neurolens.trace.rays import trace
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.setting.pupils import camera_rays as start
+from neurolens.optics.trace.rays import trace
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)

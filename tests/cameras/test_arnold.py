@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from camera_helpers import camera
 
+from neurolens.cameras.shaders.source import camera_program
 from neurolens.graph.c import Extras, write_c
-from neurolens.shaders.source import camera_program
 
 ARNOLD = Path(__file__).parents[2] / "experiments" / "arnold"
 # Calls the node as Arnold would, with two parameters and numbers of `AtCameraInput` from the standard input.

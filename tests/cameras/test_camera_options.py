@@ -16,9 +16,9 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cli import main
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.shot import Shot
-from neurolens.render.pictures import read_exr
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.pictures import read_exr
 
 SCENE = ROOT / "experiments" / "scenes" / "white.toml"
 

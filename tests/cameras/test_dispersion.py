@@ -15,9 +15,9 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import Pinhole
 from neurolens.cameras.reduced import ReducedDispersion, film_shift
 from neurolens.cameras.sampling import stratified
-from neurolens.lens.prescription import LINE_D_NM
-from neurolens.lens.shot import Shot
-from neurolens.readers.lensfile import read_lens
+from neurolens.optics.lens.prescription import LINE_D_NM
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)

@@ -21,12 +21,12 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.interpret import evaluate
-from neurolens.lens.paraxial import film_z_mm, first_order
-from neurolens.lens.shot import Runtime, Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.pupils import pupil_plane_z_mm
-from neurolens.setting.states import set_lens
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.optics.lens.paraxial import film_z_mm, first_order
+from neurolens.optics.lens.shot import Runtime, Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.pupils import pupil_plane_z_mm
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.tracegraph import exact_graph
 
 FILM, LENSES = (36.0, 24.0), Path(__file__).parents[2] / "lenses"
 

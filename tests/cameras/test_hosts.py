@@ -14,9 +14,9 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.graph.compiler import has_compiler
-from neurolens.hosts import HOSTS, RayJob, RaySettings, from_compact, resampled
-from neurolens.lens.shot import Shot
-from neurolens.render.film import PixelGrid
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.film import PixelGrid
+from neurolens.programs.hosts import HOSTS, RayJob, RaySettings, from_compact, resampled
 
 ROOT = Path(__file__).parents[2]
 MODEL = ROOT / "models" / "laikin_double_gauss_50.ols-60.onnx"
@@ -227,7 +227,7 @@ def test_frames_move_the_focus_and_the_camera(capsys: pytest.CaptureFixture[str]
 
 
 def test_an_exr_has_a_layer_a_sample(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    from neurolens.render.pictures import read_channels
+    from neurolens.pictures.render.pictures import read_channels
 
     for samples, first in ((1, ""), (2, "s1.")):
         run_json(capsys, *LINE, "--samples", samples, "--to", "gsplat", "-o", tmp_path / "rays.exr")

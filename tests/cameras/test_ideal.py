@@ -18,12 +18,12 @@ from neurolens.cameras.cameragraph import concentric_disk
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, ThinLens
 from neurolens.graph.compiler import has_compiler
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.paraxial import first_order, system_of
-from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.paraxial import first_order, system_of
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 
 
 def square_grid(side: int) -> np.ndarray:

@@ -18,15 +18,15 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
-from neurolens.flare.ghosts import coated
 from neurolens.graph import compiler
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import WORST, with_low_order_derivatives
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Runtime, Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.surrogates.export import export_onnx
+from neurolens.models.export import export_onnx
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Runtime, Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.pictures.flare.ghosts import coated
 
 FILM = (36.0, 24.0)
 BAND = np.abs(np.add.outer(np.arange(64), -np.arange(64))) < 16  # about half of the stop

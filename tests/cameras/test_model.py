@@ -20,11 +20,11 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.cameras.model import ModelScene, OnnxCamera, OnnxLens, best_focus_z_mm, load_model
 from neurolens.cameras.pupil_outline import PupilTable, pass_test, tightened
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.paraxial import film_z_mm, first_order
-from neurolens.lens.shot import Shot
-from neurolens.setting import focusing
-from neurolens.surrogates import card as cards
+from neurolens.models import card as cards
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.paraxial import film_z_mm, first_order
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.setting import focusing
 
 ROOT = Path(__file__).parents[2]
 
@@ -310,8 +310,8 @@ def test_models_need_no_torch_and_write_nothing(path: Path, tmp_path: Path) -> N
         "import sys\n"
         "sys.modules.update(dict.fromkeys(['torch', 'sklearn', 'matplotlib']))\n"
         "from neurolens.cameras.model import OnnxCamera, load_model\n"
-        "from neurolens.lens.shot import Shot\n"
-        "from neurolens.lens.shot import Shot\n"
+        "from neurolens.optics.lens.shot import Shot\n"
+        "from neurolens.optics.lens.shot import Shot\n"
         f"camera = OnnxCamera(load_model({str(path)!r}), Shot((36, 24), 2, runtime='onnxruntime'))\n"
         "import numpy as np\n"
         "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"

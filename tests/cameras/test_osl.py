@@ -14,27 +14,27 @@ from shipped import whole
 from neurolens.cameras.cameragraph import unit_disc
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
+from neurolens.cameras.shaders import blender_shader as shaders
+from neurolens.cameras.shaders import osl, pupil_fit, shader_lens
+from neurolens.cameras.shaders.blender_shader import exact_lens
+from neurolens.cameras.shaders.pupil import Blades, PupilCircles
+from neurolens.cameras.shaders.pupil_fit import fit_pupil
+from neurolens.cameras.shaders.shader_lens import ShaderLens, light, passing_share
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, pruned
 from neurolens.graph.loworder import low_tests
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_osl
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.shot import Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.pupils import pupil_plane_z_mm
-from neurolens.setting.states import set_lens
-from neurolens.shaders import blender_shader as shaders
-from neurolens.shaders import osl, pupil_fit, shader_lens
-from neurolens.shaders.blender_shader import exact_lens
-from neurolens.shaders.pupil import Blades, PupilCircles
-from neurolens.shaders.pupil_fit import fit_pupil
-from neurolens.shaders.shader_lens import ShaderLens, light, passing_share
-from neurolens.surrogates import fit
-from neurolens.surrogates.axes import Axis, product, weights
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.models import fit
+from neurolens.models.axes import Axis, product, weights
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.pupils import pupil_plane_z_mm
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.tracegraph import exact_graph
 
 MODEL = ROOT / "models" / f"{GAUSS.stem}.ols-36.onnx"
 FAR = 1e9

@@ -14,10 +14,10 @@ from neurolens.cameras import exact
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import ExactCamera, kept_outline, search_key
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.lens.figures import Cylinder, Figure
-from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Shot
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.figures import Cylinder, Figure
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.setting.states import set_lens
 
 KEY = "0123456789abcdef" * 4
 

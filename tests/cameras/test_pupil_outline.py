@@ -14,12 +14,12 @@ from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.pupil_outline import Passes, PupilOutline, PupilTable, outline_of
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.figures import Cylinder
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.lens.shot import Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.figures import Cylinder
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 
 RADIUS, SHIFT = 4.0, 0.45  # of the discs, and how fast they part, mm per mm of film radius
 VISIBLE, ONE = (400.0, 700.0), (550.0, 550.0)

@@ -20,24 +20,24 @@ from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.shaders import lens_source
+from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
+from neurolens.cameras.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
 from neurolens.cli import main
 from neurolens.graph.compiler import has_compiler
-from neurolens.lens.paraxial import film_z_mm, first_order
-from neurolens.lens.shot import Shot
-from neurolens.readers.any_format import read_any
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting import focusing
-from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
-from neurolens.setting.pupils import camera_rays
-from neurolens.setting.states import set_lens
-from neurolens.shaders import lens_source
-from neurolens.shaders.lens_source import lens_program, pupil_planes_mm
-from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
-from neurolens.study.speed import CompiledSource
-from neurolens.surrogates.fit import gap_axis, zoom_axis
-from neurolens.surrogates.pairs import domain_of, sample_domain
-from neurolens.trace.rays import trace
-from neurolens.trace.surfaces import Rays
+from neurolens.models.fit import gap_axis, zoom_axis
+from neurolens.models.pairs import domain_of, sample_domain
+from neurolens.optics.lens.paraxial import film_z_mm, first_order
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting import focusing
+from neurolens.optics.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
+from neurolens.optics.setting.pupils import camera_rays
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.surfaces import Rays
+from neurolens.studies.speed import CompiledSource
 
 ROOT = Path(__file__).parents[2]
 LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"

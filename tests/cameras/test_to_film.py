@@ -12,7 +12,7 @@ from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.lens.shot import Shot
+from neurolens.optics.lens.shot import Shot
 
 IDEAL = ("pinhole", "thin", "thick", *FISHEYES)
 

@@ -1,4 +1,4 @@
-"""`neurolens.torch.LensCamera`: the rays of numpy's camera, and gradients beside differences and closed forms."""
+"""`neurolens.programs.torch.LensCamera`: the rays of numpy's camera; gradients beside differences and closed forms."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.shot import Shot
-from neurolens.render.film import PixelGrid
-from neurolens.torch import LensCamera
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.film import PixelGrid
+from neurolens.programs.torch import LensCamera
 
 ROOT = Path(__file__).parents[2]
 GAUSS = ROOT / "models" / "laikin_double_gauss_50.ols-60.onnx"

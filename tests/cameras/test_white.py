@@ -19,9 +19,9 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import PROJECTIONS, Pinhole, ThickLens, ThinLens
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.reduced import Vignetted
-from neurolens.lens.paraxial import first_order
-from neurolens.lens.shot import Shot
-from neurolens.setting.states import set_lens
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.setting.states import set_lens
 
 MODELS = Path(__file__).parents[2] / "models"
 

@@ -8,7 +8,7 @@ import numpy as np
 from experiments.gallery.cameras import CAMERAS, Shot, Surrogate, View, shot_of, surrogate_of
 from experiments.gallery.measures import MEASURES
 from experiments.gallery.settings import Panel
-from neurolens.render.scene import scene_from_tables
+from neurolens.pictures.render.scene import scene_from_tables
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

@@ -16,9 +16,9 @@ from experiments import extremes
 from experiments.__main__ import main
 from experiments.extremes import failures, measure, trace_reference
 from neurolens.base import status as st
-from neurolens.lens.figures import Cylinder, Figure
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.trace.rays import trace
+from neurolens.optics.lens.figures import Cylinder, Figure
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.trace.rays import trace
 
 COUNT = 300
 ALL = list(takewhile(lambda case: case.group != "library", cases.all_cases(COUNT)))

@@ -15,13 +15,13 @@ from gallery_shots import GALLERY, measured, shot
 from experiments.gallery.cameras import Shot, View, Window, exact_camera, shot_of, thin_camera
 from experiments.gallery.measures import light_profile, spot
 from experiments.gallery.settings import read_effect
-from neurolens.analysis.field_curves import RECTILINEAR, curvature, distortion, seidel
-from neurolens.analysis.fields import Scene
 from neurolens.cameras.ideal import ThinLens
-from neurolens.lens.glass import LINE_D_NM, index_of
-from neurolens.lens.paraxial import first_order
-from neurolens.render.renderer import render
-from neurolens.render.scene import load_scene
+from neurolens.optics.analysis.field_curves import RECTILINEAR, curvature, distortion, seidel
+from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.lens.glass import LINE_D_NM, index_of
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import load_scene
 
 ALL = ("exact", "surrogate", "thin")
 

@@ -22,13 +22,13 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.shot import Shot, StopShape
-from neurolens.readers.lensfile import read_lens
-from neurolens.render.images import make_aperture
-from neurolens.render.scene import load_scene
-from neurolens.setting.states import set_lens
-from neurolens.trace.rays import Rays, trace
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.shot import Shot, StopShape
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.rays import Rays, trace
+from neurolens.pictures.render.images import make_aperture
+from neurolens.pictures.render.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

@@ -18,9 +18,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
-from neurolens.surrogates.pairs import PairSettings, sample_domain
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.models.pairs import PairSettings, sample_domain
+from neurolens.optics.trace.tracegraph import exact_graph
+from neurolens.studies.experiment import DomainChoice, EvaluationChoice, LensChoice
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_tessar_through_the_rear_rim_is_steinerts() -> None:
 
 
 def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:
-    """The whole against the tracer: tests/trace/test_tracegraph.py."""
+    """The whole against the tracer: tests/optics/trace/test_tracegraph.py."""
     lens, domain = lens_models.lens(), lens_models.domain()
     s = sample_domain(domain, 20_000, 3)
     inputs = {f"{k}_mm": getattr(s, k).numpy() for k in ("film_x", "film_y", "pupil_x", "pupil_y")}

@@ -11,9 +11,9 @@ from experiments import outside
 from experiments.vignetting import DOMAINS, OPENINGS, opening_errors
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
-from neurolens.study.experiment import LensChoice
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.models.fit import ModelSettings, fit_model, prepare
+from neurolens.models.pairs import PairSettings, make_pairs
+from neurolens.studies.experiment import LensChoice
 
 LENSES = Path(__file__).parents[2] / "lenses"
 pytestmark = pytest.mark.whole  # a command of its own

@@ -8,9 +8,9 @@ import pytest
 from experiments import lab, plans
 from experiments.plan_errors import by_rays, fresh_places, fresh_prints, moved, pieces_of, rendered
 from neurolens.cameras.build import make_camera
-from neurolens.lens.shot import Shot
-from neurolens.readers.lensfile import read_lens
-from neurolens.render.scene import load_scene
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.pictures.render.scene import load_scene
 
 SIDE, SEEDS = 56, 4
 

@@ -15,15 +15,15 @@ from experiments.__main__ import main
 from neurolens.base.errors import InputError
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, WAVELENGTH
 from neurolens.graph.scalars import lower
-from neurolens.lens.figures import Figure, Qcon
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.rims import check_figures
-from neurolens.trace import shapes
-from neurolens.trace.arithmetic import NUMPY
-from neurolens.trace.rays import Rays, trace
-from neurolens.trace.tensors import Tensors
-from neurolens.trace.tracegraph import exact_graph
+from neurolens.optics.lens.figures import Figure, Qcon
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.rims import check_figures
+from neurolens.optics.trace import shapes
+from neurolens.optics.trace.arithmetic import NUMPY
+from neurolens.optics.trace.rays import Rays, trace
+from neurolens.optics.trace.tensors import Tensors
+from neurolens.optics.trace.tracegraph import exact_graph
 
 LENSES = Path(__file__).parents[2] / "lenses"
 WORST = "fujifilm_fujinon_xf_35mm_f1_4_r"

@@ -5,9 +5,9 @@ import pytest
 
 from experiments import rays
 from experiments.ray_peers import PEERS, Found, Peer, Task, table_of
-from neurolens.lens.figures import Cylinder, Figure, Ideal
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.study.speed import Unavailable
+from neurolens.optics.lens.figures import Cylinder, Figure, Ideal
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.studies.speed import Unavailable
 
 COUNT = 600
 NAMES = ("laikin_double_gauss_50", "canon_aspheric_50")

@@ -21,15 +21,15 @@ from experiments.table_faults import (
     transposed,
 )
 from experiments.table_figures import SHARES, Tables, chief_rays, measure
-from neurolens.analysis import field_curves
-from neurolens.analysis.fields import Scene
-from neurolens.lens.figures import SPHERE
-from neurolens.lens.prescription import Lens
-from neurolens.photographs.profiles import Profile
-from neurolens.photographs.verify import compare, found_for
-from neurolens.readers.any_format import read_any
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
+from neurolens.optics.analysis import field_curves
+from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.lens.figures import SPHERE
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.photographs.profiles import Profile
+from neurolens.optics.photographs.verify import compare, found_for
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 
 ROOT = Path(__file__).parents[2]
 SONNAR = ROOT / "tests" / "data" / "sonnar_55_derived_rims.toml"  # lenses/sony_sonnar_55.toml before its fit

@@ -6,10 +6,10 @@ import numpy as np
 from experiments import lab
 from experiments.wild import TRACER, Form, Row, by_numpy, judge, tracer, wild
 from neurolens.base import status as st
+from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.graph.program import RAY
-from neurolens.lens.prescription import VISIBLE_NM
-from neurolens.shaders.lens_source import lens_program, pupil_planes_mm
-from neurolens.surrogates.source import fused_program
+from neurolens.models.source import fused_program
+from neurolens.optics.lens.prescription import VISIBLE_NM
 
 COUNT = 3000
 

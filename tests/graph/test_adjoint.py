@@ -17,8 +17,8 @@ from neurolens.graph.adjoint import INNER, OUTER, adjoint
 from neurolens.graph.c import Signature
 from neurolens.graph.program import Expr, Program
 from neurolens.graph.shading import Cuda
-from neurolens.lens.shot import Shot
-from neurolens.torch import LensCamera, step_by_step
+from neurolens.optics.lens.shot import Shot
+from neurolens.programs.torch import LensCamera, step_by_step
 
 ROOT = Path(__file__).parents[2]
 POINTS = np.array([[0.3, -0.4, 1.7, 0.9, -2.5], [0.8, 0.5, -0.6, 1.9, 0.7]])

@@ -18,14 +18,14 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate, monomials
 from neurolens.graph.ir import Graph
-from neurolens.lens.figures import Figure
-from neurolens.lens.glass import LINE_D_NM
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.surrogates.model import Encoding
-from neurolens.surrogates.pairs import sample_domain, trace_pairs
-from neurolens.surrogates.polynomial import ideal_map
-from neurolens.surrogates.targets import fit_encoding, scales_of
-from neurolens.trace.rays import Rays, trace
+from neurolens.models.model import Encoding
+from neurolens.models.pairs import sample_domain, trace_pairs
+from neurolens.models.polynomial import ideal_map
+from neurolens.models.targets import fit_encoding, scales_of
+from neurolens.optics.lens.figures import Figure
+from neurolens.optics.lens.glass import LINE_D_NM
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.trace.rays import Rays, trace
 
 FAST = {"dense": PublishedSettings("hanika", degree=3), "sparse": PublishedSettings("schrade", degree=5, terms=12)}
 

@@ -18,10 +18,10 @@ from experiments.published.neural import Layers
 from experiments.published.rtf import least_ellipse, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.study.rays import ray_errors
-from neurolens.surrogates.cores import LightField
-from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import FilmRays, sample_domain, trace_pairs
+from neurolens.models.cores import LightField
+from neurolens.models.model import LensModel
+from neurolens.models.pairs import FilmRays, sample_domain, trace_pairs
+from neurolens.studies.rays import ray_errors
 
 
 @cache

@@ -1,0 +1,332 @@
+"""Fits of the stop crossing, the transmittance and the gates, which follow those of position and direction.
+
+Polynomials use the terms that are there anyway, networks their last hidden layer. Both get more terms where the
+boundaries or the transmittance need them: absorption and coatings change with the wavelength faster than any ray's path
+does, and near grazing rays faster with the ray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.base.errors import InputError
+from neurolens.models.cores import STOP, InvariantPolynomial, LightField
+from neurolens.models.targets import Prepared, gate_reach, gate_values
+from neurolens.models.terms import (
+    Exponents,
+    Sweep,
+    further,
+    invariant_exponents,
+    monomials,
+    powers,
+    solve,
+    vector_columns,
+)
+
+# Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
+# the stop crossing in stop radii.
+GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
+STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
+MOST_BOUNDARY_TERMS = 64
+# Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
+# those errors, or by hardly more than with all terms. At a quarter hardly more rays were clipped wrongly than with all;
+# networks clipped more, and keep all. Of the transmittance, which nothing is decided by, a larger share is enough.
+NEEDED_SHARE, _NEARLY, _THROUGH_SHARE = 0.25, 1.2, 0.6
+# Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
+NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
+_DEGREE = 9  # of the terms among which those for boundaries are found
+_RAYS = 12_000  # on which they are found
+TRANSMITTANCE_ERROR = 2.5e-4  # RMS at which no term is added
+_TRANSMITTANCE_RAYS = 6000
+_TRANSMITTANCE_DEGREE, _MOST_W = 7, 8  # of the candidates
+_LEAST_GAIN = 0.03  # a term must take away this share of the squared error left
+# A far ray that passes all fitted gates is fitted with this value of one gate, or its own where that is less than a rim
+# radius twice over; first with this weight, which doubles while it still passes, up to the last.
+_TARGET, _MOST_TARGET = 0.1, 1.0
+_WEIGHT, _MOST_WEIGHT = 0.03, 1.0
+_ROUNDS = 8
+_RIDGE, _DEPENDENT = 1e-13, 1e-12  # relative
+
+Features = Callable[[LightField], Tensor]  # [M, N] of N rays
+
+
+def features_of(exponents: Exponents, hidden: Features | None = None) -> Features:
+    """Monomials of the invariants, after the features of a hidden layer where there is one."""
+
+    def features(field: LightField) -> Tensor:
+        own = [] if hidden is None else [hidden(field)]
+        return torch.cat([*own, monomials(field.invariants(), exponents)] if len(exponents) or not own else own)
+
+    return features
+
+
+def fit_stop(data: Prepared, features: Features) -> Tensor:
+    """[2 M]: A and B of the stop crossing (in stop radii) on M features, from rays on both sides of rims."""
+    crossing, weight = stop_crossing(data)
+    field = data.boundary_field
+    columns = vector_columns(features(field), field)
+    return solve(columns, crossing.reshape(1, -1), weight.repeat(2))[0]
+
+
+def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
+    """[2, N] crossings of the boundary rays in stop radii, and their weights [N]."""
+    pairs, lens = data.boundary, data.pairs.lens
+    crossing = torch.stack([pairs.cross_x[lens.stop_index], pairs.cross_y[lens.stop_index]]) / lens.stop_radius_mm
+    return crossing, data.boundary_weights[1]
+
+
+def invariant_core(
+    data: Prepared, exponents: Exponents, columns: Sequence[int], coefficients: Tensor, *, sparse: bool = False
+) -> InvariantPolynomial:
+    """The polynomial on these monomials with all that is fitted on them after position and direction.
+
+    Args:
+        columns: places of the chosen ones among m p (first M) and m u (M more).
+        coefficients: [2, C] of those, of position and direction.
+        sparse: whether the rest has only the terms that it needs.
+    """
+    ab, features = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64), features_of(exponents)
+    ab[:STOP, list(columns)] = coefficients
+    rest = fit_sparse(data, features) if sparse else (fit_stop(data, features), solve_scalars(data, features))
+    ab[STOP], scalars = rest
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), scalars.numpy())
+
+
+def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
+    """[2 M] and [1 + G, M] as `fit_stop` and `solve_scalars` give them, with the features that each needs."""
+    stop, *gates = (fit.needed() for fit in _boundary_fits(data, features))
+    crossing, weight = stop_crossing(data)
+    rows = vector_columns(features(data.boundary_field), data.boundary_field)
+    found = rows.new_zeros(len(rows))
+    found[stop] = solve(rows[stop], crossing.reshape(1, -1), weight.repeat(2))[0]
+    rays = data.pairs.train
+    seen, wanted = features(data.encoding(rays.inputs)), rays.transmittance[None]
+    scale = (NEEDED_SHARE / (_THROUGH_SHARE * TRANSMITTANCE_ERROR)) ** 2 / len(rays)
+    through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), scale, len(seen))
+    return found, solve_scalars(data, features, [through.needed(), *gates])
+
+
+def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] | None = None) -> Tensor:
+    """[1 + G, M]: transmittance on the passing rays, each gate on those that get as far, most on those that it decides.
+
+    Args:
+        kept: the features that the transmittance and each gate has; all without.
+
+    Raises:
+        InputError: no more rays near the boundaries than terms.
+    """
+    pairs = data.pairs
+    train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
+    if len(data.boundary) <= len(train):
+        raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
+    through, *gates = kept or [list(range(len(train)))]
+    values = gate_values(pairs.lens, data.gates, data.boundary)
+    fit = GateFit(near, values, data.boundary_weights[0], gates if kept else None)
+    fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
+    transmittance = torch.zeros((1, len(train)), dtype=torch.float64)
+    transmittance[:, through] = solve(train[through], pairs.train.transmittance[None])
+    return torch.cat([transmittance, fit.coefficients()])
+
+
+def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidden: Features | None = None) -> Exponents:
+    """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
+
+    Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
+
+    Args:
+        first: the exponents before those were grown for position and direction alone, which takes nothing from the stop
+            crossing: where those meet it better it is met as well.
+        hidden: the features of a network's last hidden layer, which are held to a share of the errors.
+    """
+    added = further(invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive), exponents)
+    allowed, most, share = 1.0, MOST_BOUNDARY_TERMS, 1.0
+    if hidden is not None:
+        allowed, most = NETWORK_SHARE**2, MOST_NETWORK_TERMS
+    if not np.array_equal(first, exponents[: len(first)]):
+        stop = _boundary_fits(data, features_of(first), which=[0])[0]
+        share = min(max(stop.error, STOP_KEPT), 1.0)
+    fits = _boundary_fits(data, features_of(exponents, hidden), stop_share=share)
+    bad = [k for k, fit in enumerate(fits) if fit.error > allowed]
+    if not bad:
+        return added[:0]
+    start, features = fits[0].terms, features_of(np.concatenate([exponents, added]), hidden)
+    fits = _boundary_fits(data, features, start, bad, share)
+    return added[[k - start for k in _selected(fits, min(most, len(added)), allowed)]]
+
+
+def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Exponents:
+    """[K, 4] further exponents, at most `most`, by forward selection beside those given [M, 4]; often none."""
+    rays = data.pairs.train.select(slice(0, _TRANSMITTANCE_RAYS))
+    if most == 0 or len(rays) < 2 * (len(exponents) + most):
+        return exponents[:0]
+    invariants, wanted = data.encoding(rays.inputs).invariants(), rays.transmittance[None]
+    features = monomials(invariants, exponents)
+    left = wanted - solve(features, wanted) @ features
+    allowed = TRANSMITTANCE_ERROR**2 * len(rays)
+    if not float((left**2).sum()) > allowed:
+        return exponents[:0]
+    candidates = invariant_exponents(_TRANSMITTANCE_DEGREE, dispersive=data.encoding.dispersive)
+    if data.encoding.dispersive:  # absorption: high powers of w, with low ones of the others
+        colours = np.array([(*p, w) for w in range(1, _MOST_W + 1) for p in powers(3, 1)], dtype=np.int64)
+        candidates = np.unique(np.concatenate([candidates, colours]), axis=0)
+    added, start = further(candidates, exponents), len(exponents)
+    features = monomials(invariants, np.concatenate([exponents, added]))
+    fit = _BoundaryFit(Sweep.of_columns(features, wanted), len(features), 1 / allowed, start)
+    return added[[k - start for k in _selected([fit], most, 1.0, _LEAST_GAIN) if k >= start]]
+
+
+class _BoundaryFit:
+    """One boundary's normal equations: `blocks` columns a term (A and B of a vector, or one)."""
+
+    def __init__(self, sweep: Sweep, terms: int, scale: float, start: int) -> None:
+        """Take the first `start` of the terms in; `scale` makes 1 of the squared error that is allowed."""
+        self.sweep, self.terms, self.scale, self.blocks = sweep, terms, scale, sweep.count // terms
+        for term in range(start):
+            self.add(term)
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over the square of the one allowed."""
+        return self.sweep.residual * self.scale
+
+    def add(self, term: int) -> None:
+        for column in range(term, self.sweep.count, self.terms):
+            if self.sweep.scores("ols")[column] > 0:
+                self.sweep.add(column)
+
+    def needed(self) -> list[int]:
+        """The columns left when the cheapest are dropped one by one, as long as the error allows it."""
+        sweep, most = self.sweep, max(NEEDED_SHARE**2, _NEARLY * self.error)
+        while len(sweep.chosen) > 1 and self.error + float((costs := sweep.costs()).min()) * self.scale <= most:
+            sweep.drop(sweep.chosen[int(costs.argmin())])
+        return sorted(sweep.chosen)
+
+    def scores(self) -> np.ndarray:
+        return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
+
+
+def needed_for(sweep: Sweep, error: float) -> list[int]:
+    """The fewest columns of A and B of a vector with this squared residual, or with hardly more than all leave."""
+    sweep.restart([])
+    terms = sweep.count // 2
+    return _BoundaryFit(sweep, terms, NEEDED_SHARE**2 / max(error, 1e-300), terms).needed()
+
+
+def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: float = 0.0) -> list[int]:
+    """Terms by forward selection until no fit errs by more than allowed, or no term gains that share of the errors."""
+    chosen: list[int] = []
+    while fits and len(chosen) < most:
+        scores = np.sum([fit.scores() for fit in fits], axis=0)
+        best = int(np.argmax(scores))
+        if not scores[best] > least_gain * sum(fit.error for fit in fits):
+            break
+        chosen.append(best)
+        for fit in fits:
+            fit.add(best)
+        fits = [fit for fit in fits if fit.error > allowed]
+    return chosen
+
+
+def _boundary_fits(
+    data: Prepared, features: Features, start: int | None = None, which: list[int] | None = None, stop_share: float = 1
+) -> list[_BoundaryFit]:
+    """The fits of the stop crossing and of every gate, or some `which` of them, with the first `start` terms in.
+
+    `stop_share`: of the squared error that the stop crossing may have otherwise.
+    """
+    crossing, weight = stop_crossing(data)
+    values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
+    field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
+    seen, fits = features(field), []
+    terms, rays = seen.shape
+    for k in range(1 + len(values)) if which is None else which:
+        w = (weights[k - 1] if k else weight)[:rays]
+        if k:
+            sweep = Sweep.of_columns(seen * w, (values[k - 1, :rays] * w)[None])
+        else:
+            weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
+            sweep = Sweep.of_vectors(seen, weighed, (crossing[:, :rays] * w)[None])
+        allowed = (GATE_ERROR**2 if k else STOP_ERROR**2 * stop_share) * max(float((w * w).sum()), 1e-300)
+        fits.append(_BoundaryFit(sweep, terms, 1 / allowed, terms if start is None else start))
+    return fits
+
+
+class GateFit:
+    """Gates [G] on features [M, N], each with weights, and features, of its own."""
+
+    def __init__(
+        self, features: Tensor, values: Tensor, weights: Tensor, kept: Sequence[list[int]] | None = None
+    ) -> None:
+        """Fit values [G, N] with weights [G, N]; `kept`: the features that each gate has, all without."""
+        self._terms = len(features)
+        all_of_them = [_turn(features, list(range(self._terms)))] * len(values) if kept is None else []
+        self._turns = all_of_them or [_turn(features, columns) for columns in kept or ()]
+        self._grams, self._moments = list[Tensor](), list[Tensor]()
+        for turn, value, weight in zip(self._turns, values, weights, strict=True):
+            rows = features.T @ turn * weight[:, None]
+            self._grams.append(rows.T @ rows)
+            self._moments.append(rows.T @ (value * weight))
+        self._solutions = [self._solve(g) for g in range(len(values))]
+
+    def _solve(self, gate: int) -> Tensor:
+        gram = self._grams[gate]
+        ridge = _RIDGE * gram.diagonal().mean() + 1e-300
+        return torch.linalg.solve(gram + ridge * torch.eye(len(gram), dtype=gram.dtype), self._moments[gate])
+
+    def coefficients(self) -> Tensor:
+        """[G, M]."""
+        found = [turn @ solution for turn, solution in zip(self._turns, self._solutions, strict=True)]
+        return torch.stack(found) if found else torch.empty((0, self._terms), dtype=torch.float64)
+
+    def block(self, features: Tensor, values: Tensor, reached: Tensor) -> None:
+        """Fit again until rays that do not pass are blocked by one gate at least.
+
+        Args:
+            features: [M, N] of those rays.
+            values: [G, N] of the gates. `reached` [G, N]: whether the ray gets so far that the value is known. A gate
+                that does not block a ray is never made to; one that the ray does not reach may be.
+        """
+        blocks = (values > 0) | ~reached
+        if not values.numel():
+            return
+        columns = [features.T @ turn for turn in self._turns]
+        fitted = torch.stack([c @ solution for c, solution in zip(columns, self._solutions, strict=True)])
+        weight = torch.zeros_like(values)
+        for _ in range(_ROUNDS):
+            passing = (fitted <= 0).all(0) & blocks.any(0)
+            if not passing.any():
+                return
+            # The gate that truly blocks it, before others; of several the one whose fit is nearest to blocking it.
+            rank = torch.where(blocks, fitted, -math.inf) + torch.where(reached & (values > 0), 1e6, 0.0)
+            gate = rank.argmax(0)
+            for g in range(len(values)):
+                at = torch.nonzero(passing & (gate == g))[:, 0]
+                if not len(at):
+                    continue
+                heavier = (2 * weight[g, at]).clamp(_WEIGHT, _MOST_WEIGHT)
+                # Rows add to what is summed already: the weight's square grows by the difference.
+                more = torch.sqrt(heavier**2 - weight[g, at] ** 2)
+                weight[g, at] = heavier
+                target = torch.where(reached[g, at], values[g, at].clamp(_TARGET, _MOST_TARGET), _TARGET)
+                rows = columns[g][at] * more[:, None]
+                self._grams[g] = self._grams[g] + rows.T @ rows
+                self._moments[g] = self._moments[g] + rows.T @ (target * more)
+                self._solutions[g] = self._solve(g)
+                fitted[g] = columns[g] @ self._solutions[g]
+
+
+def _turn(features: Tensor, kept: list[int]) -> Tensor:
+    """[M, K] that makes orthogonal columns of some of the features [M, N], so that normal equations keep their digits;
+    what depends on others is left out."""
+    norms = features[kept].norm(dim=1).clamp_min(1e-300)
+    _, triangle = torch.linalg.qr((features[kept] / norms[:, None]).T)
+    _, sizes, right = torch.linalg.svd(triangle, full_matrices=False)
+    large = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
+    found = features.new_zeros((len(features), int(large.sum())))
+    found[kept] = (right[large] / sizes[large, None]).T / norms[:, None] * math.sqrt(features.shape[1])
+    return found

@@ -1,0 +1,460 @@
+"""Curves over the field: colour, curvature and astigmatism, distortion, vignetting; Seidel sums; focus breathing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.base.errors import InputError
+from neurolens.optics.analysis.bundles import bundle, hexapolar, points
+from neurolens.optics.analysis.fields import Array, OverField, Result, Scene, on_plane
+from neurolens.optics.analysis.plots import FIELD_COLOURS, drawing, plain_log_ticks
+from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, LINE_G_NM
+from neurolens.optics.lens.paraxial import PathOfRay, System, chief_reach_mm, first_order, system_of
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.lens.shot import FocusMode
+from neurolens.optics.setting.focusing import focus_states, nearest_focus_m
+from neurolens.optics.setting.pupil_nodes import FilmLight, converged
+from neurolens.optics.setting.pupils import image_radius_mm, pupil_plane_z_mm
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.surfaces import Rays
+
+# Share of the stop's radius that stands for the paraxial ray: its error grows with the square.
+PARAXIAL = 1e-3
+_ZONES = (PARAXIAL, 0.5**0.5, 1 - 1e-7)
+_VISIBLE_NM = (380.0, 780.0)
+
+
+@dataclass(frozen=True)
+class Colour(Result):
+    """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens.
+
+    Attributes:
+        spectrum_nm: [L].
+        zone: [3] shares of the stop's radius: paraxial, half of the area, edge.
+        focus_shift_mm: [L, 3] where rays of each zone cross the axis; NaN where a rim blocks them.
+        field_deg, height_mm: [F], of the chief ray of the first line.
+        line_nm: [W]; the first is the reference.
+        lateral_um: [F, W] image height less that of the reference.
+    """
+
+    spectrum_nm: Array
+    zone: Array
+    focus_shift_mm: Array
+    field_deg: Array
+    height_mm: Array
+    line_nm: Array
+    lateral_um: Array
+
+
+def colour(
+    scene: Scene, *, spectrum_nm: Sequence[float] | None = None, line_nm: Sequence[float] | None = None,
+    fields: int = 21,
+) -> Colour:  # fmt: skip
+    """Longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field.
+
+    The spectrum is 380 to 780 nm and the lines are d, F, C and g; of a lens for other light, its range and wavelengths.
+
+    Raises:
+        InputError: a pinhole, which has no focus.
+    """
+    scene.require_power()
+    lens = scene.lens
+    if spectrum_nm is None:
+        spectrum_nm = np.linspace(*(_VISIBLE_NM if lens.visible else lens.light_nm), 41).tolist()
+    spectrum = np.asarray(spectrum_nm, dtype=np.float64)
+    line_nm = line_nm or (*scene.waves_nm, *((LINE_G_NM,) if lens.visible else ()))
+    axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
+    crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()
+    angles = np.linspace(0, scene.edge.field_deg, fields)
+    chief = bundle(scene.open, angles.tolist(), line_nm, points([0.0], [0.0]))
+    # Tangential points grow with image height where the field's angle is positive.
+    lateral = 1000 * chief.tangential_mm[..., 0].numpy()
+    return Colour(
+        spectrum, np.array(_ZONES), crossing, angles, chief.chief_height_mm.numpy(), np.array(line_nm), lateral
+    )
+
+
+_CLOSE = 1e-3  # stop radii; differences are central, so that the error is of the order of its square
+
+
+@dataclass(frozen=True)
+class Curvature(OverField):
+    """Foci over F fields from the axis to the edge, one wavelength.
+
+    Attributes:
+        tangential_mm, sagittal_mm: [F] along the axis from the film, positive away from the lens.
+        petzval_mm: [F] the Petzval surface at these heights, drawn through the sagittal focus on the axis.
+        petzval_radius_mm: its radius, positive when its centre lies towards +z; inf when flat; NaN with cylinders.
+    """
+
+    wavelength_nm: float
+    tangential_mm: Array
+    sagittal_mm: Array
+    petzval_mm: Array
+    petzval_radius_mm: float
+
+
+def curvature(
+    scene: Scene, *, wavelength_nm: float | None = None, fields: int = 31, edge_deg: float | None = None
+) -> Curvature:
+    """Sagittal and tangential foci up to the edge of the field, rims ignored.
+
+    Raises:
+        InputError: a pinhole, which has no focus.
+    """
+    scene.require_power()
+    wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
+    angles = np.linspace(0, scene.edge.field_deg if edge_deg is None else edge_deg, fields)
+    pattern = points([-_CLOSE, _CLOSE, 0.0, 0.0], [0.0, 0.0, -_CLOSE, _CLOSE])
+    rays = bundle(scene.open, angles.tolist(), [wavelength_nm], pattern)
+    slope_t, slope_s = rays.slopes
+    tangential = _crossing(rays.tangential_mm[:, 0, :2], slope_t[:, 0, :2])
+    sagittal = _crossing(rays.sagittal_mm[:, 0, 2:], slope_s[:, 0, 2:])
+    height = rays.chief_height_mm.numpy()
+    bend = petzval_curvature(scene.lens, wavelength_nm)
+    petzval, radius = sagittal[0] + bend * height**2 / 2, math.inf if bend == 0 else 1 / bend
+    return Curvature(angles, height, wavelength_nm, tangential, sagittal, petzval, radius)
+
+
+def _crossing(place: Tensor, slope: Tensor) -> Array:
+    """z from the film at which two rays [F, 2] cross."""
+    return (-(place[:, 1] - place[:, 0]) / (slope[:, 1] - slope[:, 0])).numpy()
+
+
+# Image height over focal length for an angle in rad.
+PROJECTIONS = {
+    "rectilinear, f tan": lambda a: np.where(a < math.pi / 2, np.tan(np.minimum(a, 1.57)), np.nan),
+    "equidistant, f theta": lambda a: a,
+    "equisolid, 2 f sin(theta/2)": lambda a: 2 * np.sin(a / 2),
+    "stereographic, 2 f tan(theta/2)": lambda a: 2 * np.tan(a / 2),
+    "orthographic, f sin": lambda a: np.where(a <= math.pi / 2, np.sin(a), np.nan),
+}
+RECTILINEAR = next(iter(PROJECTIONS))
+_SMALL_DEG = 1e-3  # the field whose image height gives the scale
+
+
+@dataclass(frozen=True)
+class Distortion(OverField):
+    """Distortion over F fields from the axis to the edge.
+
+    Attributes:
+        scale_mm: image height per radian at the axis: the focal length for a distant object.
+        error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
+        best: the projection of least root mean square error over the whole field.
+        reference: rectilinear below 60 degrees of half field, `best` from there on.
+        edge_percent: error of `reference` at the edge of the field. edge: which edge that is.
+    """
+
+    wavelength_nm: float
+    scale_mm: float
+    error_percent: dict[str, Array]
+    best: str
+    reference: str
+    edge_percent: float
+    edge: str
+
+
+def distortion(
+    scene: Scene, *, wavelength_nm: float | None = None, fields: int = 41, edge_deg: float | None = None
+) -> Distortion:
+    """Distortion against every projection. For a near object of a rectilinear lens, object heights are used."""
+    wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
+    angles = np.linspace(0, scene.edge.field_deg if edge_deg is None else edge_deg, fields)
+    small_first = np.concatenate([[_SMALL_DEG], angles])
+    chief, theta = scene.chief_rays(small_first, wavelength_nm), np.radians(small_first)
+    height = chief.height_mm.numpy()
+    errors = {name: _error(height, ideal(theta)) for name, ideal in PROJECTIONS.items()}
+    origin = scene.object_points(chief.start)
+    if origin is not None and not scene.wide:
+        across = (origin[0] if scene.axis == "x" else origin[1]).numpy()
+        errors[RECTILINEAR] = _error(height, across)
+    best = min(errors, key=lambda k: np.mean(errors[k] ** 2) if np.isfinite(errors[k]).all() else math.inf)
+    reference = best if scene.wide else RECTILINEAR
+    return Distortion(
+        angles, height[1:], wavelength_nm, float(height[0] / theta[0]), errors, best, reference,
+        float(errors[reference][-1]), scene.edge.name if edge_deg is None else f"{edge_deg:g} degrees",
+    )  # fmt: skip
+
+
+def _error(height: Array, ideal: Array) -> Array:
+    """Error in percent with the scale that is right at the first, small field; that field left out of the answer."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = 100 * (height / ideal * (ideal[0] / height[0]) - 1)
+    return np.where(ideal[1:] == 0, 0.0, error[1:])
+
+
+_MARGIN = 0.08  # margin of the grid around the bundle, as film points beside the chief ray see another pupil
+
+
+@dataclass(frozen=True)
+class Illumination(OverField):
+    """Light over F fields from the axis to the edge, one wavelength, glass without losses.
+
+    Attributes:
+        relative: [F] film irradiance over that on the axis.
+        unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
+        passed: [F] share of the stop's light that no rim takes.
+        cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
+        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+    """
+
+    wavelength_nm: float
+    relative: Array
+    unvignetted: Array
+    passed: Array
+    cos4: Array
+    spread: dict[str, Array]
+
+
+def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
+    """Relative illumination at the reference wavelength up to the edge of the field, from where rays leave the film.
+
+    Fields without a chief ray are NaN, and all are where the axis gets no light.
+    """
+    angles, nm = np.linspace(0, scene.edge.field_deg, fields), scene.lens.reference_nm
+    rays = bundle(scene.open, angles.tolist(), [nm], hexapolar(6))
+    pupil = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
+    both = [_film_light(scene, lens, rays.chief_height_mm, pupil) for lens in (scene.open.traced, scene.lens)]
+
+    def shares(light: list[Array]) -> dict[str, tuple[Array, Array | float]]:
+        whole, seen = light
+        with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
+            found = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
+        return {k: (v, 1.0) for k, v in zip(("relative", "unvignetted", "passed"), found, strict=True)}
+
+    height = rays.chief_height_mm.numpy()
+    known = np.where(np.isfinite(height), 1.0, np.nan)
+    light, spread = converged(
+        lambda level, some: [known[some] * b.only(some).sums(level) for b in both], shares, fields
+    )
+    cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
+    relative, unvignetted, passed = (values for values, _ in shares(light).values())
+    return Illumination(angles, height, nm, relative, unvignetted, passed, cos4, spread)
+
+
+def _film_light(scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> FilmLight:
+    """Light through a lens on the plane of the pupil; `pupil`: rays [F, P] that fill it for each film point, there."""
+    plane_z_mm = pupil_plane_z_mm(scene.lens)
+    # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
+    zero = torch.zeros_like(height_mm)
+    x, y = (-height_mm, zero) if scene.axis == "x" else (zero, -height_mm)
+    film = torch.stack((x, y), 1)
+    rear_mm, rear_z_mm = scene.lens.surfaces[-1].semi_diameter_mm, float(scene.lens.vertices_mm[-2])
+    farther = (scene.film_z_mm - plane_z_mm) / (scene.film_z_mm - rear_z_mm)
+    rear = [film + (edge - film) * farther for edge in (-rear_mm, rear_mm)]
+    places = torch.stack([pupil.x, pupil.y], 2)
+    sound = torch.isfinite(places)
+    low = torch.where(sound, places, torch.minimum(*rear)[:, None]).amin(1)
+    high = torch.where(sound, places, torch.maximum(*rear)[:, None]).amax(1)
+    margin = _MARGIN * (high - low)
+    near = torch.where(sound, places, 0.0).sum(1) / sound.sum(1).clamp_min(1)
+    return FilmLight(lens, (x, y), scene.film_z_mm, plane_z_mm, low - margin, high + margin, near)
+
+
+SUMS = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortion", "C1 axial colour", "C2 lateral")
+
+
+@dataclass(frozen=True)
+class Seidel(Result):
+    """Third-order (Seidel) sums and the two of colour, in mm, for the present stop and one image height.
+
+    As wavefront aberrations at the edge of pupil and field: W040 = S1/8, W131 = S2/2, W222 = S3/2, W220 = (S3 + S4)/4,
+    W311 = S5/2; of colour, F against C: C1/2 and C2 (of a lens for other light, its shortest wavelength against its
+    longest).
+
+    Attributes:
+        surfaces: [S, 7], one row per surface; columns as in `SUMS`.
+        total: [7].
+        image_height_mm: the paraxial image height that the sums are for.
+        lagrange_mm: H, the Lagrange invariant.
+        petzval_radius_mm: of the Petzval surface, positive when its centre lies towards +z.
+        odd_powers: surfaces whose r^3 or r terms are left out: they have no third-order theory.
+    """
+
+    wavelength_nm: float
+    image_height_mm: float
+    lagrange_mm: float
+    petzval_radius_mm: float
+    surfaces: Array
+    total: Array
+    names: tuple[str, ...]
+    odd_powers: tuple[int, ...]
+
+
+def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm: float | None = None) -> Seidel:
+    """Seidel sums at the edge of the field, or at another paraxial image height in mm.
+
+    Raises:
+        InputError: a lens with cylinders: these sums are those of lenses symmetric about their axis; ideal surfaces.
+    """
+    lens = scene.lens
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    if lens.anamorphic:
+        raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
+    scene.require_power()
+    lens.require_glass("Seidel sums")
+    if image_height_mm is None:
+        image_height_mm = float(scene.chief_rays([scene.edge.field_deg], wavelength_nm).height_mm[0])
+    system = system_of(lens, wavelength_nm)
+    n = system.index
+    blue, red = (system_of(lens, nm).index for nm in ((LINE_F_NM, LINE_C_NM) if lens.visible else lens.light_nm))
+    spread = [a - b for a, b in zip(blue, red, strict=True)]
+    marginal, chief = _rays(scene, system, image_height_mm)
+    rows = np.array([_row(s, k, n, spread, marginal, chief) for k, s in enumerate(lens.surfaces)])
+    bend = petzval_curvature(lens, wavelength_nm)
+    lagrange = n[0] * (marginal.before[0] * chief.y[0] - chief.before[0] * marginal.y[0])
+    odd = tuple(k for k, s in enumerate(lens.surfaces) if any(p in (1, 3) and a for p, a in s.figure.powers))
+    radius = math.inf if bend == 0 else 1 / bend
+    return Seidel(wavelength_nm, image_height_mm, lagrange, radius, rows, rows.sum(0), SUMS, odd)
+
+
+def petzval_curvature(lens: Lens, wavelength_nm: float = LINE_D_NM) -> float:
+    """Curvature of the Petzval surface in 1/mm (positive: centre towards +z); NaN for a lens with cylinders."""
+    if lens.anamorphic:
+        return math.nan
+    system = system_of(lens, wavelength_nm)
+    n = system.index
+    return float(sum(c * (1 / n[k + 1] - 1 / n[k]) for k, c in enumerate(system.curvature)))
+
+
+def _rays(scene: Scene, system: System, image_height_mm: float) -> tuple[PathOfRay, PathOfRay]:
+    """Marginal ray to the edge of the stop, and chief ray to -image_height_mm in the paraxial image."""
+    stop, near = scene.lens.stop_index, 0.0 if math.isinf(scene.focus_m) else -1 / scene.object_z_mm
+    scale = scene.lens.stop_radius_mm / system.march(1.0, near).y[stop]
+    marginal = system.march(scale, scale * near)
+    # The linear combination of the two through the middle of the stop.
+    y, u = -system.march(0.0, 1.0).y[stop], system.march(1.0, 0.0).y[stop]
+    chief = system.march(y, u)
+    image = -marginal.y[-1] / marginal.after[-1]
+    scale = -image_height_mm / (chief.y[-1] + image * chief.after[-1])
+    return marginal, system.march(scale * y, scale * u)
+
+
+def _row(s: Surface, k: int, n: list[float], spread: list[float], m: PathOfRay, b: PathOfRay) -> list[float]:
+    """The sums of a surface by Welford 1986, "Aberrations of Optical Systems", ch. 8 and 10.
+
+    y and u are height and slope of the paraxial marginal ray, barred those of the chief ray, A = n (u + y c),
+    H = n (u ybar - ubar y). The fifth sum avoids a division by A, which is 0 at a surface that the marginal ray meets
+    at normal incidence.
+    """
+    before, after, c = n[k], n[k + 1], float(s.vertex_curvature("y"))
+    y, y_bar = m.y[k], b.y[k]
+    a, a_bar = before * (m.before[k] + y * c), before * (b.before[k] + y_bar * c)
+    h = a * y_bar - a_bar * y
+    bend = m.after[k] / after - m.before[k] / before
+    inverse, inverse2 = 1 / after - 1 / before, 1 / after**2 - 1 / before**2
+    s5 = -a_bar * (a_bar**2 * y * inverse2 - y_bar * (2 * a_bar * y - a * y_bar) * c * inverse)
+    # What the surface departs from the sphere of its vertex curvature, per r^4.
+    conic = (1 + float(s.figure.conic)) * float(s.curvature) ** 3 - c**3
+    g = (conic + 8 * float(dict(s.figure.powers).get(4, 0.0))) * (after - before)
+    dispersion = spread[k + 1] / after - spread[k] / before
+    return [
+        -(a**2) * y * bend + g * y**4,
+        -a * a_bar * y * bend + g * y**3 * y_bar,
+        -(a_bar**2) * y * bend + g * y**2 * y_bar**2,
+        -(h**2) * c * inverse,
+        s5 + g * y * y_bar**3,
+        a * y * dispersion,
+        a_bar * y * dispersion,
+    ]
+
+
+@dataclass(frozen=True)
+class Breath:
+    """A lens at one focus distance, to first order (distortion is left out).
+
+    Attributes:
+        focus_m: from object to film.
+        efl_mm: focal length of the groups in this state.
+        magnification: image over object height, negative for an inverted image; 0 at infinity.
+        field_deg: full field of view across the image circle, seen from the entrance pupil.
+        film_z_mm: film plane, lens frame.
+        working_f_number: 1 / (2 tan theta') of the paraxial marginal ray.
+    """
+
+    focus_m: float
+    efl_mm: float
+    magnification: float
+    field_deg: float
+    film_z_mm: float
+    working_f_number: float
+
+
+def breathing(lens: Lens, focus_m: Sequence[float], focus_mode: FocusMode = "paraxial") -> list[Breath]:
+    """The lens, in the zoom position wanted, at several focus distances from object to film, `inf` allowed.
+
+    With h the radius of the image circle at infinity focus (the film does not grow) and x' the film's distance behind
+    the rear focal point: the magnification is -x'/f, and the chief ray of the film's edge leaves at
+    atan(h / `paraxial.chief_reach_mm`).
+
+    Raises:
+        InputError: no distance, or one that the lens does not reach; "internal" for a lens without focus states.
+    """
+    if not focus_m:
+        raise InputError("breathing", "focus_m", "(none)", "distances in m")
+    radius, breaths = image_radius_mm(set_lens(lens))[0], []
+    for distance in focus_m:
+        state = set_lens(lens, focus_m=distance, focus_mode=focus_mode)
+        data, reach, film_z = first_order(state), chief_reach_mm(state), state.film_z_mm
+        assert film_z is not None
+        breaths.append(
+            Breath(
+                focus_m=float(distance),
+                efl_mm=float(data.efl_mm),
+                magnification=float(-(film_z - data.rear_focal_z_mm) / data.efl_mm),
+                field_deg=2 * math.degrees(math.atan2(radius, reach)),
+                film_z_mm=float(film_z),
+                working_f_number=float(abs(reach * data.efl_mm / data.front_efl_mm) / data.entrance_pupil_diameter_mm),
+            )
+        )
+    return breaths
+
+
+def field_change(breaths: Sequence[Breath]) -> float:
+    """Largest size of the picture over the smallest, less 1: 0 for a lens that does not breathe."""
+    tangents = [math.tan(math.radians(b.field_deg / 2)) for b in breaths]
+    return max(tangents) / min(tangents) - 1
+
+
+_DASHES = ((0, ()), (0, (5, 2)))
+
+
+def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, list[Breath]]:
+    """Compute and draw a lens's breathing from its nearest focus to a thousand focal lengths.
+
+    Three panels share one logarithmic axis of distance, which has no place for infinity; there is a line for each way
+    to focus, both where the lens file has focus states. Returns what is drawn, infinity first.
+    """
+    data = first_order(set_lens(lens))
+    nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
+    modes: dict[str, FocusMode] = {"film moves": "paraxial"}
+    if focus_states(lens):
+        modes["groups move"] = "internal"
+        nearest = max(nearest, 1.0001 * nearest_focus_m(lens))
+    far = max(abs(data.efl_mm), 10 * nearest)
+    distances = [nearest * (far / nearest) ** (k / (count - 1)) for k in range(count)]
+    found = {name: breathing(lens, [math.inf, *distances], mode) for name, mode in modes.items()}
+    with drawing(path, 7.6, 7.4) as figure:
+        panels = figure.subplots(3, 1, sharex=True)
+        for (name, breaths), colour, dashes in zip(found.items(), FIELD_COLOURS, _DASHES, strict=False):
+            label = f"{name} (picture grows by {100 * field_change(breaths):.1f}%)"
+            near = [(b.field_deg, b.efl_mm, abs(b.magnification)) for b in breaths[1:]]
+            for axes, values in zip(panels, zip(*near, strict=True), strict=True):
+                axes.plot(distances, values, color=colour, ls=dashes, lw=1.8, label=label)
+        panels[0].set_title(f"Focus breathing of {lens.name}", loc="left", fontweight="bold")
+        panels[0].legend(loc="best")
+        labels = ("field of view (degrees,\nacross the image circle)", "focal length (mm)", "magnification")
+        for axes, label in zip(panels, labels, strict=True):
+            axes.set_ylabel(label)
+            axes.grid(True)
+            axes.ticklabel_format(axis="y", useOffset=False)
+        panels[2].set(xscale="log", yscale="log", xlabel="distance from object to film (m)")
+        plain_log_ticks(panels[2].xaxis, panels[2].yaxis)
+    return found

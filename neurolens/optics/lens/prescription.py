@@ -1,0 +1,338 @@
+"""A lens prescription as frozen data: surfaces from the scene to the film, and the state of focus, zoom and stop."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from typing import Any
+
+from neurolens.base.errors import InputError
+from neurolens.base.lensname import lens_id_of
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.figures import SPHERE, Figure
+
+VISIBLE_NM = (400.0, 700.0)
+LINE_D_NM = 587.5618  # helium, yellow: where first-order data stand
+
+
+@dataclass(frozen=True)
+class Coating:
+    """Thin films on one surface.
+
+    Attributes:
+        name: of the design, for people and files.
+        layers: (refractive index, thickness in nm), from the scene's side to the film's; films that disperse have
+            their Abbe number, too, and the index is then n_d (dispersion as of glasses: `glass.index_at`).
+    """
+
+    name: str
+    layers: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One surface. Lengths in mm, lens frame.
+
+    Attributes:
+        radius_mm: positive when the centre of curvature lies towards the film; `inf` for a plane.
+        thickness_mm: axial distance to the next surface (for the last one: to the film as tabled).
+        diameter_mm: full clear diameter of the rim; of the opening, for the stop.
+        n_d: refractive index at 587.56 nm of the medium after the surface.
+        V_d: Abbe number of that medium; None where unknown (constant index) or air.
+        material: name of the glass in the source, for people only.
+        stop: whether this row is the aperture stop.
+        figure: its shape besides the radius (`lens.figures`); a sphere, or a plane, by default.
+        glass: name in the glass catalogue (`neurolens.optics.lens.glass`); its dispersion rules over n_d and V_d.
+        absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
+            added to that of the glass.
+        coating: the thin films on the surface, None where bare.
+        followed_mm: distance from the axis from which on a figure continues smoothly instead of by its polynomial;
+            only `aiming.without_rims` sets it, for questions that ignore rims (`shapes.followed_mm`).
+
+    `radius_mm`, `thickness_mm`, `n_d` and the values of `figure` may be 0-d tensors where gradients with respect to
+    them are wanted.
+    """
+
+    radius_mm: Any
+    thickness_mm: Any
+    diameter_mm: float
+    n_d: Any = 1.0
+    V_d: float | None = None
+    material: str | None = None
+    stop: bool = False
+    figure: Figure = SPHERE
+    glass: str | None = None
+    absorption_per_mm: float = 0.0
+    coating: Coating | None = None
+    followed_mm: float = math.inf
+
+    @property
+    def curvature(self) -> Any:
+        """1 / radius in 1/mm, 0 for a plane."""
+        return 1.0 / self.radius_mm
+
+    def vertex_curvature(self, meridian: str) -> Any:
+        """Curvature at the vertex along "x" or "y" in 1/mm: 1 / radius + 2 A_2, and 0 where a cylinder is straight."""
+        return self.figure.vertex_curvature(self.curvature, meridian)
+
+    @property
+    def semi_diameter_mm(self) -> float:
+        return self.diameter_mm / 2
+
+
+@dataclass(frozen=True)
+class Medium:
+    """The medium in front of a lens, described by the fields of `Surface` that describe the medium after a surface."""
+
+    n_d: Any = 1.0
+    V_d: float | None = None
+    material: str | None = None
+    glass: str | None = None
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A zoom or focus state of the source: thicknesses that replace those of the table, by surface index.
+
+    None: not stated by the source, the lens's own value holds. A focus state has an `object_distance_mm`,
+    from the object to the front vertex; without one the object is at infinity.
+    """
+
+    name: str
+    efl_mm: float | None
+    thickness_mm: tuple[tuple[int, float], ...]
+    half_field_deg: float | None = None
+    f_number: float | None = None
+    stop_diameter_mm: float | None = None
+    object_distance_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A prescription with the film's place; immutable, `at` returns a new lens.
+
+    Attributes:
+        name, designer, source, notes: as cited in the lens file.
+        believed_to_be: the product that the source's example is believed to be, "" where nobody says so.
+        measured: what photographs of that product say (`photographs.verify`), as pairs of key and value.
+        rims: whether the rim diameters are the source's own or "estimated" by somebody.
+        f_number: nominal, of the source; the stop's own diameter rules the trace.
+        stated_efl_mm: focal length as the source states it, to check the computed one against; of an anamorphic lens in
+            the y-z plane, and `stated_efl_x_mm` in the x-z plane. None if not stated.
+        image_radius_mm: radius of the image circle, None where only the field is known.
+        half_field_deg: half field of view, None where unknown.
+        film_z_mm: film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
+        configurations: zoom and focus states of the source.
+        path: the file it was read from, for error messages.
+        aperture: shape of the stop's opening inside its rim, None where round.
+        derived: description of what is not from the source (a zoom between its states).
+        infinity_mm: thicknesses at infinity focus, by surface index, of the groups that `at` has moved to focus.
+        object_medium: medium in front of the first surface. The medium behind the last surface, in which the film
+            lies, is that of the last row of `surfaces`.
+        wavelengths_nm: wavelengths that the source designs the lens for, its primary one first; empty if unknown.
+    """
+
+    name: str
+    source: str
+    surfaces: tuple[Surface, ...]
+    f_number: float
+    image_radius_mm: float | None = None
+    half_field_deg: float | None = None
+    designer: str = ""
+    notes: str = ""
+    believed_to_be: str = ""
+    measured: tuple[tuple[str, Any], ...] = ()
+    rims: str = "source"
+    film_z_mm: float | None = None
+    configurations: tuple[Configuration, ...] = ()
+    path: str = "lens"
+    stated_efl_mm: float | None = None
+    stated_efl_x_mm: float | None = None
+    aperture: Aperture | None = None
+    derived: str = ""
+    infinity_mm: tuple[tuple[int, Any], ...] = ()
+    object_medium: Medium = Medium()
+    wavelengths_nm: tuple[float, ...] = ()
+
+    @property
+    def media(self) -> tuple[Medium | Surface, ...]:
+        """The media from the scene to the film, one more than surfaces: media[k] lies in front of surface k."""
+        return (self.object_medium, *self.surfaces)
+
+    @property
+    def visible(self) -> bool:
+        """Whether the d line lies within the wavelengths of the source, or the source states none."""
+        return not self.wavelengths_nm or min(self.wavelengths_nm) <= LINE_D_NM <= max(self.wavelengths_nm)
+
+    @property
+    def reference_nm(self) -> float:
+        """Wavelength of first-order data and analyses: the d line, or the source's primary one for other light."""
+        return LINE_D_NM if self.visible else self.wavelengths_nm[0]
+
+    @property
+    def light_nm(self) -> tuple[float, float]:
+        """Range of wavelengths that the lens is made for: visible light, or the source's range for other light."""
+        return VISIBLE_NM if self.visible else (min(self.wavelengths_nm), max(self.wavelengths_nm))
+
+    @property
+    def vertices_mm(self) -> list[Any]:
+        """z of every surface's vertex, and last the film plane as tabled."""
+        return list(accumulate((s.thickness_mm for s in self.surfaces), initial=0.0))
+
+    @property
+    def stop_index(self) -> int:
+        return next(k for k, s in enumerate(self.surfaces) if s.stop)
+
+    @property
+    def stop_radius_mm(self) -> float:
+        return self.surfaces[self.stop_index].semi_diameter_mm
+
+    @property
+    def semi_diameters_mm(self) -> list[float]:
+        return [s.semi_diameter_mm for s in self.surfaces]
+
+    @property
+    def anamorphic(self) -> bool:
+        """Whether any surface is a cylinder, toroid or biconic: the lens is then not round about its axis."""
+        return any(s.figure.axis for s in self.surfaces)
+
+    @property
+    def ideal(self) -> list[int]:
+        """The surfaces that are ideal thin lenses."""
+        return [k for k, s in enumerate(self.surfaces) if s.figure.power]
+
+    def require_glass(self, what: str) -> None:
+        """Raise InputError for a lens with ideal surfaces, of which there is no `what`."""
+        for k in self.ideal:
+            expected = f"surfaces of glass: an ideal lens has no {what}"
+            raise InputError(
+                self.path, f"surface {k}, focal_mm", self.surfaces[k].figure.record()["focal_mm"], expected
+            )
+
+    @property
+    def dispersive(self) -> bool:
+        """Whether the index of any glass is known to change with wavelength."""
+        return any(m.V_d is not None or m.glass is not None for m in self.media)
+
+    @property
+    def refractions(self) -> int:
+        """Surfaces at which the medium changes: the stop and other surfaces in one medium do not count."""
+        return sum(float(a.n_d) != float(b.n_d) for a, b in pairwise(self.media))
+
+    @property
+    def lens_id(self) -> str:
+        """The name that models carry, of the lens's file."""
+        return lens_id_of(self.path)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts)."""
+        rows = [_figures(s) for s in self.surfaces]
+        rows[-1][1] = None
+        m = self.object_medium
+        if m != Medium():
+            rows.append([float(m.n_d), m.V_d, m.glass, *_terms(m)])
+        return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Which lens this is, for the settings of cameras: id, name, designer, source and hash."""
+        texts = {"id": self.lens_id, "name": self.name, "designer": self.designer, "source": self.source}
+        return texts | {"sha256": self.sha256}
+
+    def scaled(self, factor: float) -> Lens:
+        """Return the lens with all lengths times `factor`; angles, indices and f-number stay.
+
+        A grey filter keeps its density (its absorption per mm shrinks as it grows), a catalogue glass absorbs more when
+        it is thicker, and coatings keep their layers.
+
+        Raises:
+            InputError: a factor that is not positive and finite.
+        """
+        if not 0 < factor < math.inf:
+            raise InputError(self.path, "factor", factor, "a positive number")
+
+        def lengths(table: Any, *names: str) -> dict[str, Any]:
+            return {name: value * factor for name in names if (value := getattr(table, name)) is not None}
+
+        def gaps(pairs: tuple[tuple[int, Any], ...]) -> tuple[tuple[int, Any], ...]:
+            return tuple((k, t * factor) for k, t in pairs)
+
+        surfaces = (
+            replace(
+                s,
+                figure=s.figure.scaled(factor),
+                absorption_per_mm=s.absorption_per_mm / factor,
+                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "followed_mm"),
+            )
+            for s in self.surfaces
+        )
+        states = (
+            replace(
+                c,
+                thickness_mm=gaps(c.thickness_mm),
+                **lengths(c, "efl_mm", "stop_diameter_mm", "object_distance_mm"),
+            )
+            for c in self.configurations
+        )
+        stated = lengths(self, "image_radius_mm", "film_z_mm", "stated_efl_mm", "stated_efl_x_mm")
+        infinity = gaps(self.infinity_mm)
+        return replace(self, surfaces=tuple(surfaces), configurations=tuple(states), infinity_mm=infinity, **stated)
+
+    def half_field_in(self, state: Configuration) -> float | None:
+        """Half field in a state: its own, else that of the image circle where there is one (None), else the lens's."""
+        return state.half_field_deg or (self.half_field_deg if self.image_radius_mm is None else None)
+
+    def with_stop_radius(self, radius_mm: float) -> Lens:
+        """Return the same lens with another opening of the stop."""
+        k = self.stop_index
+        stop = replace(self.surfaces[k], diameter_mm=2 * radius_mm)
+        return replace(self, surfaces=(*self.surfaces[:k], stop, *self.surfaces[k + 1 :]))
+
+    def with_gaps(self, gaps_mm: Mapping[int, Any]) -> Lens:
+        """Return the same lens with other thicknesses, by surface index."""
+        rows = (replace(s, thickness_mm=gaps_mm.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
+        return replace(self, surfaces=tuple(rows))
+
+    def with_aperture(self, aperture: Aperture | None) -> Lens:
+        """Return the same lens with blades or a mask in its stop; None is a round stop."""
+        return replace(self, aperture=aperture)
+
+
+def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = None) -> bool:
+    """Whether the medium is the same before and behind surface k; `in_front`, by default air, lies before the first."""
+    first = surfaces[k - 1] if k else in_front
+    before = (first.n_d, first.V_d, first.glass) if first else (1.0, None, None)
+    s = surfaces[k]
+    return before == (s.n_d, s.V_d, s.glass) and not s.figure.power
+
+
+def _terms(m: Surface | Medium) -> list[int]:
+    """The number of terms of `glass.cauchy` where it makes the index of a medium."""
+    return [3] if m.V_d is not None and m.glass is None else []
+
+
+def _figures(s: Surface) -> list[Any]:
+    """List the figures of a surface that decide where rays go, for the hash; default values are left out."""
+    radius = float(s.radius_mm)
+    row = [
+        abs(radius) if math.isinf(radius) else radius,
+        float(s.thickness_mm),
+        None if s.stop else float(s.diameter_mm),
+        float(s.n_d),
+        None if s.V_d is None else float(s.V_d),
+        s.stop,
+    ]
+    more = {
+        **s.figure.record(),
+        "glass": s.glass,
+        "cauchy": _terms(s),
+        "absorption_per_mm": float(s.absorption_per_mm),
+        "coating": s.coating and [[float(v) for v in layer] for layer in s.coating.layers],
+    }
+    more = {key: value for key, value in more.items() if value}
+    return [*row, more] if more else row

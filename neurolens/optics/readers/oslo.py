@@ -1,0 +1,190 @@
+"""OSLO lens files (.len): the simple ones, with a sphere or conic asphere of four terms per surface and round openings.
+
+"LEN NEW name focal-length surfaces", settings, then the surfaces, object first, each ended by NXT, the image by END.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neurolens.base.errors import InputError
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.readers import draft
+from neurolens.optics.readers.assemble import UNKNOWN
+from neurolens.optics.readers.draft import INFINITE, Draft, Row, lens_of, primary_first
+from neurolens.optics.readers.glasses import by_indices, named_glass
+from neurolens.optics.readers.source import UNITS_MM, Line, ReadOptions, by_word, read_lines
+
+TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
+# Designer, weights, settings of the program, drawings.
+HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
+# What changes rays and is not read, where a number other than 0 or a word follows: what is expected in its place.
+REFUSED = by_word(
+    ("NA", "EBR, FNO or NAO to size the stop"),
+    ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: the lens model has none"),
+    ("RFL RFH REFL", "no mirror: the lens model has none"),
+    ("GRT GSP GOR DFR DOE HOE HOR", "no grating or hologram: the lens model has none"),
+    ("GRD GDT NZ1 NR1 NR2 NR4", "no gradient index: the lens model has none"),
+    ("PFL PFM", "no ideal lens: it is not read from OSLO's files"),
+    ("CVX RDX AAD ASP ASR ASI ASX TOR CCX", "a sphere, a conic, or AD to AG: other shapes are not read"),
+    ("PK PU PI PUC PIC PYC EAC", "a figure: solves and pickups are not carried out"),
+    ("AN AX1 AY1 APN AAC", "a round opening"),
+)
+
+
+@dataclass
+class Block(draft.Block):
+    """One surface with what OSLO says of it."""
+
+    values: dict[str, float] = field(default_factory=dict)
+    glass: Line | None = None
+
+
+@dataclass
+class File(Draft):
+    """A file while it is read."""
+
+    kind: str = "OSLO"
+    blocks: list[Block] = field(default_factory=list)
+    ended: bool = False
+    waves_um: list[float] = field(default_factory=list)
+
+
+def read_len(path: str | Path, options: ReadOptions | None = None) -> Lens:
+    """Return the lens of an OSLO file.
+
+    Raises:
+        InputError: see the module; also solves and pickups that are not carried out in the file.
+    """
+    file = File(str(path))
+    for line in read_lines(path):
+        for part in _parts(line.text):
+            _read(file, Line(line.file, line.number, part))
+    if not file.ended:
+        raise InputError(file.file, "END", "(missing)", "END and the number of the image surface")
+    if len(file.blocks) < 3:
+        raise InputError(file.file, "NXT", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
+    _complete(file)
+    return lens_of(file, options)
+
+
+def _parts(text: str) -> list[str]:
+    """Return the commands of a line: "//" begins a comment, ";" ends a command, both only outside quotes."""
+    bare = re.match(r'(?:[^"/]|"[^"]*"|/(?!/))*', text)
+    parts = re.findall(r'(?:[^";]|"[^"]*")+', bare[0] if bare else text)
+    return [part.strip() for part in parts if part.strip()]
+
+
+def _read(file: File, line: Line) -> None:
+    word, rest = line.words[0].upper(), line.words[1:]
+    if word == "LEN":
+        quoted = re.search('"([^"]*)"', line.text)
+        file.name = quoted[1] if quoted else ""
+        file.blocks.append(Block(line))
+    elif not file.blocks:
+        raise line.error(word, "(here)", "LEN NEW before everything else")
+    elif file.ended and word in ("CFG", "CF", "C"):
+        raise line.error(word, " ".join(rest) or "(here)", "one configuration: others are not read")
+    elif file.ended:  # variables, operands and tolerances, up to an END of their own
+        file.skipped["lines behind the surfaces"] += word != "END"
+    elif word in HARMLESS:
+        pass
+    elif re.fullmatch("SNO[0-9]*|NOT[0-9]*", word):
+        file.notes.append(" ".join(rest).strip('"'))
+    elif word in REFUSED:
+        numbers = [n for n in rest if re.fullmatch("[-+.0-9eE]+", n)]
+        if not numbers or any(line.numbers(word, numbers)):
+            raise line.error(word, " ".join(rest) or "(here)", REFUSED[word])
+    else:
+        _keyword(file, file.blocks[-1], line, word, rest)
+
+
+def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -> None:
+    """Carry out a keyword of the system, or of the last surface that was begun."""
+    match word:
+        case "EBR":
+            file.pupil = 2 * line.positive(word, rest)
+        case "ANG":
+            angle = line.first(word, rest)
+            if angle < 0:
+                raise line.error(word, angle, "a number above 0")
+            file.half_field_deg = angle if 1e-3 < angle < 90 else None
+        case "NAO":
+            file.object_na = line.positive(word, rest)
+        case "FNO":
+            file.f_number = line.positive(word, rest)
+        case "WV":
+            file.waves_um = line.numbers(word, rest)
+        case "UNI":
+            mm = line.first(word, rest)
+            file.unit = next((name for name, value in UNITS_MM.items() if value == mm), None)
+            if file.unit is None:
+                raise line.error(word, mm, "1 (mm), 10 (cm), 25.4 (inch) or 1000 (m)")
+        case "NXT":
+            file.blocks.append(Block(line, str(len(file.blocks))))
+        case "END":
+            file.ended = True
+            if rest and line.first(word, rest) != len(file.blocks) - 1:
+                raise line.error(word, rest[0], f"{len(file.blocks) - 1}, the number of the image surface")
+        case "AIR":
+            block.medium = {}
+        case "GLA":
+            block.medium, block.glass = _glass(line, rest), line
+        case "AP":
+            block.aperture = rest[:1] == ["CHK"]
+            semi = line.first(word, rest[block.aperture :])
+            block.semi_diameter = semi if semi > 0 else UNKNOWN
+        case "AST":
+            block.stop = True
+        case "PY":
+            if line.first(word, rest) != 0:
+                raise line.error(word, rest[0], "0: the film in the paraxial image")
+            block.solved = True
+        case _ if word in ("RD", "CV", "TH", "CC", *TERMS):
+            block.values[word] = line.first(word, rest)
+        case _:
+            file.skipped[word] += 1
+
+
+def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
+    """GLA name of the catalogue, or one index."""
+    if not rest:
+        raise line.error("GLA", "(nothing)", "the name of a glass, or an index")
+    if re.fullmatch(r"[0-9.]+", rest[0]):
+        return {"n_d": line.numbers("GLA", rest)[0]}
+    if rest[0].upper() in ("REFL", "RFL", "REFLECT"):
+        raise line.error("GLA", rest[0], "a glass: the lens model has no mirrors")
+    return named_glass(rest[0], line.file, f"line {line.number}, GLA")
+
+
+def _complete(file: File) -> None:
+    """Set what follows from all surfaces."""
+    waves_nm = [1000 * um for um in file.waves_um]
+    for block in file.blocks:  # indices at the wavelengths, which follow behind the surfaces
+        if block.glass and block.medium.keys() == {"n_d"}:
+            indices = block.glass.numbers("GLA", block.glass.words[1:])
+            block.medium = by_indices(block.glass, "GLA", indices, waves_nm)
+    first, *middle, _ = file.blocks
+    last = middle[-1]
+    for k, block in enumerate(middle, start=1):
+        if block.solved and block is not last:
+            raise block.start.error("PY", f"(on surface {k})", "the last surface")
+    distance = first.values.get("TH", 0.0)
+    file.rows = tuple(map(_row, middle))
+    file.object_medium, file.wavelengths_nm = first.medium, primary_first(waves_nm, waves_nm[0] if waves_nm else 0.0)
+    file.object_distance = math.inf if distance >= INFINITE else distance
+    file.film_given = not (last.solved and "TH" not in last.values)
+
+
+def _row(block: Block) -> Row:
+    values = block.values
+    block.curvature, block.thickness, block.conic = (values.get(key, 0.0) for key in ("CV", "TH", "CC"))
+    radius = values.get("RD") or block.radius
+    block.curvature = 1 / radius
+    terms = sorted((TERMS[name], value) for name, value in values.items() if name in TERMS)
+    # The radius as it is printed, not the inverse of its inverse.
+    return block.row(block.rotational(terms) | {"radius_mm": radius})

@@ -1,0 +1,362 @@
+"""Focusing: groups that move inside a lens, and the film plane of best focus.
+
+Internal focusing: the source lists a few states of the groups, between infinity and the nearest, for every zoom
+position. One parameter moves all gaps from state to state linearly (as a focus ring on straight cams would), and is
+solved for so that the paraxial image of the object lies on the film, which is fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.optics.lens import paraxial
+from neurolens.optics.lens.prescription import Configuration, Lens, Surface
+from neurolens.optics.trace.arrays import follow
+from neurolens.optics.trace.surfaces import Rays
+
+Array = NDArray[np.float64]
+
+
+def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
+    """Values [M] at a place between rows of values [R, M] at ascending places x [R]: a row's own at its place.
+
+    Of two rows linear, else piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for
+    constructing local monotone piecewise cubic interpolants": a value stays between those of its two rows, so that no
+    gap can turn negative.
+    """
+    from scipy.interpolate import PchipInterpolator  # type: ignore[import-untyped]
+
+    known, own = np.unique(x, return_index=True)
+    values = np.asarray(rows, np.float64)[own]
+    at = min(int(np.searchsorted(known, place)), len(known) - 1)
+    if len(known) == 1 or known[at] == place:
+        return values[at].tolist()
+    return PchipInterpolator(known, values)(place).tolist()
+
+
+SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources give two decimals
+
+
+def at_infinity(lens: Lens) -> Lens:
+    """Return the lens with its groups at their places for infinity focus."""
+    if not lens.infinity_mm:
+        return lens
+    return replace(lens.with_gaps(dict(lens.infinity_mm)), infinity_mm=())
+
+
+def infinity_states(lens: Lens) -> list[Configuration]:
+    """Return the zoom states of the source: those with the object at infinity."""
+    return [c for c in lens.configurations if c.object_distance_mm is None]
+
+
+def focus_states(lens: Lens) -> list[Configuration]:
+    """Return the focus states of the source: those with an object at a distance."""
+    return [c for c in lens.configurations if c.object_distance_mm is not None]
+
+
+def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
+    """Return the infinity state of the zoom position of a focus state; None where the file has none: its table then.
+
+    It is the one with the fewest different gaps, then with the smallest differences.
+    """
+
+    def unlikeness(base: Configuration) -> tuple[int, float]:
+        gaps = gaps_mm(lens, base)
+        differences = [abs(gaps[k] - t) for k, t in near.thickness_mm]
+        return sum(d > SAME_MM for d in differences), sum(differences)
+
+    return min(infinity_states(lens), key=unlikeness, default=None)
+
+
+def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
+    """Return all thicknesses, by surface index, with those of the states on top of the lens's own, in that order."""
+    gaps = {k: s.thickness_mm for k, s in enumerate(lens.surfaces)}
+    for state in states:
+        gaps.update(() if state is None else state.thickness_mm)
+    return gaps
+
+
+def focus_path(lens: Lens) -> dict[int, list[float]]:
+    """How each gap changes while a lens focuses: its changes at infinity, 0, and at the focus states, by surface.
+
+    The lens is at infinity focus, at a state of its zoom or between (the changes are then interpolated in log EFL). The
+    last gap is the distance to the film.
+
+    Raises:
+        InputError: a file without focus states.
+    """
+    if not focus_states(lens):
+        raise InputError(lens.path, "focus_mode", "internal", '"best" or "paraxial": the file has no focus states')
+    film = len(lens.surfaces) - 1
+    moved = sorted({film, *(k for c in focus_states(lens) for k, _ in c.thickness_mm)})
+    by_zoom: dict[Configuration | None, list[Configuration]] = {}
+    for c in focus_states(lens):
+        by_zoom.setdefault(zoom_state_of(lens, c), []).append(c)
+    stages = min(len(found) for found in by_zoom.values())
+    rows = []
+    for base, found in by_zoom.items():
+        start = gaps_mm(lens, base)
+        near = sorted(found, key=lambda c: -(c.object_distance_mm or math.inf))[-stages:]
+        ends = [gaps_mm(lens, base, c) for c in near]
+        efl = paraxial.first_order(lens.with_gaps(start)).efl_mm
+        rows.append((math.log(efl), [end[k] - start[k] for end in ends for k in moved]))
+    rows.sort()
+    place = math.log(paraxial.first_order(lens).efl_mm)
+    place = min(max(place, rows[0][0]), rows[-1][0])
+    flat = monotone([r[0] for r in rows], [r[1] for r in rows], place)
+    return {k: [0.0, *flat[n :: len(moved)]] for n, k in enumerate(moved)}
+
+
+def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = None) -> Lens:
+    """Return the lens focused by moving its groups.
+
+    Args:
+        lens: at infinity focus; or in a focus state of its file, which is kept where `focus_m` is None.
+        focus_m: distance from object to film; None is infinity.
+        object_mm: from object to front vertex, of a focus state that was chosen by its name.
+
+    Raises:
+        InputError: a file without focus states, or a distance below the nearest, which it names.
+    """
+    if focus_m is None and object_mm is not None:
+        return replace(lens, film_z_mm=paraxial.image_z_mm(lens, -object_mm))
+    from scipy.optimize import brentq  # type: ignore[import-untyped]
+
+    lens = at_infinity(lens)
+    path, place = _mover(lens)
+    furthest = len(path[len(lens.surfaces) - 1]) - 1
+    wanted = 0.0 if focus_m is None else 1 / (1000 * focus_m)
+    nearest = _vergence(place(furthest))
+    if not nearest > 0:
+        raise InputError(lens.path, "focus_mode", "internal", "focus states that focus nearer than infinity")
+    if wanted > nearest * (1 + 1e-9):
+        limit = f"at least {_rounded_up(1 / nearest / 1000):g} m, the nearest focus of the source's states"
+        raise InputError(lens.path, "focus_m", focus_m, limit)
+    wanted, s = min(wanted, nearest), 0.0
+    if wanted > max(_vergence(place(0.0)), 0.0):
+        s = brentq(lambda s: _vergence(place(s)) - wanted, 0.0, furthest, xtol=1e-14)
+    return replace(place(s), infinity_mm=tuple((k, lens.surfaces[k].thickness_mm) for k in path))
+
+
+def _rounded_up(value: float) -> float:
+    """Return a positive number rounded up to four digits: a distance printed as the limit must be accepted."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.ceil(value / step - 1e-9) * step
+
+
+def nearest_focus_m(lens: Lens) -> float:
+    """Return the nearest distance from object to film that internal focusing reaches."""
+    path, place = _mover(at_infinity(lens))
+    return 1 / _vergence(place(len(path[len(lens.surfaces) - 1]) - 1)) / 1000
+
+
+def _mover(lens: Lens) -> tuple[dict[int, list[float]], Callable[[float], Lens]]:
+    """Return the path of a lens at infinity focus, and the lens with its groups moved along it, film fixed.
+
+    The place on the path runs from 0 (infinity) to the number of states beyond.
+    """
+    path, back_mm, film = focus_path(lens), paraxial.first_order(lens).back_focus_mm, len(lens.surfaces) - 1
+
+    def place(s: float) -> Lens:
+        added = {k: float(np.interp(s, range(len(steps)), steps)) for k, steps in path.items()}
+        moved = lens.with_gaps({k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != film})
+        return replace(moved, film_z_mm=moved.vertices_mm[film] + back_mm + added[film])
+
+    return path, place
+
+
+def _vergence(lens: Lens) -> float:
+    """1 / distance (1/mm) from the film to the object that is in focus on it; 0 for infinity (Newton: x x' = -f f')."""
+    data = paraxial.first_order(lens)
+    assert lens.film_z_mm is not None
+    extension = lens.film_z_mm - data.rear_focal_z_mm
+    return float(extension / (data.efl_mm * data.front_efl_mm + extension * (lens.film_z_mm - data.front_focal_z_mm)))
+
+
+_RINGS, _SPOKES = 512, 24
+_RINGS_OF_SPOKES = 64  # where the opening is not round
+_WIDER = 1.1  # the disc of rays over the paraxial entrance pupil: aberrations of the pupil move its edge
+_ROUNDS = 2  # the object's distance counts from the film: each round reduces the step by a factor of 100
+_SPARE = 0.05  # of a film range, added at both ends
+_NEAREST = 0.5  # of the way from the last surface to the paraxial image: no film of a range lies nearer
+
+
+def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] | None = None) -> float:
+    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light,
+    by default `Lens.light_nm`.
+
+    Rays of the colours of `paraxial.colours` are spread evenly over the entrance pupil, and those that stop and rims
+    let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
+    closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
+    thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
+    pinhole's film stays in place.
+
+    Raises:
+        InputError: no ray passes, or focus nearer than four focal lengths.
+    """
+    film_z = _paraxial_film_z_mm(lens, focus_m)
+    if paraxial.is_pinhole(lens):
+        return film_z
+    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
+        film_z = float(_least_spot_mm(lens, film_z - 1000 * focus_m, wavelength_nm)[0])
+    return film_z
+
+
+def _least_spot_mm(
+    lens: Lens, object_z_mm: float, wavelength_nm: tuple[float, float] | None, stops_mm: Sequence[float] | None = None
+) -> NDArray[np.float64]:
+    """Film planes of least spot for an axial point, behind the stop as it is or behind round ones of some radii."""
+    # Without dispersion all light is of one colour.
+    one = (lens.reference_nm, lens.reference_nm)
+    wavelengths, weights = paraxial.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
+    along, across, at_stop = _moments(lens, object_z_mm, wavelengths)
+    share = weights[None, :, None, None]
+    if stops_mm is not None:  # rays at the edge count in part
+        square = np.array(stops_mm)[:, None, None, None] ** 2
+        ring = (_WIDER * lens.stop_radius_mm) ** 2 / along.shape[1]
+        share = share * ((square - at_stop**2) / ring + 0.5).clip(0, 1)
+    along, across = ((share * m).sum((1, 2, 3)) for m in (along, across))
+    if not (across > 0).all():
+        raise InputError(lens.path, "focus_mode", "best", "a lens that axial light passes and bends")
+    return np.asarray(-along / across)
+
+
+def best_focus_of_stops_mm(
+    lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] | None = None
+) -> NDArray[np.float64]:
+    """`best_focus_z_mm` at some radii of a round stop, of one set of rays: those that each lets through. Errors as
+    there."""
+    widest = replace(lens, aperture=None).with_stop_radius(float(max(stops_mm)))
+    whole = best_focus_z_mm(widest, focus_m, wavelength_nm)
+    if paraxial.is_pinhole(lens):
+        return np.full(len(stops_mm), whole)
+    object_z = whole - 1000 * focus_m
+    found = _least_spot_mm(widest, object_z, wavelength_nm, stops_mm)
+    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    data = paraxial.first_order(lens)
+    scale = float(data.efl_mm / (data.front_focal_z_mm - object_z))
+    return np.asarray(found + (found - whole) * scale**2)
+
+
+def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
+    """Return a lens that `set_lens` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
+    return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
+
+
+_COVER, _COVER_AIR_MM = ("N-BK7", 1.5168, 64.17), 0.5  # its glass with n_d and V_d, and its distance from the film
+
+
+def with_cover_glass(
+    lens: Lens, thickness_mm: float, focus_m: float, focus_mode: str, wavelength_nm: tuple[float, float]
+) -> Lens:
+    """Return a lens whose film is placed with a plane plate before the film, wherever: it does not matter for rays.
+
+    The film is in focus again. No plate is added where it has no thickness.
+
+    Raises:
+        InputError: a plate that is thicker than the room behind the lens.
+    """
+    if not thickness_mm:
+        return lens
+    assert lens.film_z_mm is not None
+    last, z_mm, (name, n_d, V_d) = lens.surfaces[-1], float(lens.vertices_mm[-2]), _COVER
+    film_z = lens.film_z_mm + thickness_mm * (1 - float(last.n_d) / n_d)
+    room = film_z - z_mm - _COVER_AIR_MM - thickness_mm
+    if room <= 0:
+        most = math.floor(100 * (thickness_mm + room * n_d / float(last.n_d))) / 100
+        expected = f"at most {most:g} mm: the film lies {lens.film_z_mm - z_mm:.3g} mm behind the last surface"
+        raise InputError(lens.path, "cover_glass_mm", thickness_mm, expected)
+    wide = last.diameter_mm + 2 * (film_z - z_mm)  # beyond all rays to the film
+    front = Surface(math.inf, thickness_mm, wide, n_d)
+    front = replace(front, V_d=V_d, material=name, glass=name) if lens.dispersive else front
+    back = Surface(math.inf, _COVER_AIR_MM, wide, last.n_d, last.V_d, last.material, glass=last.glass)
+    place = len(lens.surfaces) - 1
+    moved = tuple((k, room if k == place else gap) for k, gap in lens.infinity_mm)
+    rows = lens.with_gaps({place: room}).surfaces
+    derived = f"{lens.derived} A cover glass of {thickness_mm:g} mm was added.".strip()
+    covered = replace(lens, surfaces=(*rows, front, back), infinity_mm=moved, film_z_mm=film_z, derived=derived)
+    return covered if focus_mode == "paraxial" else best_focused(covered, focus_m, wavelength_nm)
+
+
+def _paraxial_film_z_mm(lens: Lens, focus_m: float) -> float:
+    """Film in the paraxial image; where it stands, of a lens whose groups have moved to focus."""
+    if lens.infinity_mm and lens.film_z_mm is not None:
+        return float(lens.film_z_mm)
+    return paraxial.film_z_mm(lens, focus_m)
+
+
+def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]) -> tuple[float, float]:
+    """Film planes that hold the paraxial image of an axial point, and its least spot at every aperture and colour.
+
+    What is least for all rays lies between what is least for each colour and meridian by itself. Arguments are those
+    of `best_focus_z_mm`.
+    """
+    image = _paraxial_film_z_mm(lens, focus_m)
+    if paraxial.is_pinhole(lens):
+        return image, image
+    colours = np.linspace(*wavelength_nm, paraxial.COLOURS if lens.dispersive else 1)
+    low = high = image
+    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
+        # The rays within each ring are those that a smaller stop lets through.
+        along, across = (m.cumsum(1) for m in _moments(lens, (low + high) / 2 - 1000 * focus_m, colours)[:2])
+        found = [image, *(-along / across)[across > 0].tolist()]
+        low, high = min(found), max(found)
+    spare, last = _SPARE * (high - low), float(lens.vertices_mm[len(lens.surfaces) - 1])
+    return max(low - spare, last + _NEAREST * (image - last)), high + spare
+
+
+def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
+    """Rays [rings * spokes] to the film from a point of the axis (-inf allowed), of equal areas of the entrance pupil.
+
+    One spoke stands for all where lens and opening are round.
+    """
+    data = paraxial.first_order(lens)
+    round_ = not lens.anamorphic and lens.aperture is None
+    rings, spokes = (_RINGS, 1) if round_ else (_RINGS_OF_SPOKES, _SPOKES)
+    ring = np.sqrt((np.arange(rings) + 0.5) / rings)
+    spoke = 2 * math.pi * (np.arange(spokes) + 0.5) / spokes
+    widest = max(data.entrance_pupil_diameter_mm, paraxial.first_order(lens, meridian="x").entrance_pupil_diameter_mm)
+    radius = _WIDER / 2 * widest * ring[:, None]
+    x, y = (radius * np.cos(spoke)).reshape(-1), (radius * np.sin(spoke)).reshape(-1)
+    # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
+    front_mm = lens.surfaces[0].diameter_mm
+    start = -max(10.0, front_mm if math.isfinite(front_mm) else 10.0)
+    if math.isinf(object_z_mm):
+        zero = np.zeros_like(x)
+        return Rays(x, y, zero + start, zero, zero, zero + 1)
+    depth = data.entrance_pupil_z_mm - object_z_mm
+    length = np.sqrt(x * x + y * y + depth * depth) * math.copysign(1.0, depth)
+    dx, dy, dz = x / length, y / length, depth / length
+    t = (start - object_z_mm) / dz
+    if object_z_mm > start:
+        t = np.zeros_like(t)
+    return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
+
+
+def _moments(lens: Lens, object_z_mm: float, wavelength_nm: Array) -> tuple[Array, Array, Array]:
+    """x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes], 0 of one that is blocked; and how far from
+    the axis it meets the stop.
+
+    (x0, y0) is where it meets the plane z = 0 and (tx, ty) its slopes: the sum of (x0 + z tx)^2 + (y0 + z ty)^2 is
+    least where the sum of the first makes up for z times that of the second.
+    """
+    rays = axial_rays(lens, object_z_mm)
+    count, colours = len(rays.x), len(wavelength_nm)
+    out = follow(lens, Rays(*(np.tile(c, colours) for c in rays)), np.repeat(wavelength_nm, count), "film")
+    r, passed = out.rays, out.status == 0
+    shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
+    with np.errstate(all="ignore"):  # of lost rays
+        tx, ty = r.dx / r.dz, r.dy / r.dz
+        along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
+        at_stop = np.nan_to_num(np.hypot(*out.at_stop))
+    return (
+        np.where(passed, along, 0.0).reshape(shape),
+        np.where(passed, across, 0.0).reshape(shape),
+        at_stop.reshape(shape),
+    )

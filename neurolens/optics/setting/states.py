@@ -1,0 +1,353 @@
+"""A lens set as a photographer does, in this order: zoom, size, f-number, focus.
+
+Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
+focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which
+keeps its interpolated value); a zoom of two moving groups has no freedom left. Such a lens is marked as derived.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.base.settings import F_NUMBER, FOCAL_MM, said, within
+from neurolens.optics.lens import paraxial
+from neurolens.optics.lens.prescription import Configuration, Lens
+from neurolens.optics.lens.shot import FocusMode, Shot
+from neurolens.optics.setting.focusing import (
+    at_infinity,
+    best_focused,
+    focused_inside,
+    gaps_mm,
+    infinity_states,
+    monotone,
+    with_cover_glass,
+    zoom_state_of,
+)
+from neurolens.optics.setting.pupils import image_radius_mm, on_plane
+from neurolens.optics.setting.rims import check_clearance
+
+
+def set_lens(
+    lens: Lens,
+    shot: Shot | None = None,
+    *,
+    focus_m: float | None = None,
+    f_number: float | None = None,
+    focal_length_mm: float | None = None,
+    field_deg: float | None = None,
+    zoom: str | float | None = None,
+    focus_mode: FocusMode = "paraxial",
+    wavelength_nm: tuple[float, float] | None = None,
+) -> Lens:
+    """Return the lens zoomed, scaled, stopped down and focused, for a shot or for some settings of one::
+
+        lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=2.0, f_number=4.0)
+
+    Args:
+        shot: all of the settings, with the shape of the stop and the film's offset; the other arguments are then left
+            out. After "internal" focus the film, too, moves to the least spot.
+        focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state that is
+            named: at the object of the source), and leaves the focus where `f_number` alone is given.
+        f_number: focal length over the diameter of the paraxial entrance pupil at infinity focus, of a bladed stop by
+            the circle round it. None keeps the stop, except for a zoom state with a stop of its own. A stop wider than
+            the rims let light through is allowed: they then vignette.
+        focal_length_mm: the whole lens is scaled until its focal length at infinity focus is this.
+        field_deg: full field of view of the image circle at infinity focus: the lens is scaled, the image circle stays
+            (by the traced chief ray, along x; distortion included).
+        zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its text.
+            A lens between states is marked in `derived`.
+        focus_mode: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to
+            the least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as the
+            file's focus states do, and the film stays.
+        wavelength_nm: range of the light that "best" focuses; None takes `Lens.light_nm`.
+
+    Raises:
+        InputError: the state is unknown, the focal length lies beyond the zoom's range, a value is not positive, the
+            focus is nearer than the lens allows, the lens does not see the field, or a size is asked of a lens that
+            diverges.
+    """
+    if shot is not None:
+        return _set_for(lens, shot)
+    _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus_mode)
+    others = (focus_m, focal_length_mm, field_deg, zoom)
+    if f_number is not None and lens.film_z_mm is not None and others == (None,) * 4:
+        # Closing the stop leaves the focus where it is.
+        return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
+    lens, object_mm = at_infinity(lens), None
+    if isinstance(zoom, str) and zoom not in [c.name for c in lens.configurations]:
+        with suppress(ValueError):  # a name, then, that no state has
+            zoom = float(zoom)
+    if isinstance(zoom, str):
+        state = state_named(lens, zoom)
+        lens, object_mm = in_state(lens, state), state.object_distance_mm
+        if focus_mode == "internal" and focus_m is not None:
+            lens = at_infinity(lens)
+    elif zoom is not None:
+        lens = zoomed(lens, zoom)
+    if focal_length_mm is not None:
+        now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
+        if now_mm < 0:
+            expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
+            raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
+        factor = focal_length_mm / now_mm
+    else:
+        factor = 1.0 if field_deg is None else _factor_for_field(lens, field_deg)
+    image_radius = lens.image_radius_mm
+    if factor != 1:
+        lens, object_mm = lens.scaled(factor), None if object_mm is None else object_mm * factor
+    if field_deg is not None:
+        lens = replace(lens, image_radius_mm=image_radius, half_field_deg=field_deg / 2)
+    if f_number is not None:
+        lens = lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
+    if focus_mode == "internal":
+        return focused_inside(lens, focus_m, object_mm)
+    if object_mm is not None and focus_m is None:
+        film_z = paraxial.image_z_mm(lens, -object_mm)
+        focus_m = (film_z + object_mm) / 1000
+    else:
+        focus_m = math.inf if focus_m is None else focus_m
+        film_z = paraxial.film_z_mm(lens, focus_m)
+    lens = replace(lens, film_z_mm=film_z)
+    return best_focused(lens, focus_m, wavelength_nm or lens.light_nm) if focus_mode == "best" else lens
+
+
+def _set_for(lens: Lens, shot: Shot) -> Lens:
+    lens = set_lens(lens, focal_length_mm=shot.focal_length_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    lens = lens.with_aperture(shot.aperture or lens.aperture)
+    f_number, light_nm = shot.f_number_for(paraxial.first_order(lens).f_number), shot.wavelength_nm
+    lens = set_lens(lens, f_number=f_number, focus_m=shot.focus_m, focus_mode=shot.focus_mode, wavelength_nm=light_nm)
+    if shot.focus_mode == "internal":
+        lens = best_focused(lens, shot.focus_m, light_nm)
+    lens = with_cover_glass(lens, shot.cover_glass_mm, shot.focus_m, shot.focus_mode, light_nm)
+    assert lens.film_z_mm is not None  # `set_lens` places the film
+    return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
+
+
+def state_named(lens: Lens, name: str) -> Configuration:
+    """Return the zoom or focus state of that name; an error lists those of the file."""
+    for c in lens.configurations:
+        if c.name == name:
+            return c
+    known = ", ".join(c.name for c in lens.configurations) or "none in this file"
+    raise InputError(lens.path, "zoom", name, f"one of: {known}")
+
+
+def in_state(lens: Lens, state: Configuration) -> Lens:
+    """Return the lens with the thicknesses, stop, field and f-number of a state as the source gives them."""
+    near = state.object_distance_mm is not None
+    start = gaps_mm(lens, zoom_state_of(lens, state) if near else None)
+    moved = lens.with_gaps(start | dict(state.thickness_mm))
+    if state.stop_diameter_mm is not None:
+        moved = moved.with_stop_radius(state.stop_diameter_mm / 2)
+    return replace(
+        moved,
+        half_field_deg=lens.half_field_in(state),
+        f_number=_f_number_in(lens, state),
+        stated_efl_mm=state.efl_mm,
+        stated_efl_x_mm=None,
+        derived="",
+        infinity_mm=tuple((k, start[k]) for k, _ in state.thickness_mm) if near else (),
+    )
+
+
+def _f_number_in(lens: Lens, state: Configuration) -> float:
+    """Nominal f-number of a state: its own, else that of the zoom state which it focuses, else the lens's."""
+    if state.f_number is None and state.object_distance_mm is not None:
+        focused = zoom_state_of(lens, state)
+        return lens.f_number if focused is None or focused.f_number is None else focused.f_number
+    return lens.f_number if state.f_number is None else state.f_number
+
+
+def _check(
+    lens: Lens,
+    focus_m: float | None,
+    f_number: float | None,
+    focal_length_mm: float | None,
+    field_deg: float | None,
+    focus_mode: FocusMode,
+) -> None:
+    for field, value, bounds in (("f_number", f_number, F_NUMBER), ("focal_length_mm", focal_length_mm, FOCAL_MM)):
+        if value is not None and not within(bounds, value):
+            raise InputError(lens.path, field, value, f"a number {said(bounds)}")
+    if focus_m is not None and not focus_m > 0:
+        raise InputError(lens.path, "focus_m", focus_m, "a positive number")
+    if field_deg is not None and not 0 < field_deg < 360:
+        raise InputError(lens.path, "field_deg", field_deg, "a full field of view in degrees, above 0 and below 360")
+    if field_deg is not None and focal_length_mm is not None:
+        raise InputError(lens.path, "field_deg", field_deg, "left out beside focal_length_mm: each sets the size")
+    if focus_mode not in get_args(FocusMode):
+        raise InputError(lens.path, "focus_mode", focus_mode, " or ".join(f'"{f}"' for f in get_args(FocusMode)))
+
+
+def _factor_for_field(lens: Lens, field_deg: float) -> float:
+    """Scale at which the chief ray of half the field meets the edge of the image circle, at infinity focus."""
+    import torch  # chief rays are aimed by it; nothing else here takes it
+
+    from neurolens.optics.trace.aiming import aim_at_stop
+    from neurolens.optics.trace.rays import trace
+
+    lens = at_infinity(lens)
+    lens = replace(lens, film_z_mm=paraxial.film_z_mm(lens, math.inf), aperture=None)
+    radius, _ = image_radius_mm(lens)
+    half = torch.tensor([math.radians(field_deg / 2)], dtype=torch.float64)
+    chief = aim_at_stop(lens, half, torch.zeros(1, 1, dtype=torch.float64))
+    out = trace(lens, chief.rays, towards="film")
+    reached = float(chief.field_rad[0, 0])
+    assert lens.film_z_mm is not None
+    height = abs(float(on_plane(out.rays, lens.film_z_mm).x))
+    if not bool(chief.reached.all()) or int(out.status[0]) != 0 or not height > 0:
+        widest = min(math.degrees(reached) * 2, lens.half_field_deg * 2 if lens.half_field_deg else 360.0)
+        raise InputError(lens.path, "field_deg", field_deg, f"a field that this lens sees (about {widest:.3g} degrees)")
+    return radius / height
+
+
+MOVES = 0.02  # a group moves whose travel is above this share of the largest travel
+_STATED = 1e-6  # a focal length this near to a state's, as stated or as computed, is the state's
+_ROUNDS = 40
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _State:
+    """A zoom state of the source: focal length as computed, and `places`, the distances of the groups' fronts from the
+    film (paraxial image), scene to film, one more than the gaps.
+    """
+
+    source: Configuration
+    efl_mm: float
+    places: Vector
+
+
+def zoomed(lens: Lens, efl_mm: float) -> Lens:
+    """Return the lens at infinity focus, zoomed to a focal length between those of its states.
+
+    At the focal length of a state, stated or computed, it is that state. Else its `derived` says between which states
+    it lies; stop, field and nominal f-number are interpolated too.
+
+    Raises:
+        InputError: fewer than two states, a focal length beyond theirs, or groups that would collide on the way.
+    """
+    states = _states(lens)
+    if len(states) < 2:
+        raise InputError(lens.path, "zoom", efl_mm, "the name of a state: a zoom needs two states of the file or more")
+    for s in states:
+        for known in (s.source.efl_mm, s.efl_mm):
+            if known is not None and abs(efl_mm / known - 1) < _STATED:
+                return in_state(lens, s.source)
+    known_mm = [e for s in states for e in (s.source.efl_mm, s.efl_mm) if e is not None]
+    if not min(known_mm) < efl_mm < max(known_mm):
+        raise InputError(lens.path, "zoom", efl_mm, f"a focal length from {min(known_mm):g} to {max(known_mm):g} mm")
+    gaps = _varying_gaps(lens)
+    places = _solved(lens, gaps, states, efl_mm)
+    inner = dict(zip(gaps, (places[:-1] - places[1:]).tolist(), strict=True))
+    last = len(lens.surfaces) - 1
+    i = sum(s.efl_mm <= efl_mm for s in states[1:-1])
+    beside = states[i], states[i + 1]
+    moved = in_state(lens, Configuration("", efl_mm, (*inner.items(), (last, float(places[-1])))))
+    check_clearance(moved.surfaces, lens.path, f"zoom {efl_mm:g} mm, ")
+    moved = _interpolated_texts(moved, states, efl_mm)
+    names = " and ".join(f'"{s.source.name}"' for s in beside)
+    return replace(moved, derived=f"Zoom to {efl_mm:g} mm, between the source's states {names}: gaps interpolated.")
+
+
+def _states(lens: Lens) -> list[_State]:
+    gaps, found = _varying_gaps(lens), []
+    for c in infinity_states(lens):
+        data = paraxial.first_order(lens.with_gaps(gaps_mm(lens, c)))
+        if not 0 < data.efl_mm < math.inf:
+            expected = "a positive one in every state of a zoom"
+            raise InputError(lens.path, f'focal length of "{c.name}"', f"({data.efl_mm:.6g} mm)", expected)
+        thickness = gaps_mm(lens, c)
+        inner = [thickness[k] for k in gaps]
+        places = data.back_focus_mm + np.append(np.cumsum(inner[::-1])[::-1], 0.0)
+        found.append(_State(c, data.efl_mm, places))
+    return sorted(found, key=lambda s: s.efl_mm)
+
+
+def _varying_gaps(lens: Lens) -> list[int]:
+    """Return the surfaces behind which a zoom state sets the gap, but the last, whose gap ends at the film."""
+    last = len(lens.surfaces) - 1
+    return sorted({k for c in infinity_states(lens) for k, _ in c.thickness_mm} - {last})
+
+
+def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) -> Vector:
+    """Places of the groups with this focal length and the paraxial image on the film: Gauss-Newton, least moves."""
+    x = [math.log(s.efl_mm) for s in states]
+    target = min(max(math.log(efl_mm), x[0]), x[-1])
+    known = np.array([s.places for s in states])
+    places, travel = np.array(monotone(x, known.tolist(), target)), np.ptp(known, axis=0)
+    least = MOVES * travel.max()
+    moving, kept = travel > least, int(np.argmax(np.ptp(known[:, :-1] - known[:, 1:], axis=0) > least))
+    if moving.sum() > 2:
+        (gap_mm,) = monotone(x, (known[:, kept : kept + 1] - known[:, kept + 1 : kept + 2]).tolist(), target)
+        if moving[kept]:
+            places[kept] = places[kept + 1] + gap_mm
+        else:
+            places[kept + 1] = places[kept] - gap_mm
+    directions = _directions(moving, kept)
+
+    def wrong(places: Vector) -> Vector:
+        inner = dict(zip(gaps, (places[:-1] - places[1:]).tolist(), strict=True))
+        data = paraxial.first_order(lens.with_gaps(inner))
+        return np.array([data.efl_mm - efl_mm, data.back_focus_mm - places[-1]])
+
+    step_mm = 1e-4 * efl_mm
+    for _ in range(_ROUNDS):
+        off = wrong(places)
+        if np.abs(off).max() < 1e-12 * efl_mm:
+            return places
+        columns = [(wrong(places + step_mm * d) - wrong(places - step_mm * d)) / (2 * step_mm) for d in directions]
+        change = np.linalg.lstsq(np.array(columns).T, -off, rcond=1e-6)[0] @ directions
+        places = places + change
+        if np.abs(change).max() < 1e-13 * efl_mm:
+            return places
+    raise InputError(lens.path, "zoom", efl_mm, "a position between states that its groups can reach in focus")
+
+
+def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
+    """Return the moves [D, groups] that may correct the interpolation."""
+    unit = np.eye(len(moving))
+    if moving.sum() < 2:
+        return unit
+    if moving.sum() == 2:
+        return np.asarray(unit[moving])
+    # The first varying gap is kept: what bounds it moves together, or stands still if one of the two does.
+    together = [unit[kept] + unit[kept + 1]] if moving[kept] and moving[kept + 1] else []
+    others = [unit[j] for j in np.flatnonzero(moving) if j not in (kept, kept + 1)]
+    return np.array(together + others)
+
+
+def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:
+    """Return the stop, half field (by the image's height) and nominal f-number between those of the states that say."""
+    x = [math.log(s.efl_mm) for s in states]
+    place = min(max(math.log(efl_mm), x[0]), x[-1])
+
+    def value(known: list[float | None]) -> float | None:
+        sure = [(at, [k]) for at, k in zip(x, known, strict=True) if k is not None]
+        if not sure or not sure[0][0] <= place <= sure[-1][0]:
+            return None
+        return monotone([s[0] for s in sure], [s[1] for s in sure], place)[0]
+
+    heights = [
+        None if s.source.half_field_deg is None or s.source.half_field_deg >= 89
+        else s.efl_mm * math.tan(math.radians(s.source.half_field_deg))
+        for s in states
+    ]  # fmt: skip
+    height, stop = value(heights), value([s.source.stop_diameter_mm for s in states])
+    f_number = value([s.source.f_number for s in states])
+    if stop is not None:
+        lens = lens.with_stop_radius(stop / 2)
+    return replace(
+        lens,
+        half_field_deg=lens.half_field_deg if height is None else math.degrees(math.atan(height / efl_mm)),
+        f_number=lens.f_number if f_number is None else f_number,
+        stated_efl_mm=None,
+    )

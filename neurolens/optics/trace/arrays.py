@@ -1,0 +1,82 @@
+"""Rays followed as numpy arrays in float64: all that setting a lens and searching its pupil need, without torch.
+
+The surfaces and their tests are those of the tracer (`surfaces`); derivatives, power and recorded paths are `rays`'.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base import status as st
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace.arithmetic import NUMPY
+from neurolens.optics.trace.shapes import traced_curve
+from neurolens.optics.trace.surfaces import Hit, Rays, Test, cross, media, nearest_approach, rim_tests
+
+Array = NDArray[np.float64]
+
+UNIT_SLACK = 1e-3  # how far the squared length of a direction may be from 1; float32 rounding is a thousandth of this
+_CHUNK = 8192  # rays at a time, which fit a core's cache
+_FEWER = 0.8  # of rays, below which those that are left are put together
+
+
+class Followed(NamedTuple):
+    """Rays behind the last surface (lens frame, unit directions), the status of each, and where they met the stop.
+
+    Of rays that are lost only the status means anything.
+    """
+
+    rays: Rays
+    status: NDArray[np.int32]
+    at_stop: tuple[Array, Array]
+
+
+def follow(lens: Lens, rays: Rays, wavelength_nm: Any, towards: Literal["scene", "film"] = "scene") -> Followed:
+    """Follow rays [N] of one wavelength or [N] through the whole lens, as `rays.trace` does."""
+    return _follow(lens, rays, wavelength_nm, towards == "film")
+
+
+def passing(lens: Lens, rays: Rays, wavelength_nm: float) -> NDArray[np.bool_]:
+    """Whether camera rays pass the whole lens, bool [N]; lost ones are left out of the work on later surfaces."""
+    passed = np.zeros(len(rays.x), bool)
+    for first in range(0, len(rays.x), _CHUNK):
+        part = Rays(*(c[first : first + _CHUNK] for c in rays))
+        passed[first : first + _CHUNK] = _follow(lens, part, wavelength_nm, False, prune=True).status == st.PASSED
+    return passed
+
+
+@np.errstate(all="ignore")  # of lost rays
+def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bool = False) -> Followed:
+    sense, order = (1, range(len(lens.surfaces))) if to_film else (-1, range(len(lens.surfaces))[::-1])
+    mediums, vertex, left = media(lens, wavelength_nm), 0.0, np.arange(len(rays.x))
+    sound = np.abs(NUMPY.dot(rays[3:], rays[3:]) - 1) <= UNIT_SLACK
+    status = np.where(sound, st.PASSED, st.blocked(order[0], st.MISSED)).astype(np.int32)
+    start = nearest_approach(NUMPY, rays, 1.0) if to_film else rays[:3]  # light may start far away
+    at_stop, r = (rays.x, rays.y), Rays(*start, *(d * mediums[0 if to_film else -1].n for d in rays[3:]))
+    for k in order:
+        surface, z = lens.surfaces[k], float(lens.vertices_mm[k])
+        r, vertex = r._replace(z=r.z + (vertex - z)), z
+        before, after = (mediums[k], mediums[k + 1]) if to_film else (mediums[k + 1], mediums[k])
+
+        def rim(met: Hit, surface: Any = surface) -> list[Test]:
+            tests = rim_tests(NUMPY, surface)(met)
+            if lens.aperture is None or not surface.stop:
+                return tests
+            return [*tests, (0.5, lens.aperture.inside(met.x, met.y, surface.semi_diameter_mm))]
+
+        met, bent, found = cross(
+            NUMPY, surface, traced_curve(surface, float), r, sense, before, after, entering=k == order[0], rim=rim
+        )
+        here = status[left]
+        for tests, reason in found:
+            for low, high in tests:
+                here = np.where((here == st.PASSED) & ~np.less_equal(low, high), st.blocked(k, reason), here)
+        status[left], r = here, bent.rays
+        at_stop = (met.x, met.y) if surface.stop else at_stop
+        if prune and (here == st.PASSED).sum() < _FEWER * len(left):
+            alive = here == st.PASSED
+            left, r = left[alive], Rays(*(c[alive] for c in r))
+    return Followed(Rays(*r[:2], r.z + vertex, *(d / mediums[-1 if to_film else 0].n for d in r[3:])), status, at_stop)

@@ -1,0 +1,468 @@
+"""The exact tracer, in either direction: the reference for surrogates.
+
+Rays are separate tensors of shape [N]; float64 for truth, float32 for speed. A ray that cannot go on carries a
+status and stays finite. Ghosts (`follow`) meet the same surfaces with the same tests, but may be reflected.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.base.files import cache_folder
+from neurolens.base.tasks import keep_memory
+from neurolens.optics.lens import glass
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.trace.arithmetic import is_number, times
+from neurolens.optics.trace.films import TensorPassage
+from neurolens.optics.trace.shapes import centred, is_deep, start_of, traced_curve
+from neurolens.optics.trace.surfaces import (
+    Hit,
+    Medium,
+    Rays,
+    SurfaceStep,
+    Test,
+    cross,
+    media,
+    nearest_approach,
+    radius2,
+    rim_tests,
+)
+from neurolens.optics.trace.tensors import Survival, Tensors, at_most
+
+Towards = Literal["scene", "film"]
+
+# Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
+CHUNK = 32768
+# How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
+UNIT_SLACK = 1e-3
+# Of the rays that `passing` follows, the share below which those that are left are put together.
+_FEWER = 0.8
+
+
+class Crossing(NamedTuple):
+    """The crossings of rays with one surface, each [N]: points in mm, margins of Snell's and the sphere's square roots.
+
+    `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there. Points on
+    the far half of a sphere, beyond any rim, lie mirrored outwards (see `_unfolded`).
+    """
+
+    x: Tensor
+    y: Tensor
+    meets: Tensor
+    refracts: Tensor
+
+
+class Traced(NamedTuple):
+    """The result of a trace.
+
+    Attributes:
+        rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
+            were totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
+        status: [N] int32, see `neurolens.base.status`.
+        transmittance: [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
+        crossings: surface index to `Crossing`, for the recorded surfaces.
+        path: the rays on and after every surface, in the order of travel, or empty if not requested.
+    """
+
+    rays: Rays
+    status: Tensor
+    transmittance: Tensor | None
+    crossings: dict[int, Crossing]
+    path: tuple[Rays, ...] = ()
+
+
+def trace(
+    lens: Lens,
+    rays: Rays,
+    wavelength_nm: Tensor | float | None = None,
+    *,
+    towards: Towards = "scene",
+    transmittance: bool = False,
+    record: Sequence[int] = (),
+    path: bool = False,
+) -> Traced:
+    """Trace rays through the whole lens.
+
+    Args:
+        lens: the prescription; its stop's diameter is the opening that clips.
+        rays: points and unit directions [N], lens frame, mm. The dtype (float32 or float64) is that of the result.
+        wavelength_nm: one number, or a tensor [N], of which those outside `glass.stated_nm`, and NaN, have the status
+            of what is outside the domain in a lens that disperses; None takes `Lens.reference_nm`.
+        towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
+        transmittance: whether to follow the power of unpolarised light, with the polarisation that surfaces give to it.
+        record: surfaces whose crossings are wanted.
+        path: whether the points on all surfaces and the directions after them are wanted.
+
+    Raises:
+        InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape or a
+            number outside `glass.stated_nm`, an unknown `towards`, a surface to record that the lens does not have.
+
+    A direction that is not a unit vector counts as a miss of the first surface.
+    Differentiable with respect to rays, wavelength and prescription fields given as tensors.
+    """
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    check_rays(lens, rays, wavelength_nm)
+    if not torch.compiler.is_compiling():
+        keep_memory()
+    if towards not in ("scene", "film"):
+        raise InputError("trace", "towards", towards, '"scene" or "film"')
+    if any(not 0 <= k < len(lens.surfaces) for k in record):
+        raise InputError("trace", "record", tuple(record), f"surfaces from 0 to {len(lens.surfaces) - 1}")
+    needs_grad = any(_differentiated(v) for v in (*rays, wavelength_nm, *_parameters(lens)))
+    chunk = partial(
+        _trace_chunk, lens, towards=towards, transmittance=transmittance, record=record, path=path, freeze=needs_grad
+    )
+    count = rays.x.shape[0]
+    if needs_grad or count <= CHUNK:
+        return chunk(rays, wavelength_nm)
+    parts = []
+    for i in range(0, count, CHUNK):
+        part = slice(i, i + CHUNK)
+        lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
+        parts.append(chunk(Rays(*(c[part] for c in rays)), lam))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Join the results of chunks."""
+    first = parts[0]
+    if isinstance(first, Tensor):
+        return torch.cat(list(parts))
+    if isinstance(first, dict):
+        return {k: _joined([part[k] for part in parts]) for k in first}
+    if isinstance(first, tuple):
+        columns = [_joined(column) for column in zip(*parts, strict=True)]
+        return type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
+    return first
+
+
+def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = "scene") -> Tensor:
+    """Test whether rays pass the whole lens, bool [N]: exactly where the status of `trace` is 0.
+
+    Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
+    Arguments and errors are those of `trace`, with one wavelength.
+    """
+    check_rays(lens, rays, wavelength_nm)
+    keep_memory()
+    chunks = zip(*(c.split(CHUNK) for c in rays), strict=True)
+    with torch.no_grad():
+        return torch.cat([_passing_chunk(lens, Rays(*chunk), wavelength_nm, towards) for chunk in chunks])
+
+
+def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Towards) -> Tensor:
+    sense, order = _path(lens, towards)
+    tracing, left = Tracing(lens, rays, wavelength_nm, sense, order[0], False), torch.arange(len(rays.x))
+    for k in order:
+        tracing.cross(k)
+        if float(tracing.tests.passed.sum()) < _FEWER * len(left):
+            alive = torch.nonzero(tracing.tests.passed)[:, 0]
+            tracing.rays, left = Rays(*(c.index_select(0, alive) for c in tracing.rays)), left.index_select(0, alive)
+            tracing.tests = Survival(torch.ones_like(tracing.rays.x), st.PASSED)
+    passed = torch.zeros(len(rays.x), dtype=torch.bool)
+    passed[left] = tracing.tests.passed > 0
+    return passed
+
+
+def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph: bool = False) -> Callable[..., Any]:
+    """Compile a function that traces rays through a lens by torch, the prescription folded in as constants.
+
+    Every new number of rays compiles anew, so call it with batches of one length. Without a C++ compiler the first call
+    raises torch's own error; the eager `trace` needs none.
+
+    What the compiler may take for constant is marked here only: that imports it, which takes longer than a camera needs
+    to start. Torch keeps the machine code that it makes, and runs what it finds: by default in a folder that every user
+    of the machine can create, so that its cache is moved into the user's own.
+    """
+    for surface in lens.surfaces if lens else ():  # read the catalogue now: compiled code cannot read files
+        glass.index_of(surface, glass.LINE_D_NM)
+    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache_folder("torch"))
+    for constant in (start_of, centred):
+        torch.compiler.assume_constant_result(constant)
+    return torch.compile(run, dynamic=False, fullgraph=fullgraph)
+
+
+def _differentiated(value: Any) -> bool:
+    """Test whether derivatives with respect to a value are followed, backwards or forwards."""
+    if not isinstance(value, Tensor):
+        return False
+    return (value.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(value).tangent is not None
+
+
+def _parameters(lens: Lens) -> list[Any]:
+    found: list[Any] = []
+    for s in lens.surfaces:
+        found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.absorption_per_mm, s.figure.conic)
+        found += (a for _, a in s.figure.powers)
+        found += (figure for layer in (s.coating.layers if s.coating else ()) for figure in layer)
+    return found
+
+
+def _path(lens: Lens, towards: Towards) -> tuple[int, range]:
+    """Return the sense of travel along z, and the surfaces in the order in which light meets them."""
+    last = len(lens.surfaces) - 1
+    return (1, range(last + 1)) if towards == "film" else (-1, range(last, -1, -1))
+
+
+class Tracing:
+    """Rays on their way through a lens, surface by surface.
+
+    Args:
+        sense: the direction of travel in which they start, +1 to the film.
+        entering: the surface that they meet first. guard: whether lost rays stay finite on the way.
+        freeze: whether lost rays are put on the axis at once, for gradients.
+    """
+
+    def __init__(
+        self, lens: Lens, rays: Rays, wavelength_nm: Any, sense: int, entering: int, guard: bool, freeze: bool = False
+    ) -> None:
+        self.lens, self.sense, self.freeze = lens, sense, freeze
+        self.o = Tensors(guard or freeze, rays.x.dtype)
+        self.wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
+        self.media = media(lens, self.wavelength_nm)  # media[k] lies before surface k as light travels to the film
+        self.curves = [traced_curve(s) for s in lens.surfaces]
+        self.medium = self.media[0 if sense > 0 else -1]
+        self.vertex: Any = 0.0
+        self._entering: int | None = entering
+        self.tests, self.rays = self._start(rays, lit, entering)
+
+    def _start(self, rays: Rays, lit: Tensor | None, entering: int) -> tuple[Survival, Rays]:
+        """Return rays with optical direction cosines, and the test that their directions are unit vectors."""
+        o = self.o
+        length2 = o.dot(rays[3:], rays[3:])
+        sound = at_most((length2 - 1).abs(), UNIT_SLACK)
+        if self.freeze:
+            # A NaN input must not reach the gradients of the other rays.
+            sound = sound * torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
+        if lit is None:
+            tests = Survival(sound, st.blocked(entering, st.MISSED))
+        else:
+            tests = Survival(torch.ones_like(sound) * lit, st.OUTSIDE_DOMAIN)  # of one wavelength for all rays, too
+            tests.require([(0.5, sound)], entering, st.MISSED)
+        if self.freeze:
+            rays = tests.along_axis(rays, self.sense, 0.0)
+        if self.sense > 0:
+            # Light may start far away; near the lens float32 keeps points and directions consistent.
+            rays = Rays(*nearest_approach(o, rays, 1.0), *rays[3:])
+        return tests, Rays(*rays[:3], *(times(d, self.medium.n) for d in rays[3:]))
+
+    def cross(self, k: int, reflected: bool = False) -> tuple[Rays, SurfaceStep, tuple[Medium, Medium]]:
+        """Go on to surface k and through it, or back from it where `reflected`.
+
+        Returns the rays before it, in its vertex frame, what it does to them, and the media as they meet them.
+        """
+        lens, surface = self.lens, self.lens.surfaces[k]
+        vertex = lens.vertices_mm[k]
+        # In this surface's frame float32 keeps its precision.
+        r, self.vertex = self.rays._replace(z=self.rays.z + (self.vertex - vertex)), vertex
+        met_media = (self.media[k], self.media[k + 1]) if self.sense > 0 else (self.media[k + 1], self.media[k])
+        crossed = cross(
+            self.o, surface, self.curves[k], r, self.sense, *met_media,
+            entering=k == self._entering, reflected=reflected, rim=self._rim(surface),
+        )  # fmt: skip
+        for tests, reason in crossed.tests:
+            self.tests.require(tests, k, reason)
+        if self.curves[k].flat:
+            # A sphere's square root turns NaN and overflow into a miss; a plane would pass them.
+            self.tests.end(radius2(self.o, crossed.met))
+        self.rays, self._entering = crossed.bent.rays, None
+        self.medium = met_media[0 if reflected else 1]
+        self.sense = -self.sense if reflected else self.sense
+        # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
+        if self.freeze:
+            self.rays = self.tests.along_axis(self.rays, self.sense, 0.0)
+        return r, crossed, met_media
+
+    def _rim(self, surface: Surface) -> Callable[[Hit], list[Test]] | None:
+        aperture, radius_mm = self.lens.aperture, surface.semi_diameter_mm
+        if aperture is None or not surface.stop:
+            return None
+        outer = rim_tests(self.o, surface)
+        return lambda met: [*outer(met), (0.5, aperture.inside(met.x, met.y, radius_mm).to(met.x.dtype))]
+
+    def in_lens_frame(self) -> Rays:
+        """Return the rays behind the last surface with unit directions."""
+        r, n = self.rays._replace(z=self.rays.z + self.vertex), self.medium.n
+        return r if is_number(n) and n == 1 else Rays(*r[:3], *(d / n for d in r[3:]))
+
+    def leave(self) -> Rays:
+        """Return the rays in the lens frame; those that did not go on are along the axis."""
+        return self.tests.along_axis(self.in_lens_frame(), self.sense, self.vertex)
+
+
+def _trace_chunk(
+    lens: Lens,
+    rays: Rays,
+    wavelength_nm: Tensor | float,
+    *,
+    towards: Towards,
+    transmittance: bool,
+    record: Sequence[int],
+    path: bool,
+    freeze: bool,
+) -> Traced:
+    sense, order = _path(lens, towards)
+    tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], path or bool(record), freeze)
+    power = TensorPassage(tracing.o, lens, tracing.wavelength_nm) if transmittance else None
+    crossings: dict[int, Crossing] = {}
+    passed: list[Rays] = []
+    for k in order:
+        r, (met, bent, _), (before, after) = tracing.cross(k)
+        if power is not None:
+            power.pass_surface(k, r, met, bent.q, (before, after), sense)
+        if k in record:
+            margins = times(met.q2, before.inverse_n2), times(bent.q2, after.inverse_n2)
+            crossings[k] = Crossing(*_unfolded(lens.surfaces[k], met), *margins)
+        if path:
+            passed.append(tracing.in_lens_frame())
+    arrived = None if power is None else tracing.tests.only(power.arrived(rays.x), 0.0)
+    return Traced(tracing.leave(), tracing.tests.status(), arrived, crossings, tuple(passed))
+
+
+def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
+    """x and y of a meeting, [N] each, mm; on the far half of a deep sphere mirrored outwards at its equator.
+
+    So the distance from the axis grows on beyond a deep rim, where it would fall again, and tells the half.
+    """
+    if not is_deep(surface):
+        return met.x, met.y
+    height = torch.hypot(met.x, met.y).clamp_min(1e-300)
+    outwards = torch.where(met.z * surface.curvature > 1, 2 * abs(surface.radius_mm) / height - 1, 1.0)
+    return met.x * outwards, met.y * outwards
+
+
+def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
+    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not stated.
+
+    Warn of wavelengths at which the index of a glass is not stated, but not of tensors on a GPU, which would wait.
+    """
+    shape, dtype = rays.x.shape, rays.x.dtype
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
+    for name, c in zip(Rays._fields, rays, strict=True):
+        if c.shape != shape or c.dtype != dtype or c.ndim != 1:
+            found = f"({tuple(c.shape)}, {c.dtype})"
+            raise InputError("trace", f"rays.{name}", found, f"[N] like x: {tuple(shape)}, {dtype}")
+    if isinstance(wavelength_nm, Tensor):
+        if wavelength_nm.ndim and wavelength_nm.shape != shape:
+            found = f"({tuple(wavelength_nm.shape)})"
+            raise InputError("trace", "wavelength_nm", found, f"a number or a tensor {tuple(shape)}")
+        if wavelength_nm.device.type == "cpu" and not torch.compiler.is_compiling():
+            low, high = glass.stated_nm(lens)
+            known = wavelength_nm.detach()[(wavelength_nm >= low) & (wavelength_nm <= high)]  # other rays have a status
+            for nm in torch.stack(known.aminmax()).tolist() if known.numel() else ():
+                glass.check_light(lens, nm)
+    elif not 0 < wavelength_nm < math.inf:
+        raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
+    else:
+        glass.check_light(lens, wavelength_nm)
+
+
+def sound_wavelength(
+    lens: Lens, wavelength_nm: Tensor | float, dtype: torch.dtype
+) -> tuple[Tensor | float, Tensor | None]:
+    """Wavelengths in the precision of the rays, invalid ones replaced by the d line, and which are valid [N].
+
+    A NaN in an index would reach the gradients of the prescription, and float64 would spread to float32 rays halfway.
+    None where all are valid or, without dispersion, irrelevant.
+    """
+    if not isinstance(wavelength_nm, Tensor):
+        return wavelength_nm, None
+    low, high = glass.stated_nm(lens)
+    sound = (wavelength_nm >= low / st.DOMAIN_SLACK) & (wavelength_nm <= high * st.DOMAIN_SLACK)
+    return torch.where(sound, wavelength_nm, glass.LINE_D_NM).to(dtype), sound if lens.dispersive else None
+
+
+# ---- ghosts: light that any sequence of surfaces refracts or reflects ----
+
+Action = Literal["T", "R"]
+Steps = Sequence[tuple[int, Action]]
+
+
+class GhostTrace(NamedTuple):
+    """The result of following a sequence.
+
+    Attributes:
+        rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
+        status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
+        power: [N], the share of unpolarised light that the surfaces send on and the glass does not absorb.
+        points: x, y, z of the meeting points of every step, lens frame, mm.
+    """
+
+    rays: Rays
+    status: Tensor
+    power: Tensor
+    points: tuple[tuple[Tensor, Tensor, Tensor], ...]
+
+
+def turning(count: int, reflections: Sequence[int]) -> list[tuple[int, Action]]:
+    """The steps of light from the front to the film of `count` surfaces, reflected at some of them in this order."""
+    steps: list[tuple[int, Action]] = []
+    at, sense = 0, 1
+    for k in reflections:
+        steps += [*((between, "T") for between in range(at, k, sense)), (k, "R")]
+        at, sense = k - sense, -sense
+    return [*steps, *((k, "T") for k in range(at, count))]
+
+
+def follow(
+    lens: Lens,
+    rays: Rays,
+    steps: Steps,
+    wavelength_nm: Tensor | float | None = None,
+    *,
+    towards: Towards = "film",
+    polarised: bool = False,
+) -> GhostTrace:
+    """Follow light along a sequence of surfaces.
+
+    Args:
+        lens: the prescription; every rim and the stop are tested at every crossing.
+        rays: points and unit directions [N], lens frame, mm; float32 or float64.
+        steps: surfaces in the order in which they are met, "T" refracted or "R" reflected.
+        wavelength_nm: number or [N]; None takes `Lens.reference_nm`.
+        towards: "film" for light that enters at the front, "scene" for light that enters at the rear.
+        polarised: whether to follow the polarisation that each surface gives to the light, or to average it there.
+
+    Raises:
+        InputError: as `trace` for rays and wavelengths; no steps, a surface that does not exist or is not the next one
+            in the direction of travel.
+    """
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    check_rays(lens, rays, wavelength_nm)
+    _check(len(lens.surfaces), steps, towards)
+    tracing = Tracing(lens, rays, wavelength_nm, 1 if towards == "film" else -1, steps[0][0], guard=True)
+    passage = TensorPassage(tracing.o, lens, tracing.wavelength_nm, polarised)
+    points = []
+    for k, action in steps:
+        sense, reflected = tracing.sense, action == "R"
+        r, (met, bent, _), mediums = tracing.cross(k, reflected)
+        points.append((met.x, met.y, met.z + tracing.vertex))
+        passage.pass_surface(k, r, met, bent.q, mediums, sense, reflected)
+    power = tracing.tests.only(passage.arrived(rays.x), 0.0)
+    return GhostTrace(tracing.leave(), tracing.tests.status(), power, tuple(points))
+
+
+def _check(count: int, steps: Steps, towards: Towards) -> None:
+    """Surfaces must follow one another as light meets them."""
+    if not steps:
+        raise InputError("sequence", "steps", "(none)", "at least one surface")
+    if towards not in ("scene", "film"):
+        raise InputError("sequence", "towards", towards, '"scene" or "film"')
+    at, sense = (-1, 1) if towards == "film" else (count, -1)
+    for n, (k, action) in enumerate(steps):
+        if action not in ("T", "R"):
+            raise InputError("sequence", f"step {n}", action, '"T" or "R"')
+        if k != at + sense or not 0 <= k < count:
+            raise InputError("sequence", f"step {n}", k, f"surface {at + sense}, of 0 to {count - 1}")
+        at, sense = k, -sense if action == "R" else sense

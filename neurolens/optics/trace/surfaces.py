@@ -1,0 +1,446 @@
+"""One surface: where a ray meets it, the tests that it passes there, and how it is bent or reflected.
+
+Written once, for tensors, numpy arrays and graphs (`arithmetic`), and used for the lens in both directions and for
+ghosts. Directions in here are optical direction cosines: unit vectors times the refractive index of the medium,
+p = n d, for which Snell's law needs no division (p after = p before + a multiple of the normal). `sense` is +1 for rays
+that travel from the scene to the film (+z) and -1 for camera rays. Coordinates are relative to the surface's vertex.
+
+Formulas: Spencer and Murty 1962, "General Ray-Tracing Procedure", in the form that needs no division by dz and gives
+the cosine of incidence for free; optical direction cosines as in Welford 1986, "Aberrations of Optical Systems", ch. 4.
+Spheres, conics and cylinders are met in closed form. An asphere is met by an iteration of Newton's kind along the ray,
+started from the quadric that fits best; started at the vertex plane it fails beyond about 55 degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base import status as st
+from neurolens.optics.lens import glass, prescription
+from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
+from neurolens.optics.trace.shapes import (
+    STEEPEST,
+    Curve,
+    Quadric,
+    crossed,
+    curve_of,
+    depth,
+    height2,
+    is_deep,
+    rim_sine,
+    sag_and_derivatives,
+    without_rim,
+)
+
+Array = NDArray[np.float64]
+
+# A test that a ray passes where the first value is at most the second; NaN does not pass.
+Test = tuple[Any, Any]
+
+
+class Rays(NamedTuple):
+    """Rays as a structure of arrays, each [N]: a point (mm) and a direction (unit, or times the index in here)."""
+
+    x: Any
+    y: Any
+    z: Any
+    dx: Any
+    dy: Any
+    dz: Any
+
+
+class Medium(NamedTuple):
+    """A refractive index with its square and the inverse of that: numbers, or [N] where dispersive."""
+
+    n: Any
+    n2: Any
+    inverse_n2: Any
+
+
+AIR = Medium(1.0, 1.0, 1.0)
+_FARTHEST = 1e6  # parameter of a meeting, from the point of the ray nearest to the vertex
+
+
+class Hit(NamedTuple):
+    """The intersection of rays with a surface, each [N].
+
+    `q` is n times the cosine of incidence and `q2` its square: positive where the ray meets the surface, and with
+    guards a smooth measure of how far it misses elsewhere. The ray meets the surface where it passes the `tests`.
+    `normal` is the unit normal towards +z; None for a sphere or plane, whose curvature gives it (`normal_at`).
+    """
+
+    x: Any
+    y: Any
+    z: Any
+    q: Any
+    q2: Any
+    tests: list[Test]
+    normal: Quadric | None = None
+
+
+class Outgoing(NamedTuple):
+    """Rays behind a surface (vertex frame), n' times their cosine there, its square, and the test for total reflection.
+
+    The square `q2` is not positive where rays are totally reflected.
+    """
+
+    rays: Rays
+    q: Any
+    q2: Any
+    tests: list[Test]
+
+
+def medium(n: Any) -> Medium:
+    """Return a medium of index `n`, a number or a value."""
+    n2 = n * n
+    return Medium(n, n2, 1 / n2)
+
+
+def media(lens: Lens, wavelength_nm: Any) -> list[Medium]:
+    """Media from the scene to the film; media(...)[k] lies before surface k. The same object where it does not change.
+
+    `wavelength_nm` is a number or [N]; a dispersive medium has the shape of the wavelength.
+    """
+    known: dict[Any, Medium] = {"air": AIR}
+    for s in lens.media:
+        if _medium_key(s) not in known:
+            known[_medium_key(s)] = medium(glass.index_of(s, wavelength_nm))
+    return [known[_medium_key(s)] for s in lens.media]
+
+
+def _medium_key(s: Surface | prescription.Medium) -> Any:
+    if s.glass is None and s.V_d is None and is_number(s.n_d) and s.n_d == 1:
+        return "air"
+    return (s.glass, None if s.glass else (float(s.n_d) if is_number(s.n_d) else id(s.n_d)), s.V_d)
+
+
+def nearest_approach(o: Arithmetic, r: Rays, inverse_n2: Any) -> Quadric:
+    """The point of a ray nearest to the vertex: its coordinates are small, which keeps float32 to micrometres."""
+    e = times(o.dot(r[:3], r[3:]), inverse_n2)
+    return o.fma(e, r.dx, r.x, -1), o.fma(e, r.dy, r.y, -1), o.fma(e, r.dz, r.z, -1)
+
+
+def meet(o: Arithmetic, r: Rays, curve: Curve, sense: int, before: Medium, entering: bool = False) -> Hit:
+    """Meet a surface at the point next to its vertex.
+
+    `entering` marks the first surface met, where rays may arrive at more than 90 degrees.
+    """
+    if curve.flat:
+        return _meet_plane(o, r, sense)
+    nearest = nearest_approach(o, r, before.inverse_n2)
+    if curve.plain:
+        return _meet_sphere(o, r, nearest, curve.curvature, sense, before, entering)
+    if curve.start is not None:
+        return _meet_asphere(o, r, nearest, curve, sense, before)
+    return _meet_conic(o, r, nearest, curve, sense, before)
+
+
+def _meet_plane(o: Arithmetic, r: Rays, sense: int) -> Hit:
+    q = times(r.dz, sense)
+    t = r.z / o.positive(q)
+    x, y = (o.fma(t, d, a, -sense) for d, a in ((r.dx, r.x), (r.dy, r.y)))
+    return Hit(x, y, o.like(r.z, 0.0), q, r.dz * r.dz, [(TINY, q)])
+
+
+def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int, before: Medium, entering: bool) -> Hit:
+    c = times(curvature, sense)
+    f = o.fma(m[2], -2.0 * sense, o.dot(m, m) * c)
+    q2 = o.fma(f, before.n2, r.dz * r.dz, times(c, -1))
+    q = o.root(q2)
+    if not entering:
+        denominator = o.fma(r.dz, sense, q)
+        t = f / o.positive(denominator)
+        x, y, z = (o.add_to(a, t, d) for a, d in zip(m, r[3:], strict=True))
+        # A root that is NaN fails the test of the denominator, too.
+        return Hit(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.guard else [])])
+    # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
+    forward = times(r.dz, sense)
+    conjugate = times(forward - q, before.inverse_n2) / (c if is_number(c) else o.nonzero(c))
+    t = o.select(forward, 0.0, conjugate, f / o.select(forward, 0.0, 1.0, forward + q))
+    x, y, z = _along(o, m, t, r)
+    # A general ray may meet the far half of the sphere, where there is no glass.
+    return Hit(x, y, z, q, q2, [(TINY, q2), (times(z, curvature), 1.0)])
+
+
+def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, before: Medium) -> Hit:
+    c = curve.curvature
+    kind = (c * curve.bent[0], c * curve.bent[1], c * curve.stretch)
+    q2, denominator, t = _meet_quadric(o, r, m, kind, sense, before)
+    x, y, z = _along(o, m, t, r)
+    nx, ny, nz = times(x, -kind[0]), times(y, -kind[1]), o.fma(z, -kind[2], 1.0)
+    scale = o.inverse_root(o.dot((nx, ny, nz), (nx, ny, nz)))
+    tests = [(TINY, q2), (TINY, denominator * denominator), (TINY, nz)]
+    return Hit(x, y, z, o.root(q2) * scale, q2 * scale * scale, tests, (nx * scale, ny * scale, nz * scale))
+
+
+def _meet_quadric(o: Arithmetic, r: Rays, m: Quadric, c: Quadric, sense: int, before: Medium) -> tuple[Any, Any, Any]:
+    """Meet cx x^2 + cy y^2 + cz z^2 = 2 z at the root next to the vertex.
+
+    Returns the square of the left side's derivative along the ray, which is positive where there is a root, what the
+    parameter of the ray is divided by, and this parameter, from the ray's nearest approach `m`.
+    """
+    p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
+    if cx is cy or (is_number(cx) and is_number(cy) and cx == cy):
+        # Rotationally symmetric: p.p = n^2 and m.p = 0 simplify the terms.
+        a = o.fma(p[2] * p[2], cz - cx, times(before.n2, cx))
+        b = p[2] * o.fma(m[2], cz - cx, -1.0)
+        f = o.fma(o.dot(m[:2], m[:2]), cx, m[2] * o.fma(m[2], cz, -2.0))
+    else:
+        a, b, f = _weighted(o, p, p, c), _weighted(o, m, p, c) - r.dz, o.fma(m[2], -2.0, _weighted(o, m, m, c))
+    q2 = o.fma(a, f, b * b, -1)
+    q, back = o.held_root(q2), times(b, -sense)
+    # The two forms of the same root: each divides by what is not small.
+    denominator = o.select(back, 0.0, a, o.fma(q, sense, -b))
+    numerator = o.select(back, 0.0, o.fma(q, -sense, -b), f)
+    return q2, denominator, numerator / o.nonzero(denominator)
+
+
+def _weighted(o: Arithmetic, a: Sequence[Any], b: Sequence[Any], w: Sequence[Any]) -> Any:
+    """Sum of the products of two vectors' components, each times its weight; terms of weight 0 are left out."""
+    total: Any = None
+    for p, q, k in zip(a, b, w, strict=True):
+        if not (is_number(k) and k == 0):
+            total = times(p * q, k) if total is None else o.fma(p, q, total, k)
+    return o.like(a[0], 0.0) if total is None else total
+
+
+def _along(o: Arithmetic, m: Quadric, t: Any, r: Rays) -> Quadric:
+    return o.fma(t, r.dx, m[0]), o.fma(t, r.dy, m[1]), o.fma(t, r.dz, m[2])
+
+
+def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, before: Medium) -> Hit:
+    """Iterate along the rays, from the quadric that fits the asphere best.
+
+    Only the last step carries the derivative (implicit function theorem), so that gradients cost no memory for
+    iterations.
+    """
+    assert curve.start is not None
+    still = Rays(*(o.fixed(v) for v in r))
+    nearest = (o.fixed(m[0]), o.fixed(m[1]), o.fixed(m[2]))
+    with o.constant():
+        glass_before = Medium(*(o.fixed(v) for v in before))
+        missed, _, t = _meet_quadric(o, still, nearest, curve.start, sense, glass_before)
+        for n in range(curve.steps + o.polish - 1):
+            step = _toward(o, _along(o, nearest, t, still), still, curve, sense)
+            if n == curve.steps - 1:
+                deciding = step
+            t = t + step
+        if o.guard:
+            t = o.select(o.abs(t), _FARTHEST, t, 0.0)  # rays that meet nothing, as backwards: no NaN in the normal
+    at = _along(o, m, o.fixed(t), r)
+    step, p = _last_step(o, at, r, curve), (r.dx, r.dy, r.dz)
+    x, y, z = _along(o, at, step, r)
+    if curve.across:
+        _, (nx, ny, nz), _, exists = crossed(o, curve, (x, y, z), p)
+        scale = times(o.inverse_root(o.dot((nx, ny, nz), (nx, ny, nz))), -1)
+        q = o.dot((nx, ny, nz), p) * times(scale, sense)
+    else:
+        _, slope, _, exists = depth(o, curve, height2(o, curve, x, y), order=1)
+        nx, ny = (v * -slope if bent else o.like(v, 0.0) for v, bent in zip((x, y), curve.bent, strict=True))
+        scale = o.inverse_root(o.fma(ny, ny, o.fma(nx, nx, 1.0)))
+        nz, q = 1.0, o.fma(ny, r.dy, o.fma(nx, r.dx, r.dz)) * times(scale, sense)
+    length = times(o.abs(deciding if o.polish else step), before.n)
+    tests = [(length, curve.last_step), (TINY, q)]
+    if exists is not None:
+        tests.append((STEEPEST, exists))
+    # How far a ray misses is of use only where crossings are learnt from.
+    q2 = q * q
+    if o.guard:
+        for low, high in tests:
+            q2 = o.select(low, high, q2, o.least(missed, -q * q))
+    return Hit(x, y, z, q, q2, tests, (nx * scale, ny * scale, times(scale, nz)))
+
+
+def _toward(o: Arithmetic, at: Quadric, r: Rays, curve: Curve, sense: int) -> Any:
+    """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
+
+    Newton's own is lost where a ray all but touches the surface, for there two meetings lie close together; the
+    parabola has both.
+    """
+    p, (x, y, z) = (r.dx, r.dy, r.dz), at
+    if curve.across:
+        value, gradient, bend, _ = crossed(o, curve, at, p)
+        rate, lack = o.dot(gradient, p), 2.0 * value
+    else:
+        sag, slope, turn, _ = depth(o, curve, height2(o, curve, x, y), order=2)
+        bent = (*map(float, curve.bent), 0.0)
+        along = _weighted(o, at, p, bent)
+        rate = o.fma(slope, along, -r.dz)
+        # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its slope.
+        bend = o.fma(along * along, turn, slope * _weighted(o, p, p, bent))
+        lack = 2.0 * (sag - z)
+    root = o.held_root(o.fma(bend, lack, rate * rate, -1))
+    return lack / times(o.fma(rate, -sense, root), sense)
+
+
+def _last_step(o: Arithmetic, at: Quadric, r: Rays, curve: Curve) -> Any:
+    """Return Newton's step, which by then is Euler's."""
+    if curve.across:
+        value, gradient, *_ = crossed(o, curve, at, (r.dx, r.dy, r.dz))
+        return -value / o.nonzero(o.dot(gradient, r[3:]))
+    sag, slope, *_ = depth(o, curve, height2(o, curve, at[0], at[1]), order=0)
+    along = _weighted(o, at, r[3:], (*map(float, curve.bent), 0.0))
+    return (at[2] - sag) / o.nonzero(o.fma(slope, along, -r.dz))
+
+
+def normal_at(o: Arithmetic, met: Hit, curvature: Any) -> Quadric:
+    """Return the unit normal towards +z at a meeting point; spheres and planes have it by their curvature."""
+    if met.normal is not None:
+        return met.normal
+    return met.x * -curvature, met.y * -curvature, 1.0 - met.z * curvature
+
+
+def refract(
+    o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int, before: Medium, after: Medium, step: Any = None
+) -> Outgoing:
+    """Snell's law: the tangential part of the optical direction cosines stays, the normal part follows their length.
+
+    `step` is n'^2 - n^2, where it is known better than from the media.
+    """
+    step = after.n2 - before.n2 if step is None else step
+    q2 = met.q2 + step
+    q = o.root(q2, o.finite)
+    # q - met.q without the rounding of both roots, which was a third of all error in float32.
+    bend = step / o.positive(q + met.q)
+    # From air nothing is totally reflected.
+    tests = [] if before is AIR else [(TINY, q2)]
+    if met.normal is not None:
+        direction = [o.fma(bend, n, p, sense) for p, n in zip(r[3:], met.normal, strict=True)]
+    else:
+        pull = times(curvature, -sense)
+        ahead = o.fma(bend, sense, r.dz)
+        direction = [o.fma(bend, met.x, r.dx, pull), o.fma(bend, met.y, r.dy, pull), o.add_to(ahead, bend, met.z, pull)]
+    return Outgoing(Rays(*met[:3], *direction), q, q2, tests)
+
+
+def reflect(o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int) -> Rays:
+    """Return rays with the normal part of their direction turned round."""
+    normal = normal_at(o, met, curvature)
+    return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense) for p, n in zip(r[3:], normal, strict=True)))
+
+
+def through_ideal(o: Arithmetic, r: Rays, met: Hit, power: float) -> Rays:
+    """Rays in air behind an ideal thin lens of power 1 / f: slopes change by -x / f and -y / f."""
+    towards = o.abs(r.dz) * power
+    dx, dy = o.fma(towards, met.x, r.dx, -1), o.fma(towards, met.y, r.dy, -1)
+    scale = o.inverse_root(o.dot((dx, dy, r.dz), (dx, dy, r.dz)))
+    return Rays(*met[:3], dx * scale, dy * scale, r.dz * scale)
+
+
+class SurfaceStep(NamedTuple):
+    """The passage of rays through a surface; the rays behind it are in its vertex frame.
+
+    `bent` has the rays behind; `tests` are all tests at the surface in order, each with its reason (`base.status`).
+    """
+
+    met: Hit
+    bent: Outgoing
+    tests: list[tuple[list[Test], int]]
+
+
+def cross(
+    o: Arithmetic,
+    surface: Surface,
+    curve: Curve,
+    r: Rays,
+    sense: int,
+    before: Medium,
+    after: Medium,
+    *,
+    entering: bool = False,
+    reflected: bool = False,
+    rim: Callable[[Hit], list[Test]] | None = None,
+) -> SurfaceStep:
+    """Take rays through a surface, or back from it where they are `reflected`; `rim` replaces the tests of the rim."""
+    met = meet(o, r, curve, sense, before, entering)
+    tests = [(met.tests, st.MISSED), ((rim or rim_tests(o, surface))(met), st.RIM)]
+    if reflected:
+        return SurfaceStep(met, Outgoing(reflect(o, r, met, curve.curvature, sense), met.q, met.q2, []), tests)
+    if surface.figure.power:
+        bent = Outgoing(through_ideal(o, r, met, surface.figure.power), met.q, met.q2, [])
+    elif before is after:
+        bent = Outgoing(Rays(*met[:3], *r[3:]), met.q, met.q2, [])
+    else:
+        bent = refract(o, r, met, curve.curvature, sense, before, after)
+    return SurfaceStep(met, bent, [*tests, (bent.tests, st.TOTAL_REFLECTION)])
+
+
+def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Hit], list[Test]]:
+    """Return the tests whether a meeting lies inside a surface's rim."""
+    if is_deep(surface):
+        # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
+        most = 1 - math.sqrt(1 - rim_sine(surface) ** 2)
+        return lambda met: [(times(met.z, surface.curvature), most)]
+    return lambda met: [(radius2(o, met), surface.semi_diameter_mm**2)]
+
+
+def radius2(o: Arithmetic, met: Hit) -> Any:
+    """Return the squared distance of a meeting from the axis, mm^2."""
+    return o.dot(met[:2], met[:2])
+
+
+def meet_front(
+    shape: Surface | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
+) -> tuple[Array, Array]:
+    """(x, y) where the line of each ray meets the front surface, None the plane z = 0, next to its vertex; else NaN.
+
+    Rays are points (mm) and directions of either sense, float64 [N].
+    """
+    # Before the lens light travels towards +z, or from the side and beyond: the sense is that of the camera ray's end.
+    rays = Rays(x, y, z, -dx, -dy, -dz)
+    curve = Curve(0.0, plain=True) if shape is None else without_rim(curve_of(shape))
+    with np.errstate(all="ignore"):
+        met = meet(NUMPY, rays, curve, 1, AIR, entering=True)
+        passed = np.logical_and.reduce([low <= high for low, high in met.tests])
+        return np.where(passed, met.x, math.nan), np.where(passed, met.y, math.nan)
+
+
+def front_rays(
+    shape: Surface | None,
+    x: Array,
+    y: Array,
+    z: Array,
+    dx: Array,
+    dy: Array,
+    dz: Array,
+    *,
+    index: Sequence[float] | None = None,
+    wavelength_nm: Array | float = math.nan,
+) -> tuple[Array, Array]:
+    """Return the scene rays as models have them, and the solid angle per area of their direction vectors [N].
+
+    Rows [4, N]: x and y (mm) on the front surface, and the direction vector, theta (dx, dy) / |(dx, dy)| with theta
+    from -z; of first-order models, which have no shape, the slope. Arguments as of `meet_front`, unit directions away
+    from the lens. `index`: where direction vectors are those inside the front glass, its index as a power series in
+    1 / lambda^2 (1/um^2).
+    """
+    x, y = meet_front(shape, x, y, z, dx, dy, dz)
+    with np.errstate(all="ignore"):
+        if shape is None:
+            return np.stack([x, y, dx / -dz, dy / -dz]), np.abs(dz) ** 3
+        wider: Array | float = 1.0
+        if index is not None:
+            n = np.polyval(np.asarray(index)[::-1], (1000 / wavelength_nm) ** 2)
+            (dx, dy, dz), wider = entered(shape, x, y, np.stack([dx, dy, dz]), n)
+        sine = np.hypot(dx, dy)
+        angle = np.arctan2(sine, -dz)
+        ratio = np.where(sine > 1e-12, angle / sine, 1.0)
+        return np.stack([x, y, ratio * dx, ratio * dy]), wider * np.where(angle > 1e-12, sine / angle, 1.0)
+
+
+def entered(shape: Surface, x: Array, y: Array, d: Array, index: Array) -> tuple[Array, Array]:
+    """Return the unit directions [3, N] inside the front glass of rays that leave it at (x, y) along d [3, N].
+
+    Also the solid angle of a bundle of them outside over that inside, n^2 cos(inside) / cos(outside) [N].
+    """
+    _, zx, zy = sag_and_derivatives(shape, x, y)
+    normal = np.stack([zx, zy, np.full_like(zx, -1.0)]) / np.sqrt(1 + zx * zx + zy * zy)
+    cosine = (d * normal).sum(0)
+    inner = np.sqrt(1 - (1 - cosine * cosine) / index**2)
+    return d / index + normal * (inner - cosine / index), index**2 * inner / cosine

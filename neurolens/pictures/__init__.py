@@ -1,0 +1,1 @@
+"""What a lens camera makes: renders, flare, blurred plates, shots."""

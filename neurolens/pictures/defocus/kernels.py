@@ -1,0 +1,418 @@
+"""The blur of points: where on the film the light of a scene point arrives, as a picture for each channel.
+
+A point is named by its place in a plate and its inverse depth. Each point of the pupil sends its light to the film
+point whose ray sees it there, found by Newton's method on the camera's own rays; cells of a grid of the pupil are drawn
+as the areas that they cover. So a kernel has no noise, and cat's eyes, coma and colour fringes are the lens's.
+
+Onion rings: concentric grooves, which grinding leaves on aspheres, move the light within a blur disc. A groove raises
+the surface along the axis by h(r). The path of a ray through it changes by W = h (n d_z - n' d'_z), d and d' the
+directions before and after the surface. By Fermat's principle the light of a point that passes the same place of the
+lens then arrives on the film beside its old place, by the gradient of W over the direction cosines with which rays
+leave that place. This is exact to first order in h; diffraction by the grooves is left out, as by Joo et al. 2016
+("Efficient ray tracing through aspheric lenses and imperfect bokeh synthesis"), who measured such rings.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.field import frame_of
+from neurolens.pictures.defocus.plate import (
+    LIGHT_NM,
+    FloatArray,
+    Plate,
+    PlatePinhole,
+    RayTable,
+    channel_wavelengths,
+    turned,
+)
+from neurolens.pictures.flare.canvas import LOST, draw_edges, edges_of
+
+Array = NDArray[np.float64]
+_STEP_MM = 0.01  # on the pupil's plane, of differences
+GRID = 48  # cells of the pupil along a side
+COLOURS = 5  # wavelengths of a channel
+_STEPS = 5  # of Newton's method
+_CLOSE = 0.01  # pixels by which a ray may miss the point
+_FAR = 0.02  # of the kernel's width: the places of rays that miss by more are not used
+_SURE = 0.5  # share of the light whose rays meet the point, below which the places of all rays count
+LARGEST = 2048  # pixels a side of a kernel
+_RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
+_MARGIN = 2  # pixels around it
+_A_GROOVE, _FINEST = 8, 1536  # cells for each groove of an asphere, and the most along a side
+_FINER = 3  # pixels along a side of one, odd, that show grooves finer than it
+_LARGEST = 16384  # pixels a side of an atlas
+
+
+@dataclass(frozen=True)
+class Grooves:
+    """Grooves of the height H sin(2 pi r / spacing)."""
+
+    height_nm: float
+    spacing_mm: float
+
+    def heights(self, radius_mm: Array) -> tuple[Array, Array]:
+        """The heights in mm, and their derivatives by the radius."""
+        turn, height = 2 * math.pi / self.spacing_mm, 1e-6 * self.height_nm
+        return height * np.sin(turn * radius_mm), height * turn * np.cos(turn * radius_mm)
+
+
+def aspheres(camera: Any) -> list[int]:
+    """The surfaces of a camera's lens that are round aspheres. Raises InputError: there is none."""
+    lens = getattr(camera, "lens", None)
+    surfaces = lens.surfaces if lens is not None else ()
+    found = [k for k, s in enumerate(surfaces) if s.figure.aspheric and not s.figure.axis]
+    if not found:
+        raise InputError(
+            camera.name, "ring_height", "(no asphere)", "the file of a lens with aspheres, to have grooves"
+        )
+    return found
+
+
+def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDArray[Any]) -> Array:
+    """How light moves: [aspheres, 5, N] for rays of film points [2, N] by points of the pupil's square [2, N].
+
+    Of each asphere the distance in mm from the axis at which the ray meets it, and by how many mm light moves on the
+    film, x and y, for a slope of 1 there, then for a height of 1 mm.
+    """
+    surfaces, outline = aspheres(camera), camera.film.outline
+    pupil, _ = outline.sample(*(v.astype(np.float32) for v in (film_mm, square, nm)))
+
+    steps = _STEP_MM * np.array([[0, 0], [1, 0], [0, 1]])[..., None]
+    (q, here), *moved = (camera.path_by_height(surfaces, film_mm, pupil + step, nm) for step in steps)
+    (ax, ay), (bx, by) = (m[0] - q for m in moved)
+    to_a, to_b = (m[1] - here for m in moved)
+    gradient = np.stack([to_a * by - to_b * ay, to_b * ax - to_a * bx], 2) / (ax * by - ay * bx)
+    return np.concatenate([here[:, :1], here[:, 1:] * gradient[:, 0], gradient[:, 1]], 1)
+
+
+def moves(response: Array, grooves: Grooves) -> Array:
+    """By how many mm [2, N] grooves on all aspheres move light on the film; `response` as of `responses`."""
+    height, slope = grooves.heights(response[:, 0])
+    return np.asarray((response[:, 1:3] * slope[:, None] + response[:, 3:] * height[:, None]).sum(axis=0))
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The picture of a point.
+
+    Attributes:
+        light: [h, w, 3] the part of the radiance of one square pixel of the plate that arrives at each pixel.
+        corner_px: column and row in the film, of its first pixel; whole numbers.
+        film_by_plate: [2, 2] by how much the point's picture moves on the film as the point moves in the plate, pixels.
+        sweep: [2, 3] how fast the ray from a film pixel to the point moves in the plate as it comes nearer (pixels by
+            1/m): the constant, and the factors of column and row in the kernel.
+    """
+
+    light: FloatArray
+    corner_px: tuple[int, int]
+    film_by_plate: Array
+    sweep: Array
+
+    @property
+    def middle_px(self) -> tuple[float, float]:
+        """The centroid of the green light, in the film."""
+        green = self.light[..., 1].astype(np.float64)
+        total = max(float(green.sum()), 1e-30)
+        x, y = (float(green.sum(axis=a) @ (np.arange(green.shape[1 - a]) + 0.5)) / total for a in (0, 1))
+        return self.corner_px[0] + x, self.corner_px[1] + y
+
+    def centred(self, side: int, middle_px: tuple[float, float]) -> FloatArray:
+        """The kernel of sum 1 in each channel on `side` pixels a side, whose centre is the film place `middle_px`.
+
+        Light that has no room is lost; the kernel moves by whole pixels.
+        """
+        found = np.zeros((side, side, 3), np.float32)
+        x, y = (c - math.floor(m) + side // 2 for c, m in zip(self.corner_px, middle_px, strict=True))
+        height, width = self.light.shape[:2]
+        rows, columns = slice(max(0, -y), min(height, side - y)), slice(max(0, -x), min(width, side - x))
+        part = self.light[rows, columns]
+        found[y + rows.start :, x + columns.start :][: part.shape[0], : part.shape[1]] = part
+        return np.asarray(found / np.maximum(self.energy, 1e-30), np.float32)
+
+    @property
+    def energy(self) -> Array:
+        """The light of red, green and blue."""
+        return np.asarray(self.light.sum(axis=(0, 1), dtype=np.float64))
+
+
+def kernel_at(
+    camera: Camera, plate: Plate, place_px: tuple[float, float], inverse_depth: float, guess_px: tuple[float, float],
+    cells: int = GRID, colours: int = COLOURS, wavelengths_nm: tuple[float, float, float] | None = None,
+    grooves: Grooves | None = None,
+) -> Kernel | None:  # fmt: skip
+    """The kernel of a point at a place of the plate, in pixels of the camera's picture; None where no light arrives.
+
+    Args:
+        guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths a channel.
+        wavelengths_nm: one wavelength for red, green and blue each, in place of those that make white light.
+        grooves: marks of grinding on the lens's aspheres, which make onion rings.
+
+    Raises:
+        InputError: a kernel of over 2048 pixels a side; grooves on a lens without aspheres, or too many.
+    """
+    pupil = _square(_RIM * _disk(np.linspace(-1, 1, cells + 1)))
+    table = RayTable(camera, plate, pupil, np.zeros(pupil.shape[1], np.float32))
+    if wavelengths_nm is not None:
+        nm = np.array(wavelengths_nm, np.float32)[:, None]
+    elif len(table.nm) > 1:
+        low, high = (min(max(v, LIGHT_NM[0]), LIGHT_NM[1]) for v in camera.wavelength_nm or LIGHT_NM)
+        hue = ((np.arange(colours) + 0.5) / colours).astype(np.float32)
+        nm = channel_wavelengths(hue, low, high)
+    else:
+        nm = table.nm[:, :1]
+    aimed = _aimed(table, place_px, inverse_depth, guess_px, nm.reshape(-1))
+    aimed = aimed.on_grid(nm.size, cells)
+    if grooves is not None:
+        aimed = aimed.with_rings(table, nm.reshape(-1), grooves)
+    lit = aimed.weight > 0
+    if not lit.any():
+        return None
+    places = aimed.place[:, lit]
+    least, most = places.min(axis=1), places.max(axis=1)
+    corner = np.floor(least).astype(int) - _MARGIN
+    width, height = (np.ceil(most).astype(int) + _MARGIN - corner).tolist()
+    if max(width, height) > LARGEST:
+        raise InputError("kernel", "size", f"({width} x {height} pixels)", f"at most {LARGEST} a side: blur less")
+    # Grooves finer than a pixel, in one box a pixel, would leave a checkerboard.
+    finer = _FINER if grooves is not None and _FINER * max(width, height) <= LARGEST else 1
+    light = np.zeros((finer * height, finer * width, 3), np.float32)
+    colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
+    for k in range(nm.size):
+        aimed.draw(light, k, corner, colour[[k // nm.shape[1]]] / nm.shape[1], finer)
+    light = np.maximum(_averaged(light, finer), 0)
+    return Kernel(light, (int(corner[0]), int(corner[1])), aimed.film_by_plate, aimed.sweep(corner))
+
+
+def _averaged(light: FloatArray, finer: int) -> FloatArray:
+    """The light of pixels that are so many times as wide, under a quadratic spline over three; the rim is dark."""
+    for axis in (0, 1) if finer > 1 else ():
+        for _ in range(2):
+            light = np.mean([np.roll(light, k - finer // 2, axis) for k in range(finer)], axis=0)
+        light = np.add.reduceat(light, np.arange(0, light.shape[axis], finer), axis)
+    return light
+
+
+def _disk(side: NDArray[Any]) -> Array:
+    """A grid [2, N, N] over the square of -1 to 1 on the disk: x sqrt(1 - y^2 / 2), and the same in y. It is smooth, as
+    the one of `Camera.sample`, which has corners along the diagonals, is not."""
+    x, y = np.meshgrid(side, side)
+    return np.stack([x * np.sqrt(1 - y**2 / 2), y * np.sqrt(1 - x**2 / 2)])
+
+
+def _square(disk: Array) -> FloatArray:
+    """Points [2, N] of the unit square that `Camera.sample` takes for points of the disk."""
+    (u, v), radius = disk.reshape(2, -1), np.hypot(*disk.reshape(2, -1))
+    return turned(np.stack([0.5 + 0.5 * radius, np.full_like(radius, 0.5)]), np.arctan2(v, u))
+
+
+def _between(values: NDArray[Any], at: NDArray[Any]) -> Array:
+    """Values [..., cells + 1, cells + 1] at other columns and rows `at` of their grids, linear between points."""
+    share = np.maximum(1 - np.abs(at[:, None] - np.arange(values.shape[-1])), 0)
+    return np.asarray(share @ values @ share.T)
+
+
+@dataclass(frozen=True)
+class _Aimed:
+    """Rays of a pupil's grid, of several wavelengths one after the other, that see a point.
+
+    Attributes: of N rays, or after `on_grid` of rays [waves, cells + 1, cells + 1].
+        place: [2, ...] on the film in pixels. weight: [...]. slope: [2, ...], b of their lines.
+        film_by_plate: [2, 2] the mean derivatives of places by the point's.
+    """
+
+    place: Array
+    weight: Array
+    slope: Array
+    film_by_plate: Array
+
+    def on_grid(self, waves: int, cells: int) -> _Aimed:
+        """The rays as grids, their places taken from `_RIM` to the outline itself, along the radii of the pupil."""
+        place, weight, slope = (
+            v.reshape(*v.shape[:-1], waves, cells + 1, -1) for v in (self.place, self.weight, self.slope)
+        )
+        index, nearer = np.arange(cells + 1) - cells / 2, 1 - 2 / cells
+        far, near = (np.hypot(*_disk(2 / cells * k * index)) for k in (1, nearer))
+        within = _between(place, cells / 2 + nearer * index)
+        solid = (weight > 0) & (_between(weight > 0, cells / 2 + nearer * index) > 1 - 1e-9) & (far > 0)
+        more = (1 / _RIM - 1) * far / np.where(far > 0, far - near, 1) * (place - within)
+        return _Aimed(place + np.where(solid, more, 0), weight, slope, self.film_by_plate)
+
+    def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], colour: Array, finer: int) -> None:
+        """Add the light of a wavelength to a kernel's picture, each quarter of the pupil with its cells cut along the
+        grid's diagonal; `finer`: the picture's pixels along the side of one of the film's."""
+        height, width = light.shape[:2]
+        (x, y), weight = finer * (self.place[:, number] - corner[:, None, None]), self.weight[number]
+        lit, cells = weight > 0, len(weight) - 1
+        half, square = cells // 2, 1 - np.linspace(-1, 1, cells + 1) ** 2 / 2
+        # The area of the disk that a cell has, over its whole.
+        share = (square[:, None] + square - 1) / np.sqrt(square[:, None] * square) * (4 / math.pi / cells**2)
+        # `edges_of` turns film points in mm into pixels: one mm a pixel, from the middle.
+        rows = np.stack(
+            [np.where(lit, width / 2 - x, 0), np.where(lit, y - height / 2, 0), weight * share, np.where(lit, 0, LOST)]
+        )
+        halves = slice(0, half + 1), slice(half, cells + 1)
+        for across, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            part = rows[:, halves[down], halves[across]][..., :: 1 if across == down else -1]
+            edges = edges_of(np.ascontiguousarray(part.reshape(4, -1), np.float32), half, (width, height), 1.0)
+            draw_edges(light, range(height), edges, np.array([len(edges)]), colour)
+
+    def with_rings(self, table: RayTable, nm: FloatArray, grooves: Grooves) -> _Aimed:
+        """The rays on a grid so fine that it shows grooves, with their places moved by them."""
+        cells, lit = self.weight.shape[1] - 1, self.weight > 0
+        pupil, film = (
+            np.tile(_square(_disk(np.linspace(-1, 1, cells + 1))), len(nm)),
+            table.film_mm(self.place.reshape(2, -1)),
+        )
+        response = responses(table.camera, film, table.unturned(film, pupil), np.repeat(nm, lit[0].size))
+        least = 2 * float(response[:, 0, lit.reshape(-1)].max(initial=0.0)) * _A_GROOVE / _FINEST
+        if grooves.spacing_mm < least:
+            raise InputError("kernel", "ring_spacing_mm", grooves.spacing_mm, f"at least {least:.2g} mm on this lens")
+        fine = cells * max(1, math.ceil(least * _FINEST / grooves.spacing_mm / cells))
+        place, weight, slope, whole, response = (
+            _between(v, np.arange(fine + 1) * cells / fine)
+            for v in (self.place, self.weight, self.slope, lit, response.reshape(-1, 5, *lit.shape))
+        )
+        moved_mm = moves(response.reshape(*response.shape[:2], -1), grooves).T
+        moved = (moved_mm * table.size / table.camera.film_mm * (-1, 1)).T.reshape(place.shape)
+        return _Aimed(place + moved, np.where(whole > 1 - 1e-9, weight, 0), slope, self.film_by_plate)
+
+    def sweep(self, corner: NDArray[np.int_]) -> Array:
+        """See `Kernel.sweep`: a fit by least squares to the rays that pass."""
+        lit = self.weight > 0
+        basis = np.stack([np.ones(int(lit.sum())), *(self.place[:, lit] - corner[:, None])], axis=1)
+        return np.asarray(np.linalg.lstsq(basis, self.slope[:, lit].T, rcond=None)[0].T)
+
+
+def _aimed(
+    table: RayTable, target: tuple[float, float], w: float, guess: tuple[float, float], nm: FloatArray
+) -> _Aimed:
+    """The rays of all points of the pupil that see a point of the plate, at each of some wavelengths."""
+    pupil, waves = np.tile(table.pupil, len(nm)), np.repeat(nm, table.pupil.shape[1])
+    wanted = np.array(target)[:, None]
+
+    def seen(place: Array) -> tuple[Array, Array, Array]:
+        lines = table.at(place, pupil, waves).T.astype(np.float64)
+        return lines[:2] + w * lines[2:4], lines[4], lines[2:4]
+
+    place = np.repeat(np.array(guess, np.float64)[:, None], len(waves), axis=1)
+    step = 0.01 * max(table.size)
+    at, weight, slope = seen(place)
+    moved = [seen(place + step * np.eye(2)[:, [k]]) for k in (0, 1)]
+    good = (weight > 0) & (moved[0][1] > 0) & (moved[1][1] > 0)
+    if not good.any():
+        return _Aimed(place, np.zeros(len(waves)), slope, np.eye(2))
+    film_by_plate = np.linalg.inv(np.stack([((m[0] - at) / step)[:, good].mean(axis=1) for m in moved], axis=1))
+    for _ in range(_STEPS):
+        off = wanted - at
+        # Rays that do not pass say nothing about where the point's light is: they move as the others do.
+        off[:, weight <= 0] = off[:, weight > 0].mean(axis=1, keepdims=True) if (weight > 0).any() else 0.0
+        place = place + film_by_plate @ off
+        at, weight, slope = seen(place)
+        if np.hypot(*(wanted - at))[weight > 0].max(initial=0.0) < _CLOSE:
+            break
+    # Each ray's own area: near the end of the light the pupil's outline moves fast with the film point.
+    ahead, behind = ([seen(place + d * np.eye(2)[:, [k]]) for k in (0, 1)] for d in (0.5, -0.5))
+    (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(ahead, behind, strict=True))
+    stretch = np.abs(xx * yy - xy * yx)
+    known = np.all([found[1] > 0 for found in (*ahead, *behind)], axis=0) & (stretch > 0)
+    area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(film_by_plate))))
+    close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
+    light, kept = weight * area, np.where(close, weight, 0) * area
+    # The light of rays that Newton's method leaves beside the point goes where the others' goes.
+    share = kept.sum() / max(light.sum(), 1e-30)
+    return _Aimed(place, kept / share if share > _SURE else light, slope, film_by_plate)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One kernel: its field (-1 to 1 from left to right and from bottom to top of the film), its distance from the film
+    in m, the film place that is its centre, and the kernel; None where no light arrives."""
+
+    field: tuple[float, float]
+    distance_m: float
+    place_px: tuple[float, float]
+    kernel: Kernel | None
+
+    @property
+    def width_px(self) -> int:
+        """Pixels a side, odd, that hold the kernel about its place."""
+        if self.kernel is None:
+            return 1
+        first = np.subtract(self.kernel.corner_px, np.floor(self.place_px))
+        return 2 * int(np.abs([first, first + self.kernel.light.shape[1::-1] - 1]).max()) + 1
+
+
+def own_plate(camera: Camera, size: tuple[int, int]) -> Plate:
+    """An empty plate of the camera's own pinhole, that of `neurolens stmap`, with `size` pixels on its film."""
+    frame = frame_of(camera)
+    per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
+    reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
+    return Plate([], PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1]), size)
+
+
+def kernels_over(
+    camera: Camera, size: tuple[int, int], distances_m: Sequence[float], fields: tuple[int, int],
+    wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
+    report: Callable[[float], None] = lambda _: None,
+) -> list[list[Cell]]:  # fmt: skip
+    """The kernels of each distance, row by row from the top of the picture.
+
+    Args:
+        size: of the picture in pixels. distances_m: from the film, along the axis; inf is far.
+        fields: columns and rows of places, in the middles of equal parts of the picture.
+        wavelengths_nm, grooves: as for `kernel_at`.
+
+    Raises:
+        InputError: a distance within the lens; kernels too large for memory.
+    """
+    plate, found = own_plate(camera, size), []
+    places = [
+        ((i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1])
+        for j, i in itertools.product(range(fields[1]), range(fields[0]))
+    ]
+    least = plate.pinhole.before_film_mm / 1000
+    for distance in distances_m:
+        if not distance > least:
+            raise InputError("kernels", "distance_m", distance, f"above {least:g}, the entrance pupil")
+    for number, distance in enumerate(distances_m):
+        ahead, cells = distance - least, list[Cell]()
+        for place in places:
+            kernel = kernel_at(camera, plate, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves)
+            field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
+            cells.append(Cell(field, distance, place if kernel is None else kernel.middle_px, kernel))
+            if max(fields) * (side := cells[-1].width_px) > _LARGEST:
+                got = f"({fields[0] * side} x {fields[1] * side} pixels)"
+                expected = f"at most {_LARGEST} pixels a side: fewer fields, or less blur"
+                raise InputError("kernels", "size", got, expected)
+            report((number + len(cells) / len(places)) / len(distances_m))
+        found.append(cells)
+    return found
+
+
+def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
+    """The atlas [rows side, columns side, 3] of the kernels of one distance, each of sum 1 in each channel."""
+    picture = np.zeros((len(cells) // columns * side, columns * side, 3), np.float32)
+    for k, cell in enumerate(cells):
+        j, i = divmod(k, columns)
+        if cell.kernel is not None:
+            picture[j * side :, i * side :][:side, :side] = cell.kernel.centred(side, cell.place_px)
+    return picture
+
+
+def as_preview(picture: FloatArray, side: int) -> FloatArray:
+    """An atlas with each kernel as bright as the others, to be looked at."""
+    found = picture.copy()
+    for j, i in itertools.product(range(0, len(found), side), range(0, found.shape[1], side)):
+        part = found[j : j + side, i : i + side]
+        part /= float(np.percentile(part[part > 0], 90)) if part.any() else 1.0
+    return found

@@ -1,0 +1,280 @@
+"""Grids of rays that draw ghosts: the part of a light's disc that each ghost takes, and how fine its grid is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.pictures.flare.ghosts import GhostTracer, Pair
+from neurolens.pictures.flare.lights import Light, Patch, light_towards, rays_across
+from neurolens.pictures.flare.steps import LOST, Floats, entering
+
+Array = NDArray[np.float64]
+FEWEST, MOST = 320, 512  # lit cells, and cells along a side
+REACH = 16.0  # of `GhostTracer.follow`: rims are cut between rays inside and outside
+_SCOUTS = 48  # cells a side of the grid of scouts, the rays that look for ghosts
+_FEW = 2  # one scout in so many a side is traced at all wavelengths
+_NEAR = 2.0  # r^2 / R^2 up to which rays beyond rims count for the spread of colours
+_EVEN = 0.02  # least unevenness, and least spread of colours over the size, of a ghost
+_STEP = 0.25  # part of a cell by which the shadow of a rim may move on the film between two wavelengths
+_BAND = 0.02  # step of colour that may remain in one ghost, over the irradiance that wide ghosts leave on the film
+_NODES = 31  # wavelengths of scouts
+_FOLD = 2.0  # change of the logarithm of a ray's power, up and down together, from band to band
+_AT_ONCE = 128  # ghosts
+_MOVED, _LONG, _SOFT, _SHORT = 32, math.radians(0.25), 0.2, 2.5  # for moves: cells a side, step, soft edge in r^2 / R^2
+_ERROR, _WORST = 3.0, 0.25  # share of light beside its place, times the cells across half the film; at most
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid over a rectangle of the square about a light's disc.
+
+    Attributes:
+        low, high: corners of the rectangle, in disc radii. columns, rows: cells.
+        wavelengths: how many, about, stand for all of the range.
+        spectrum: wavelengths in nm, and the power of a ray at each of them over that at the first; empty if unknown.
+    """
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    columns: int
+    rows: int
+    wavelengths: int = 1
+    spectrum: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def places(self) -> Array:
+        """The corners of cells, [2, (rows + 1) (columns + 1)], row after row."""
+        u, v = (
+            np.linspace(a, b, n + 1) for a, b, n in zip(self.low, self.high, (self.columns, self.rows), strict=True)
+        )
+        return np.stack([np.tile(u, len(v)), np.repeat(v, len(u))])
+
+    def coarser(self, factor: int, least: int) -> Grid:
+        """The grid with a part of the cells of its sides and of its wavelengths, but with `least` cells a side."""
+        columns, rows = (min(n, max(n // factor, least)) for n in (self.columns, self.rows))
+        return replace(self, columns=columns, rows=rows, wavelengths=max(self.wavelengths // factor, 1))
+
+    @property
+    def cell(self) -> float:
+        """Area of a cell over that of the disc."""
+        (a, b), (c, d) = self.low, self.high
+        return (c - a) * (d - b) / (np.pi * self.columns * self.rows)
+
+
+def grids_of(
+    tracer: GhostTracer,
+    light: Light,
+    wavelength_nm: float,
+    half_mm: tuple[float, float],
+    cell_mm: float,
+    wavelengths_nm: Sequence[float] = (400.0, 700.0),
+    only: Sequence[Pair] | None = None,
+) -> dict[Pair, Grid]:
+    """The grids of all ghosts, or of `only` some, that reach the film.
+
+    A cell has one density, and a wavelength stands for its neighbours: both put light beside its place, a share a / n
+    with n cells a side and b / k with k wavelengths. The work of a ghost is n k times its size on the film. For a given
+    sum of errors all work is least where a / n and b / k of each ghost are the cube root of a b size, times a number
+    that all ghosts share: so most cells go to ghosts that are bright, small and uneven.
+
+    Args:
+        wavelength_nm: of the scouts; others differ little.
+        half_mm: half the film's width and height.
+        cell_mm: about the size of cells on the film, which the share of light beside its place follows.
+        wavelengths_nm: of light, increasing.
+    """
+    whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
+    start = entering(rays_across(tracer.lens, light, whole.places)[0])
+    few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
+    nodes = sorted({wavelengths_nm[round(at)] for at in np.linspace(0, len(wavelengths_nm) - 1, _NODES)})
+    ghosts: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
+    pairs = tracer.pairs if only is None else only
+    for k in range(0, len(pairs), _AT_ONCE):
+        some = pairs[k : k + _AT_ONCE]
+        rows = tracer.follow(start, wavelength_nm, only=some, reach=REACH).rows
+        each = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in nodes]
+        for pair, kept, of_one, *by_colour in zip(
+            some, _kept(rows, half_mm), rows, *_colours(each, half_mm), strict=True
+        ):  # fmt: skip
+            if kept.any():
+                ghosts.append((pair, kept, _look(kept, of_one, tuple(by_colour), nodes, half_mm)))
+    work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in ghosts])
+    most = min(_ERROR * cell_mm / half_mm[0], _WORST)
+    error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
+    film = 4 * half_mm[0] * half_mm[1]
+    band = _BAND * sum(k.light / k.size_mm**2 * min(k.size_mm**2 / film, 1.0) ** 2 for *_, k in ghosts)
+    grids = {}
+    for (pair, kept, look), each_error in zip(ghosts, error.tolist(), strict=True):
+        least = min(look.swept_mm / (_STEP * cell_mm), look.light / max(look.size_mm**2 * band, 1e-300))
+        grids[pair] = _around(kept, look, each_error, math.ceil(least))
+    return grids
+
+
+def ghost_moves(tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float) -> tuple[Array, Array]:
+    """How far the middle of a ghost's light moves on the film (mm) along the sides of a light's patch, [2, 2]; and how
+    much of its light comes or goes along the side where that is most, and its light, [2].
+
+    The middle moves as the ghost's edges do, which are most often those of the stop: on the film these move by another
+    amount than the light of one point of the front. Rays near rims have smaller weights, so that none comes or goes.
+    Where rims cut away light, the middle moves by up to that share of the radius as well, and the way is shortened by
+    this, but not below `_SHORT` images of the side: edges of a ghost without a smear would be seen.
+    """
+    coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
+
+    def seen(off: Array) -> tuple[Array, float, float] | None:
+        light = light_towards(patch.light.towards + off, patch.light.rgb, patch.light.distance_m)
+        if light is None:
+            return None
+        rays, area = rays_across(tracer.lens, light, coarse.places)
+        x, y, power, worst = tracer.follow_each(entering(rays), [wavelength_nm], pair)[0].astype(np.float64)
+        weight = np.where(power > 0, power * np.clip((1 - worst) / _SOFT, 0, 1), 0)
+        lit, whole = weight > 0, float(weight.sum())
+        energy = area * coarse.cell * whole
+        if not energy:  # nothing arrives, or from so far that floats do not hold it
+            return None
+        place, share = np.stack([x, y])[:, lit], weight[lit] / whole
+        middle = place @ share
+        return middle, math.sqrt(((place.T - middle) ** 2).sum(1) @ share), energy
+
+    moves, changing, efl = np.zeros((2, 2)), np.zeros(2), abs(float(first_order(tracer.lens).efl_mm))
+    for along, side in zip(moves, patch.sides, strict=True):
+        step = _LONG / max(float(np.linalg.norm(side)), 1e-300)
+        places = [(f, place) for f in (-step, step) if side.any() and (place := seen(f * side)) is not None]
+        if len(places) == 1:
+            places += [(0.0, place) for place in (seen(0 * side),) if place is not None]
+        if len(places) == 2:
+            (f, (one, radius, light)), (g, (other, _, end)) = places
+            change, moved = 2 * abs((end - light) / ((end + light) * (g - f))), (other - one) / (g - f)
+            way, short = max(float(np.linalg.norm(moved)), 1e-300), _SHORT * efl * _LONG / step
+            along[:] = moved * max(1 - change * radius / way, min(short / way, 1))
+            changing = np.maximum(changing, 0.5 * (end + light) * np.array([change, 1]))
+    return moves, changing
+
+
+class _Look(NamedTuple):
+    """A ghost as scouts see it.
+
+    Attributes:
+        along_u, along_v: light that cells of one density put beside its place, times the cells of a side.
+        colours: the same for wavelengths, times their number. size_mm: of the part on the film.
+        lit: share of the rectangle that holds its light. light: its light on the film.
+        swept_mm: about how far the shadow of a rim moves on the film from one end of the spectrum to the other.
+        spectrum: as in `Grid`.
+    """
+
+    along_u: float
+    along_v: float
+    colours: float
+    size_mm: float
+    lit: float
+    light: float
+    swept_mm: float
+    spectrum: tuple[tuple[float, float], ...]
+
+
+def _look(
+    kept: NDArray[np.bool_], rows: Floats, colours: tuple[Any, ...], nm: Sequence[float], half_mm: tuple[float, float]
+) -> _Look:
+    """Measure a ghost by the cells that are kept, its scouts `rows` [4, N], and its `_colours` at wavelengths."""
+    x, y, power, worst = rows.reshape(4, _SCOUTS + 1, _SCOUTS + 1).astype(np.float64)
+    lit, half = worst <= 1, np.array(half_mm)[:, None]
+    whole = kept & _corners(lit, np.logical_and)
+    light = np.where(whole, 0.25 * _corners(power, np.add), 0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        area = np.abs(
+            (x[1:, 1:] - x[:-1, :-1]) * (y[1:, :-1] - y[:-1, 1:])
+            - (x[1:, :-1] - x[:-1, 1:]) * (y[1:, 1:] - y[:-1, :-1])
+        )
+    level = np.log(np.where(whole, np.maximum(light, 1e-30) / np.maximum(area, 1e-30), 1))
+    off, box = [], []
+    for axis in (1, 0):
+        step = np.minimum(np.abs(np.diff(level, axis=axis)), 1) * _pairs(whole, axis, np.logical_and)
+        at = np.flatnonzero(kept.any(1 - axis))
+        box.append(int(at[-1]) + 1 - int(at[0]))
+        off.append(0.125 * float((step * _pairs(light, axis, np.add)).sum()) * box[-1])
+    places = np.clip(np.stack([x[lit], y[lit]]), -half, half) if lit.any() else np.zeros((2, 1))
+    share = (lit.sum() + 0.5) / ((box[0] + 1) * (box[1] + 1))
+    size, whole_light = max(float(np.ptp(places, 1).max()), 1e-3 * half_mm[0]), float(light.sum())
+    along_u, along_v = (max(v, _EVEN * whole_light) for v in off)
+    moved, swept, power_at = colours
+    spectrum = tuple(zip(nm, power_at.tolist(), strict=True))
+    of_colours = whole_light * min(max(moved / size, _EVEN), 1.0)
+    return _Look(along_u, along_v, of_colours, size, share, whole_light, swept, spectrum)
+
+
+def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray[Any]:
+    return of(a[1:], a[:-1]) if axis == 0 else of(a[:, 1:], a[:, :-1])
+
+
+def _colours(each: Sequence[Floats], half_mm: tuple[float, float]) -> tuple[Array, Array, Array]:
+    """How ghosts differ by the wavelength, by the rows [P, 4, N] of their rays at each wavelength.
+
+    The first array [P] is how far each ghost moves from the first to the last wavelength in mm, inf for a ghost without
+    light; the second [P], about how far in mm the shadows of rims move on the film, summed from wavelength to
+    wavelength. A rim may cut a ghost at another place in each colour even where the rays themselves do not move.
+    Between two wavelengths a shadow moves by the share of the rays on the film that pass at only one of them, times the
+    ghost's width. The third [P, W] is the power at each wavelength over that at the first, by the rays that pass at
+    both of two neighbours.
+    """
+    one, other = each[0], each[-1]
+    here = (one[:, 3] <= _NEAR) & (other[:, 3] <= _NEAR) & (np.abs(one[:, :2]).max(1) < 2 * max(half_mm))
+    off = np.where(here, ((other[:, :2] - one[:, :2]).astype(np.float64) ** 2).sum(1), 0).sum(1)
+    moved = np.where(here.any(1), np.sqrt(off / np.maximum(here.sum(1), 1)), np.inf)
+
+    half = np.array(half_mm, np.float32)[:, None]
+    passed = [(rows[:, 3] <= 1) & (np.abs(rows[:, :2]) < half).all(1) for rows in each]
+    share = sum(((a ^ b).sum(1) / np.maximum((a | b).sum(1), 1) for a, b in pairwise(passed)), np.zeros(len(one)))
+    inside = [np.where(lit[:, None], rows[:, :2], np.nan) for lit, rows in zip(passed, each, strict=True)]
+    low, high = (of(np.concatenate(inside, 2), 2) for of in (np.fmin.reduce, np.fmax.reduce))
+    swept = share * np.nan_to_num((high - low).max(1))
+
+    ratios = [np.ones(len(one))]
+    for before, after in pairwise(rows[:, 2].astype(np.float64) for rows in each):
+        sums = [np.where((before > 0) & (after > 0), power, 0).sum(1) for power in (before, after)]
+        ratios.append(np.divide(sums[1], sums[0], out=np.ones_like(sums[0]), where=sums[0] > 0))
+    return moved, np.asarray(swept), np.cumprod(ratios, 0).T.astype(np.float64)
+
+
+def _kept(rows: Floats, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
+    """Whether light of each cell may reach the film, [P, S, S], by the rows [P, 4, N] of the scouts.
+
+    A cell all of whose corners a rim stops is kept where `worst`, extrapolated by its change in the cell, reaches 1.
+    """
+    shape = (len(rows), 4, _SCOUTS + 1, _SCOUTS + 1)
+    xy, worst = np.split(rows.reshape(shape)[:, [0, 1, 3]], [2], 1)
+    lost = ~(worst < LOST)
+    inf = np.float32(np.inf)
+    low, high = _corners(np.where(lost, inf, xy), np.minimum), _corners(np.where(lost, -inf, xy), np.maximum)
+    near, far = (_corners(np.where(lost, v, worst), op)[:, 0] for v, op in ((inf, np.minimum), (-inf, np.maximum)))
+    half = np.array(half_mm, np.float32)[:, None, None]
+    return np.asarray(((near <= 1) | (2 * near - far <= 1)) & ((low < half) & (high > -half)).all(1))
+
+
+def _corners(a: NDArray[Any], of: Callable[[Any, Any], Any]) -> NDArray[Any]:
+    rows = of(a[..., :-1, :], a[..., 1:, :])
+    return of(rows[..., :-1], rows[..., 1:])
+
+
+def _around(kept: NDArray[np.bool_], look: _Look, error: float, least: int) -> Grid:
+    """The grid about the cells that are kept [S, S], so fine that the light beside its place is `error` each way.
+
+    It has at least so many wavelengths.
+    """
+    low, high, fewest = [], [], math.sqrt(FEWEST / look.lit)
+    for axis in (0, 1):
+        at = np.flatnonzero(kept.any(axis))
+        low.append(2 * int(at[0]) / _SCOUTS - 1)
+        high.append(2 * (int(at[-1]) + 1) / _SCOUTS - 1)
+    columns, rows = (int(min(max(math.ceil(a / error), fewest), MOST)) for a in (look.along_u, look.along_v))
+    power = np.log([max(power, 1e-30) for _, power in look.spectrum])
+    folds = math.ceil(np.abs(np.diff(power)).sum() / _FOLD)
+    wavelengths = max(1, least, folds, math.ceil(look.colours / error))
+    return Grid((low[0], low[1]), (high[0], high[1]), columns, rows, wavelengths, look.spectrum)

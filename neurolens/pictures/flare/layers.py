@@ -1,0 +1,555 @@
+"""Flare in a picture: its layers, which are added to a render of the same lens, film and focus, and what makes them.
+
+Values are those of a render: film irradiance over the irradiance that a white card of radiance 1 makes on the axis.
+Each maker makes one picture, and by name others that are parts of it. A layer that is switched off is absent.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import Kept
+from neurolens.base.progress import Progress, Report
+from neurolens.base.tasks import in_order
+from neurolens.optics.lens.glass import inverse_square_um
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace.rays import Rays, trace
+from neurolens.pictures.flare import canvas
+from neurolens.pictures.flare.canvas import Doubles, Floats, Raster, Smear
+from neurolens.pictures.flare.diffraction import starburst_picture
+from neurolens.pictures.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
+from neurolens.pictures.flare.grids import REACH, Grid, ghost_moves, grids_of
+from neurolens.pictures.flare.lights import Light, Patch, SceneLights, disc, keep, light_rays, patches, rays_across
+from neurolens.pictures.flare.photons import LEVELS, Photons, PhotonTracer
+from neurolens.pictures.flare.steps import entering
+from neurolens.pictures.render.colour import SRGB, SpectralRange, in_gamut
+from neurolens.pictures.render.film import check_memory, digest
+from neurolens.pictures.render.scene import Scene
+from neurolens.pictures.render.settings import LAYERS, FlareSettings
+
+_AXIS = 1 << 15  # rays of the exposure
+_AT_ONCE = 1 << 16  # photons of a call
+_ENOUGH = 200  # photons of a kernel: a noise of 8%
+_COLOURED = 3200  # photons of a kernel of colour: eyes see its noise in wider areas
+_KEEP_S = 30.0  # between two states of long work
+_GOLDEN = 0.6180339887498949
+_STRIP = 1 << 22  # bytes of a strip of a picture, which one thread draws
+_ROOM = 1 << 26  # bytes of edges that wait to be drawn
+_EDGES = 176  # bytes of a cell's edges
+FEWEST = 4  # wavelengths that stand for all
+_PATCH_DEG = 2.0  # of an extended light: see `patches`
+_PATCHES, _CELLS = (4, 6, 9), 48  # along a side, at most; cells of a ghost along a side, which many patches keep
+_BEGUN, _SMEARED = 14_000, 0.45  # times to begin a group of ghosts, and to smear a pixel, in that of a cell
+_MUCH, _TRIALS = 1e7, 6  # work that takes seconds; groups whose time is measured before it
+_UNEVEN, _FAINT = 0.6, 5e-4  # share of its light that may come or go over a patch; share of all light, of a faint ghost
+Layers = dict[str, Floats]
+REST = "rest"
+
+
+@dataclass(frozen=True)
+class FlareJob:
+    """Everything that decides the flare of one picture.
+
+    Attributes:
+        lens: its film must be placed (`set_lens`), and it must have the coating of the settings (`with_coating`).
+        wavelength_nm: range of light. threads: of the work.
+        ghosts: traces the ghosts of the same lens and stop; left out, all of two reflections.
+        single: names of the ghosts that become layers; the others are the layer "rest".
+        keep: picture beside which the photons of long work are kept until they are whole.
+        finer: how many times as many wavelengths a ghost may take as stars and photons do.
+    """
+
+    lens: Lens
+    lights: Sequence[Light]
+    raster: Raster
+    settings: FlareSettings = FlareSettings()
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    threads: int = 2
+    ghosts: GhostTracer | None = None
+    single: tuple[str, ...] = ()
+    keep: Path | None = None
+    finer: int = 4
+
+    def spectral(self, finer: int = 1) -> SpectralRange:
+        """The range of light in its wavelengths, or in so many times as many."""
+        return SpectralRange(*self.wavelength_nm, bins=finer * self.settings.bins)
+
+    @property
+    def exposure(self) -> float:
+        """See `axis_irradiance`."""
+        return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm))
+
+    @cached_property
+    def tracer(self) -> GhostTracer:
+        """The tracer of its ghosts."""
+        return self.ghosts or GhostTracer(self.lens)
+
+
+@lru_cache(maxsize=32)
+def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
+    """Irradiance at the film's centre from uniform surroundings of radiance 1, in sr: the integral of T cos."""
+    film_z = lens.film_z_mm
+    assert film_z is not None  # of a tracer's lens
+
+    def share(sines: Doubles) -> Doubles:
+        d = torch.from_numpy(np.stack([*sines, -np.sqrt(1 - (sines**2).sum(0))]))
+        zero = torch.zeros_like(d[0])
+        traced = trace(lens, Rays(zero, zero, zero + film_z, *d), wavelength_nm, transmittance=True)
+        assert traced.transmittance is not None
+        return torch.where(traced.status == 0, traced.transmittance, 0.0).numpy()
+
+    coarse, widest = disc(0, _AXIS), 1.0
+    for _ in range(3):  # narrows to the cone that passes, and a little more
+        lit = share(widest * coarse) > 0
+        widest *= 1.02 * float(np.hypot(*coarse)[lit].max(initial=0.0)) if lit.any() else 0.3
+    light = math.pi * widest**2 * float(share(min(widest, 1.0) * coarse).mean())
+    if not light > 0:
+        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
+    return light
+
+
+class _Task(NamedTuple):
+    """A ghost of a light, at some wavelengths [K] with their colours [K, 3]."""
+
+    light: Light
+    pair: Pair
+    grid: Grid
+    wavelengths_nm: list[float]
+    colours: Doubles
+
+    @property
+    def work(self) -> int:
+        """Cells that are drawn."""
+        return len(self.wavelengths_nm) * self.grid.columns * self.grid.rows
+
+
+def _quietly(fraction: float, seconds_left: float | None = None) -> None:
+    """Report nothing."""
+
+
+def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) -> Iterator[tuple[int, Floats]]:
+    """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
+
+    Each ghost is drawn as the areas of a grid of rays (`flare.canvas`). Of the wavelengths, fewer stand for all where a
+    ghost's colours part little.
+
+    Args:
+        layers: for each pair of the tracer, the layer that takes it. done: is called with the share of the work that is
+            done, and of long work with the seconds that are left, first by a trial.
+    """
+    tracer, raster, spectral = job.tracer, job.raster, job.spectral(job.finer)
+    layer = dict(zip(tracer.pairs, layers, strict=True))
+    unit, nm = raster.per_mm**2 / job.exposure / spectral.bins, spectral.centres_nm
+    groups: dict[tuple[int, int, Smear | None], list[_Task]] = {}
+    for light in job.lights:
+        for patch, pair, grid, moves in _parts(job, tracer, light, nm.tolist()):
+            response = np.asarray(unit * spectral.response * spectral.spectrum(patch.light.rgb), np.float64).T
+            smear = canvas.smear_of(patch, raster.per_mm * moves * (-1, 1))
+            coarse = 1 if smear is None else smear.coarse
+            grid = grid.coarser(coarse, _CELLS)
+            task = _Task(patch.light, pair, grid, *_bands(nm, response, grid))
+            groups.setdefault((layer[pair], coarse, smear), []).append(task)
+    ordered = [_Group(*key, tasks) for key, tasks in groups.items()]
+    whole, expected = max(sum(group.work(raster) for group in ordered), 1.0), _expected_s(job, ordered)
+    done(0.0, expected)
+    began, worked, pictures = time.perf_counter(), 0.0, dict[int, Floats]()
+    for number in sorted({group.layer for group in ordered}):
+        pictures.clear()
+        for group in (group for group in ordered if group.layer == number):
+            picture = pictures.setdefault(group.coarse, np.zeros((*group.size(raster), 3), np.float32))
+            for work in _add(job, group, picture):
+                worked += work
+                left, taken = 1 - worked / whole, time.perf_counter() - began
+                done(1 - left, None if expected is None else left * (left * expected + taken))
+        drawn = (canvas.enlarged(picture, k, raster.height, raster.width) for k, picture in pictures.items())
+        yield number, sum(drawn, np.zeros((raster.height, raster.width, 3), np.float32))
+
+
+class _Group(NamedTuple):
+    """Ghosts of one layer that are smeared alike and drawn together, with pixels so many times as wide (`coarse`)."""
+
+    layer: int
+    coarse: int
+    smear: Smear | None
+    tasks: list[_Task]
+
+    def size(self, raster: Raster) -> list[int]:
+        """Rows and columns of its picture; one that is enlarged has a border."""
+        return [n // self.coarse + 3 * (self.coarse > 1) for n in (raster.height, raster.width)]
+
+    def work(self, raster: Raster) -> float:
+        """About the time that it takes, in that of a cell at one wavelength."""
+        smeared = 0 if self.smear is None else _SMEARED * math.prod(self.size(raster))
+        return _BEGUN + smeared + sum(task.work for task in self.tasks)
+
+
+def _add(job: FlareJob, group: _Group, picture: Floats) -> Iterator[float]:
+    """Add ghosts to a picture of the group's size, and yield the work that was done each time."""
+    raster, kernel, drawing = job.raster, None, picture
+    if group.smear is not None:
+        kernel = group.smear.kernel(max(raster.width, raster.height) // 2, group.coarse)
+        room = [n + k - 1 for n, k in zip(group.size(raster), kernel.shape, strict=True)]
+        drawing = np.zeros((*room, 3), np.float32)
+    yield from _draw(job.tracer, group.tasks, drawing, raster.per_mm / group.coarse, job.threads)
+    if kernel is not None:
+        picture += canvas.smeared(drawing, kernel) / np.float32(group.coarse**2)
+    yield group.work(raster) - sum(task.work for task in group.tasks)
+
+
+def _expected_s(job: FlareJob, groups: Sequence[_Group]) -> float | None:
+    """Seconds that ghosts will take, by a ghost each of a few groups, drawn for trial, which are at equal
+    steps of the work; None for little work."""
+    steps = np.cumsum([group.work(job.raster) for group in groups])
+    if not groups or steps[-1] < _MUCH:
+        return None
+    pace = []
+    for at in np.unique(np.searchsorted(steps, steps[-1] * (np.arange(_TRIALS) + 0.5) / _TRIALS)):
+        began, group = time.perf_counter(), groups[at]._replace(tasks=groups[at].tasks[:1])
+        work = sum(_add(job, group, np.zeros((*group.size(job.raster), 3), np.float32)))
+        pace.append((time.perf_counter() - began) / work)
+    return float(steps[-1] * np.median(pace))  # the first imports and compiles
+
+
+def _parts(
+    job: FlareJob, tracer: GhostTracer, light: Light, nm: Sequence[float]
+) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
+    """The patches of a light, and the ghosts of each with their grids and moves. Patches are finer for a ghost much of
+    whose light comes or goes over a patch, because rims cut it differently there."""
+    raster, middle_nm = job.raster, 0.5 * sum(job.wavelength_nm)
+    half_mm, cell = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), job.settings.cell_px / raster.per_mm
+    efl, needs = abs(float(first_order(tracer.lens).efl_mm)), dict.fromkeys(tracer.pairs, _PATCHES[0])
+    for most in _PATCHES:
+        pairs = [pair for pair in tracer.pairs if needs[pair] == most]
+        found, sums = list[tuple[Patch, Pair, Grid, Doubles]](), dict.fromkeys(pairs, np.zeros(2))
+        for patch in patches(light, _PATCH_DEG * _PATCHES[0] / most, most) if pairs else ():
+            size = 1.5 * float(np.abs(patch.sides).sum()) * efl
+            around = half_mm[0] + size, half_mm[1] + size  # a smear may bring ghosts from beside the film
+            for pair, grid in grids_of(tracer, patch.light, middle_nm, around, cell, nm, pairs).items():
+                moves, lit = ghost_moves(tracer, patch, pair, grid, middle_nm)
+                columns, rows = (min(n, max(n * _PATCHES[0] // most, _CELLS)) for n in (grid.columns, grid.rows))
+                found.append((patch, pair, replace(grid, columns=columns, rows=rows), moves))
+                sums[pair] = sums[pair] + lit
+        if most == _PATCHES[0]:
+            least = _FAINT * sum(whole for _, whole in sums.values())
+            for pair, (changing, whole) in sums.items():
+                enough = (n for n in _PATCHES if whole <= least or changing * most <= _UNEVEN * whole * n)
+                needs[pair] = next(enough, _PATCHES[-1])
+        yield from (part for part in found if needs[part[1]] == most)
+
+
+def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: float, threads: int) -> Iterator[float]:
+    """Add ghosts to a picture of so many pixels per mm, and yield the work that was done each time."""
+    height, width, _ = picture.shape
+    high = max(1, _STRIP // (32 * width))
+    strips = [range(height)[k : k + high] for k in range(0, height, high)]
+
+    def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
+        """The edges of each wavelength's cells, and the light of the cells."""
+        rays, area = rays_across(tracer.lens, task.light, task.grid.places)
+        rows = tracer.follow_each(entering(rays), task.wavelengths_nm, task.pair, REACH)
+        each = [canvas.edges_of(of_one, task.grid.columns, (width, height), per_mm) for of_one in rows]
+        return each, area * task.grid.cell * task.colours
+
+    for batch in _batches(tasks):
+        found, colours = zip(*in_order(threads, edges, batch), strict=True)
+        each = [edges for of_ghost in found for edges in of_ghost]
+        strip = partial(
+            canvas.draw_edges, picture, edges=np.concatenate(each), counts=np.array(list(map(len, each))),
+            light=np.concatenate(colours),
+        )  # fmt: skip
+        for _ in in_order(threads, strip, strips):
+            pass
+        yield sum(task.work for task in batch)
+
+
+def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
+    """Tasks in order, of one light and as many at a time as have room for their edges."""
+    batch, used = list[_Task](), 0
+    for task in tasks:
+        size = _EDGES * task.work
+        if batch and (used + size > _ROOM or task.light is not batch[0].light):
+            yield batch
+            batch, used = [], 0
+        batch.append(task)
+        used += size
+    if batch:
+        yield batch
+
+
+def _bands(nm: Doubles, response: Doubles, grid: Grid) -> tuple[list[float], Doubles]:
+    """The wavelengths that stand for all of `nm` [W] in a ghost, and their colours [K, 3] for responses [W, 3].
+
+    One wavelength is traced for each band. The others of the band have its places and their own power: a coating may
+    reflect ten times as much at one end of a band as at the other. Ghosts with equally many bands share the wavelengths
+    that are traced, unless a ghost is too dark at one of them to stand for its band.
+    """
+    count = min(max(grid.wavelengths, FEWEST), len(nm))
+    w = inverse_square_um(nm)  # glass moves light about evenly with it
+    at = np.arange(count) if count == len(nm) else (count * (w[0] - w) / (1.000001 * (w[0] - w[-1]))).astype(int)
+    nodes, level = zip(*(grid.spectrum or ((nm[0], 1.0),)), strict=True)
+    power = np.interp(nm, nodes, np.maximum(level, 1e-3 * max(level) + 1e-30))
+    traced, colours = list[float](), list[Doubles]()
+    for band in (np.flatnonzero(at == k) for k in np.unique(at)):
+        chosen = float(np.average(nm[band], weights=np.abs(response[band]).sum(1) + 1e-30))
+        if 2 * np.interp(chosen, nm, power) < power[band].mean():
+            bright = nm[band[2 * power[band] >= power[band].mean()]]
+            chosen = float(bright[np.abs(bright - chosen).argmin()])
+        traced.append(chosen)
+        colours.append(power[band] @ response[band] / np.interp(chosen, nm, power))
+    return traced, np.array(colours)
+
+
+# Photons by what became of them; those of "ghosts" and "glare" are the flare.
+PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
+    "image": lambda photons: (photons.reflections == 0) & (photons.scattered == 0),
+    "ghosts": lambda photons: (photons.reflections > 0) & ~photons.glare,
+    "glare": lambda photons: photons.glare,
+    "flare": lambda photons: (photons.reflections > 0) | (photons.scattered > 0),
+}
+
+
+def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quietly) -> Floats:
+    """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
+
+    Args:
+        part: one of `PARTS`: photons that were reflected or scattered ("flare"), reflected twice at most ("ghosts"),
+            reflected more often or scattered ("glare"), or neither ("image").
+        photons: of each light and wavelength. done: is called with the share of the work.
+    """
+    settings, raster, spectral = job.settings, job.raster, job.spectral()
+    lens, tracer, count = job.lens, PhotonTracer(job.lens, settings.scatter), spectral.bins
+    edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
+    firsts = range(0, photons, _AT_ONCE)
+    whole = [(number, light, k) for number, light in enumerate(job.lights) for k in range(count)]
+    picture = np.zeros((raster.height, raster.width, 3), np.float32)
+    sums = np.zeros((2, raster.height, raster.width), np.float32)
+    same = lens, tracer.scatter, list(job.lights), raster, part, spectral.centres_nm, photons
+    known = digest((*same, settings.most_reflections, settings.seed))
+    kept, begun = Kept(job.keep and kept_file(job.keep, part), known, _KEEP_S), 0
+    if (state := kept.load()) is not None:
+        done_before, arrays = state[0].get("done", -1), state[1]
+        if done_before in range(len(whole) + 1) and [a.shape for a in arrays] == [picture.shape, sums.shape]:
+            begun, (picture, sums) = done_before, arrays
+
+    def one(task: tuple[int, Light, int, int]) -> tuple[Floats, float]:
+        """Sums of weights and of their squares, [2, H, W], and the area of the light."""
+        number, light, k, first = task
+        shift = (k / count + settings.seed * _GOLDEN % 1) % 1
+        rays, area = light_rays(lens, light, first, min(_AT_ONCE, photons - first), shift, photons**-0.5)
+        # A seed of its own, the same for any number of threads.
+        chances = ((settings.seed << 44) + (number * count + k) * photons + first) % (1 << 64)
+        film = np.zeros((2, raster.height, raster.width), np.float32)
+        nm = float(spectral.centres_nm[k])
+        for xy, weight in _arrivals(tracer, part, rays, nm, settings.most_reflections, chances):
+            x, y = xy * raster.per_mm
+            for power in (1, 2):
+                film[power - 1] += np.histogram2d(y, -x, bins=edges, weights=weight**power)[0]
+        return film, area
+
+    tasks = ((*of_light, first) for of_light in whole[begun:] for first in firsts)
+    answers, steps, ready = in_order(job.threads, one, tasks), max(len(firsts) * (len(whole) - begun), 1), 0
+    for number, (_, light, k) in enumerate(whole[begun:], begun + 1):
+        film, area = np.zeros_like(sums), 0.0
+        for _, (some, of_light) in zip(firsts, answers, strict=False):
+            film, area, ready = film + some, of_light, ready + 1
+            done(ready / steps)
+        colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / count
+        colour = colour * (area * raster.per_mm**2 / photons / job.exposure)
+        picture += film[0, ..., None] * colour.astype(np.float32)
+        sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
+        kept.save({"done": number}, (picture, sums))
+    return _smoothed(picture, sums, settings.kernel_px) if settings.kernel_px > 0 else picture
+
+
+def kept_file(picture: Path, part: str) -> Path:
+    """The file of photons that interrupted work leaves beside a picture."""
+    return picture.with_name(f"{picture.name}.{part}.part")
+
+
+def _arrivals(
+    tracer: PhotonTracer, part: str, rays: Floats, wavelength_nm: float, most_reflections: int, seed: int
+) -> Iterator[tuple[Floats, Floats]]:
+    """Places on the film [2, M] (mm) and weights [M] of the photons of a part."""
+    # Glare that surfaces alone reflect turns round by choice; photons that scatter go as they would.
+    for scatters in (False, True)[: 1 + tracer.scatter.on] if part == "glare" else (None,):
+        boost = tracer.turning(wavelength_nm, LEVELS - 1) if scatters is False else 1.0
+        photons = tracer.trace(rays, wavelength_nm, most_reflections=most_reflections, seed=seed, boost=boost)
+        which = PARTS[part](photons)
+        if scatters is not None:
+            which &= (photons.scattered > 0) == scatters
+        # A film that sends light back is exposed by what it keeps.
+        yield photons.film_xy_mm[:, which], photons.weight[which] / (1 - tracer.scatter.sensor)
+
+
+def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
+    """Smooth a picture [H, W, 3] of photons: its luminance by kernels from `radius` on, its colour by wider kernels."""
+    wide = min(picture.shape[:2])
+    bright = in_gamut(_spread_wide(picture, sums, radius, _ENOUGH, wide / 8))
+    coloured = in_gamut(_spread_wide(picture, sums, radius, _COLOURED, wide / 2))
+    luminance = [np.maximum(part @ SRGB.to_xyz[1].astype(np.float32), 1e-30)[..., None] for part in (bright, coloured)]
+    return coloured * (luminance[0] / luminance[1])
+
+
+def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int, widest: float) -> Floats:
+    """A picture [H, W, 3] whose pixels' light is spread by kernels that keep its sum, mirrored at the edges.
+
+    Each pixel takes the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight, or is as
+    little noisy by their `sums` of weights and of squares, [2, H, W], with a soft step to the next, and none much wider
+    than `widest`, in pixels. The kernel is Epanechnikov's, 2 / pi (1 - r^2) in units of its radius.
+    """
+    total, left, last = np.zeros_like(picture), np.ones(picture.shape[:2], np.float32), False
+    while not last:
+        weight, square = np.moveaxis(canvas.spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
+        last = radius > widest
+        # n photons of equal weight have a sum of squares of n times the kernel's mean square, 4 / (3 pi r^2).
+        held = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / enough
+        share = np.ones_like(left) if last else (held - 0.5).clip(0, 1)
+        total += canvas.spread(picture * (left * share)[..., None], radius)
+        left, radius = left * (1 - share), 2 * radius
+    return total
+
+
+def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
+    """The layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
+
+    Raises:
+        InputError: as the makers.
+    """
+    layers: Layers = {}
+    progress = progress or Progress(quiet=True)
+    for name, make in MAKERS.items():
+        if job.settings.makes(name):
+            with progress.stage(name) as report:
+                made = make(job, report)
+            for picture in made.values():
+                picture *= np.array(job.settings.gain(name), np.float32)
+            layers |= made
+    return layers
+
+
+def with_coating(lens: Lens, settings: FlareSettings) -> Lens:
+    """The lens with the coating of the settings; raises InputError as `coated`."""
+    return lens if settings.coating is None else coated(lens, settings.coating)
+
+
+class Choice(NamedTuple):
+    """What the flare of all frames of a scene shares: ghosts that become layers, and whether lights fade (`keep`)."""
+
+    single: tuple[str, ...]
+    fade: bool
+
+
+def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: int, *, fade: bool = False) -> Choice:
+    """The ghosts that `brightest` names in some frames of a scene that has the table [flare].
+
+    Args:
+        frames: the scene, its camera in the frame's place, and the lens in its state.
+        fade: whether lights fade before they are left out, as those of an animation do.
+
+    Raises:
+        InputError: as of `coated`.
+    """
+    sources = SceneLights(frames[0][0])
+    return Choice(brightest([_scene_job(sources, *frame, raster, threads, fade) for frame in frames]), fade)
+
+
+def _scene_job(sources: SceneLights, scene: Scene, lens: Lens, raster: Raster, threads: int, fade: bool) -> FlareJob:
+    """The flare of a scene by its own lights."""
+    settings = scene.settings.flare
+    assert settings is not None and lens.film_z_mm is not None
+    lights = keep(sources.seen(scene, lens.film_z_mm), settings.most, fade).lights
+    light_nm = scene.settings.camera.wavelength_nm
+    return FlareJob(with_coating(lens, settings), lights, raster, settings, light_nm, threads)
+
+
+def scene_flare(
+    scene: Scene, lens: Lens, raster: Raster, white_balance: str | None, threads: int, progress: Progress,
+    choice: Choice | None = None,
+) -> Layers:  # fmt: skip
+    """The layers of a scene that has the table [flare], by its own lights and a lens whose film is placed.
+
+    Args:
+        choice: of all frames; None chooses by this picture.
+
+    Raises:
+        InputError: as `flare_layers` and `coated`.
+    """
+    choice, sources = choice or scene_choice([(scene, lens)], raster, threads), SceneLights(scene)
+    job = replace(_scene_job(sources, scene, lens, raster, threads, choice.fade), single=choice.single)
+    matrix = sources.balance(white_balance).T.astype(np.float32)
+    return {name: picture @ matrix for name, picture in flare_layers(job, progress).items()}
+
+
+def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
+    """The whole flare, [H, W, 3]: layers of `MAKERS`, without their parts."""
+    none = np.zeros((raster.height, raster.width, 3), np.float32)
+    return sum((layers[name] for name in MAKERS if name in layers), none)
+
+
+def brightest(frames: Sequence[FlareJob], done: Report = _quietly) -> tuple[str, ...]:
+    """Names of the ghosts whose own pictures, with their gains, have the greatest values on the film in any frame.
+
+    These are at most `settings.brightest` names, the brightest first. A ghost without light on the film is never one.
+    """
+    raster, count, peaks = frames[0].raster, frames[0].settings.brightest, dict[str, float]()
+    if not count:
+        return ()
+    every = [job.tracer.pairs for job in frames]
+    check_memory(raster.width, raster.height, 12 * (2 * min(count, max(map(len, every))) + 4))
+    for number, (job, pairs) in enumerate(zip(frames, every, strict=True)):
+        factors = _factors(job)
+        report = partial(lambda begun, share, _=None: done((begun + share) / len(frames)), number)
+        for k, picture in ghost_layers(job, range(len(pairs)), report):
+            peak = float((picture.max(0).max(0) * factors[pairs[k]]).max())
+            peaks[pairs[k].name] = max(peak, peaks.get(pairs[k].name, 0.0))
+    return tuple(sorted((name for name in peaks if peaks[name] > 0), key=lambda name: -peaks[name])[:count])
+
+
+def _ghosts(job: FlareJob, done: Report) -> Layers:
+    if job.settings.photons:
+        return {"ghosts": photon_picture(job, "ghosts" if job.settings.glare else "flare", job.settings.photons, done)}
+    pairs, raster, factors = job.tracer.pairs, job.raster, _factors(job)
+    # Ghosts of one layer and of equal factors share a picture.
+    keys = [(p.name if p.name in job.single else REST, factors[p]) for p in pairs]
+    kinds = list(dict.fromkeys(keys))
+    check_memory(raster.width, raster.height, 12 * (len(kinds) + len(job.single) + 4))
+    parts = {name: np.zeros((raster.height, raster.width, 3), np.float32) for name in (*job.single, REST)}
+    for number, picture in ghost_layers(job, [kinds.index(key) for key in keys], done):
+        name, factor = kinds[number]
+        parts[name] += picture * np.array(factor, np.float32)
+    return {"ghosts": np.sum(list(parts.values()), 0), **(parts if job.single else {})}
+
+
+def kept_beside(picture: Path) -> list[Path]:
+    """The files of photons that interrupted work has left beside a picture."""
+    return [path for part in PARTS if (path := kept_file(picture, part)).is_file()]
+
+
+def _factors(job: FlareJob) -> dict[Pair, tuple[float, float, float]]:
+    """The gain of each pair."""
+    names = [pair.name for pair in ghost_pairs(job.lens)]
+    for name in job.settings.gains:
+        if name not in (*MAKERS, *names):
+            expected = f"a layer ({', '.join(MAKERS)}) or a ghost ({[*names, 'g01-00'][0]}) of this lens"
+            raise InputError("flare", "gain", name, expected)
+    return {pair: job.settings.gain(pair.name) for pair in job.tracer.pairs}
+
+
+MAKERS: dict[str, Callable[[FlareJob, Report], Layers]] = {
+    "ghosts": _ghosts,
+    "glare": lambda job, done: {"glare": photon_picture(job, "glare", job.settings.glare, done)},
+    "starburst": lambda job, done: {"starburst": starburst_picture(job, done)},
+}
+assert tuple(MAKERS) == LAYERS

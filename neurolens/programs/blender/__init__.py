@@ -1,0 +1,285 @@
+"""The extension as a zip that Blender installs, and lenses added to one or to its user folder.
+
+blender_manifest.toml, *.py     the extension, neurolens/programs/blender/extension
+lenses.json                     facts of every lens, see `extension.library`
+shaders/NAME.osl                one a form of a lens
+thumbnails/NAME.png             its section; NAME.bokeh.png three discs of light
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import sys
+import time
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path, fcntl, place_inside, read_bytes, safe_name
+from neurolens.base.lensname import year_of
+from neurolens.base.tomlfile import parse_json
+
+EXTENSION = Path(__file__).parent / "extension"
+FACTS, SCHEMA = "lenses.json", 1
+_ID = "neurolens"
+_CODE = (*sorted(path.name for path in EXTENSION.glob("*.py")), "blender_manifest.toml")
+_THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
+_LARGEST = 1 << 28  # of a library: 200 lenses unpacked are some 80 MB
+LONGEST_S = 60.0  # that a lens waits for another to be added
+
+
+@dataclass(frozen=True)
+class Form:
+    """A shader of a lens; `extension.library.Variant` describes the numbers."""
+
+    kind: str
+    model: str
+    osl: str
+    rms_um: float | None
+    film_radius_mm: float
+    f_number: float
+    nearest_m: float | None
+    poor: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class PackedLens:
+    """A lens of the menu, whose files are named by `lens_id`. `picture` and `bokeh` are PNGs, `lens_field` is an
+    `extension.library.Field` as a table, `character` has the keys of `extension.library.CHARACTER`."""
+
+    lens_id: str
+    name: str
+    efl_mm: float
+    f_number: float
+    source: str
+    picture: bytes | None
+    forms: list[Form]
+    lens_field: dict[str, Any] | None = None
+    maker: str = ""
+    character: Mapping[str, float | None] | None = None
+    bokeh: bytes | None = None
+
+    def files(self) -> dict[str, bytes]:
+        """The contents of its files, by their places in the extension."""
+        found = {f"shaders/{self._stem(f)}.osl": f.osl.encode() for f in self.forms}
+        pictures = {self._picture(): self.picture, self._picture(".bokeh"): self.bokeh}
+        found |= {name: data for name, data in pictures.items() if data is not None}
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """The entry of `lenses.json`."""
+        same = ("name", "efl_mm", "f_number", "source", "maker", "character")
+        variants = [{**asdict(f), "file": f"shaders/{self._stem(f)}.osl"} for f in self.forms]
+        return {
+            "id": self.lens_id,
+            **{name: getattr(self, name) for name in same},
+            "year": year_of(self.source),
+            "picture": None if self.picture is None else self._picture(),
+            "bokeh": None if self.bokeh is None else self._picture(".bokeh"),
+            "variants": [{k: v for k, v in variant.items() if k != "osl"} for variant in variants],
+            "field": self.lens_field,
+        }
+
+    def _picture(self, what: str = "") -> str:
+        return f"thumbnails/{safe_name(self.lens_id)}{what}.png"
+
+    def _stem(self, form: Form) -> str:
+        """A safe name of files: the model's name is a text of its card, which anybody may have written."""
+        return safe_name(f"{self.lens_id}.{form.model or form.kind}")
+
+
+@cache
+def extension_library(name: str = "library") -> ModuleType:
+    """A module of the extension that needs no Blender, without its package, which does: the reader of facts, lights."""
+    spec = spec_from_file_location(f"neurolens_{name}", EXTENSION / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
+    """Write the extension with these lenses, atomically.
+
+    Raises:
+        InputError: two lenses of one id. OSError: a place that cannot be written.
+    """
+    packed = list(lenses)
+    if len({p.lens_id for p in packed}) < len(packed):
+        raise InputError(out, "lenses", [p.lens_id for p in packed], "each id once")
+    files = {name: (EXTENSION / name).read_bytes() for name in _CODE}
+    for lens in packed:
+        files |= lens.files()
+    _write_zip(out, files | {FACTS: _facts(lens.facts() for lens in packed)})
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """A block that one process or thread at a time runs for a folder; others wait. Systems without such locks let all
+    of them through.
+
+    Raises:
+        InputError: another held it for `LONGEST_S`.
+    """
+    handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
+    try:
+        end = time.monotonic() + LONGEST_S
+        while handle is not None:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    raise InputError(folder, "lock", _holder(folder), f"freed within {LONGEST_S:g} s") from None
+                time.sleep(0.05)
+                continue
+            except OSError:
+                pass
+            break
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)  # which ends the lock
+
+
+def _holder(folder: Path) -> str:
+    """Who locks a folder, where the system tells (Linux does)."""
+    with suppress(OSError):
+        for words in map(str.split, Path("/proc/locks").read_text().splitlines()):
+            if words[1] == "FLOCK" and words[5].endswith(f":{folder.stat().st_ino}"):
+                return f"(held by process {words[4]})"
+    return "(held by another process)"
+
+
+def check_takes(to: Path) -> None:
+    """Refuse a zip or a user folder that takes no lens, before a lens is made; raises InputError as `add_lens`."""
+    _contents(to)
+
+
+def add_lens(to: Path, lens: PackedLens) -> None:
+    """Put a lens into a packed extension (.zip) or into its user folder, which is made if needed, in place of one with
+    its id.
+
+    Raises:
+        InputError: no packed extension, facts that are not those of neurolens, no folder. OSError: it cannot be
+            written.
+    """
+    if to.suffix != ".zip" and not to.exists():
+        to.mkdir(parents=True, exist_ok=True)
+    with locked(to if to.is_dir() else to.parent):  # another process may add a lens meanwhile
+        files, known = _contents(to)
+        new = lens.files() | {FACTS: _facts(_merged(known, lens))}  # the facts last: they name files
+        if to.suffix == ".zip":
+            _write_zip(to, files | new)
+            return
+        for name, data in new.items():
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(to / name) as temporary:
+                temporary.write_bytes(data)
+
+
+def _contents(to: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
+    """The files of a packed extension (of a folder none), and the entries of its facts, none of a new folder."""
+    if to.suffix == ".zip":
+        return _of_zip(to)
+    file = to / FACTS
+    if to.exists() and not to.is_dir():
+        raise InputError(to, "--extension", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
+    if not file.exists():
+        return {}, []
+    data = read_bytes(file, _LARGEST, "a file of facts")
+    try:
+        return {}, _entries(data)
+    except (InputError, RecursionError, *extension_library().DAMAGED) as error:
+        raise InputError(file, "file", f"({error})", "facts that neurolens wrote") from None
+
+
+def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
+    """The files of a packed extension, and the entries of its facts."""
+    expected = "a zip of `neurolens blender build`"
+    data = io.BytesIO(read_bytes(path, _LARGEST, expected))
+    try:
+        with zipfile.ZipFile(data) as packed:
+            # An entry gives no more bytes than it says here, so that these bound the memory that is taken.
+            if sum(i.file_size for i in packed.infolist()) > _LARGEST:
+                raise ValueError(f"more than {_LARGEST} bytes unpacked")
+            for info in packed.infolist():
+                place_inside(Path(), info.filename)
+            files = {i.filename: packed.read(i) for i in packed.infolist() if not i.is_dir()}
+        return files, _entries(files[FACTS])
+    except MemoryError:
+        raise
+    except Exception as error:  # zipfile raises many types: for passwords, methods of compression, damaged data
+        clear = isinstance(error, (zipfile.BadZipFile, ValueError))  # other messages are about the code
+        why = f"no {error}" if isinstance(error, KeyError) else str(error) if clear else "damaged or encrypted"
+        raise InputError(path, "file", f"({why or type(error).__name__})", expected) from None
+
+
+def user_folders() -> list[Path]:
+    """The user folders of the extension in the Blenders of this machine that have it, the newest Blender first."""
+    home = Path.home()
+    if given := os.environ.get("BLENDER_USER_RESOURCES"):
+        places = [Path(given)]
+    else:
+        root = {
+            "darwin": home / "Library" / "Application Support" / "Blender",
+            "win32": Path(os.environ.get("APPDATA", home)) / "Blender Foundation" / "Blender",
+        }.get(sys.platform, Path(os.environ.get("XDG_CONFIG_HOME", home / ".config")) / "blender")
+        places = [p for p in root.glob("*") if re.fullmatch(r"\d+\.\d+", p.name)]
+        places.sort(key=lambda p: [int(n) for n in p.name.split(".")], reverse=True)
+    installed = (p for place in places for p in sorted((place / "extensions").glob(f"*/{_ID}/blender_manifest.toml")))
+    return [p.parents[2] / ".user" / p.parents[1].name / _ID for p in installed]
+
+
+def _entries(text: bytes) -> list[dict[str, Any]]:
+    """The entries of facts that the extension can read, so that it reads those to which a lens is added.
+
+    Raises:
+        InputError, those of `DAMAGED` in the extension's library, RecursionError: other facts.
+    """
+    data = parse_json(text, FACTS)
+    if data["schema"] != SCHEMA:
+        raise ValueError(f"schema {data['schema']}")
+    for entry in data["lenses"]:
+        extension_library().lens_of(Path(), entry)
+    return list(data["lenses"])
+
+
+def _merged(known: Iterable[dict[str, Any]], lens: PackedLens) -> list[dict[str, Any]]:
+    """The entries with the lens added; an entry of its id keeps the forms that the lens does not bring."""
+    mine = lens.facts()
+    kinds = {v["kind"] for v in mine["variants"]}
+    others = []
+    for entry in known:
+        if entry["id"] != lens.lens_id:
+            others.append(entry)
+            continue
+        mine["variants"] += [v for v in entry["variants"] if v["kind"] not in kinds]
+        mine |= {name: mine[name] or entry.get(name) for name in ("picture", "bokeh", "character")}
+    return [*others, mine]
+
+
+def _facts(entries: Iterable[Mapping[str, Any]]) -> bytes:
+    return (json.dumps({"schema": SCHEMA, "lenses": list(entries)}, indent=1, allow_nan=False) + "\n").encode()
+
+
+def _write_zip(out: Path, files: Mapping[str, bytes]) -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in sorted(files):
+            info = zipfile.ZipInfo(name, _THEN)
+            info.compress_type, info.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            packed.writestr(info, files[name])
+    with atomic_path(out) as temporary:
+        temporary.write_bytes(buffer.getvalue())

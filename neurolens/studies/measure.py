@@ -1,0 +1,335 @@
+"""Errors of models by zone, on rays not used in any fit, traced once through the exact lens; fits with their errors.
+
+A smaller stop changes no ray, only which of them pass, which the crossing with the stop decides.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens import __version__
+from neurolens.base import status as st
+from neurolens.base.files import atomic_path, fingerprint_of, read_kept, sha256_of, write_kept
+from neurolens.base.progress import Report
+from neurolens.cameras.model import OnnxLens, load_model
+from neurolens.models.export import export_onnx
+from neurolens.models.fit import NETWORKS, ModelSettings, Prepared, fit_model
+from neurolens.models.model import Domain, Prediction
+from neurolens.models.network import clear_training
+from neurolens.models.pairs import (
+    FilmRays,
+    PairSet,
+    PairSettings,
+    join_pairs,
+    make_pairs,
+    sample_domain,
+    trace_pairs,
+)
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace.surfaces import Rays
+from neurolens.studies.rays import (
+    PIXELS_ACROSS,
+    ZONES,
+    EachRay,
+    Predict,
+    RayErrors,
+    each_ray,
+    false_shares,
+)
+
+# Whole stops closed, by the name of the state.
+STOPS = {"full": 0, "2_stops": 2, "4_stops": 4}
+# States whose zones a card contains.
+ZONED = ("full", "2_stops")
+# Fewest rays of a zone for a figure.
+LEAST_RAYS = 100
+# A root mean square dominated by a few bad rays is measured on MORE times as many rays, if its relative standard
+# deviation is above KNOWN.
+MORE, MOST, KNOWN = 8, 1_000_000, 0.08
+_BATCH = 65536
+
+
+@dataclass(frozen=True)
+class FreshRays:
+    """Test rays of the models of one lens and domain.
+
+    Attributes:
+        lens, domain: the exact lens at its widest stop, and the domain of the models.
+        held_out: [M] rays that the lens passes.
+        held_square: [M] their squared distance from the axis (mm^2) at the stop.
+        drawn: [N] rays uniform over the film and pupil discs, blocked ones included.
+        passes: [N] bool, at full aperture.
+        stop_square: [N] squared distance from the axis (mm^2) at the stop.
+    """
+
+    lens: Lens
+    domain: Domain
+    held_out: PairSet
+    held_square: Tensor
+    drawn: FilmRays
+    passes: Tensor
+    stop_square: Tensor
+
+    def stop_radius_mm(self, state: str) -> float:
+        """The radius of one of `STOPS`, in mm."""
+        return self.domain.stop_radius_mm / math.sqrt(2) ** STOPS[state]
+
+
+def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, seed: int) -> FreshRays:
+    """Draw and trace `count` rays for the vignetting; `seed` must not be that of a fit's pairs."""
+    parts = []
+    for start in range(0, count, _BATCH):
+        rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
+        exact = trace_pairs(lens, rays, domain.pupil_z_mm)
+        parts.append((*rays.columns(), exact.status == st.PASSED, _stop_square(lens, exact)))
+    *drawn, passes, square = (torch.cat(c) for c in zip(*parts, strict=True))
+    return FreshRays(lens, domain, held_out, _stop_square(lens, held_out), FilmRays(*drawn), passes, square)
+
+
+def with_more(fresh: FreshRays, seed: int) -> FreshRays:
+    """`MORE` times as many passing rays, the given ones among them; at most `MOST` are added."""
+
+    def without_crossings(pairs: PairSet) -> PairSet:
+        """The same rays without the data per surface, which is most of their memory."""
+        by_surface = ("cross_x", "cross_y", "meets", "refracts")
+        return replace(pairs, **{name: getattr(pairs, name)[:0].clone() for name in by_surface})
+
+    lens, count = fresh.lens, len(fresh.held_out)
+    sets, squares, wanted = [without_crossings(fresh.held_out)], [fresh.held_square], min((MORE - 1) * count, MOST)
+    while wanted > 0:
+        pairs = passing_rays(lens, fresh.domain, min(count, wanted), seed + len(sets))
+        sets.append(without_crossings(pairs))
+        squares.append(_stop_square(lens, pairs))
+        wanted -= len(pairs)
+    return replace(fresh, held_out=join_pairs(sets), held_square=torch.cat(squares))
+
+
+def passing_rays(lens: Lens, domain: Domain, count: int, seed: int) -> PairSet:
+    """So many rays of a domain that the exact lens passes."""
+    return make_pairs(lens, domain, PairSettings(train=1, held_out=count, rim=1, seed=seed)).held_out
+
+
+def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:
+    return pairs.cross_x[lens.stop_index] ** 2 + pairs.cross_y[lens.stop_index] ** 2
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Errors of one model on `FreshRays`.
+
+    Attributes:
+        figures: those of `rays.RayErrors`, false_pass and false_block at full aperture.
+        stopped_down: false_pass and false_block of the states of `STOPS` but the first.
+        zones: by state of `ZONED` and zone: rms_um, direction_rms_deg of `rays` rays, and false_pass, false_block of
+            `passing` rays that the exact lens passes. None with fewer than `LEAST_RAYS`, or where an RMS is not
+            known to `KNOWN`.
+        each: errors ray by ray, of the rays of `held_out`.
+    """
+
+    figures: dict[str, float | None]
+    stopped_down: dict[str, dict[str, float | None]]
+    zones: dict[str, dict[str, dict[str, Any]]]
+    each: EachRay
+
+    def errors(self, keys: tuple[str, ...]) -> dict[str, Any]:
+        """Data for card and record: figures of `keys`, None if not finite, then `zones`."""
+        plain = {key: finite(self.figures[key]) for key in keys}
+        return {**plain, "stopped_down": self.stopped_down, "zones": self.zones}
+
+
+def measure(fresh: FreshRays, predict: Predict) -> Findings:
+    """Errors of one model; `predict` as `onnx_predictor` gives it."""
+    each = each_ray(fresh.lens, fresh.domain, fresh.held_out, predict)
+    model = {s: predict(fresh.drawn, fresh.stop_radius_mm(s)).status == st.PASSED for s in STOPS}
+    exact = {s: fresh.passes & (fresh.stop_square <= fresh.stop_radius_mm(s) ** 2) for s in STOPS}
+    shares = {s: false_shares(exact[s], model[s]) for s in STOPS}
+    full = shares.pop("full")
+    zones = {s: {z: _zone(fresh, each, s, z, exact[s], model[s]) for z in ZONES} for s in ZONED}
+    return Findings({**asdict(RayErrors.over(fresh.lens, fresh.domain, each)), **full}, shares, zones, each)
+
+
+def well_known(fresh: FreshRays, each: EachRay) -> bool:
+    """Whether the rays determine the errors over the film and of its zones to `KNOWN`."""
+    whole = (each.focus_um, each.infinity_um, each.direction_deg, each.position_um, each.transmittance)
+    parts = [zone_of(fresh, each, s, z) for s in ZONED for z in ZONES]
+    zones = [v for part in parts for v in (part.focus_um, part.direction_deg) if len(v) >= LEAST_RAYS]
+    return all(rms_deviation(v) <= KNOWN for v in (*whole, *zones))
+
+
+def rms_deviation(values: Tensor) -> float:
+    """Relative standard deviation of the root mean square of values."""
+    square = values * values
+    mean = float(square.mean()) if len(values) > 1 else 0.0
+    return float(square.std()) / (2 * mean * math.sqrt(len(values))) if mean > 0 else 0.0
+
+
+def zone_of(fresh: FreshRays, each: EachRay, state: str, zone: str) -> EachRay:
+    """Errors of the rays of one zone that pass in one state."""
+    open_ = fresh.held_square <= fresh.stop_radius_mm(state) ** 2
+    return each.select(_within(fresh.domain, fresh.held_out.inputs, zone) & open_)
+
+
+def _within(domain: Domain, rays: FilmRays, zone: str) -> Tensor:
+    low, high = ZONES[zone]
+    place = torch.hypot(rays.film_x, rays.film_y) / domain.film_radius_mm
+    return (place >= low) & ((place < high) | (high == 1.0))
+
+
+def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor, model: Tensor) -> dict[str, Any]:
+    part = zone_of(fresh, each, state, zone)
+    within = _within(fresh.domain, fresh.drawn, zone)
+    passing, shares = int(exact[within].sum()), false_shares(exact[within], model[within])
+    return {
+        "rms_um": _rms(part.focus_um),
+        "direction_rms_deg": _rms(part.direction_deg),
+        "rays": len(part.inside),
+        **(shares if passing >= LEAST_RAYS else dict.fromkeys(shares)),
+        "passing": passing,
+    }
+
+
+def _rms(values: Tensor) -> float | None:
+    """RMS with four digits; None with too few rays, or if a few of them dominate."""
+    if len(values) < LEAST_RAYS or rms_deviation(values) > KNOWN:
+        return None
+    return finite(float(f"{float(torch.sqrt((values * values).mean())):.4g}"))
+
+
+def finite(value: float | None) -> float | None:
+    """The value, or None where it is not finite."""
+    return None if value is None or not math.isfinite(value) else value
+
+
+# Keys of the ray and vignetting errors that a model's card promises and its record shows.
+CARD_KEYS = tuple(
+    "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max "
+    "false_pass false_block".split()
+)
+# Reported as poor: false passes or blocks beyond this share, an RMS error beyond so many pixels of 4000 across.
+POOR_SHARE, POOR_PX = 0.01, 1.0
+# Added to the seed of the fit's rays: the same seed would give the rays that the rims were fitted to.
+FRESH = 104729
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One model: its settings, the exported file, its record for `results.json`."""
+
+    settings: ModelSettings
+    file: Path
+    record: dict[str, Any]
+
+    @property
+    def error(self) -> float:
+        """Film-equivalent RMS, or that of the angle where no ray is within 60 degrees."""
+        found = self.record.get("rms_um")
+        return float(found if found is not None else self.record.get("direction_rms_deg") or 1e9)
+
+
+def onnx_predictor(model: OnnxLens) -> Predict:
+    """An exported model as `rays` and `vignetting` want it."""
+
+    def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
+        x, y, z, u, v, nm = (np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns())
+        out = model.rays(np.stack([x, y]), np.stack([u, v]), nm, z, stop_radius_mm)
+        scene, power, stop, status = (
+            torch.from_numpy(a) for a in (out.scene_ray, out.transmittance, out.stop_xy_mm, out.status)
+        )
+        return Prediction(Rays(*scene), power, stop[0], stop[1], status)
+
+    return predict
+
+
+def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
+    """The test rays of all models of one lens and domain; many, as a few bad ones, one in 10,000, may dominate."""
+    pairs = prepared.pairs
+    seed = pairs.settings.seed + FRESH
+    rays = fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
+    return with_more(rays, seed)
+
+
+def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
+    """Errors of an exported model for its card; keys with units, None if not finite."""
+    errors = measure(rays, onnx_predictor(model)).errors(CARD_KEYS)
+    return {**errors, "poor": what_is_poor(errors), "rays": len(rays.held_out), "passing": int(rays.passes.sum())}
+
+
+def what_is_poor(errors: Mapping[str, Any]) -> list[str]:
+    """Errors of a model that are visible in a picture, as sentences for its card."""
+    shares = {key: errors.get(key) or 0.0 for key in ("false_pass", "false_block")}
+    poor = [f"{key.replace('_', ' ')} {100 * share:.2g}%" for key, share in shares.items() if share > POOR_SHARE]
+    pixels = errors.get("rms_px") or 0.0
+    return [*poor, f"RMS error {pixels:.2g} pixels of a picture {PIXELS_ACROSS} wide"] if pixels > POOR_PX else poor
+
+
+def fit_and_measure(
+    prepared: Prepared, settings: ModelSettings, folder: Path, vignetting_rays: int, report: Report,
+    rays: Callable[[], FreshRays] | None = None,
+) -> Measured:  # fmt: skip
+    """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
+
+    Errors are of the exported float32 graph in onnxruntime. `rays`: `shared_rays`, where several models share them.
+    """
+    file, pairs = folder / f"{settings.label}.onnx", prepared.pairs
+    made_of = (pairs.domain.to_dict(), asdict(pairs.settings), asdict(settings), vignetting_rays)
+    fingerprint = fingerprint_of([__version__, pairs.lens.sha256, *made_of])
+    if (record := known_record(file, fingerprint)) is not None:
+        return Measured(settings, file, record)
+    training = folder / f"{settings.label}.training.npz"  # left by a killed run
+    model = fit_model(prepared, settings, report, checkpoint=training)
+    on = rays() if rays else shared_rays(prepared, vignetting_rays)
+    facts = {
+        "name": settings.label, "family": settings.family, "variables": model.core.basis, "file": f"models/{file.name}",
+        "coefficients_per_vector": None if settings.method in NETWORKS else model.core.coefficients_per_vector,
+        "parameters": model.core.coefficients, "fit_s": model.fit_s,
+    }  # fmt: skip
+    record = export_measured(
+        file, fingerprint, facts, lambda path, errors: export_onnx(model, path, errors), lambda m: measure_on(on, m)
+    )
+    clear_training(training)
+    return Measured(settings, file, record)
+
+
+def export_measured(
+    file: Path, fingerprint: str, facts: dict[str, Any], export: Callable[[Path, dict[str, Any]], object],
+    errors_of: Callable[[OnnxLens], dict[str, Any]],
+) -> dict[str, Any]:  # fmt: skip
+    """Export a model, measure the exported file, and export it with its errors; the record is kept beside it.
+
+    Args:
+        fingerprint: by which `known_record` knows the record again.
+        facts: of the record, besides the errors and what the file tells.
+        export: writes the model with errors to a path.
+    """
+    with atomic_path(file) as unmeasured:  # a file without its errors never has the final name
+        export(unmeasured, {})
+        errors = errors_of(load_model(unmeasured))
+        export(unmeasured, errors)
+    record = {**facts, **errors, "bytes": file.stat().st_size, "load_s": seconds_to_load(file)}
+    write_kept(file.with_suffix(".json"), {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record})
+    return record
+
+
+def seconds_to_load(file: Path) -> float:
+    """Seconds that it takes to load a model."""
+    start = time.perf_counter()
+    load_model(file)
+    return time.perf_counter() - start
+
+
+def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
+    """The record of an earlier finished fit of the same settings whose model file is unchanged."""
+    data = read_kept(file.with_suffix(".json")) or {}
+    if data.get("fingerprint") != fingerprint or not file.is_file() or data["sha256"] != sha256_of(file):
+        return None
+    record: dict[str, Any] = data["record"]
+    return record

@@ -1,0 +1,401 @@
+"""Cameras that may show a scene, each with its error against the exact lens and, where it matters, its cost.
+
+They are pinholes, thin and thick lenses, the exact lens, models that ship, and polynomials fitted to one shot of a lens
+alone: its film, stop, focus and light.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+import warnings
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.base.lensname import IDEAL_OF, split_kind
+from neurolens.base.progress import Report
+from neurolens.base.records import Timing, noisy
+from neurolens.cameras.build import as_c, ideal_as, with_dispersion
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
+from neurolens.cameras.reduced import Warped
+from neurolens.cameras.shaders.blender_shader import lens_of
+from neurolens.graph.compiler import has_compiler
+from neurolens.graph.scalars import lower
+from neurolens.models.export import export_onnx
+from neurolens.models.fit import fit_model, prepare
+from neurolens.models.pairs import PairSettings, make_pairs
+from neurolens.models.polynomial import fit_planes
+from neurolens.models.targets import ModelSettings, Prepared
+from neurolens.studies.experiment import DomainChoice
+from neurolens.studies.plan import footprints as prints
+from neurolens.studies.plan.costs import (
+    ALONE,
+    CYCLES_NS,
+    GLSL_OPERATIONS,
+    Work,
+    glsl_operations,
+    noise,
+    ns_a_ray,
+    shader_cost,
+)
+from neurolens.studies.plan.footprints import Footprints
+from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe
+
+Target = Literal["render", "c", "onnx", "osl", "glsl"]
+Cost = Callable[[], tuple[Timing, float]]  # of a ray, and noise
+EXACT = "exact"
+OURS = ("render", "c")  # targets that run compiled C
+IDEAL = ("pinhole", "thin", "thick")
+_MAPPED = " + ST map"  # after the name of an ideal camera
+FITTED = "fitted for this shot"
+_CLOSE = 1.3  # times the operations of the smallest model that holds, up to which others of its form are timed
+_MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A camera that was tried.
+
+    Attributes:
+        camera: the text that `--camera` or `export` takes.
+        error_px, light_error: at the counted percentile; inf where it has no light that the lens has.
+        cost: what the camera takes on a path, in the plan's unit, times `noise`; inf where nobody asked for it.
+        noise: how many times the paths it needs for equal error, see `costs`.
+        how: what else it needs, or how it was made.
+        within: whether it meets the budget of its plan.
+        settings: of a model that was fitted for the shot.
+        spread: how many times as long as the least the median of its timed calls took (1 where cost is counted).
+        disperses: whether its picture depends on the wavelength.
+        seconds: of one thread, of the whole picture to the noise of the exact lens (10^9 operations where no time is
+            known), by the least of the camera's timed calls; by their median the picture takes `more` than that.
+        camera_seconds: the camera's share of them.
+    """
+
+    name: str
+    camera: str
+    error_px: float
+    light_error: float
+    cost: float
+    noise: float
+    how: str = ""
+    within: bool = False
+    settings: ModelSettings | None = None
+    spread: float = 1.0
+    disperses: bool = False
+    seconds: float = math.inf
+    more: float = 0.0
+    camera_seconds: float = 0.0
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the timing spreads too far to tell it from one that is a little shorter: see `records.noisy`."""
+        return noisy({"min": 1.0, "median": self.spread})
+
+    def meets(self, budget_px: float) -> bool:
+        """Whether it may be used."""
+        return self.error_px <= budget_px and self.light_error <= LIGHT
+
+    def whole(self, work: Work, denoised: bool = False) -> float:
+        """The cost of a path, times the noise of its picture unless that is taken out later."""
+        return self.cost + work.rest[self.disperses] * (1.0 if denoised else self.noise)
+
+
+def candidates(
+    probed: Probe, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
+    folder: Path | None = None, explain: bool = False, report: Report | None = None, work: Work = ALONE,
+) -> tuple[Choice, ...]:  # fmt: skip
+    """Cameras with error and cost, enough to decide for each of some budgets; arguments as for `plan.plan`.
+
+    `work`: of the paths of the target.
+    """
+    say = report or (lambda done, left=None: None)
+    say(0.2)
+    trial = Trial(probed, target, tuple(budgets_px), explain, work)
+    with warnings.catch_warnings():  # a film beyond the end of a model's range: its error counts
+        warnings.simplefilter("ignore", NeurolensWarning)
+        tried = [*_ideal(trial), *_exact(trial), *_shipped(trial, models)]
+        fitted = [] if folder is None else _fitted(trial, folder, tried, lambda done, left=None: say(0.2 + 0.6 * done))
+        return tuple(_costed(trial, tried + fitted))
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A camera with its errors, and the function that gives the cost of a ray and its noise.
+
+    Attributes:
+        form: of models, "ols" or another method.
+        size: operations of a ray. Where both are given, a model of more size is taken to cost no less than one of the
+            same form.
+    """
+
+    choice: Choice
+    cost: Cost
+    form: str = ""
+    size: int = 0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The scene, target and budgets that cameras are tried for, whether all are to have their cost, and the work of a
+    path."""
+
+    probed: Probe
+    target: Target
+    budgets_px: tuple[float, ...] = ()
+    explain: bool = False
+    work: Work = ALONE
+
+    @property
+    def share(self) -> prints.Array:
+        """The share of the scene's light that each wavelength stands for."""
+        return self.probed.places.share
+
+    @property
+    def by_size(self) -> bool:
+        """Whether costs rise with size; shaders of models have pupils and noise of their own."""
+        return self.target != "osl" and not self.explain
+
+    def judged(
+        self, name: str, spec: str, seen: Footprints, cost: Cost, how: str = "", form: str = "", size: int = 0,
+        beside: prints.Array | float = 0.0, disperses: bool = False,
+    ) -> _Judged:  # fmt: skip
+        """A camera's error against the exact footprints, its cost not known yet; `beside`: light outside the lens's."""
+        probed = self.probed
+        apart = prints.distance_mm(probed.wanted, seen, self.share) / probed.asked.pixel_mm
+        light = np.abs(seen.light / np.maximum(probed.wanted.light, 1e-30) - 1) + beside
+        if "distortion" in probed.asked.afterwards:  # its map corrects light, too
+            light = np.where(seen.light > 0, 0.0, light)
+        error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
+        times = noise(seen.weight, self.share) * self.work.noise[disperses]
+        choice = Choice(name, spec, error, dim, math.inf, times, how, disperses=disperses)
+        return _Judged(choice, cost, form, size)
+
+    def costed(self, judged: _Judged) -> Choice:
+        """A camera with its cost."""
+        choice, (timing, weights) = judged.choice, judged.cost()
+        times = weights * self.work.noise[choice.disperses]
+        return replace(
+            choice,
+            cost=timing["min"] * (1.0 if self.probed.asked.denoised else times),
+            noise=times,
+            spread=timing["median"] / timing["min"] if timing["min"] else 1.0,
+            # A shader that does not focus so near shows nothing.
+            error_px=choice.error_px if math.isfinite(times) else math.inf,
+        )
+
+    def timed(self, camera: Camera, seen: Footprints) -> tuple[Timing, float]:
+        """The cost of a ray of a camera that runs here, by the clock, and the noise of its weights."""
+        return ns_a_ray(camera, self.probed.places), noise(seen.weight, self.share)
+
+    def counted(self, cost: float, seen: Footprints) -> tuple[Timing, float]:
+        """A cost that is no measurement, and so has no spread."""
+        return {"min": cost, "median": cost}, noise(seen.weight, self.share)
+
+    def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
+        """The cost of a camera without a lens, and its noise times the area of its picture, which has more paths."""
+        known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
+        timing, times = self.timed(camera, seen) if known is None else self.counted(known[name], seen)
+        return timing, area * times
+
+    def shader(self, file: str | Path) -> tuple[Timing, float]:
+        """The cost of the shader of a model or a lens."""
+        asked = self.probed.asked
+        state = asked.zoom if str(file) == self.probed.lens.path else None  # a model is of one state
+        lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
+        ns, times = shader_cost(lens, self.probed.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
+        return {"min": ns, "median": ns}, times
+
+
+def camera_of(probed: Probe, choice: Choice) -> Camera:
+    """The camera of a choice, in our renderer; with the maps of its picture, where it needs them.
+
+    Raises:
+        InputError, ModelError: as the cameras.
+    """
+    kind, path = split_kind(choice.camera)
+    if choice.name == EXACT:
+        return with_dispersion(probed.exact, probed.asked.shot)
+    if kind in IDEAL_OF:
+        flat = as_c(ideal_as(kind, probed.exact.lens, probed.asked.shot))
+        mapped = choice.name.endswith(_MAPPED)
+        return Warped(flat, probed.exact, probed.asked.shot.focus_m, tables=probed.exact_field) if mapped else flat
+    model = OnnxCamera(load_model(path), probed.asked.shot)
+    return with_dispersion(model, probed.asked.shot)
+
+
+def _ideal(trial: Trial) -> Iterator[_Judged]:
+    """Pinhole, thin and thick lens, as they are and with their picture warped afterwards, where the target has them.
+
+    In C and GLSL they are their own source.
+    """
+    probed, shot = trial.probed, trial.probed.asked.shot
+    for name in {"onnx": (), "osl": IDEAL[:2]}.get(trial.target, IDEAL):
+        spec = f"{name}:{probed.lens.path}"
+        with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
+            camera = as_c(ideal_as(f"{name}:", probed.exact.lens, shot))
+            seen = prints.footprints(camera, probed.places)
+            yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
+            # In our renderer the thick lens stands in the thin one's place.
+            if "distortion" in probed.asked.afterwards or (name == "thin" and trial.target in OURS):
+                continue
+            maps = Warped(camera, probed.exact, probed.asked.shot.focus_m)
+            if maps.area < _MOST_OVERSCAN:
+                how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
+                cost = partial(trial.ideal, name, camera, seen, maps.area)
+                yield trial.judged(f"{name}{_MAPPED}", spec, prints.footprints(maps, probed.places), cost, how)
+
+
+def _exact(trial: Trial) -> Iterator[_Judged]:
+    """The exact lens, which has no error with all of its dispersion: as C where that runs, and as code where its
+    surfaces have a form in it."""
+    probed, target = trial.probed, trial.target
+    shown = with_dispersion(probed.exact, probed.asked.shot)
+    seen = probed.seen if shown is probed.exact else prints.footprints(shown, probed.places)
+    exact, path, compiled = probed.exact, probed.lens.path, probed.exact.runtime == "c"
+    cost: Cost = {
+        "osl": lambda: trial.shader(path),
+        "glsl": lambda: trial.counted(glsl_operations(exact), probed.seen),
+    }.get(target, lambda: trial.timed(shown, seen))
+    if target in ("render", "osl", "glsl") or (target == "c" and compiled):
+        with suppress(InputError):  # a shader that is too large
+            yield trial.judged(EXACT, str(path), seen, cost, disperses=shown.dispersive)
+
+
+def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = ()) -> Iterator[_Judged]:
+    """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form, or its
+    form is one of `without`.
+
+    Errors are of onnxruntime: compilers take seconds, and C and shaders give the same rays. They are measured within
+    the outline of the exact lens's pupil, from the same points of it: rows of samples leave out the rim of what fills
+    an outline, and two outlines of one lens would differ by a percent of light and 0.2% of the blur. Light that a model
+    lets pass outside it counts as its light's error.
+    """
+    target = trial.target
+    compiled = target in OURS and has_compiler()
+    with suppress(InputError, ModelError):
+        model = load_model(file)
+        form = model.card["fit"]["method"].partition("-")[0]
+        if form in without or not (compiled or target != "c"):
+            return
+        shot = trial.probed.asked.shot
+        whole = OnnxCamera(model, replace(shot, runtime="onnxruntime"), outline=trial.probed.exact.film.outline)
+        camera = with_dispersion(whole, shot)
+        seen = prints.footprints(camera, trial.probed.places)
+        beside = prints.light_beside(camera, trial.probed.places) / np.maximum(trial.probed.seen.light, 1e-30)
+
+        def cost() -> tuple[Timing, float]:
+            if target == "osl":
+                return trial.shader(file)
+            if target == "glsl":
+                return trial.counted(glsl_operations(whole), seen)
+            return trial.timed(with_dispersion(whole.compiled(), shot) if compiled else camera, seen)
+
+        size = _operations(model)
+        yield trial.judged(file.stem, str(file), seen, cost, how, form, size, beside, camera.dispersive)
+
+
+def _operations(model: OnnxLens) -> int:
+    """The number of float operations that a ray of a model costs; 0 for networks that only onnxruntime runs."""
+    with suppress(InputError):
+        return sum(lower(model.graph()).count().values())
+    return 0
+
+
+def _shipped(trial: Trial, files: Sequence[Path]) -> list[_Judged]:
+    """Models that are there; those of one form from the smallest on, up to one that holds the least budget."""
+    judged: list[_Judged] = []
+    for file in sorted(files, key=lambda f: f.stat().st_size if f.is_file() else 0):
+        done = {j.form for j in judged if trial.by_size and j.choice.meets(min(trial.budgets_px))}
+        judged += _model(trial, file, without=done)
+    return judged
+
+
+def _costed(trial: Trial, tried: Sequence[_Judged]) -> Iterator[Choice]:
+    """Cameras with their cost where it matters: those that hold a budget, and of models of one form the smallest and
+    those that are about as small."""
+    asked = {id(j) for j in tried} if trial.explain else set[int]()
+    for budget_px in trial.budgets_px:
+        holds = [j for j in tried if j.choice.meets(budget_px)]
+        for j in holds:
+            least = min(k.size for k in holds if k.form == j.form)
+            if not (trial.by_size and j.size > _CLOSE * least > 0):
+                asked.add(id(j))
+    for j in tried:
+        yield trial.costed(j) if id(j) in asked else j.choice
+
+
+TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
+# Gates that alone block a smaller share of the rays go: they darken no pixel by a thousandth.
+_FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=5e-4)
+_FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
+_MOVED_TERMS = 16, 22  # from so many on, planes are searched: once, for the second number
+PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
+
+
+def shot_domain(probed: Probe) -> DomainChoice:
+    """The domain of a probe as the choice of an experiment."""
+    return DomainChoice(probed.domain.film_radius_mm, probed.domain.focus_m, probed.asked.shot.wavelength_nm)
+
+
+def shot_terms(probed: Probe) -> list[int]:
+    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
+    return [n for n in TERMS if n >= (4 if probed.lens.anamorphic else 2)]
+
+
+def shot_fits(probed: Probe, folder: Path) -> Callable[[int], tuple[Path, ModelSettings]]:
+    """A function that fits a polynomial of so many terms to a shot alone.
+
+    It returns the model's file, in the folder, and its settings.
+    """
+    lens = probed.lens.with_aperture(None)
+    plain, model = prepare(make_pairs(lens, probed.domain, PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
+    folder.mkdir(parents=True, exist_ok=True)
+
+    @cache
+    def moved() -> Prepared:  # the planes of one size: a search takes a second, and others of its kind agree on them
+        return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
+
+    def fit(terms: int) -> tuple[Path, ModelSettings]:
+        settings = replace(model, name=f"shot-ols-{terms}", terms=terms)
+        file = folder / f"{probed.lens.lens_id}.{settings.label}.onnx"
+        planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
+        export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
+        return file, replace(settings, planes=planes)  # as a training from scratch has it
+
+    return fit
+
+
+def _fitted(trial: Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:
+    """Polynomials fitted for the shot alone: the smallest that holds each budget, and those on the way to it.
+
+    Nothing is fitted where a pinhole or an ideal lens, which costs less, holds a budget, unless all are asked for.
+    """
+    probed = trial.probed
+    easy = [j.choice for j in tried if j.choice.name.startswith(IDEAL) and not trial.explain]
+    # Nothing that is fitted has no error.
+    asked = [b for b in trial.budgets_px if (b > 0 or trial.explain) and not any(c.meets(b) for c in easy)]
+    if not asked:
+        return []
+    fit, sizes = shot_fits(probed, folder), shot_terms(probed)
+
+    found: dict[int, list[_Judged]] = {}
+    for k, budget_px in enumerate(asked):
+
+        def holds(terms: int, budget_px: float = budget_px) -> bool:
+            if terms not in found:
+                file, settings = fit(terms)
+                made = _model(trial, file, FITTED)
+                found[terms] = [replace(j, choice=replace(j.choice, settings=settings)) for j in made]
+            return any(j.choice.meets(budget_px) for j in found[terms])
+
+        bisect.bisect_left(sizes, True, key=holds)
+        say((k + 1) / len(asked))
+    return [j for js in found.values() for j in js]

@@ -1,0 +1,332 @@
+"""Scenes of an experiment: renders through every camera, compared with the exact lens's, side by side.
+
+The image error is the relative MSE on linear radiance and FLIP on a display, each beside its noise floor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.base.errors import InputError, NeurolensError, pip_install
+from neurolens.base.progress import Report
+from neurolens.cameras.build import ideal_as
+from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.graph.compiler import has_compiler
+from neurolens.models.model import Domain
+from neurolens.optics.analysis.plots import drawing, plain_log_ticks
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.colour import SpectralRange
+from neurolens.pictures.render.job import camera_axes
+from neurolens.pictures.render.pictures import standard_attributes, write_exr, write_png
+from neurolens.pictures.render.primitives import Rays
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import CameraSettings, Scene, load_scene
+from neurolens.pictures.render.world import world_of
+from neurolens.studies.experiment import RenderChoice
+from neurolens.studies.plots import error_scale, log_norm
+
+Image = NDArray[np.float64]
+
+MIN_PAIRS = 4  # with fewer pairs the noise floor is too noisy to divide by
+EPS = 1e-2  # squared radiance in the denominator of the relative MSE: dark pixels do not dominate the mean
+PIXELS_PER_DEGREE = 67.0  # of FLIP, its authors' default: 0.7 m from a 0.7 m wide 4K display
+# Settings of the comparison for a run's results; the exposure is a factor before the sRGB curve.
+SETTINGS = {"exposure": 1.0, "pixels_per_degree": PIXELS_PER_DEGREE, "eps": EPS}
+
+
+def checked_image(image: ArrayLike, name: str) -> Image:
+    """`image` as float64 [H, W, 3].
+
+    Raises:
+        InputError: another shape, an empty picture, or values that are not finite; `name` names the picture.
+    """
+    array = np.asarray(image)
+    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+        raise InputError("image", f"{name}, shape", f"({array.shape})", "[height, width, 3] linear RGB")
+    if not np.issubdtype(array.dtype, np.floating):
+        raise InputError("image", f"{name}, type", str(array.dtype), "floating-point linear radiance, not 8-bit values")
+    array = array.astype(np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(array)))
+    if bad:
+        raise InputError("image", f"{name}, values", f"({bad} values not finite)", "finite linear RGB")
+    return array
+
+
+def _checked_pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
+    a, b = checked_image(test, "test"), checked_image(reference, "reference")
+    if a.shape != b.shape:
+        raise InputError("image", "test, shape", f"({a.shape})", f"the shape of the reference, {b.shape}")
+    return a, b
+
+
+def to_srgb(linear: ArrayLike, exposure: float = 1.0) -> Image:
+    """Linear RGB times `exposure`, clipped to [0, 1], through the sRGB curve (IEC 61966-2-1). Any shape."""
+    c = np.clip(np.asarray(linear, dtype=np.float64) * exposure, 0.0, 1.0)
+    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+
+
+def rel_mse(test: ArrayLike, reference: ArrayLike) -> float:
+    """Relative mean squared error on linear radiance: mean over pixels and channels of (a - b)^2 / (b^2 + eps).
+
+    Rousselle, Knaus, Zwicker 2011, "Adaptive sampling and reconstruction using greedy error minimization", with their
+    eps = 0.01.
+
+    Args:
+        test, reference: [H, W, 3] linear RGB.
+    Raises:
+        InputError: shapes that differ or are not [H, W, 3]; values that are not finite.
+    """
+    a, b = _checked_pair(test, reference)
+    return float(np.mean((a - b) ** 2 / (b**2 + EPS)))
+
+
+def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
+    """LDR-FLIP for each pixel, [H, W] in [0, 1]: what an observer sees when flipping between the two pictures.
+
+    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", through their `flip-evaluator`.
+    Linear RGB goes through `to_srgb`; the viewing distance is that of `PIXELS_PER_DEGREE`.
+
+    Raises:
+        InputError: as `rel_mse`.
+        NeurolensError: flip-evaluator is not installed.
+    """
+    a, b = _checked_pair(test, reference)
+    try:
+        import flip_evaluator
+    except ImportError as error:
+        raise NeurolensError(f"FLIP needs flip-evaluator: {pip_install('train')}") from error
+    pictures = (np.ascontiguousarray(to_srgb(x), dtype=np.float32) for x in (b, a))
+    options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
+    errors, _, _ = flip_evaluator.evaluate(*pictures, "LDR", **options)
+    return np.asarray(errors, dtype=np.float64).reshape(a.shape[:2])
+
+
+def flip(test: ArrayLike, reference: ArrayLike) -> float:
+    """Mean of `flip_map`: 0 for equal pictures, 1 at most."""
+    return float(flip_map(test, reference).mean())
+
+
+@dataclass(frozen=True)
+class ImageErrors:
+    """Errors of a camera's renders: means over `pairs` pairs, the noise floor over all pairs of exact renders.
+
+    Attributes:
+        flip_paired: against the exact render of the same random numbers, where most noise cancels: what the camera
+            itself changes, and the one to judge it by.
+        flip, rel_mse: against an exact render of another seed, noise included.
+        paired_share: of the noise floor; None where that is 0.
+    """
+
+    flip_paired: float
+    paired_share: float | None
+    flip: float
+    rel_mse: float
+    noise_floor_flip: float
+    noise_floor_rel_mse: float
+    pairs: int
+
+
+def compare(renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike]) -> ImageErrors:
+    """Error of a surrogate's renders against exact ones, beside the noise floor.
+
+    Render i of the surrogate is compared with exact render i, whose random numbers it shares (paired), and with exact
+    render i + 1 (the last with the first), as two independent renders differ. The floor is exact i against that one.
+
+    Args:
+        renders: one or more [H, W, 3] linear renders; number i has the seed of exact render i.
+        exact_renders: at least four, and at least as many as `renders`.
+
+    Raises:
+        InputError: too few renders, or pictures that do not fit each other.
+    """
+    count = len(exact_renders)
+    if count < MIN_PAIRS:
+        raise InputError("image", "renders of different seeds", count, f"at least {MIN_PAIRS}, for {MIN_PAIRS} pairs")
+    if not (1 <= len(renders) <= count):
+        raise InputError("image", "surrogate renders", len(renders), f"1 to {count}, one for each exact render")
+    others = [*exact_renders[1:], exact_renders[0]]
+
+    def mean(measure: Callable[..., float], tests: Sequence[ArrayLike], references: Sequence[ArrayLike]) -> float:
+        return float(np.mean([measure(a, b) for a, b in zip(tests, references, strict=False)]))
+
+    floor, paired = mean(flip, exact_renders, others), mean(flip, renders, exact_renders)
+    return ImageErrors(
+        flip_paired=paired,
+        paired_share=paired / floor if floor > 0 else None,
+        flip=mean(flip, renders, others),
+        rel_mse=mean(rel_mse, renders, others),
+        noise_floor_flip=floor,
+        noise_floor_rel_mse=mean(rel_mse, exact_renders, others),
+        pairs=len(renders),
+    )
+
+
+_COLUMNS = 4  # with more, each picture would be too small
+
+
+def side_by_side(
+    images: Mapping[str, ArrayLike], error_maps: Mapping[str, ArrayLike], path: str | Path,
+    captions: Mapping[str, str] | None = None, title: str = "",
+) -> Path:  # fmt: skip
+    """Renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
+
+    Args:
+        images: name to linear RGB [H, W, 3], shown through `to_srgb`; all of one shape.
+        error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
+            All share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
+        path: PNG, PDF or SVG to write.
+        captions: name to one or two lines shown below its picture.
+    Raises:
+        InputError: values that are not finite.
+    """
+    pictures = {name: checked_image(image, name) for name, image in images.items()}
+    maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
+    low, high = error_scale(maps.values(), 99.5)
+    height, width = next(iter(pictures.values())).shape[:2]
+    rows, each = math.ceil(len(pictures) / _COLUMNS), 2 if maps else 1
+    columns = math.ceil(len(pictures) / rows)
+    wide = max(2.45, 7.6 / columns)
+    note = {"xycoords": "axes fraction", "xytext": (0, -5), "textcoords": "offset points", "ha": "center", "va": "top"}
+    with drawing(path, columns * wide + 1, rows * (each * wide * height / width + 1), title) as figure:
+        figure.set_layout_engine("compressed", h_pad=0.06)  # for pictures, which keep their aspect
+        grid = figure.subplots(each * rows, columns, squeeze=False)
+        for axes in grid.flat:
+            axes.set_axis_off()
+        for k, (name, picture) in enumerate(pictures.items()):
+            above, below = (grid[k // columns * each + i, k % columns] for i in (0, each - 1))
+            above.imshow(to_srgb(picture), interpolation="nearest")
+            above.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
+            if name in maps:
+                look = {"cmap": "magma", "norm": log_norm(low, high), "interpolation": "nearest"}
+                shown = below.imshow(np.maximum(maps[name], low), **look)
+            captioned = below if name in maps else above
+            captioned.annotate((captions or {}).get(name, ""), (0.5, 0), fontsize=8.6, color="#444444", **note)
+        if maps:
+            label = "FLIP difference, no unit: 0 none, 1 the most (logarithmic, one scale for all)"
+            bar = figure.colorbar(shown, ax=grid, label=label, aspect=40, extend="both")
+            bar.outline.set_visible(False)
+            plain_log_ticks(bar.ax.yaxis)
+    return Path(path)
+
+
+EXACT = "exact"
+
+
+@dataclass
+class Pictures:
+    """Records for `results.json`: pictures, cameras, figures."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)
+
+
+def scene_cameras(
+    lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings, fused: bool = False
+) -> dict[str, Camera]:
+    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens.
+
+    All are in best focus, and show the plane in focus at one size. Lens and models as C if `fused`.
+    """
+    widest = first_order(lens).f_number
+    # The same light for all cameras.
+    real = Shot(
+        shot.film_mm, shot.focus_m, max(shot.f_number or widest, widest), wavelength_nm=shot.wavelength_nm,
+        runtime=None if fused else "onnxruntime",
+    )  # fmt: skip
+    exact = ExactCamera(lens, real, bounds=domain.bounds)
+    fitted = {name: OnnxCamera(load_model(file), real) for name, file in models.items()}
+    thin, pinhole = (ideal_as(kind, exact.lens, real) for kind in ("thin:", "pinhole:"))
+    return {EXACT: exact, **fitted, "thin lens": thin, "pinhole": pinhole}
+
+
+def render_all(
+    choice: RenderChoice, lens: Lens, domain: Domain, models: Mapping[str, Path], folder: Path, report: Report
+) -> Pictures:
+    """Every scene through every camera with several seeds: for the noise floor, and their mean as the picture."""
+    records, fused = Pictures(), choice.fused and has_compiler()
+    scenes = [load_scene(path) for path in choice.scenes]
+    done, total = 0, len(scenes) * (3 + len(models)) * choice.seeds
+    for scene in scenes:
+        film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
+        renders: dict[str, list[FloatArray]] = {}
+        for name, camera in scene_cameras(lens, domain, models, scene.settings.camera, fused).items():
+            for seed in range(choice.seeds):
+                result = render(
+                    scene, camera, width=choice.width, height=choice.height, samples=choice.samples, seed=seed,
+                    threads=choice.threads, film=film,
+                )  # fmt: skip
+                renders.setdefault(name, []).append(result.rgb)
+                done += 1
+                report(done / total)
+            stats = result.stats
+            share, record = stats["camera_fraction"], {"name": name, "scene": scene.name, "render_s": stats["seconds"]}
+            record |= {"camera_s": share * stats["seconds"], "camera_share": share}
+            records.cameras.append(record | {key: stats[key] for key in ("samples", "width", "height", "threads")})
+            metadata = {"render": result.stats, "camera": camera.settings, "mean_of_renders": choice.seeds}
+            file, mean = folder / f"{_stem(scene, name)}.exr", np.mean(renders[name], axis=0, dtype=np.float32)
+            attributes = standard_attributes(camera.settings, choice.width, choice.height)
+            write_exr(file, mean, half=True, metadata=metadata, attributes=attributes)
+            write_png(file.with_suffix(".png"), mean)
+        _compare_scene(records, scene, choice, renders, folder)
+    return records
+
+
+def _stem(scene: Scene, name: str) -> str:
+    return f"{scene.name}-{name.replace(' ', '-')}"
+
+
+def _compare_scene(
+    records: Pictures, scene: Scene, choice: RenderChoice, renders: Mapping[str, list[FloatArray]], folder: Path
+) -> None:
+    exact = renders[EXACT]
+    captions, maps = {}, {}
+    for name, pictures in renders.items():
+        record: dict[str, Any] = {"name": f"{scene.name}, {name}", "scene": scene.name, "camera": name}
+        record |= {f"file_{kind}": f"{folder.name}/{_stem(scene, name)}.{kind}" for kind in ("png", "exr")}
+        record["samples"] = choice.samples * choice.seeds
+        if name != EXACT:
+            errors = compare(pictures, exact)
+            record |= asdict(errors)
+            captions[name] = (
+                f"FLIP {errors.flip_paired:.3g} (noise {errors.noise_floor_flip:.3g})\n"
+                f"relMSE {errors.rel_mse:.3g} (noise {errors.noise_floor_rel_mse:.3g})"
+            )
+            maps[name] = flip_map(np.mean(pictures, axis=0), np.mean(exact[: len(pictures)], axis=0))
+        records.images.append(record)
+    maps[EXACT] = flip_map(exact[0], exact[1])
+    captions[EXACT] = "two seeds: the noise floor"
+    file = folder / f"{scene.name}-side-by-side.png"
+    shown = {name: np.mean(pictures, axis=0) for name, pictures in renders.items()}
+    side_by_side(shown, maps, file, captions, title=f"{scene.name}, error against exact")
+    caption = f"The mean of {choice.seeds} renders of {choice.samples} samples a pixel. Below each its FLIP difference "
+    caption += "from the exact lens's with the same random numbers; below the exact lens that of two seeds."
+    title = f"{scene.name}: every camera"
+    records.figures.append({"file": f"{folder.name}/{file.name}", "title": title, "caption": caption, "wide": True})
+
+
+def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depths [N] of what a camera's chief rays of film points [2, N] meet, in m from the film plane along the axis.
+
+    inf where they meet nothing, NaN where no light passes.
+    """
+    shot, count = scene.settings.camera, film_mm.shape[1]
+    nanometres = np.full(count, np.mean(shot.wavelength_nm), np.float32)
+    rays = camera.sample(film_mm.astype(np.float32), np.full((2, count), 0.5, np.float32), nanometres)
+    axes, position = camera_axes(shot), np.array(shot.position_m, np.float32)[:, None]
+    world = world_of(scene, SpectralRange(*shot.wavelength_nm), geometry=True)
+    distance, _ = world.nearest(Rays.of(axes @ rays.origin_m + position, axes @ rays.direction))
+    with np.errstate(invalid="ignore"):
+        depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z
+    return np.where(rays.weight > 0, np.where(np.isfinite(distance), depth, np.inf), np.nan)
