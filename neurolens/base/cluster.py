@@ -95,7 +95,7 @@ class Dask(ThreadPoolExecutor):
     def _client(self) -> Any:
         with self._lock:
             if self._cluster is None:
-                self._cluster = _Cluster(_distributed(), self._address)
+                self._cluster = _Cluster(distributed(), self._address)
             return self._cluster.client
 
     def _on_worker(self, work: Callable[..., R], args: Any, named: Any) -> R:
@@ -166,7 +166,8 @@ def _in_time(work: Callable[..., Any], limit_s: float, args: Any, named: Any) ->
         pool.shutdown(wait=False)
 
 
-def _distributed() -> Any:
+def distributed() -> Any:
+    """Dask's package. Raises NeurolensError, which names the extra, where it is not installed."""
     try:
         import distributed
     except ModuleNotFoundError:

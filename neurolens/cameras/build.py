@@ -56,8 +56,6 @@ def with_dispersion(camera: Camera, shot: Shot) -> Camera:
 
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     kind, path = resolve(spec)
-    if path is None or kind in IDEAL_OF:
-        refuse(spec, "runtime", shot.runtime, "left out: only a lens or a model has a choice")
     if path is None:
         return _ideal(kind, shot)
     if kind in IDEAL_OF:

@@ -217,6 +217,7 @@ class LensCamera:
     _light_nm: tuple[float, float]
     _runs: dict[tuple[int, Kind, int], GraphRun]
     _told: Callable[[str], None]
+    _asked: bool
     differentials_error: float | None = None
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
@@ -298,14 +299,9 @@ class LensCamera:
             InputError: C was asked for, and there is no compiler, or one that fails.
         """
         self.runtime, self._runs = runtime or ("c" if has_compiler() else "onnxruntime"), {}
-        self._told = (progress or Progress(quiet=True)).note
+        self._asked, self._told = runtime is not None, (progress or Progress(quiet=True)).note
         if self.runtime == "c":
-            try:
-                self._run("rays")
-            except InputError:
-                if runtime:
-                    raise
-                self.runtime = "onnxruntime"
+            self._run("rays")
         self.settings = self.settings | {"runtime": self.runtime}
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
@@ -378,9 +374,16 @@ class LensCamera:
                 same = {k: graph.outputs[k] for k in ("pupil_mm", "weight")} | {"area_mm2": area}
                 graph.outputs |= graph.inline(lanes_graph(self._shift, companions), same)
         if self.runtime == "c":
-            return _compiled(
-                graph, numbers, self.film, lens, lambda how: self._told(f"compiled {self.name}, {kind}, {how}")
-            )
+            try:
+                return _compiled(
+                    graph, numbers, self.film, lens, lambda how: self._told(f"compiled {self.name}, {kind}, {how}")
+                )
+            except InputError as error:  # a compiler that fails, or takes too long
+                if self._asked:
+                    raise
+                self._told(f"{self.name} runs in onnxruntime: {error}")
+                self.runtime, self._runs = "onnxruntime", {}
+                return self._made(kind, companions)
         return self._in_onnxruntime(graph, numbers, lens)
 
     @cached_property

@@ -198,7 +198,12 @@ def _squeeze(file: Path, zoom: str | None) -> float:
         from neurolens.optics.setting.states import set_lens
 
         return squeeze_of(set_lens(read_any(file), zoom=zoom))
-    return float(make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
+    return float(
+        make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom, runtime="onnxruntime")).settings["lens_state"][
+            "squeeze"
+        ]
+        or 1.0
+    )
 
 
 def squeeze_of(lens: Lens) -> float:

@@ -159,7 +159,7 @@ examples:
 
     def _write_camera(self, file: Path) -> dict[str, Any]:
         """The whole camera of a model or a lens file as source code."""
-        shot = Shot(self.film, self.focus_m, self.f_number, zoom=self.zoom)
+        shot = Shot(self.film, self.focus_m, self.f_number, zoom=self.zoom, runtime="onnxruntime")
         camera: Any = make_camera(file, shot, self.progress())
         facts = camera.settings
         lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]

@@ -358,7 +358,7 @@ class Shots:
     def _field(self, args: Flare) -> Field:
         """The directions that the film sees, which frames of one state share."""
         if args.state not in self._fields:
-            camera = make_camera(args.file, args.state.shot(args.film), self._progress)
+            camera = make_camera(args.file, args.state.shot(args.film, runtime="onnxruntime"), self._progress)
             self._fields[args.state] = field_of(camera, args.focus_m, "equidistant")
         return self._fields[args.state]
 

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.cluster import Dask
+from neurolens.base.cluster import Dask, distributed
 from neurolens.base.errors import NeurolensError, printable, warn
 from neurolens.base.files import atomic_write_text, library
 from neurolens.base.html import html
@@ -53,7 +53,7 @@ class Render(cli.Reporting):
 
     The same seed gives the same picture for any number of threads; all cameras share its
     random numbers. Lenses and models run as C where the machine has a compiler, which the first
-    picture takes some seconds for. No camera needs torch.
+    picture takes some seconds for. No camera needs torch, but for --field.
 
     The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
     command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
@@ -123,6 +123,8 @@ examples:
             raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
 
     def _run(self) -> int:
+        if self.dask is not None:
+            distributed()  # before a camera is made
         frame = self.frame()
         frames = {
             numbered(self.out, digits): replace(frame, **values, number=number, seed=frame.seed + (number or 0))

@@ -31,7 +31,8 @@ _SECONDS = 300  # the largest models known compile in ten
 _ROOM = 2**20
 _KEPT = 64  # libraries of 50 to 200 kB
 _ONE_AT_A_TIME = threading.RLock()  # threads that need the same library do not both compile it
-os.register_at_fork(after_in_child=_ONE_AT_A_TIME._at_fork_reinit)  # type: ignore[attr-defined]
+if hasattr(os, "register_at_fork"):  # not under Windows
+    os.register_at_fork(after_in_child=_ONE_AT_A_TIME._at_fork_reinit)  # type: ignore[attr-defined]
 
 
 def find_compiler() -> str:

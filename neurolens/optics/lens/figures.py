@@ -23,6 +23,8 @@ import numpy as np
 # 180 no lens that ships gains by it (`python -m experiments precision`).
 CANCELS = 100.0
 MOST_Q_TERMS = 20
+LEAST_NORM_MM = 1e-3
+WIDEST_Q = 2.0  # rim radius over the normalisation radius of a Qcon; beyond, its terms overflow
 Bound = tuple[str, float, float, float, str]
 
 
@@ -281,22 +283,25 @@ class Qcon(Figure):
     norm_mm: float
 
     def __post_init__(self) -> None:
-        if not (0 < self.norm_mm < math.inf and all(map(math.isfinite, self.qcon)) and len(self.qcon) <= MOST_Q_TERMS):
-            raise ValueError(f"at most {MOST_Q_TERMS} finite coefficients and a normalisation radius above 0")
+        finite = all(map(math.isfinite, self.qcon)) and len(self.qcon) <= MOST_Q_TERMS
+        if not (finite and LEAST_NORM_MM <= self.norm_mm < math.inf):
+            least = f"a normalisation radius of at least {LEAST_NORM_MM:g} mm"
+            raise ValueError(f"at most {MOST_Q_TERMS} finite coefficients and {least}")
 
     @property
     def powers(self) -> tuple[tuple[int, Any], ...]:
-        return tuple((p, float(a)) for p, a in _qcon_powers(self.qcon, self.norm_mm))
+        return tuple((p, float(a)) for p, a in qcon_powers(self.qcon, self.norm_mm))
 
     def centred(self, rim_mm: float) -> Centred | None:
-        return _centred(_qcon_powers(self.qcon, self.norm_mm), rim_mm)
+        return _centred(qcon_powers(self.qcon, self.norm_mm), rim_mm)
 
     def scaled(self, factor: float) -> Figure:
         return replace(self, qcon=tuple(a * factor for a in self.qcon), norm_mm=self.norm_mm * factor)
 
     def bounds(self, rim_mm: float) -> list[Bound]:
-        sag, wider = sum(map(abs, self.qcon)), rim_mm / self.norm_mm
-        more = ("qcon", sag, 0.0, 1e6, " mm of sag"), ("norm_mm", wider, 0.0, 2.0, ": rim radius over it")
+        least = rim_mm / WIDEST_Q
+        more = ("norm_mm", self.norm_mm, least, math.inf, ": from half of the rim's radius on")
+        more = ("qcon", sum(map(abs, self.qcon)), 0.0, 1e6, " mm of sag"), more
         return [super().bounds(0.0)[0], *more]
 
     @classmethod
@@ -307,7 +312,7 @@ class Qcon(Figure):
         if "asphere" in row:
             raise row.error("asphere", row.data["asphere"], "none beside qcon")
         each = replace(row, data={f"qcon[{m}]": value for m, value in enumerate(values)})
-        norm = row.number("norm_mm", unit="mm", above=0)
+        norm = row.number("norm_mm", unit="mm", above=LEAST_NORM_MM)
         return super().read(row) | {"qcon": [each.number(key) for key in each.data], "norm_mm": norm}
 
 
@@ -360,7 +365,7 @@ def number_of(value: Any) -> float:
 
 
 @lru_cache(maxsize=4096)
-def _qcon_powers(a: tuple[float, ...], norm_mm: float) -> tuple[tuple[int, Fraction], ...]:
+def qcon_powers(a: tuple[float, ...], norm_mm: float) -> tuple[tuple[int, Fraction], ...]:
     """The powers of h of a Qcon sum, exactly."""
     found = [Fraction()] * len(a)
     for m, value in enumerate(a):

@@ -97,7 +97,8 @@ class Shot:
         "(default: full)",
     )  # fmt: skip
     runtime: Runtime | None = setting(
-        None, "what runs a lens or model, to compare: the same rays (default: c where the machine has a C compiler)"
+        None,
+        "what runs a lens or model, to compare: the same rays (default: c where the machine has a C compiler that takes it)",
     )
 
     def __post_init__(self) -> None:

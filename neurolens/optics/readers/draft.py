@@ -14,7 +14,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError, printable
 from neurolens.base.settings import WAVELENGTH_NM, within
-from neurolens.optics.lens.figures import MOST_Q_TERMS, figure_of
+from neurolens.optics.lens.figures import MOST_Q_TERMS, WIDEST_Q, figure_of, qcon_powers
 from neurolens.optics.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.optics.readers.assemble import (
     UNKNOWN,
@@ -77,6 +77,10 @@ class Block:
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MOST_Q_TERMS:
             raise self.start.error(name, f"({len(values)} terms)", f"at most {MOST_Q_TERMS} terms")
+        if qcon and not any(values):
+            return self.rotational()
+        if qcon and rim > WIDEST_Q * radius:
+            return self.rotational(qcon_powers(values, radius))
         if qcon:
             return self.rotational() | {"qcon": values, "norm_mm": radius}
         try:

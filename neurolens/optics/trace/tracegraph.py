@@ -90,7 +90,10 @@ def exact_graph(
     directions = r[3:] if is_number(n) and n == 1 else [d * (1 / n) for d in r[3:]]
     g.outputs["scene_ray"] = g.concat(*(g.value(v) for v in (*r[:3], *directions)))
     if power is not None:
-        g.outputs |= {"transmittance": power.arrived(r.x), "stop_xy_mm": at_stop}
+        through = g.value(power.arrived(r.x))
+        if through.node.kind == "constant":  # no surface takes light: still a number a ray
+            through = g.select(rays[0] <= rays[0], through, 0.0)
+        g.outputs |= {"transmittance": through, "stop_xy_mm": at_stop}
     pairs, codes = zip(*tests, strict=True) if tests else ((), ())
     status = g.first_failure([(g.value(a), g.value(b)) for a, b in pairs], codes)
     if stop_radius is not None:

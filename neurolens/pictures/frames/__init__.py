@@ -359,7 +359,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
     for frame in frames[:: -(-len(frames) // _CHOICE_FRAMES)]:
         if _state(frame) not in lenses:
             shot = frame.shot(scene.settings.camera, scene.aperture)
-            lenses[_state(frame)] = make_camera(str(frame.camera), shot).lens  # type: ignore[attr-defined]
+            lenses[_state(frame)] = make_camera(str(frame.camera), replace(shot, runtime="onnxruntime")).lens  # type: ignore[attr-defined]
         scenes.append((seen_from(scene, frame.scene, frame.position_m, frame.look_at_m), lenses[_state(frame)]))
     with _errors_of_table(prepared.frame.scene):
         return scene_choice(scenes, _raster(prepared), threads, fade=prepared.frame.number is not None)

@@ -133,7 +133,7 @@ def test_what_a_name_means(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     Path("cooke_triplet_50").mkdir()  # the folder of an earlier run is no lens
     assert resolve("cooke_triplet_50").file == shipped
     Path("cooke_triplet_50.d").write_text("a file comes first")
-    assert resolve("fused:cooke_triplet_50.d") == ("fused:", Path("cooke_triplet_50.d"))
+    assert resolve("fused:cooke_triplet_50.d") == ("", Path("cooke_triplet_50.d"))
     assert resolve("pinhole") == ("pinhole", None) and resolve("thin:cooke_triplet_50") == ("thin:", shipped)
     Path("1:2.8 lens.zmx").touch()
     assert split_kind("thick:1:2.8 lens.zmx") == ("thick:", "1:2.8 lens.zmx")
@@ -158,7 +158,7 @@ def test_a_plan_s_file_stands_for_its_camera_of_any_format(files: dict[str, Path
     plan = tmp_path / "plans" / "plan.toml"
     plan.parent.mkdir()
     plan.write_text(f'title = "x"\ncamera = "fused:../{files["zmx"].name}"\n')
-    assert resolve(plan) == ("fused:", files["zmx"]) and resolve(f"thin:{plan}") == ("thin:", files["zmx"])
+    assert resolve(plan) == ("", files["zmx"]) and resolve(f"thin:{plan}") == ("thin:", files["zmx"])
 
 
 def test_ids_are_names_of_files() -> None:

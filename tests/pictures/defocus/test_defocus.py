@@ -485,7 +485,9 @@ def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
         np.testing.assert_allclose(cells.sum(axis=(1, 2)), 1, rtol=1e-4)
         middle = (cells[..., 1].sum(axis=1) * (np.arange(side) + 0.5)).sum(axis=1)
         np.testing.assert_allclose(middle, side / 2, atol=0.6)
-        np.testing.assert_allclose(cells[0], cells[2][:, ::-1], atol=0.02 * cells.max())  # the lens is round
+        # The lens is round; the middles of these cells lie on borders of pixels, and roundings choose the side.
+        turned = [np.roll(cells[2][:, ::-1], k, axis=1) for k in (-1, 0, 1)]
+        assert min(np.abs(cells[0] - other).max() for other in turned) < 0.02 * cells.max()
     light = [k["light"][1] for k in data["kernels"][:3]]
     assert light[0] == pytest.approx(light[2], rel=1e-3) and light[0] < 0.95 * light[1]
 

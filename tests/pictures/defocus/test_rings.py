@@ -150,9 +150,9 @@ def test_grooves_finer_than_a_pixel_leave_no_checkerboard_but_rings_where_those_
     camera = make_camera("fused:canon_aspheric_50", Shot((36.0, 24.0), 2.0, f_number=1.2))
     plate = own_plate(camera, (2000, 1333))
     place, w = (1000.0, 666.5 - away), 1 / (6 - plate.pinhole.before_film_mm / 1000)
-    kernel = kernel_at(camera, plate, place, w, place, colours=1, grooves=Grooves(60.0, 0.5))
+    kernel = kernel_at(camera, plate, place, w, place, colours=2, grooves=Grooves(60.0, 0.5))
     assert kernel is not None
-    light = kernel.light[..., -1].astype(np.float64)
+    light = kernel.light[..., 1].astype(np.float64)
     height, width = light.shape
     cells = light[: height // 8 * 8, : width // 8 * 8].reshape(height // 8, 8, width // 8, 8).swapaxes(1, 2)
     lit = cells.min(axis=(2, 3)) > 0.3 * light[light > 0].mean()  # without the rim
