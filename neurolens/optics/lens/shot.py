@@ -98,7 +98,8 @@ class Shot:
     )  # fmt: skip
     runtime: Runtime | None = setting(
         None,
-        "what runs a lens or model, to compare: the same rays (default: c where the machine has a C compiler that takes it)",
+        "what runs a lens or model, to compare: the same rays (default: c where the machine has a C compiler that "
+        "takes it)",
     )
 
     def __post_init__(self) -> None:

@@ -80,7 +80,7 @@ class Block:
         if qcon and not any(values):
             return self.rotational()
         if qcon and rim > WIDEST_Q * radius:
-            return self.rotational(qcon_powers(values, radius))
+            return self.rotational((p, float(a)) for p, a in qcon_powers(tuple(values), radius))
         if qcon:
             return self.rotational() | {"qcon": values, "norm_mm": radius}
         try:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
+from shipped import whole
 
 from neurolens.cameras import field as fields
 from neurolens.cameras.build import make_camera
@@ -61,8 +62,10 @@ def table_of(
     ("name", "film", "focus_m", "near_m", "f_number", "degrees", "central_px"),
     [
         ("isshiki_fisheye_10", (18.0, 18.0), 1.0, 0.3, 90.0, np.linspace(4, 50, 12), 10),
-        ("nikon_zoom_14_24", (36.0, 24.0), math.inf, 0.3, 22.0, np.linspace(3, 38, 12), 1),
-        ("nikon_af_s_nikkor_800mm_f5_6e_fl_ed_vr", (36.0, 24.0), math.inf, 6.0, 90.0, np.linspace(0.1, 0.8, 12), 0),
+        *whole(("nikon_zoom_14_24", (36.0, 24.0), math.inf, 0.3, 22.0, np.linspace(3, 38, 12), 1)),
+        *whole(
+            ("nikon_af_s_nikkor_800mm_f5_6e_fl_ed_vr", (36.0, 24.0), math.inf, 6.0, 90.0, np.linspace(0.1, 0.8, 12), 0)
+        ),
     ],
     ids=["fisheye", "wide", "telephoto"],
 )
@@ -105,6 +108,7 @@ def test_a_table_has_the_chief_rays_where_one_centre_has_not(
     assert off >= central_px
 
 
+@pytest.mark.whole  # a quarter of a minute
 def test_a_lens_with_cylinders_has_two_pupils_which_a_table_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fields, "_OTHER", (25, 16))
     monkeypatch.setattr(files, "_CELLS", (12,))

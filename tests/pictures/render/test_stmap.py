@@ -189,6 +189,7 @@ def test_lateral_colour_is_that_of_the_analysis() -> None:
     assert np.abs(found.lateral_um[3:8]).max() > 1  # there is some to be seen
 
 
+@pytest.mark.whole  # takes half a minute; lenses that are round have the same maps
 def test_maps_of_an_anamorphic_lens_tell_their_pixels_shape_and_both_pupils(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
