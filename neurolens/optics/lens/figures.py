@@ -299,10 +299,9 @@ class Qcon(Figure):
         return replace(self, qcon=tuple(a * factor for a in self.qcon), norm_mm=self.norm_mm * factor)
 
     def bounds(self, rim_mm: float) -> list[Bound]:
-        least = rim_mm / WIDEST_Q
-        more = ("norm_mm", self.norm_mm, least, math.inf, ": from half of the rim's radius on")
-        more = ("qcon", sum(map(abs, self.qcon)), 0.0, 1e6, " mm of sag"), more
-        return [super().bounds(0.0)[0], *more]
+        sag = sum(map(abs, self.qcon))
+        norm = "norm_mm", self.norm_mm, rim_mm / WIDEST_Q, math.inf, ": from half of the rim's radius on"
+        return [super().bounds(0.0)[0], ("qcon", sag, 0.0, 1e6, " mm of sag"), norm]
 
     @classmethod
     def read(cls, row: Any) -> dict[str, Any]:

@@ -58,6 +58,9 @@ def table_of(
     return camera, field, *files.ray_table(camera, field, size, film, focus_m, near_m)
 
 
+EIGHT_HUNDRED = "nikon_af_s_nikkor_800mm_f5_6e_fl_ed_vr"
+
+
 @pytest.mark.parametrize(
     ("name", "film", "focus_m", "near_m", "f_number", "degrees", "central_px"),
     [
