@@ -9,7 +9,8 @@ import inspect
 import math
 import os
 from base64 import b64encode
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from html import escape
@@ -59,6 +60,15 @@ EXAMPLES = {  # of each name: its docstring has it, and a test runs it
 }
 
 
+@contextmanager
+def _installed() -> Iterator[None]:
+    """Say of a package that is missing what a command says: the extra that brings it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise (NeurolensError(missing(error)) if missing(error) else error) from None
+
+
 class Call:
     """A function of the front."""
 
@@ -66,10 +76,8 @@ class Call:
         self._run, self.__name__, self.__doc__, self.__signature__ = run, name, doc, signature
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        try:
+        with _installed():
             return self._run(*given, **named)
-        except ModuleNotFoundError as error:  # as a command says it, with the extra that brings the package
-            raise (NeurolensError(missing(error)) if missing(error) else error) from None
 
     def __repr__(self) -> str:
         return f"neurolens.{self.__name__}{self.__signature__}"
@@ -80,7 +88,8 @@ def of(name: str) -> Call:
     example = f"Example::\n\n    >>> import neurolens as nl\n    >>> {EXAMPLES[name]}\n"
     others: dict[str, Callable[..., Any]] = {"find": find, "load": load, "fit": fit, "rays": rays}
     if (own := others.get(name)) is not None:
-        return Call(name, own, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own))
+        run = _rays if name == "rays" else own
+        return Call(name, run, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own))
     chosen = {"lens": Lens, "camera": Camera}.get(name)
     reads = chosen.reads if chosen else command(name)
     listed = "\n".join(f"    {key}: {action.help}" for key, action in parameters(reads)[1].items())
@@ -88,6 +97,7 @@ def of(name: str) -> Call:
     return Call(name, chosen.make if chosen else partial(run_command, reads), doc, signature_of(reads))
 
 
+@_installed()
 def run_command(cls: type[cli.Command], *given: Any, **named: Any) -> Answer:
     """Run a command; a lens or camera among the values brings its settings."""
     for value in (*given, *named.values()):
@@ -98,6 +108,20 @@ def run_command(cls: type[cli.Command], *given: Any, **named: Any) -> Answer:
 
 def _settings(value: Any) -> Mapping[str, Any]:
     return value.settings if isinstance(value, _Chosen) else {}
+
+
+def _rays(*given: Any, **named: Any) -> dict[str, Any]:
+    """Rays with the settings that a lens or camera brings, where the call has none of the same name."""
+    values = inspect.signature(rays).bind_partial(*given, **named).arguments
+    values |= values.pop("settings", {})
+    if not isinstance(chosen := values.get("camera"), _Chosen):
+        return rays(*given, **named)
+    read = chosen._read
+    brought = {name: value for name, value in read.state.settings().items() if value is not None}
+    if isinstance(chosen, Camera):
+        brought |= {"film": read.film} | read.more
+    with cli.more_glasses(read.glass):
+        return rays(**{**brought, **values})
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,6 +164,7 @@ class _ReadLens(cli.Command):
     called: ClassVar[str] = "nl.lens"
     file: Path = cli.lens(positional=True)
     state: cli.LensState = cli.lens_state()
+    glass: tuple[Path, ...] = setting_of(cli.Reporting, "glass", ())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,10 +178,18 @@ class _ReadCamera(cli.Command):
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     state: cli.LensState = cli.lens_state()
+    glass: tuple[Path, ...] = setting_of(cli.Reporting, "glass", ())
+
+    @property
+    def more(self) -> dict[str, Any]:
+        """What is given of a `Shot` besides the state and the film."""
+        given = {name: getattr(self, name) for name in ("film_offset_mm", "vignetting", "dispersion")}
+        return {name: value for name, value in given.items() if value is not None}
 
 
 class Lens(_Chosen):
-    """A lens by its name or file, zoomed, stopped down and focused; notebooks draw it. Needs the extra "train" (torch).
+    """A lens by its name or file, zoomed, stopped down and focused; notebooks draw it. What traces its rays, as `trace`,
+    `analyse`, `describe` and `draw`, needs the extra "train" (torch).
 
     Raises:
         InputError: no such lens, with the nearest name; a setting that it cannot have.
@@ -171,7 +204,8 @@ class Lens(_Chosen):
     def _tabled(self) -> Prescription:
         from neurolens.optics.readers.any_format import read_any
 
-        return read_any(self._read.file)
+        with cli.more_glasses(self._read.glass):
+            return read_any(self._read.file)
 
     @cached_property
     def prescription(self) -> Prescription:
@@ -205,6 +239,7 @@ class Lens(_Chosen):
         """From the film to the object in focus, or inf."""
         return float(self._read.state.focus_of(self._tabled, self.prescription))
 
+    @_installed()
     def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
         """Trace rays through every surface; the answer has the form of a model's, in float64.
 
@@ -248,17 +283,21 @@ class Lens(_Chosen):
         return f"{one_line(self.prescription.name, 200)}: {size}, focus at {focus}"
 
     @cached_property
-    def _png(self) -> bytes:
-        with TemporaryFolder() as folder:
-            self.draw(file := Path(folder) / "lens.png")
+    def _png(self) -> bytes | None:
+        """Its drawing; None without the packages that draw."""
+        with TemporaryFolder() as folder, suppress(ModuleNotFoundError):
+            call(command("lens"), (self,), {**self.settings, "layout": (file := Path(folder) / "lens.png")})
             return file.read_bytes()
+        return None
 
-    def _repr_png_(self) -> bytes:
+    def _repr_png_(self) -> bytes | None:
         return self._png
 
     def _repr_html_(self) -> str:
-        picture = b64encode(self._png).decode()
-        return f'<p>{escape(repr(self))}</p><img width="705" src="data:image/png;base64,{picture}">'
+        text = f"<p>{escape(repr(self))}</p>"
+        if self._png is None:
+            return text
+        return f'{text}<img width="705" src="data:image/png;base64,{b64encode(self._png).decode()}">'
 
 
 class Camera(_Chosen):
@@ -278,8 +317,8 @@ class Camera(_Chosen):
             InputError: a setting that this kind of camera does not have.
         """
         read = self._read
-        more = {name: getattr(read, name) for name in ("film_offset_mm", "vignetting", "dispersion")}
-        return cli.camera(read.camera, read.state.shot(read.film, **more), Progress(quiet=True))
+        with cli.more_glasses(read.glass):
+            return cli.camera(read.camera, read.state.shot(read.film, **read.more), Progress(quiet=True))
 
 
 class Model(OnnxLens):
