@@ -120,8 +120,7 @@ def _rays(*given: Any, **named: Any) -> dict[str, Any]:
     brought = {name: value for name, value in read.state.settings().items() if value is not None}
     if isinstance(chosen, Camera):
         brought |= {"film": read.film} | read.more
-    with cli.more_glasses(read.glass):
-        return rays(**{**brought, **values})
+    return rays(**{**brought, **values})
 
 
 @dataclass(frozen=True, repr=False)
@@ -164,7 +163,6 @@ class _ReadLens(cli.Command):
     called: ClassVar[str] = "nl.lens"
     file: Path = cli.lens(positional=True)
     state: cli.LensState = cli.lens_state()
-    glass: tuple[Path, ...] = setting_of(cli.Reporting, "glass", ())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +176,6 @@ class _ReadCamera(cli.Command):
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     state: cli.LensState = cli.lens_state()
-    glass: tuple[Path, ...] = setting_of(cli.Reporting, "glass", ())
 
     @property
     def more(self) -> dict[str, Any]:
@@ -188,8 +185,8 @@ class _ReadCamera(cli.Command):
 
 
 class Lens(_Chosen):
-    """A lens by its name or file, zoomed, stopped down and focused; notebooks draw it. What traces its rays, as `trace`,
-    `analyse`, `describe` and `draw`, needs the extra "train" (torch).
+    """A lens by its name or file, zoomed, stopped down and focused; notebooks draw it. `trace`, `analyse`, `describe`
+    and `draw` need the extra "train" (torch).
 
     Raises:
         InputError: no such lens, with the nearest name; a setting that it cannot have.
@@ -204,8 +201,7 @@ class Lens(_Chosen):
     def _tabled(self) -> Prescription:
         from neurolens.optics.readers.any_format import read_any
 
-        with cli.more_glasses(self._read.glass):
-            return read_any(self._read.file)
+        return read_any(self._read.file)
 
     @cached_property
     def prescription(self) -> Prescription:
@@ -317,8 +313,7 @@ class Camera(_Chosen):
             InputError: a setting that this kind of camera does not have.
         """
         read = self._read
-        with cli.more_glasses(read.glass):
-            return cli.camera(read.camera, read.state.shot(read.film, **read.more), Progress(quiet=True))
+        return cli.camera(read.camera, read.state.shot(read.film, **read.more), Progress(quiet=True))
 
 
 class Model(OnnxLens):

@@ -199,15 +199,6 @@ def test_rays_have_the_settings_of_a_lens_or_camera_unless_the_call_has_its_own(
         np.testing.assert_array_equal(ours[name], theirs[name])
 
 
-def test_a_lens_takes_glasses_of_a_catalogue(folder: Path) -> None:
-    (folder / "mine.agf").write_text("CC mine\nNM N-BK7 1 517642.251 1.5 64.17 0 1\nCD 2.25 0 0 0 0 0\nLD 0.3 2.5\n")
-    file = ROOT / "lenses" / "thorlabs_lb1471_biconvex_50.toml"
-    plain, other = nl.lens(file), nl.lens(file, glass="mine.agf")
-    assert other.focal_length_mm > 1.01 * plain.focal_length_mm  # of a lower index
-    told = [nl.analyse(lens, ["seidel"])["seidel"] for lens in (plain, other)]
-    assert told[0] != told[1]
-
-
 def test_a_camera_that_is_set_is_the_one_of_the_render() -> None:
     camera = nl.camera(nl.load(MODEL), film=(24, 16), focus_m=2, f_number=4)
     rays = camera.made.sample(*(np.zeros((2, 1), np.float32) + v for v in (0, 0.5)), np.full(1, 550, np.float32))

@@ -135,7 +135,7 @@ class RaySettings:
 
     def __post_init__(self) -> None:
         check_bounds(self, "rays")
-        clean: dict[str, Any] = {name: _whole(name, getattr(self, name), k) for name, k in (("samples", 1), ("seed", 0))}
+        clean: dict[str, Any] = {"samples": _whole("samples", self.samples, 1), "seed": _whole("seed", self.seed, 0)}
         for name in ("position_m", "look_at_m", "up"):
             if (given := getattr(self, name)) is None and name != "up":
                 continue
@@ -182,8 +182,8 @@ def rays(
     """The rays of a picture through a lens, as `neurolens rays` writes them.
 
     Args:
-        camera: a lens file, a model, the name of one, or another camera (`cameras.build.make_camera`). A lens or a
-            camera of `neurolens.lens` and `neurolens.camera` brings its settings; those of the call win.
+        camera: a lens file, a model, the name of one, or another camera (`cameras.build.make_camera`).
+            To `neurolens.rays` a lens or camera that is set brings its settings; those of the call win.
         film: its width and height in mm. width, height: of the picture in pixels, one or both.
         device: of torch; None gives arrays of numpy.
         settings: fields of `RaySettings`, and of `Shot` (f_number, zoom, ...; focus_m is infinity unless given).
@@ -242,7 +242,8 @@ class RayJob:
         self.camera, self.grid, self.settings, self.host = camera, grid, settings, HOSTS[settings.to]
         known = camera.wavelength_nm
         if settings.wavelengths is not None and known and not all(within(known, nm) for nm in settings.wavelengths):
-            raise InputError("rays", "wavelengths", settings.wavelengths, f"{said(known)} nm, the light of {camera.name}")
+            expected = f"{said(known)} nm, the light of {camera.name}"
+            raise InputError("rays", "wavelengths", settings.wavelengths, expected)
         self._sampler, self._light = Sampler(settings.samples, settings.seed), ChannelWavelengths(*LIGHT_NM)
         position = settings.position_m or (0.0, 0.0, 0.0)
         look = settings.look_at_m or (*position[:2], position[2] - 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -134,9 +135,7 @@ def test_a_camera_with_a_centre_has_rays_through_it() -> None:
     assert table.grid.shape[1] == 15 and max(row["worst_px"] for row in left) < 0.01
 
 
-def test_the_page_reads_a_table_that_does_not_span_the_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_reads_a_table_that_does_not_span_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("yaml", reason="PyYAML (extra dev) is not installed")
     page = (ROOT / "docs" / "pages" / "how-to" / "st-maps.md").read_text(encoding="utf-8")
     code = next(block for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "noncentral" in block)
@@ -146,9 +145,9 @@ def test_the_page_reads_a_table_that_does_not_span_the_picture(
     table = RayTable((1920, 1080), (200, 30), (1699, 1029), grid)
     files.write_ray_table(tmp_path / "gauss", table, [{"rms_px": 0.0, "worst_px": 0.0, "distance_m": 1.0}], "it", field)
     monkeypatch.chdir(tmp_path)
-    exec(code.replace("[0.5, 0.5]", "[300.5, 40.5]"), names := dict[str, Any]())
+    Path("block.py").write_text(code.replace("[0.5, 0.5]", "[300.5, 40.5]"), encoding="utf-8")
     exact = table(np.array([[300.0, 40.0], [959.5, 539.5]]))
-    found = names["found"]
+    found = runpy.run_path("block.py")["found"]
     found[:, 3:] /= np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
     np.testing.assert_allclose(found, exact, atol=1e-8)
 
