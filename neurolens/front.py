@@ -9,8 +9,8 @@ import inspect
 import math
 import os
 from base64 import b64encode
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from html import escape
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neurolens.base import lensname
-from neurolens.base.errors import InputError, NeurolensError, missing, one_line
+from neurolens.base.errors import InputError, installed, one_line
 from neurolens.base.files import TemporaryFolder, library
 from neurolens.base.progress import Progress
 from neurolens.base.settings import setting_of
@@ -60,15 +60,6 @@ EXAMPLES = {  # of each name: its docstring has it, and a test runs it
 }
 
 
-@contextmanager
-def _installed() -> Iterator[None]:
-    """Say of a package that is missing what a command says: the extra that brings it."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise (NeurolensError(missing(error)) if missing(error) else error) from None
-
-
 class Call:
     """A function of the front."""
 
@@ -76,7 +67,7 @@ class Call:
         self._run, self.__name__, self.__doc__, self.__signature__ = run, name, doc, signature
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        with _installed():
+        with installed():
             return self._run(*given, **named)
 
     def __repr__(self) -> str:
@@ -88,8 +79,9 @@ def of(name: str) -> Call:
     example = f"Example::\n\n    >>> import neurolens as nl\n    >>> {EXAMPLES[name]}\n"
     others: dict[str, Callable[..., Any]] = {"find": find, "load": load, "fit": fit, "rays": rays}
     if (own := others.get(name)) is not None:
-        run = _rays if name == "rays" else own
-        return Call(name, run, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own))
+        return Call(
+            name, _rays if name == "rays" else own, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own)
+        )
     chosen = {"lens": Lens, "camera": Camera}.get(name)
     reads = chosen.reads if chosen else command(name)
     listed = "\n".join(f"    {key}: {action.help}" for key, action in parameters(reads)[1].items())
@@ -97,7 +89,7 @@ def of(name: str) -> Call:
     return Call(name, chosen.make if chosen else partial(run_command, reads), doc, signature_of(reads))
 
 
-@_installed()
+@installed()
 def run_command(cls: type[cli.Command], *given: Any, **named: Any) -> Answer:
     """Run a command; a lens or camera among the values brings its settings."""
     for value in (*given, *named.values()):
@@ -112,15 +104,8 @@ def _settings(value: Any) -> Mapping[str, Any]:
 
 def _rays(*given: Any, **named: Any) -> dict[str, Any]:
     """Rays with the settings that a lens or camera brings, where the call has none of the same name."""
-    values = inspect.signature(rays).bind_partial(*given, **named).arguments
-    values |= values.pop("settings", {})
-    if not isinstance(chosen := values.get("camera"), _Chosen):
-        return rays(*given, **named)
-    read = chosen._read
-    brought = {name: value for name, value in read.state.settings().items() if value is not None}
-    if isinstance(chosen, Camera):
-        brought |= {"film": read.film} | read.more
-    return rays(**{**brought, **values})
+    brought = getattr(given[0] if given else named.get("camera"), "of_shot", {})
+    return rays(*given, **{k: v for k, v in brought.items() if k != "film" or len(given) < 2} | named)
 
 
 @dataclass(frozen=True, repr=False)
@@ -151,6 +136,12 @@ class _Chosen:
     def _read(self) -> Any:
         return command_of(self.reads, (self.name,), self.settings)
 
+    @property
+    def of_shot(self) -> dict[str, Any]:
+        """What is set, as `Shot` names it, but a camera's film as "film"."""
+        known, found = {"film", *Shot.__dataclass_fields__}, vars(self._read) | self._read.state.settings()
+        return {name: value for name, value in found.items() if name in known and value is not None}
+
     def set(self, **settings: Any) -> Self:
         """The same with further settings; None takes one away. Raises InputError for one that cannot be."""
         return self.make(self, **settings)
@@ -176,12 +167,6 @@ class _ReadCamera(cli.Command):
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     state: cli.LensState = cli.lens_state()
-
-    @property
-    def more(self) -> dict[str, Any]:
-        """What is given of a `Shot` besides the state and the film."""
-        given = {name: getattr(self, name) for name in ("film_offset_mm", "vignetting", "dispersion")}
-        return {name: value for name, value in given.items() if value is not None}
 
 
 class Lens(_Chosen):
@@ -235,7 +220,7 @@ class Lens(_Chosen):
         """From the film to the object in focus, or inf."""
         return float(self._read.state.focus_of(self._tabled, self.prescription))
 
-    @_installed()
+    @installed()
     def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
         """Trace rays through every surface; the answer has the form of a model's, in float64.
 
@@ -279,8 +264,7 @@ class Lens(_Chosen):
         return f"{one_line(self.prescription.name, 200)}: {size}, focus at {focus}"
 
     @cached_property
-    def _png(self) -> bytes | None:
-        """Its drawing; None without the packages that draw."""
+    def _png(self) -> bytes | None:  # None without the packages that draw
         with TemporaryFolder() as folder, suppress(ModuleNotFoundError):
             call(command("lens"), (self,), {**self.settings, "layout": (file := Path(folder) / "lens.png")})
             return file.read_bytes()
@@ -290,10 +274,8 @@ class Lens(_Chosen):
         return self._png
 
     def _repr_html_(self) -> str:
-        text = f"<p>{escape(repr(self))}</p>"
-        if self._png is None:
-            return text
-        return f'{text}<img width="705" src="data:image/png;base64,{b64encode(self._png).decode()}">'
+        drawn = self._png and f'<img width="705" src="data:image/png;base64,{b64encode(self._png).decode()}">'
+        return f"<p>{escape(repr(self))}</p>{drawn or ''}"
 
 
 class Camera(_Chosen):
@@ -312,8 +294,9 @@ class Camera(_Chosen):
         Raises:
             InputError: a setting that this kind of camera does not have.
         """
-        read = self._read
-        return cli.camera(read.camera, read.state.shot(read.film, **read.more), Progress(quiet=True))
+        settings = self.of_shot
+        shot = self._read.state.shot(settings.pop("film"), **settings)
+        return cli.camera(self._read.camera, shot, Progress(quiet=True))
 
 
 class Model(OnnxLens):
