@@ -10,6 +10,7 @@ import math
 import os
 from base64 import b64encode
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from html import escape
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neurolens.base import lensname
-from neurolens.base.errors import InputError, NeurolensError, missing, one_line
+from neurolens.base.errors import InputError, installed, one_line
 from neurolens.base.files import TemporaryFolder, library
 from neurolens.base.progress import Progress
 from neurolens.base.settings import setting_of
@@ -66,10 +67,8 @@ class Call:
         self._run, self.__name__, self.__doc__, self.__signature__ = run, name, doc, signature
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        try:
+        with installed():
             return self._run(*given, **named)
-        except ModuleNotFoundError as error:  # as a command says it, with the extra that brings the package
-            raise (NeurolensError(missing(error)) if missing(error) else error) from None
 
     def __repr__(self) -> str:
         return f"neurolens.{self.__name__}{self.__signature__}"
@@ -80,7 +79,9 @@ def of(name: str) -> Call:
     example = f"Example::\n\n    >>> import neurolens as nl\n    >>> {EXAMPLES[name]}\n"
     others: dict[str, Callable[..., Any]] = {"find": find, "load": load, "fit": fit, "rays": rays}
     if (own := others.get(name)) is not None:
-        return Call(name, own, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own))
+        return Call(
+            name, _rays if name == "rays" else own, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own)
+        )
     chosen = {"lens": Lens, "camera": Camera}.get(name)
     reads = chosen.reads if chosen else command(name)
     listed = "\n".join(f"    {key}: {action.help}" for key, action in parameters(reads)[1].items())
@@ -88,6 +89,7 @@ def of(name: str) -> Call:
     return Call(name, chosen.make if chosen else partial(run_command, reads), doc, signature_of(reads))
 
 
+@installed()
 def run_command(cls: type[cli.Command], *given: Any, **named: Any) -> Answer:
     """Run a command; a lens or camera among the values brings its settings."""
     for value in (*given, *named.values()):
@@ -98,6 +100,12 @@ def run_command(cls: type[cli.Command], *given: Any, **named: Any) -> Answer:
 
 def _settings(value: Any) -> Mapping[str, Any]:
     return value.settings if isinstance(value, _Chosen) else {}
+
+
+def _rays(*given: Any, **named: Any) -> dict[str, Any]:
+    """Rays with the settings that a lens or camera brings, where the call has none of the same name."""
+    brought = getattr(given[0] if given else named.get("camera"), "of_shot", {})
+    return rays(*given, **{k: v for k, v in brought.items() if k != "film" or len(given) < 2} | named)
 
 
 @dataclass(frozen=True, repr=False)
@@ -128,6 +136,12 @@ class _Chosen:
     def _read(self) -> Any:
         return command_of(self.reads, (self.name,), self.settings)
 
+    @property
+    def of_shot(self) -> dict[str, Any]:
+        """What is set, as `Shot` names it, but a camera's film as "film"."""
+        known, found = {"film", *Shot.__dataclass_fields__}, vars(self._read) | self._read.state.settings()
+        return {name: value for name, value in found.items() if name in known and value is not None}
+
     def set(self, **settings: Any) -> Self:
         """The same with further settings; None takes one away. Raises InputError for one that cannot be."""
         return self.make(self, **settings)
@@ -156,7 +170,8 @@ class _ReadCamera(cli.Command):
 
 
 class Lens(_Chosen):
-    """A lens by its name or file, zoomed, stopped down and focused; notebooks draw it. Needs the extra "train" (torch).
+    """A lens by its name or file, zoomed, stopped down and focused; notebooks draw it. `trace`, `analyse`, `describe`
+    and `draw` need the extra "train" (torch).
 
     Raises:
         InputError: no such lens, with the nearest name; a setting that it cannot have.
@@ -205,6 +220,7 @@ class Lens(_Chosen):
         """From the film to the object in focus, or inf."""
         return float(self._read.state.focus_of(self._tabled, self.prescription))
 
+    @installed()
     def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
         """Trace rays through every surface; the answer has the form of a model's, in float64.
 
@@ -248,17 +264,18 @@ class Lens(_Chosen):
         return f"{one_line(self.prescription.name, 200)}: {size}, focus at {focus}"
 
     @cached_property
-    def _png(self) -> bytes:
-        with TemporaryFolder() as folder:
-            self.draw(file := Path(folder) / "lens.png")
+    def _png(self) -> bytes | None:  # None without the packages that draw
+        with TemporaryFolder() as folder, suppress(ModuleNotFoundError):
+            call(command("lens"), (self,), {**self.settings, "layout": (file := Path(folder) / "lens.png")})
             return file.read_bytes()
+        return None
 
-    def _repr_png_(self) -> bytes:
+    def _repr_png_(self) -> bytes | None:
         return self._png
 
     def _repr_html_(self) -> str:
-        picture = b64encode(self._png).decode()
-        return f'<p>{escape(repr(self))}</p><img width="705" src="data:image/png;base64,{picture}">'
+        drawn = self._png and f'<img width="705" src="data:image/png;base64,{b64encode(self._png).decode()}">'
+        return f"<p>{escape(repr(self))}</p>{drawn or ''}"
 
 
 class Camera(_Chosen):
@@ -277,9 +294,9 @@ class Camera(_Chosen):
         Raises:
             InputError: a setting that this kind of camera does not have.
         """
-        read = self._read
-        more = {name: getattr(read, name) for name in ("film_offset_mm", "vignetting", "dispersion")}
-        return cli.camera(read.camera, read.state.shot(read.film, **more), Progress(quiet=True))
+        settings = self.of_shot
+        shot = self._read.state.shot(settings.pop("film"), **settings)
+        return cli.camera(self._read.camera, shot, Progress(quiet=True))
 
 
 class Model(OnnxLens):

@@ -120,6 +120,8 @@ def test_mistakes_that_only_a_call_can_make_are_one_line() -> None:
         (lambda: nl.fit(nl.lens(GAUSS, blades=5)), "blades"),
         (lambda: nl.train(lens=[nl.lens(GAUSS, f_number=4)]), "f_number: got (unknown key)"),
         (lambda: nl.lens(GAUSS).trace(np.zeros(6)), "an array (6, N)"),
+        (lambda: nl.lens("--help"), "LENS: --help"),
+        (lambda: nl.analyse(GAUSS, ["--help"]), "WHAT: got '--help'"),
     ):
         with pytest.raises(ValueError, match=re.escape(words)) as caught:
             wrong()
@@ -182,6 +184,21 @@ def test_a_lens_brings_its_settings_and_a_call_overrules_them() -> None:
     assert other["seidel"] == lens.set(f_number=4).analyse("seidel")["seidel"]
 
 
+def test_rays_have_the_settings_of_a_lens_or_camera_unless_the_call_has_its_own() -> None:
+    film, small = (36, 24), {"width": 12, "samples": 2}
+    lens = nl.lens(GAUSS, focus_m=2, f_number=8)
+    set_, plain = nl.rays(lens, film, **small), nl.rays(GAUSS, film, focus_m=2, f_number=8, **small)
+    own, far = nl.rays(lens, film, focus_m=5, **small), nl.rays(GAUSS, film, focus_m=5, f_number=8, **small)
+    for ours, theirs in ((set_, plain), (own, far)):
+        np.testing.assert_array_equal(ours["direction"], theirs["direction"])
+    assert (set_["direction"] != far["direction"]).any()
+    assert (nl.rays(lens.set(blades=3), film, **small)["direction"] != set_["direction"]).any()
+    camera = nl.camera(GAUSS, film=(24, 16), focus_m=2, vignetting="none")
+    ours, theirs = nl.rays(camera, **small), nl.rays(GAUSS, (24, 16), focus_m=2, vignetting="none", **small)
+    for name in ("direction", "weight"):
+        np.testing.assert_array_equal(ours[name], theirs[name])
+
+
 def test_a_camera_that_is_set_is_the_one_of_the_render() -> None:
     camera = nl.camera(nl.load(MODEL), film=(24, 16), focus_m=2, f_number=4)
     rays = camera.made.sample(*(np.zeros((2, 1), np.float32) + v for v in (0, 0.5)), np.full(1, 550, np.float32))
@@ -218,15 +235,18 @@ def test_the_package_is_imported_at_once_and_its_names_when_they_are_asked_for()
     assert min(float(run(code)) for _ in range(2)) < 0.05
 
 
-def test_without_torch_a_lens_says_what_to_install_and_models_run() -> None:
+def test_without_torch_a_lens_says_what_to_install_for_its_rays_and_models_run() -> None:
     code = (
         "import sys; sys.modules['torch'] = None; import neurolens as nl\n"
         f"print(nl.load({MODEL!r}).card['lens']['id'])\n"
-        "try: nl.lens('laikin_double_gauss_50')\n"
-        "except Exception as error: print(type(error).__name__, error)"
+        f"lens = nl.lens({GAUSS!r}).set(f_number=4); print(lens.t_stop > 4, lens._repr_png_(), lens._repr_html_())\n"
+        "for run in (lambda: lens.trace([[0]] * 6), lens.analyse, lens.describe, lambda: lens.draw('a.png')):\n"
+        "    try: run()\n"
+        "    except Exception as error: print(type(error).__name__, error)"
     )
     said = run(code).splitlines()
-    assert said[0] == GAUSS and said[1].startswith("NeurolensError") and "[train]" in said[1]
+    assert said[0] == GAUSS and said[1].startswith("True None <p>") and "<img" not in said[1] and len(said) == 6
+    assert all(line.startswith("NeurolensError") and "[train]" in line for line in said[2:])
 
 
 def test_every_name_has_an_example_that_its_help_shows() -> None:

@@ -111,6 +111,15 @@ def missing(error: BaseException) -> str:
     return f"this needs {package}, which is not installed: {pip_install(EXTRAS[package])}"
 
 
+@contextmanager
+def installed() -> Iterator[None]:
+    """In the block, an import that does not find a package is a NeurolensError that says what brings it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise (NeurolensError(missing(error)) if missing(error) else error) from None
+
+
 def reason(error: BaseException) -> str:
     """What an error says, of one of the system with its file; the error of a full disk names none."""
     if text := missing(error):

@@ -74,7 +74,7 @@ def parameters(cls: type[Command]) -> tuple[Parser, dict[str, argparse.Action]]:
     A name is that of the option with its unit, as focus_m of --focus M, and for_ of --for. Arguments come first, then
     the option that names the lens: in a call, as nl.render(scene, lens), these may stand without their names.
     """
-    parser = _Parser(prog=cls.called)
+    parser = _Parser(prog=cls.called, add_help=False)
     cls.fill(parser)
     shown = (a for a in parser._actions if a.help != argparse.SUPPRESS and a.dest not in ("help", "json"))
     return parser, {a.dest + "_" * keyword.iskeyword(a.dest): a for a in sorted(shown, key=_keyed)}
@@ -108,7 +108,10 @@ def command_of(cls: type[C], given: Sequence[Any], named: Mapping[str, Any]) -> 
     if len(given) > len(bare) or named.keys() & set(bare[: len(given)]):
         raise InputError(cls.called, "arguments", f"({len(given)} without names)", f"{', '.join(bare)}, each once")
     values = dict(zip(bare, given, strict=False)) | dict(named)
-    return cls.of(parser.parse_args([w for k, v in values.items() if v is not None for w in _words(known[k], v)]))
+    words = [(known[k].option_strings, _words(known[k], v)) for k, v in values.items() if v is not None]
+    options, bare = ([w for named_by, ws in words if bool(named_by) is own for w in ws] for own in (True, False))
+    parser.intermixed = False  # which would lose the "--" before the arguments, whose values may start with "-"
+    return cls.of(parser.parse_args([*options, *(["--", *bare] if bare else [])]))
 
 
 def call(cls: type[Any], given: Sequence[Any], named: Mapping[str, Any]) -> Answer:

@@ -114,6 +114,8 @@ class _Writer:
                 names += self._of_frame(k)
                 if tables:
                     names.append(self._ray_table(k))
+                else:  # one of an earlier run would not belong to these files
+                    standards.ray_table_path(self._name(k)).unlink(missing_ok=True)
                 report((k + 1) / len(self.frames))
         entries = self._entries(progress)
         exits, _ = read_channels(command.out / f"shot.exit{shot.frames[0].name}.exr", "RG")
@@ -158,8 +160,11 @@ class _Writer:
         field, near_m = frame.fields[""], command.near_m(frame.fields[""].frame)
         table, left = standards.ray_table(frame.camera, field, command.picture, command.film, frame.focus_m, near_m)
         self._worse("noncentral_px", max(row["worst_px"] for row in left))
-        name = command.out / f"shot{self.shot.frames[k].name}"
-        return standards.write_ray_table(name, table, left, self.shot.about, field)
+        return standards.write_ray_table(self._name(k), table, left, self.shot.about, field)
+
+    def _name(self, k: int) -> Path:
+        """The start of the names of a frame's files."""
+        return self.command.out / f"shot{self.shot.frames[k].name}"
 
     def _worse(self, name: str, value: float | None) -> None:
         if value is not None:

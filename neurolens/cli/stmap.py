@@ -414,6 +414,8 @@ examples:
                     camera, field, self.picture, self.film, shot.focus_m, near_m
                 )
             files = [handover.write_ray_table(out, table, data["noncentral"], str(self.camera), field)]
+        elif out is not None:  # one of an earlier run would not belong to these coefficients
+            handover.ray_table_path(out).unlink(missing_ok=True)
         if out is not None:
             files = handover.write_projection(out, fitted, data) + files
         if not left.sound:

@@ -498,11 +498,16 @@ def noncentral_pays(parallax: Sequence[Mapping[str, float]]) -> bool:
     return any(row["worst_px"] > CENTRAL_PX for row in parallax)
 
 
+def ray_table_path(out: Path) -> Path:
+    """NAME.noncentral.yaml."""
+    return out.with_name(f"{out.name}.noncentral.yaml")
+
+
 def write_ray_table(
     out: Path, table: projections.RayTable, left: list[dict[str, float]], about: str, field: Field
 ) -> str:
     """Write NAME.noncentral.yaml; its name."""
-    path = out.with_name(f"{out.name}.noncentral.yaml")
+    path = ray_table_path(out)
     values = {"table": table, "left": left, "before_film_mm": float(np.mean(field.frame.pupil_mm))}
     atomic_write_text(path, html("handover.noncentral.yaml.jinja", about=f"{about}, neurolens {__version__}", **values))
     return str(path)

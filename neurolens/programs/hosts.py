@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any, Literal, NamedTuple
 
@@ -24,11 +26,11 @@ from numpy.typing import NDArray
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.records import plain
-from neurolens.base.settings import check_bounds, setting, wavelengths_nm, whole
+from neurolens.base.settings import FILM_MM, WAVELENGTH_NM, check_bounds, said, setting, wavelengths_nm, whole, within
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.field import frame_of
-from neurolens.optics.lens.shot import Shot
+from neurolens.optics.lens.shot import Shot, check_film
 from neurolens.pictures.render.colour import ChannelWavelengths
 from neurolens.pictures.render.film import PixelGrid, check_memory
 from neurolens.pictures.render.job import camera_axes
@@ -41,6 +43,7 @@ Vector = tuple[float, float, float]
 LIGHT_NM = (400.0, 700.0)
 BYTES_A_RAY = 44  # at most, with three weights
 MOST_COMPACT_PX = 0.01  # by how much rays in 16 bytes may be off
+_LARGEST = (1 << 63) - 1  # what generators of random numbers take
 _PROBES, _FLATTEST = 4096, 0.17  # rays that measure it; their least cosine to the axis, of 80 degrees
 
 
@@ -132,6 +135,19 @@ class RaySettings:
 
     def __post_init__(self) -> None:
         check_bounds(self, "rays")
+        clean: dict[str, Any] = {"samples": _whole("samples", self.samples, 1), "seed": _whole("seed", self.seed, 0)}
+        for name in ("position_m", "look_at_m", "up"):
+            if (given := getattr(self, name)) is None and name != "up":
+                continue
+            clean[name] = _numbers(given)
+            if len(clean[name]) != 3 or not all(map(math.isfinite, clean[name])):
+                raise InputError("rays", name, given, "three numbers x, y, z")
+        if self.wavelengths is not None:
+            clean["wavelengths"] = waves = _numbers(self.wavelengths)
+            if not waves or not all(within(WAVELENGTH_NM, nm) for nm in waves):
+                raise InputError("rays", "wavelengths", self.wavelengths, f"one or more in nm, {said(WAVELENGTH_NM)}")
+        for name, value in clean.items():
+            object.__setattr__(self, name, value)
         if self.weights == "rgb" and self.wavelengths is not None:
             raise InputError("rays", "wavelengths", self.wavelengths, "left out: weights rgb are of all light")
         if self.compact and HOSTS[self.to].world:
@@ -143,6 +159,22 @@ class RaySettings:
         return LIGHT_NM if self.wavelengths is None else (min(self.wavelengths), max(self.wavelengths))
 
 
+def _whole(name: str, value: Any, least: int) -> int:
+    """An integer from `least` on; what is none is refused."""
+    with suppress(TypeError):
+        if least <= (number := operator.index(value)) <= _LARGEST:
+            return number
+    raise InputError("rays", name, value, f"an integer from {least}")
+
+
+def _numbers(values: Any) -> tuple[float, ...]:
+    """The numbers of a sequence; none where it is no sequence of numbers."""
+    try:
+        return () if isinstance(values, str) else tuple(float(value) for value in values)
+    except (TypeError, ValueError, OverflowError):
+        return ()
+
+
 def rays(
     camera: str | os.PathLike[str], film: tuple[float, float], *, width: int | None = None, height: int | None = None,
     device: Any = None, **settings: Any,
@@ -151,6 +183,7 @@ def rays(
 
     Args:
         camera: a lens file, a model, the name of one, or another camera (`cameras.build.make_camera`).
+            To `neurolens.rays` a lens or camera that is set brings its settings; those of the call win.
         film: its width and height in mm. width, height: of the picture in pixels, one or both.
         device: of torch; None gives arrays of numpy.
         settings: fields of `RaySettings`, and of `Shot` (f_number, zoom, ...; focus_m is infinity unless given).
@@ -175,6 +208,13 @@ def rays(
     asked = RaySettings(**{name: settings.pop(name) for name in own & settings.keys()})
     if width is None and height is None:
         raise InputError("rays", "width", None, "width or height of the picture in pixels")
+    width, height = (
+        None if pixels is None else _whole(name, pixels, 1) for name, pixels in (("width", width), ("height", height))
+    )
+    try:
+        film = check_film(film)
+    except (TypeError, InputError):
+        raise InputError("rays", "film", film, f"a width and a height, each {said(FILM_MM)} mm") from None
     grid = PixelGrid(*size_by_shape(film[0] / film[1], width, height), film)
     check_memory(grid.width, grid.height, BYTES_A_RAY * asked.samples)
     given: dict[str, Any] = {"focus_m": math.inf, "wavelength_nm": asked.light_nm} | settings
@@ -195,11 +235,15 @@ class RayJob:
         compact_px: by how much of a pixel in the plane in focus rays of `compact` are off at most; else 0.
 
     Raises:
-        InputError: `compact` where that is too much, or where rays run sideways.
+        InputError: `compact` where that is too much, or where rays run sideways; wavelengths that the camera has not.
     """
 
     def __init__(self, camera: Camera, grid: PixelGrid, settings: RaySettings, focus_m: float) -> None:
         self.camera, self.grid, self.settings, self.host = camera, grid, settings, HOSTS[settings.to]
+        known = camera.wavelength_nm
+        if settings.wavelengths is not None and known and not all(within(known, nm) for nm in settings.wavelengths):
+            expected = f"{said(known)} nm, the light of {camera.name}"
+            raise InputError("rays", "wavelengths", settings.wavelengths, expected)
         self._sampler, self._light = Sampler(settings.samples, settings.seed), ChannelWavelengths(*LIGHT_NM)
         position = settings.position_m or (0.0, 0.0, 0.0)
         look = settings.look_at_m or (*position[:2], position[2] - 1)

@@ -267,6 +267,17 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys: pytest.CaptureFixture[s
         ({"to": "unity"}, "to: got 'unity', expected one of: opengl"),
         ({"samples": 1 << 16, "width": 16384, "height": 10923}, "of .* GB"),
         ({"width": None}, "width or height"),
+        ({"width": 4.5}, "width: got 4.5, expected an integer"),
+        ({"samples": 1.5}, "samples: got 1.5, expected an integer"),
+        ({"seed": -1}, "seed: got -1, expected an integer from 0"),
+        ({"film": (36, 0)}, "film: .* a width and a height"),
+        ({"film": 36}, "film: got 36, expected a width and a height"),
+        ({"position_m": (0, 0)}, "position_m: .* three numbers"),
+        ({"up": (0, math.nan, 0)}, "up: .* three numbers"),
+        ({"wavelengths": []}, "wavelengths: .* one or more in nm"),
+        ({"wavelengths": 550}, "wavelengths: got 550, expected one or more in nm"),
+        ({"camera": MODEL, "wavelengths": [550, 850]}, "wavelengths: .* from 400 to 700 nm"),
     ):
         with pytest.raises(InputError, match=said):
-            neurolens.rays("pinhole", FILM, **{"width": 24} | settings)
+            neurolens.rays(**{"camera": "pinhole", "film": FILM, "width": 24} | settings)
+    assert picture(wavelengths=[850.0], samples=np.int64(1))["wavelength_nm"].max() == 850  # it has no dispersion

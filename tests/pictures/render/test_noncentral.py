@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +142,23 @@ def test_a_camera_with_a_centre_has_rays_through_it() -> None:
     assert table.grid.shape[1] == 15 and max(row["worst_px"] for row in left) < 0.01
 
 
+def test_the_page_reads_a_table_that_does_not_span_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("yaml", reason="PyYAML (extra dev) is not installed")
+    page = (ROOT / "docs" / "pages" / "how-to" / "st-maps.md").read_text(encoding="utf-8")
+    code = next(block for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "noncentral" in block)
+    camera = make_camera("fisheye-equidistant", Shot(film_mm=(36.0, 24.0), focus_m=1.0))
+    field = field_of(camera, 1.0, "equidistant", spectrum=spectrum_of(camera, only_nm=550.0))
+    grid = np.random.default_rng(1).normal(size=(7, 9, 6))
+    table = RayTable((1920, 1080), (200, 30), (1699, 1029), grid)
+    files.write_ray_table(tmp_path / "gauss", table, [{"rms_px": 0.0, "worst_px": 0.0, "distance_m": 1.0}], "it", field)
+    monkeypatch.chdir(tmp_path)
+    Path("block.py").write_text(code.replace("[0.5, 0.5]", "[300.5, 40.5]"), encoding="utf-8")
+    exact = table(np.array([[300.0, 40.0], [959.5, 539.5]]))
+    found = runpy.run_path("block.py")["found"]
+    found[:, 3:] /= np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
+    np.testing.assert_allclose(found, exact, atol=1e-8)
+
+
 def test_dark_parts_of_the_picture_bend_no_ray_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """The light of this fisheye ends within the film, whose corners have rays that mean nothing."""
     monkeypatch.setattr(fields, "_ROUND", (257, 1))
@@ -169,6 +188,7 @@ def test_the_command_writes_the_table_where_one_centre_is_not_enough(
     ideal = ("projection", "fisheye-equidistant", *words[2:], "kannala-brandt", "-o", tmp_path / "b")
     assert "noncentral" not in run_json(capsys, *ideal) and not (tmp_path / "b.noncentral.yaml").exists()
     assert len(run_json(capsys, *ideal, "--noncentral")["files"]) == 3
+    assert len(run_json(capsys, *ideal)["files"]) == 2 and not (tmp_path / "b.noncentral.yaml").exists()
     said = failure(capsys, *words, "kannala-brandt", "--near", "0.1")
     assert "--near" in said and "the distance of the entrance pupil" in said
     assert "-o NAME" in failure(capsys, *words, "kannala-brandt", "--noncentral")

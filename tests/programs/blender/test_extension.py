@@ -243,6 +243,24 @@ COLOURS = SHADER.replace(
 COLOURS = COLOURS.replace("blades / 10.0", "dispersion > 1 ? 1 - few : dispersion")
 
 
+def test_a_camera_of_two_scenes_has_the_dispersion_of_the_rendered_one(scene: Any, tmp_path: Path) -> None:
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    camera, on_camera = scene.camera.data, sys.modules[f"{MODULE}.camera"]
+    camera.custom_shader.from_string(COLOURS)
+    on_camera._compile(camera)
+    scene.cycles.samples = 16
+    other = bpy.data.scenes.new("Z")  # the last of the two
+    other.collection.objects.link(scene.camera)
+    try:
+        other.cycles.samples = 1
+        assert middle(scene, tmp_path)[2] == pytest.approx(1)
+        scene.cycles.samples, other.cycles.samples = 1, 16
+        assert middle(scene, tmp_path)[2] == pytest.approx(0)
+        assert camera.cycles_custom["few"] is True  # in the viewport
+    finally:
+        bpy.data.scenes.remove(other)
+
+
 def test_few_samples_have_no_dispersion_unless_the_user_chose_it(scene: Any, tmp_path: Path) -> None:
     """In renders by their number of samples, in the viewport always; files keep what their render takes."""
     bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")

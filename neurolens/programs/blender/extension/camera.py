@@ -217,10 +217,11 @@ def _set(
     _follow_zoom(camera)
 
 
-def tell_samples(render: bool) -> None:
+def tell_samples(render: bool, only: Any = None) -> None:
     """Tell the shaders of all cameras whether they get few samples: in the viewport always, in renders by their number.
-    Files keep what is told for renders, so that they render alike without the extension."""
-    for scene in bpy.data.scenes:
+    Files keep what is told for renders, so that they render alike without the extension. `only`: the scene that is
+    rendered, since another one with the same camera may have another number."""
+    for scene in bpy.data.scenes if only is None else [only]:
         few = not render or scene.cycles.samples < FEW
         for camera in (o.data for o in scene.objects if o.type == "CAMERA" and applied(o.data)):
             if bool(camera.cycles_custom.get("few", few)) != few:

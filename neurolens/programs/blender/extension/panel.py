@@ -328,12 +328,13 @@ def warn_of_black(scene: Any, _graph: Any = None) -> None:
             print(f"neurolens: camera {found.name!r}, frame {scene.frame_current}: {line}", file=sys.stderr)
 
 
-_render, _viewport = (
+_saved, _viewport = (
     bpy.app.handlers.persistent(lambda *_, render=render: on_camera.tell_samples(render)) for render in (True, False)
 )
+_rendered = bpy.app.handlers.persistent(lambda scene, *_: on_camera.tell_samples(True, scene))
 HANDLERS = (  # by the list of `bpy.app.handlers` that calls them
-    ("render_pre", warn_of_black), ("render_init", _render), ("render_complete", _viewport),
-    ("render_cancel", _viewport), ("save_pre", _render), ("save_post", _viewport), ("load_post", _viewport),
+    ("render_pre", warn_of_black), ("render_init", _rendered), ("render_complete", _viewport),
+    ("render_cancel", _viewport), ("save_pre", _saved), ("save_post", _viewport), ("load_post", _viewport),
 )  # fmt: skip
 
 
