@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -274,8 +273,9 @@ class Lens(_Chosen):
         return self._png
 
     def _repr_html_(self) -> str:
-        drawn = self._png and f'<img width="705" src="data:image/png;base64,{b64encode(self._png).decode()}">'
-        return f"<p>{escape(repr(self))}</p>{drawn or ''}"
+        from neurolens.base.html import html
+
+        return html("notebook.html", text=repr(self), picture=self._png and b64encode(self._png).decode())
 
 
 class Camera(_Chosen):
