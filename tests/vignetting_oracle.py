@@ -1,4 +1,4 @@
-"""False passes and blocks at one stop, traced at that stop: `study.measure` is held to it."""
+"""False passes and blocks at one stop, traced at that stop: `studies.measure` is held to it."""
 
 from collections.abc import Callable
 from typing import Any

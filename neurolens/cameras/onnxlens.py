@@ -144,7 +144,7 @@ class LensRun:
         self._sessions: dict[tuple[Any, ...], Any] = {}  # by process and outputs; opened when they are needed
 
     def graph(self, form: Form = SCALARS) -> Graph:
-        """The graph of the lens; inputs and outputs as `surrogates.assemble` says."""
+        """The graph of the lens; inputs and outputs as `models.assemble` says."""
         raise NotImplementedError
 
     def run(self, rays: FloatArray, film_z_mm: ArrayLike, stop_radius_mm: float) -> LensRays:
@@ -204,7 +204,7 @@ class OnnxLens(LensRun):
         return self.file.at(self.state)
 
     def graph(self, form: Form = SCALARS) -> Graph:
-        """The graph of the model in its state; inputs and outputs as `surrogates.assemble` says."""
+        """The graph of the model in its state; inputs and outputs as `models.assemble` says."""
         if form not in self._graphs:
             self._graphs[form] = model_graph(self.fitted, form)
         return self._graphs[form]

@@ -366,7 +366,7 @@ class LensState:
         return Shot(film_mm, **({"focus_m": math.inf} | given))
 
     def set_lens(self, tabled: Lens) -> Lens:
-        """The lens of a file in this state; raises InputError as `setting.states.set_lens`."""
+        """The lens of a file in this state; raises InputError as `optics.setting.states.set_lens`."""
         from neurolens.optics.setting.focusing import best_focused, with_cover_glass
         from neurolens.optics.setting.states import set_lens
 

@@ -17,7 +17,7 @@ from neurolens.base.settings import changed, setting
 from neurolens.cli import arguments as cli
 
 INDEX = "index.jsonl"  # in lenses/: a line a lens, {file, sha256, row}, by `python -m experiments lens-index`
-CHARACTER = {  # keys of --sort: the figure of `study.describe`, and its heading; strongest first
+CHARACTER = {  # keys of --sort: the figure of `studies.describe`, and its heading; strongest first
     "cats-eye": ("cats_eye", "cat's eye"), "swirl": ("swirl", "swirl"), "bubbles": ("bubble", "bubbles"),
     "softness": ("softness_um", "soft um"), "flare": ("flare", "flare"),
 }  # fmt: skip
@@ -148,7 +148,7 @@ examples:
         return self.answer({"lenses": rows}, lambda: _list_text(rows, self.sort))
 
     def _rows(self, files: list[Path], checked: bool) -> list[dict[str, Any]]:
-        """`study.describe.library_row` of each lens, in the order of --sort; the library's index has some of them."""
+        """`studies.describe.library_row` of each lens, in the order of --sort; the library's index has some of them."""
         index = read_index() if checked and not self.glass else {}
         rows = {file: row for file in files if (row := kept_row(file, index))}
         left = [file for file in files if file not in rows]
@@ -292,7 +292,7 @@ def _surfaces(surfaces: list[dict[str, Any]]) -> str:
 
 
 def _surface_words(row: dict[str, Any]) -> str:
-    """Properties of a row of `study.describe.glass_table` besides radius and glass; empty for a sphere."""
+    """Properties of a row of `studies.describe.glass_table` besides radius and glass; empty for a sphere."""
     words = [
         row["figure"],
         f"coating {row['coating']['name']}" if row["coating"] else "",

@@ -194,7 +194,7 @@ def pursue(
     """Orthogonal matching pursuit for several states at once, with the same columns for all.
 
     It chooses rows of `columns` [M, N] of each state until their weighted sum is within `good` (RMS) of `wanted` [N] in
-    every state. The pursuits of `surrogates.terms` need torch, which a render with a model does not have.
+    every state. The pursuits of `models.terms` need torch, which a render with a model does not have.
 
     Returns the numbers of the rows, and their weights in each state.
     """

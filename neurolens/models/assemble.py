@@ -314,7 +314,7 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
 
 
 def _turned(position: Value, curve: Value, surface: Surface) -> Value:
-    """z of a toroid from that of its curve; see `trace.shapes.sag_mm`."""
+    """z of a toroid from that of its curve; see `optics.trace.shapes.sag_mm`."""
     assert surface.figure.across is not None
     c, a2 = 1 / surface.figure.across[0], position.graph.square(position[int(surface.figure.axis == "x")])
     way = 1.0 - curve * c

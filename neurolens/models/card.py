@@ -1,8 +1,8 @@
 """The card of a model file: how it is read, what must stand in it, and its lens and domain at any state.
 
 A file is a complete ONNX model for other programs. This package neither parses nor runs its nodes: it reads the card
-and the coefficients in the file's metadata, and builds the graph again from them (`surrogates.file`).
-`surrogates.export` writes cards. Nothing here needs torch.
+and the coefficients in the file's metadata, and builds the graph again from them (`models.file`).
+`models.export` writes cards. Nothing here needs torch.
 """
 
 from __future__ import annotations
@@ -360,7 +360,7 @@ def _zoom_mm(path: Any, axis: Axis, zoom: str | float) -> float:
 
 
 def mix_domain(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, Any]:
-    """The domain (as `surrogates.model.Domain.to_dict` writes it) of a state whose nodes weigh `weights` [K].
+    """The domain (as `models.model.Domain.to_dict` writes it) of a state whose nodes weigh `weights` [K].
 
     Wavelengths and the nearest object are those of the first node; the distances in focus are mixed as 1 / distance.
     """

@@ -1,6 +1,6 @@
 """Models as ONNX files with their cards: of one state, or of a zoom's (and internal focus's) range; inverse maps.
 
-A card is one JSON string: what the model is, where it holds and how well. `surrogates.card` reads and checks it.
+A card is one JSON string: what the model is, where it holds and how well. `models.card` reads and checks it.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ _MAX_NODES = 256  # states of one model
 # Limits of a model: terms and units, each of which is a row for every ray; numbers; and products of two terms that are
 # terms, all of which a writer compares. The largest models that settings allow have 5,000, 1.9 and one million.
 _MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
-_MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 42  # of a prescription, as `readers.lensfile` has them
+_MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 42  # of a prescription, as `optics.readers.lensfile` has them
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 _NOWHERE = -1.0  # a film position in no domain, which replaces that of the call where the state is out of range
 DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
@@ -69,8 +69,8 @@ class ModelFile:
 
     Attributes:
         path: the file.
-        card: what `surrogates.card` wrote.
-        nodes: a model for every node of the axes, in the order of `surrogates.axes.product`; one without axes. Their
+        card: what `models.card` wrote.
+        nodes: a model for every node of the axes, in the order of `models.axes.product`; one without axes. Their
             coefficients are rounded to float32, and their lens is that of the first node.
     """
 

@@ -1,7 +1,7 @@
 """Fits: settings in, a complete model out, of one state of a lens or of many (zoom, internal focus).
 
 A `StateSpace` says which states: the axes of a lens file, and its lens and domain at every state. Models of many states
-have one structure; every number of the model at a state is interpolated between nodes (see `surrogates.axes`), so that
+have one structure; every number of the model at a state is interpolated between nodes (see `models.axes`), so that
 it is a plain `LensModel`. A core is linear in its numbers: its error at a state is at most a small multiple (the
 Lebesgue constant) of the nodes' errors, plus the error of interpolating the exact lens itself.
 
@@ -299,7 +299,7 @@ class StateModel:
 
     Attributes:
         space: the states, and the exact lens at each.
-        nodes: one model a node, in the order of `surrogates.axes.product`; of one structure: they differ in numbers.
+        nodes: one model a node, in the order of `models.axes.product`; of one structure: they differ in numbers.
         fit_s: seconds that the whole fit took.
     """
 
@@ -323,7 +323,7 @@ class StateModel:
         return tuple(a.range[0] for a in self.axes)
 
     def at(self, *state: float) -> LensModel:
-        """The model of one state; InputError as `surrogates.axes.weights`."""
+        """The model of one state; InputError as `models.axes.weights`."""
         first = self.nodes[0]
         return replace(
             mixed(self.nodes, weights(self.axes, state)),

@@ -42,7 +42,7 @@ DOUBLE = "c-double"
 WRITERS: Mapping[str, Callable[..., str]] = {
     "c": write_c, DOUBLE: write_double, **{name: partial(write_shading, kind) for name, kind in LANGUAGES.items()}
 }  # fmt: skip
-OSL = "osl"  # of whole cameras: `shaders.osl`
+OSL = "osl"  # of whole cameras: `cameras.shaders.osl`
 _WIDTH, _MOST_WAVELENGTHS = 110, 64
 # Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL, words of HLSL,
 # WGSL, CUDA and VEX, names of the code that is written.

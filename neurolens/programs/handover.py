@@ -99,7 +99,7 @@ class Handed:
     """A shot.
 
     Attributes:
-        attributes: of the first camera, see `render.pictures.standard_attributes`; texts are a stranger's.
+        attributes: of the first camera, see `pictures.render.pictures.standard_attributes`; texts are a stranger's.
         rate: frames a second, numerator and denominator. colours: names of those that have maps of their own.
     """
 

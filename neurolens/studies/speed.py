@@ -369,7 +369,7 @@ def program_candidate(
     name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None, flags: tuple[str, ...] = FLAGS,
     double: bool = False,
 ) -> Candidate:  # fmt: skip
-    """A program of `surrogates.source`, compiled when the race prepares it; no stop radius: the domain's."""
+    """A program of `models.source`, compiled when the race prepares it; no stop radius: the domain's."""
     compiled = cache(lambda: CompiledSource(program, flags, double))
 
     @cache

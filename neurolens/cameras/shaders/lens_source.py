@@ -46,7 +46,7 @@ def write_lens(
     """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
 
     Args:
-        to: of `surrogates.source.WRITERS`. name: of the function, None takes the lens's id. zoom: a state of
+        to: of `models.source.WRITERS`. name: of the function, None takes the lens's id. zoom: a state of
             `set_lens`, or "range".
     """
     lens = read_any(file)

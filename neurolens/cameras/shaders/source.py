@@ -222,7 +222,7 @@ def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, o
     return program
 
 
-# Names in the source, where they stand in the card, and how they follow a state (as in `surrogates.card`).
+# Names in the source, where they stand in the card, and how they follow a state (as in `models.card`).
 _NUMBERS = (
     (("efl_mm",), "lens", "efl_mm", "reciprocal"),
     (("film_radius_mm",), "domain", "film_radius_mm", "square"),

@@ -1,6 +1,6 @@
 """Bundles of rays from the scene that fill the real stop, traced to the film, for every lens whose chief rays exist.
 
-The chief ray is found from the stop outwards (`trace.aiming`), as pupils may move with the field (fisheyes). Its
+The chief ray is found from the stop outwards (`optics.trace.aiming`), as pupils may move with the field (fisheyes). Its
 neighbours start on the plane across it at the front of the lens, and Newton's method on that plane takes each to its
 point of the stop; rays for which this fails at once walk there from the chief ray in small steps. The derivative of
 the mapping also turns stop area into the energy that a ray carries.

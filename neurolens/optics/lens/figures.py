@@ -2,9 +2,9 @@
 
 A figure is a class below, named in `FIGURES`, and nothing outside asks which class it is. Its fields are the keys of a
 surface in a lens file. It answers what readers, hashes, first-order and Seidel sums and checks ask, and gives
-`trace.shapes` the numbers by which rays meet it: a conic of the surface's radius, a second section across it, and a
-polynomial of the height. Lengths are in mm, heights h are distances from the axis (from the plane of symmetry of a
-cylinder).
+`optics.trace.shapes` the numbers by which rays meet it: a conic of the surface's radius, a second section across it,
+and a polynomial of the height. Lengths are in mm, heights h are distances from the axis (from the plane of symmetry
+of a cylinder).
 """
 
 from __future__ import annotations
@@ -113,14 +113,14 @@ class Figure:
         return replace(self, asphere=tuple((p, a * factor ** (1 - p)) for p, a in self.asphere))
 
     def bounds(self, rim_mm: float) -> list[Bound]:
-        """What `setting.rims.check_figures` checks: key, size, least, most, and what the size is of."""
+        """What `optics.setting.rims.check_figures` checks: key, size, least, most, and what the size is of."""
         sags = [float(a) * rim_mm**p for p, a in self.powers]
         sag = max(1e-6 * sum(map(abs, sags)), abs(sum(sags)))
         return [("conic", abs(self.conic), 0.0, 1e9, ""), ("asphere", sag, 0.0, 1e6, " mm of sag at the rim")]
 
     @classmethod
     def read(cls, row: Any) -> dict[str, Any]:
-        """Fields from a surface of a lens file, a `readers.source.Table`; raises its errors."""
+        """Fields from a surface of a lens file, an `optics.readers.source.Table`; raises its errors."""
         example = "a table such as { 4 = 1e-6, 6 = 2e-9 }"
         found: dict[str, Any] = {"conic": row.number("conic")} if "conic" in row else {}
         return found | ({"asphere": row.powers("asphere", example)} if "asphere" in row else {})
@@ -341,7 +341,7 @@ def figure_of(record: Mapping[str, Any]) -> Figure:
 
 
 def read_figure(row: Any) -> Figure:
-    """Return the figure of a surface of a lens file, a `readers.source.Table`; raises its errors."""
+    """Return the figure of a surface of a lens file, an `optics.readers.source.Table`; raises its errors."""
     kind = _kind(row.data)
     found = figure_of(kind.read(row))
     known = {f.name for f in fields(kind)}

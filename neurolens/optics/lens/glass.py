@@ -154,7 +154,8 @@ ALIASES = {
 }
 
 
-# Glasses of catalogues that a command names (`readers.glasses`) by every key that finds them, and those not read.
+# Glasses of catalogues that a command names (`optics.readers.glasses`) by every key that finds them, and those not
+# read.
 _ADDED: dict[str, list[Glass]] = {}
 _REFUSED: dict[str, str] = {}
 # Glasses looked up so far. A plain dictionary, because torch.compile can trace through it to the coefficients.

@@ -45,7 +45,7 @@ class Surface:
         V_d: Abbe number of that medium; None where unknown (constant index) or air.
         material: name of the glass in the source, for people only.
         stop: whether this row is the aperture stop.
-        figure: its shape besides the radius (`lens.figures`); a sphere, or a plane, by default.
+        figure: its shape besides the radius (`optics.lens.figures`); a sphere, or a plane, by default.
         glass: name in the glass catalogue (`neurolens.optics.lens.glass`); its dispersion rules over n_d and V_d.
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
@@ -118,7 +118,7 @@ class Lens:
     Attributes:
         name, designer, source, notes: as cited in the lens file.
         believed_to_be: the product that the source's example is believed to be, "" where nobody says so.
-        measured: what photographs of that product say (`photographs.verify`), as pairs of key and value.
+        measured: what photographs of that product say (`optics.photographs.verify`), as pairs of key and value.
         rims: whether the rim diameters are the source's own or "estimated" by somebody.
         f_number: nominal, of the source; the stop's own diameter rules the trace.
         stated_efl_mm: focal length as the source states it, to check the computed one against; of an anamorphic lens in

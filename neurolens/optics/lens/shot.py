@@ -139,7 +139,7 @@ def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
 class StopShape:
     """The shape of the stop's opening, as files and options state it; without any field it is the lens file's.
 
-    `render.images.make_aperture` makes an `Aperture` of it, which reads the picture of a mask.
+    `pictures.render.images.make_aperture` makes an `Aperture` of it, which reads the picture of a mask.
     """
 
     blades: int | None = setting(

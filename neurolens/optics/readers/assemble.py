@@ -1,7 +1,7 @@
 """What a file says otherwise than a lens does, or leaves open: Forbes's aspheres, stop, f-number, film and rims.
 
 Forbes's mild aspheres (Qbfs) become even powers of the height (G. W. Forbes, Opt. Express 15, 5218, 2007); the strong
-ones are a figure of their own (`lens.figures.Qcon`). With u the height over a normalisation radius and x = u^2,
+ones are a figure of their own (`optics.lens.figures.Qcon`). With u the height over a normalisation radius and x = u^2,
 
     sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x),
 

@@ -1,4 +1,4 @@
-/* The light of a plate as a camera gathers it: see `defocus/picture.py`. Python defines NUMBERS, WEIGHT, FINEST
+/* The light of a plate as a camera gathers it: see `pictures/defocus/picture.py`. Python defines NUMBERS, WEIGHT, FINEST
    and CLEAR.
 
    A ray of the camera is a straight line in the plate: at the inverse depth w (1/m, from the plate's eye) it is seen at

@@ -3,9 +3,9 @@
 Ghosts share their paths. Light that comes to surface j is reflected there once for all ghosts of j, and what travels
 back to surface i is traced once for all ghosts that are reflected there or further to the front; only the path from i
 to the film belongs to a single ghost. So a lens of n surfaces takes n^3 / 3 steps for n^2 / 2 ghosts. The steps are
-graphs (`flare.steps`), compiled once for a lens's kinds of surfaces, and `ghosts.c` loops over them. Focus, zoom, stop
-and wavelength are numbers of the call, which need no compiling. `trace.rays.follow` is the truth in float64 for one
-path. For programs that draw ghosts on a GPU, `ghost_graphs` has each path as a graph of its own.
+graphs (`pictures.flare.steps`), compiled once for a lens's kinds of surfaces, and `ghosts.c` loops over them. Focus,
+zoom, stop and wavelength are numbers of the call, which need no compiling. `optics.trace.rays.follow` is the truth in
+float64 for one path. For programs that draw ghosts on a GPU, `ghost_graphs` has each path as a graph of its own.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def ghost_pairs(lens: Lens) -> tuple[Pair, ...]:
 
 
 def coated(lens: Lens, names: str) -> Lens:
-    """The lens with a coating of `lens.designs` on each bare surface between glass and air.
+    """The lens with a coating of `optics.lens.designs` on each bare surface between glass and air.
 
     Args:
         names: a design, and others for single surfaces, which replace what these have: "three-layer,s07=bare".

@@ -142,8 +142,8 @@ def _quietly(fraction: float, seconds_left: float | None = None) -> None:
 def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) -> Iterator[tuple[int, Floats]]:
     """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
 
-    Each ghost is drawn as the areas of a grid of rays (`flare.canvas`). Of the wavelengths, fewer stand for all where a
-    ghost's colours part little.
+    Each ghost is drawn as the areas of a grid of rays (`pictures.flare.canvas`). Of the wavelengths, fewer stand for
+    all where a ghost's colours part little.
 
     Args:
         layers: for each pair of the tracer, the layer that takes it. done: is called with the share of the work that is

@@ -1,4 +1,4 @@
-/* Follows photons through a lens in sweeps: see `photons.py`. `stack.c` and the graphs of `flare.photons` stand before
+/* Follows photons through a lens in sweeps: see `photons.py`. `stack.c` and the graphs of `pictures.flare.photons` stand before
    this text; Python defines BLOCK, CHANCES, NUMBERS, LEVELS and MOST_SCATTERS. A list of photons is rows of BLOCK
    numbers: the state, with the photon's weight as its power, then how often the photon was reflected and how often it
    scattered. `wait` has a list of photons for each surface, where the next sweep picks them up, and for the film. */
@@ -60,7 +60,7 @@ static void draw(int n, float *chances, uint64_t *state)
     }
 }
 
-/* Run a graph of `flare.photons` on the state in `first`, on `count` rows of `second` and on random numbers; it writes
+/* Run a graph of `pictures.flare.photons` on the state in `first`, on `count` rows of `second` and on random numbers; it writes
    `outputs` rows of `room->event`. */
 static void happen(
     void (*run)(size_t, const float *const *, const float *, float *const *), int n, const float *first,

@@ -3,9 +3,9 @@
 Photons leave the lights, and each surface reflects a photon with the probability of its Fresnel or coating reflectance.
 The photons that reach the film after reflections are the flare, smoothed by a kernel (Keshmirian 2008). Here photons
 are aimed at the front surface alone and weighted by the solid angle. They go through the compiled steps of
-`flare.steps` in sweeps (`photons.c`): a sweep goes through all surfaces to the film, then back through all, and photons
-that turn round wait at their surface for the next sweep. All photons are accounted for: each one arrives, leaves at the
-front, ends at a rim, is absorbed, or is cut off.
+`pictures.flare.steps` in sweeps (`photons.c`): a sweep goes through all surfaces to the film, then back through all,
+and photons that turn round wait at their surface for the next sweep. All photons are accounted for: each one arrives,
+leaves at the front, ends at a rim, is absorbed, or is cut off.
 
 A boost b makes reflection more frequent than it is: if T is the transmitted share, a photon turns round with the
 probability b (1 - T) / (T + b (1 - T)), and its weight makes up for that. Steinert (2009, 5.3.2) transmits photons with

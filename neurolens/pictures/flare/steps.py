@@ -1,10 +1,11 @@
 """The surfaces of a lens as compiled steps, by which ghosts and photons are traced.
 
 Light always travels towards -z here: the frame is mirrored (z reversed) while light goes to the film. So one step
-serves both directions, and it is the tracer's (`trace.surfaces`). The figure of a surface and its media are numbers of
-the call, so that all surfaces of one kind share a function, which is compiled once. Fresnel's reflectance is written
-without the difference of nearly equal roots, which float32 would lose where glasses are cemented. The reflectance of a
-coating is a polynomial in the cosine on the side of the lower index, fitted to its transfer matrices at one wavelength.
+serves both directions, and it is the tracer's (`optics.trace.surfaces`). The figure of a surface and its media are
+numbers of the call, so that all surfaces of one kind share a function, which is compiled once. Fresnel's reflectance
+is written without the difference of nearly equal roots, which float32 would lose where glasses are cemented. The
+reflectance of a coating is a polynomial in the cosine on the side of the lower index, fitted to its transfer matrices
+at one wavelength.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pictures of whole shots with their flare and their files; `frames.farm` renders them in tiles.
+"""Pictures of whole shots with their flare and their files; `pictures.frames.farm` renders them in tiles.
 
 A `Frame` holds everything that decides one picture; `render_frame` renders it and writes its files::
 
@@ -112,7 +112,7 @@ class Frame(Picture):
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
         focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, cover_glass_mm,
-            vignetting, dispersion, runtime: as in `lens.shot.Shot`.
+            vignetting, dispersion, runtime: as in `optics.lens.shot.Shot`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
         colour: changes of the scene's [film] table by their keys, as {"white_balance": "A"}.
@@ -232,7 +232,7 @@ class Prepared:
         return f"{self.scene.name}, {self.camera.name}"
 
     def render(self, threads: int = 2, progress: Any = None, watch: Watch | None = None) -> RenderResult:
-        """Path-trace the frame, without its flare; see `render.renderer.render`."""
+        """Path-trace the frame, without its flare; see `pictures.render.renderer.render`."""
         (width, height), frame = self.size, self.frame
 
         def taken(camera: Camera, watch: Watch | None) -> RenderResult:
@@ -260,7 +260,7 @@ class Prepared:
 def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepared:
     """Read and check everything that a frame needs, before it is rendered to `out` (of a tile: beside it).
 
-    The glasses of `frame.glass_files` must be known already, see `readers.glasses.more_glasses`.
+    The glasses of `frame.glass_files` must be known already, see `optics.readers.glasses.more_glasses`.
 
     Warns:
         NeurolensWarning: what the camera's settings note, as a film larger than the image circle.
@@ -306,7 +306,7 @@ def render_frame(
     The bytes of the picture depend on the frame alone, not on the number of threads.
 
     Args:
-        out: the picture; of a tile the name of the whole picture, see `render.renderer.tile_path`.
+        out: the picture; of a tile the name of the whole picture, see `pictures.render.renderer.tile_path`.
         choice: see `flare_choice`, which all frames of an animation share; None: of this frame.
         watch: previews, checkpoints and an early end. preview: whether OUT.png is written.
 

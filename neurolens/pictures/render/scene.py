@@ -50,7 +50,7 @@ class CameraSettings(StopShape, Checked):
         position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
         focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
-            `lens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
+            `optics.lens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
         film_mm: width and height of the part of the film that is used.
         wavelength_nm: range of light. width, height: picture in pixels. samples: a pixel.
         max_depth: number of surfaces along a path at which light is scattered.

@@ -50,7 +50,7 @@ class FilmSettings:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """The [sensor] table of a scene: what a sensor counts of a linear picture, see `render.sensor`.
+    """The [sensor] table of a scene: what a sensor counts of a linear picture, see `pictures.render.sensor`.
 
     Attributes:
         mosaic: colours of the pixels of two rows from the top left, or "none": every pixel counts all three.

@@ -112,7 +112,7 @@ def candidates(
     probed: Probe, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
     folder: Path | None = None, explain: bool = False, report: Report | None = None, work: Work = ALONE,
 ) -> tuple[Choice, ...]:  # fmt: skip
-    """Cameras with error and cost, enough to decide for each of some budgets; arguments as for `plan.plan`.
+    """Cameras with error and cost, enough to decide for each of some budgets; arguments as for `studies.plan.plan`.
 
     `work`: of the paths of the target.
     """

@@ -388,7 +388,7 @@ def effect_maps(probed: Probe) -> Maps:
 
 
 def passed_share(probed: Probe) -> Array:
-    """[N] share of the light through the stop that no rim takes, by exact tracing (`analysis.field_curves`).
+    """[N] share of the light through the stop that no rim takes, by exact tracing (`optics.analysis.field_curves`).
 
     It is traced from the axis outwards; beyond the last field with a chief ray its share is kept. An anamorphic lens is
     traced along x and along y, and the two shares are multiplied, as if its rims were slits.

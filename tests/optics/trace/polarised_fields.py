@@ -1,4 +1,4 @@
-"""Light followed as a vector in the lens frame, surface by surface: what `trace.transmission` is held against.
+"""Light followed as a vector in the lens frame, surface by surface: what `optics.trace.transmission` is held against.
 
 It needs no angles between s and p directions: Yun, Crabtree and Chipman 2011, "Three-dimensional polarization
 ray-tracing calculus I", Applied Optics 50(18). |E|^2 is power.
