@@ -435,7 +435,7 @@ def test_without_torch_glass_is_found_lenses_are_converted_c_and_maps_are_writte
     ]
     done = python(WITHOUT_TORCH.replace("main(sys.argv[1:])", f"[main(c) for c in {commands!r}] != [0] * 6"))
     assert done.returncode == 0, done.stderr
-    assert "pip install '.[train]'" in done.stderr and (tmp_path / "a.exr").exists()
+    assert (tmp_path / "a.exr").exists()
     assert "needs torch" in done.stdout and (tmp_path / "a.toml").exists() and (tmp_path / "a.h").exists()
 
 

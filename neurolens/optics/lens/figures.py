@@ -300,7 +300,7 @@ class Qcon(Figure):
 
     def bounds(self, rim_mm: float) -> list[Bound]:
         sag = sum(map(abs, self.qcon))
-        norm = "norm_mm", self.norm_mm, rim_mm / WIDEST_Q, math.inf, ": from half of the rim's radius on"
+        norm = "norm_mm", self.norm_mm, rim_mm / WIDEST_Q, 1e9, " mm, at least half of the rim's radius"
         return [super().bounds(0.0)[0], ("qcon", sag, 0.0, 1e6, " mm of sag"), norm]
 
     @classmethod

@@ -287,11 +287,14 @@ def test_lens_files_hold_them(name: str, tmp_path: Path) -> None:
         ("focal_mm = 60.0, conic = 1.0", "conic: got 1.0, expected a plane in air"),
         ("qcon = 3, norm_mm = 9", "qcon: got 3, expected 1 to 20 coefficients"),
         (f"qcon = {[1e-9] * 21}, norm_mm = 9", "qcon: got .*, expected 1 to 20 coefficients"),
-        ("qcon = [1e-3]", r"norm_mm: got \(missing\), expected a finite number above 0 in mm"),
+        ("qcon = [1e-3]", r"norm_mm: got \(missing\), expected a finite number above 0.001 in mm"),
         ("qcon = [1e-3, true], norm_mm = 9", r"qcon\[1\]: got True, expected a finite number"),
         ("qcon = [1e-3], norm_mm = 9, asphere = { 4 = 1e-6 }", "asphere: got .*, expected none beside qcon"),
         ('qcon = [1e-3], norm_mm = 9, cylinder = "x"', "cylinder: got 'x', expected none beside qcon"),
-        ("qcon = [1e-3], norm_mm = 4", "norm_mm: got 2.5, expected a size from 0 to 2: rim radius over it"),
+        (
+            "qcon = [1e-3], norm_mm = 4",
+            "norm_mm: got 4.0, expected a size from 5 to 1e.09 mm, at least half of the rim's radius",
+        ),
         ("norm_mm = 4", "norm_mm: got 4, expected qcon beside it"),
     ],
 )

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.render.render_helpers import world
 
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import frame_of
@@ -18,6 +17,7 @@ from neurolens.pictures.defocus.picture import defocus, spread_over, take_highli
 from neurolens.pictures.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.pictures.render.pictures import read_channels, read_exr
 from tests.command_line import failure
+from tests.pictures.render.render_helpers import world
 
 FILM = "36x20.25"
 # Five posts at 0.7 m before a far wall, and a grid of lamps on it: as many are behind posts as beside them. All shine

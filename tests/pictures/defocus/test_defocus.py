@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -486,7 +487,7 @@ def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
         middle = (cells[..., 1].sum(axis=1) * (np.arange(side) + 0.5)).sum(axis=1)
         np.testing.assert_allclose(middle, side / 2, atol=0.6)
         # The lens is round; the middles of these cells lie on borders of pixels, and roundings choose the side.
-        turned = [np.roll(cells[2][:, ::-1], k, axis=1) for k in (-1, 0, 1)]
+        turned = [np.roll(cells[2][:, ::-1], k, axis=(0, 1)) for k in itertools.product((-1, 0, 1), repeat=2)]
         assert min(np.abs(cells[0] - other).max() for other in turned) < 0.02 * cells.max()
     light = [k["light"][1] for k in data["kernels"][:3]]
     assert light[0] == pytest.approx(light[2], rel=1e-3) and light[0] < 0.95 * light[1]

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from shipped import whole
-from tests.flare.test_ghosts import lens_of
 
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -22,6 +21,7 @@ from neurolens.pictures.flare.steps import LOST, entering
 from neurolens.pictures.render.colour import SRGB
 from neurolens.pictures.render.settings import FlareSettings
 from tests.ghost_pictures import ghost_picture
+from tests.pictures.flare.test_ghosts import lens_of
 
 
 def drawn(found: np.ndarray, columns: int, share: float, size: tuple[int, int] = (12, 10)) -> np.ndarray:

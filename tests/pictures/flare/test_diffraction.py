@@ -10,7 +10,6 @@ import pytest
 import torch
 from path_difference import opd_mm
 from shipped import whole
-from tests.flare.test_ghosts import lens_of, plate
 
 from experiments.starburst import light_of, streaks
 from neurolens.base.errors import InputError
@@ -26,6 +25,7 @@ from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.layers import FlareJob, axis_irradiance
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.render.settings import FlareSettings
+from tests.pictures.flare.test_ghosts import lens_of, plate
 
 AXIS, NM = Light(0.0, 0.0), 550.0
 IN_FOCUS_MM = -0.032  # from the focus of the d line to that of 550 nm at f/8

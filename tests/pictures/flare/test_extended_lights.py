@@ -9,7 +9,6 @@ import pytest
 from scipy.ndimage import uniform_filter
 from scipy.stats import qmc
 from shipped import whole
-from tests.flare.test_ghosts import LENSES, lens_of
 
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.prescription import Lens
@@ -33,6 +32,7 @@ from neurolens.pictures.flare.steps import entering
 from neurolens.pictures.render.scene import load_scene
 from neurolens.pictures.render.settings import FlareSettings
 from tests.ghost_pictures import ghost_picture
+from tests.pictures.flare.test_ghosts import LENSES, lens_of
 
 CASE = Path(__file__).parents[4] / "shared/data/cases/render/area_light_flare.toml"
 

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.flare.test_ghosts import LENSES, lens_of
 
 from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
@@ -20,6 +19,7 @@ from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.pictures.render.colour import SRGB
 from neurolens.pictures.render.settings import FlareSettings, Scatter
+from tests.pictures.flare.test_ghosts import LENSES, lens_of
 
 COUNT = 1 << 17
 
