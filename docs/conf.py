@@ -89,7 +89,7 @@ def _module(name: str) -> str:
 
 
 def _prepare(app: Any, document: str, content: list[str]) -> None:
-    """Index pages get the menu of what they link to; pages outside docs/pages are in no menu; files show their name.
+    """Index pages and that of results get the menu of what they link to; pages outside docs/pages are in no menu; files show their name.
 
     Links to HTML pages stay links: Sphinx would take them for downloads, without what lies beside them.
     """
@@ -99,8 +99,9 @@ def _prepare(app: Any, document: str, content: list[str]) -> None:
     )
     if not document.startswith("docs/pages/"):
         content[0] = f"---\norphan: true\n---\n{content[0]}"
-    elif document.endswith("index"):
-        pages = re.findall(r"\]\(([\w/-]+)\.md\)", content[0])
+    elif document.endswith(("/index", "/results")):
+        own = "results/" if document.endswith("/results") else ""  # other pages that it names are in other menus
+        pages = re.findall(rf"\]\(({own}[\w/-]+)\.md\)", content[0])
         content[0] += "\n```{toctree}\n:hidden:\n:maxdepth: 2\n\n" + "\n".join(dict.fromkeys(pages)) + "\n```\n"
 
 
