@@ -89,7 +89,8 @@ def _module(name: str) -> str:
 
 
 def _prepare(app: Any, document: str, content: list[str]) -> None:
-    """Index pages and that of results get the menu of what they link to; pages outside docs/pages are in no menu; files show their name.
+    """Index pages and that of results get the menu of what they link to; pages outside docs/pages are in no menu; files
+    show their name.
 
     Links to HTML pages stay links: Sphinx would take them for downloads, without what lies beside them.
     """
