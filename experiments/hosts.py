@@ -85,7 +85,7 @@ def rays(size: tuple[int, int], samples: int, seed: int, grey: bool, **more: Any
 
 def ours(size: tuple[int, int], samples: int, seed: int, grey: bool) -> Any:
     """The picture [H, W, 3] of our renderer."""
-    camera = make_camera(f"fused:{MODEL}", Shot(FILM, **shot(grey)))
+    camera = make_camera(MODEL, Shot(FILM, **shot(grey)))
     return render(our_scene(grey), camera, width=size[0], height=size[1], samples=samples, seed=seed, threads=1).rgb
 
 

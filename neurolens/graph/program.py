@@ -117,18 +117,26 @@ class Expr:
 
 
 Number = Expr | float | ArrayLike
-_FOLDED: dict[str, Callable[..., Any]] = {
-    "neg": lambda a: -a,
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "sqrt": np.sqrt,
-    "floor": np.floor,
-    "max": lambda a, b: np.where(a > b, a, b),  # as sources have it: of NaN, the second
-    "min": lambda a, b: np.where(a < b, a, b),
+
+
+def rules_of(library: Any) -> dict[str, Callable[..., Any]]:
+    """What the steps of programs do to arrays of a library, numpy or torch; each adds its own choices."""
+    return {
+        "neg": lambda a: -a,
+        "add": lambda a, b: a + b,
+        "sub": lambda a, b: a - b,
+        "mul": lambda a, b: a * b,
+        "div": lambda a, b: a / b,
+        "sqrt": library.sqrt,
+        "floor": library.floor,
+        "max": lambda a, b: library.where(a > b, a, b),  # as sources have it: of NaN, the second
+        "min": lambda a, b: library.where(a < b, a, b),
+        "fma": lambda a, b, c: a * b + c,
+    }
+
+
+_FOLDED = rules_of(np) | {
     "clamp": lambda x, limit: np.where(np.abs(x) < limit, x, np.copysign(limit, x)),
-    "fma": lambda a, b, c: a * b + c,
     "select": lambda a, b, x, y: np.where(a <= b, x, y),
     "pick": lambda t, x, y: np.where(t > 0, x, y),
 }

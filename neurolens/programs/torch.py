@@ -30,7 +30,7 @@ from neurolens.cameras.lenscamera import LensCamera as _Camera
 from neurolens.graph.adjoint import OUTER, adjoint
 from neurolens.graph.c import Signature
 from neurolens.graph.compiler import has_compiler
-from neurolens.graph.program import WAVELENGTH, Argument, Program, Step, row_names
+from neurolens.graph.program import WAVELENGTH, Argument, Program, Step, row_names, rules_of
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import Cuda
 from neurolens.optics.lens.prescription import LINE_D_NM
@@ -334,18 +334,8 @@ class _Rays(torch.autograd.Function):
 
 # ---- A program on tensors. -------------------------------------------------------------------------------------------
 
-_RULES: dict[str, Callable[..., Any]] = {
-    "neg": lambda a: -a,
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "sqrt": torch.sqrt,
-    "floor": torch.floor,
-    "max": lambda a, b: torch.where(a > b, a, b),
-    "min": lambda a, b: torch.where(a < b, a, b),
+_RULES = rules_of(torch) | {
     "clamp": lambda x, limit: x.clamp(-limit, limit),
-    "fma": lambda a, b, c: a * b + c,
     "select": lambda a, b, x, y: _chosen(a <= b, x, y, torch.result_type(a, b)),
 }
 

@@ -50,6 +50,8 @@ def test_figures_of_the_readme() -> None:
     assert f"a picture takes {times} times as long as through a thin lens" in README
     gains = {k: exact / model for k, (exact, model, _) in ((k, answers.as_c(k)) for k in (2, 7, 12, 33))}
     assert f"{answers.short(gains[12])} times at 12 refractions, {answers.short(gains[33])} at 33" in README
+    hand = [answers.by_hand(k) / answers.as_c(k)[1] for k in (12, 33)]
+    assert f"written by hand {answers.short(hand[0])} and {answers.short(hand[1])} times" in README
     # From 7 refractions on: half as fast again, the rule of `train` and `models`.
     assert gains[2] < 1.5 <= gains[7] and "pays from 7 refractions on" in README
     rows = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))["models"]

@@ -51,7 +51,7 @@ def test_a_hole_ahead_of_the_lens_cuts_the_overlap_of_two_circles(ahead_mm: floa
     half = ahead_mm * math.tan(math.radians(FIELD_DEG)) / 2 / RADIUS_MM  # of the circles' distance, in radii
     overlap = (2 * math.acos(half) - 2 * half * math.sqrt(1 - half**2)) / math.pi
     deviation = np.sqrt((discs.place_mm[0] ** 2).sum(0)).max() / 2  # of an even disc
-    assert char.cats_eye(discs, 100 * deviation) == pytest.approx(overlap, rel=10 * ALIKE)
+    assert char.cats_eye(discs, 100 * deviation) == pytest.approx(overlap, rel=ALIKE)
     assert char.cats_eye(discs, 400 * deviation) == pytest.approx(1 - (1 - overlap) / 4, rel=10 * ALIKE)
 
     def moment(of: str) -> float:
