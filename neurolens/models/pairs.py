@@ -15,7 +15,7 @@ from torch.quasirandom import SobolEngine
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.settings import WAVELENGTH_NM, said
+from neurolens.base.settings import FILM_MM, WAVELENGTH_NM, said, within
 from neurolens.models.model import Domain
 from neurolens.optics.lens.paraxial import PupilBounds, first_order
 from neurolens.optics.lens.prescription import Lens
@@ -88,11 +88,11 @@ def domain_of(
         pupil_z_mm: plane of the pupil points; None takes the one on which the pupil is tightest.
 
     Raises:
-        InputError: a radius or `nearest_m` that is not positive and finite, wavelengths outside `WAVELENGTH_NM` or in
+        InputError: a radius outside `FILM_MM`, `nearest_m` that is not positive and finite, wavelengths outside `WAVELENGTH_NM` or in
             the wrong order.
     """
-    if film_radius_mm is not None and not film_radius_mm > 0:
-        raise InputError("domain", "film_radius_mm", film_radius_mm, "a positive length in mm")
+    if film_radius_mm is not None and not within(FILM_MM, film_radius_mm):
+        raise InputError("domain", "film_radius_mm", film_radius_mm, f"a length {said(FILM_MM)} mm")
     if nearest_m is not None and not 0 < nearest_m < math.inf:
         raise InputError("domain", "nearest_m", nearest_m, "a positive distance in m, or none")
     low, high = wavelength_nm or lens.light_nm

@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,6 +143,8 @@ def test_without_dispersion_there_is_one_wavelength() -> None:
     ("wrong", "named"),
     [
         ({"film_radius_mm": 0.0}, "film_radius_mm"),
+        ({"film_radius_mm": 1e308}, "film_radius_mm"),
+        ({"film_radius_mm": math.inf}, "film_radius_mm"),
         ({"nearest_m": 0.0}, "nearest_m"),
         ({"wavelength_nm": (700.0, 400.0)}, "wavelength_nm"),
         ({"wavelength_nm": (0.4, 0.7)}, "wavelength_nm"),
@@ -202,3 +205,10 @@ def test_a_domain_that_nothing_reaches(pairs: RayPairs) -> None:
     shut = pairs.lens.with_stop_radius(1e-6)
     with pytest.raises(InputError, match="domain"):
         make_pairs(shut, pairs.domain, PairSettings(10, 10, 10))
+
+
+def test_a_focus_beyond_all_floats_in_mm_is_infinity() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        far, infinite = (domain_of(singlet(), film_radius_mm=5.0, focus_m=(f, f)) for f in (1e308, math.inf))
+    assert far.film_z_mm == pytest.approx(infinite.film_z_mm, rel=1e-12)

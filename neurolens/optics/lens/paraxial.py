@@ -21,6 +21,7 @@ from neurolens.optics.lens.prescription import Lens
 Meridian = Literal["x", "y"]
 COLOURS = 7  # wavelengths that stand for a range
 _SAME_NM = 0.1  # files round spectral lines
+_FAR_M = 1e15  # an object beyond is at infinity: its image is, to the last digit of a float64
 _LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light has a focus, too
 
 
@@ -230,6 +231,11 @@ def stop_radius_mm(lens: Lens, f_number: float) -> float:
     return first_order(lens.with_stop_radius(1.0)).f_number / f_number
 
 
+def distance_m(focus_m: float) -> float:
+    """Return the distance, as infinity where no float64 of an image tells the two apart."""
+    return math.inf if focus_m > _FAR_M else focus_m
+
+
 def film_z_mm(lens: Lens, focus_m: float) -> float:
     """Return the film plane that focuses an object `focus_m` metres from the film, see `film_z_of_planes_mm`.
 
@@ -274,7 +280,7 @@ def film_z_of_planes_mm(
     """
     if not focus_m > 0:
         raise InputError(file, "focus_m", focus_m, "a distance in m above 0, or inf")
-    if math.isinf(focus_m):
+    if math.isinf(distance_m(focus_m)):
         return rear_principal_z_mm + efl_mm
     efl_mm, focus_m = float(efl_mm), float(focus_m)  # numbers of numpy would warn of overflow
     separation = rear_principal_z_mm - front_principal_z_mm

@@ -200,6 +200,7 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
     Raises:
         InputError: no ray passes, or focus nearer than four focal lengths.
     """
+    focus_m = paraxial.distance_m(focus_m)
     film_z = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return film_z
@@ -297,6 +298,7 @@ def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]
     What is least for all rays lies between what is least for each colour and meridian by itself. Arguments are those
     of `best_focus_z_mm`.
     """
+    focus_m = paraxial.distance_m(focus_m)
     image = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return image, image
@@ -305,7 +307,8 @@ def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
         # The rays within each ring are those that a smaller stop lets through.
         along, across = (m.cumsum(1) for m in _moments(lens, (low + high) / 2 - 1000 * focus_m, colours)[:2])
-        found = [image, *(-along / across)[across > 0].tolist()]
+        seen = across > 0
+        found = [image, *(-along[seen] / across[seen]).tolist()]
         low, high = min(found), max(found)
     spare, last = _SPARE * (high - low), float(lens.vertices_mm[len(lens.surfaces) - 1])
     return max(low - spare, last + _NEAREST * (image - last)), high + spare
