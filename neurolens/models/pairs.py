@@ -88,8 +88,8 @@ def domain_of(
         pupil_z_mm: plane of the pupil points; None takes the one on which the pupil is tightest.
 
     Raises:
-        InputError: a radius outside `FILM_MM`, `nearest_m` that is not positive and finite, wavelengths outside `WAVELENGTH_NM` or in
-            the wrong order.
+        InputError: a radius outside `FILM_MM`, `nearest_m` that is not positive and finite, wavelengths outside
+            `WAVELENGTH_NM` or in the wrong order.
     """
     if film_radius_mm is not None and not within(FILM_MM, film_radius_mm):
         raise InputError("domain", "film_radius_mm", film_radius_mm, f"a length {said(FILM_MM)} mm")
