@@ -24,7 +24,7 @@ PAGES = lab.ROOT / "docs" / "pages"
 BLUE, ORANGE, GREEN, RED, *_ = FIELD_COLOURS
 GREY = FIELD_COLOURS[-1]
 PIXEL_UM = 5.0
-MACHINE = "One core of a 2.6 GHz AMD EPYC with AVX-512, November 2026."
+MACHINE = "Measured on one core of a 2.6 GHz AMD EPYC with AVX-512 in November 2026."
 
 
 @dataclass(frozen=True)
@@ -147,17 +147,17 @@ def models() -> Answer:
         "models",
         "How exact is a model?",
         f"median {short(statistics.median(network))} um; a pixel is {PIXEL_UM:g} um",
-        f"A network that ships leaves {short(statistics.median(network))} um RMS on the film (median of "
-        f"{len(network)} round photographic lenses, worst {short(max(network))}), and a polynomial "
+        f"Of the models that ship, a network leaves {short(statistics.median(network))} um RMS on the film (median of "
+        f"{len(network)} round photographic lenses, worst {short(max(network))}) and a polynomial "
         f"{short(statistics.median(polynomial))} um (median of {len(polynomial)} lenses by name, worst "
-        f"{short(max(polynomial))}). The networks pass or block at most {share(worst)} of the rays wrongly; those "
-        "of condensers and of a fast singlet are poor, and their cards say so.",
+        f"{short(max(polynomial))}). The networks pass or block at most {share(worst)} of the rays wrongly; the "
+        "networks of condensers and of a fast singlet are poor, and their cards say so.",
         "RMS error on the film of the models that ship, from the best lens to the worst.",
         draw,
         "lenses|model|number|median um|worst um",
         table,
         [("python -m experiments models", "../../models/README.md"), ("python -m experiments clipping", "clipping.md")],
-        "The errors are those of rays that no fit has seen, over the lens's whole film, stop, focus and 400 to 700 nm.",
+        "The errors are those of rays that no fit has seen, over the whole film, stop and focus, and 400 to 700 nm.",
         [
             ("experiments/results/zoom.md", "one model for a whole zoom: `python -m experiments zoom`"),
             ("experiments/results/inverse.md", "from the scene back to the film: `python -m experiments inverse`"),
@@ -220,10 +220,10 @@ def methods() -> Answer:
         "methods",
         "How does it compare with published methods?",
         f"a published polynomial leaves {short(theirs / ours)} times our error",
-        f"A polynomial of ours leaves {short(ours)} um on the film at {short(figure_of('ols-64', 'fused ns/ray'))} "
-        f"ns a ray, the best of the sparse polynomials that were published before {short(theirs)} um at "
-        f"{short(figure_of('schrade-40', 'fused ns/ray'))} ns. The published methods test one opening or two, so "
-        f"that {span(passed)}% of their rays pass where a rim in between blocks them.",
+        f"Our polynomial leaves {short(ours)} um on the film at {short(figure_of('ols-64', 'fused ns/ray'))} ns a ray; "
+        f"the best sparse polynomial that was published before leaves {short(theirs)} um at "
+        f"{short(figure_of('schrade-40', 'fused ns/ray'))} ns. The published methods test one opening of the lens or "
+        f"two, so that a rim in between blocks {span(passed)}% of the rays that they pass.",
         "Error on the film against time as C: ours are blue, published methods orange, renderers' own lenses grey.",
         draw,
         "method|RMS um|ns a ray as C|wrongly passed, %",
@@ -231,8 +231,7 @@ def methods() -> Answer:
         [("python -m experiments surrogates laikin_double_gauss_50", "surrogates/laikin_double_gauss_50.md")],
         "One lens, the 50 mm f/1.8 double Gauss, at full aperture and field. The published methods are our "
         "implementations of [their papers](../papers.md), fitted on the same rays and written by the same writers. "
-        + MACHINE
-        + " The tables of rays were meant for a GPU and are judged on a CPU here.",
+        "The tables of rays were meant for a GPU and are judged on a CPU here. " + MACHINE,
         [
             ("experiments/results/surrogates/ogawa_zoom_70_200.md", "the same through a 70-200 zoom"),
             ("experiments/results/surrogates/phone_lens_6.md", "the same through a phone lens"),
@@ -313,18 +312,18 @@ def speed() -> Answer:
         "speed",
         "Where does a model pay?",
         "from 7 refractions on, in your own C or shader",
-        f"As C on one core a model within 1 um takes {short(core[12][1])} ns a ray through 12 refractions, "
-        f"{short(gains[12])} times as fast as our exact lens and {short(hand[12])} times as a tracer written by "
-        f"hand (at 2 refractions {short(gains[2], 3)} and {short(hand[2])}, at 33 {short(gains[33])} and "
-        f"{short(hand[33])}). On a GPU it gains {short(gpu_gains[12])} and {short(gpu_gains[33])} times at 12 and "
+        f"As C on one core, a model within 1 um takes {short(core[12][1])} ns a ray through 12 refractions and is "
+        f"{short(gains[12])} times as fast as our exact lens and {short(hand[12])} times as fast as a tracer written "
+        f"by hand. On a GPU it gains {short(gpu_gains[12])} and {short(gpu_gains[33])} times at 12 and "
         "33 refractions and loses at 2; in our own renderer the exact lens costs so little that no model pays.",
         "How many times as fast as exact tracing a model is, by the lens's refractions.",
         draw,
-        "where|exact, ns|model, ns|gain|model, RMS um",
+        "where|exact, ns a ray|model, ns a ray|gain|model, RMS um",
         table,
         [("python -m experiments fused", "fused_speed.md"), ("python -m experiments gpu-day", "gpu_day.md")],
-        "Rays are complete: stop, rims, transmittance and status, in float32. Times are the best of 20 rounds. "
-        + MACHINE,
+        f"Beside the tracer written by hand, a model is {short(hand[2])} times as fast at 2 refractions and "
+        f"{short(hand[33])} times at 33. Rays are complete: stop, rims, transmittance and status, in float32. Times "
+        "are the best of 20 rounds. " + MACHINE,
         [
             (
                 "experiments/results/avx512/tracer_race.md",
@@ -379,25 +378,23 @@ def peers() -> Answer:
     whole = rows["C, with dispersion and transmittance|float32"]["ns"]["min"]
     hand = rows["by hand, AVX, 3 vectors|float32"]["ns"]["min"]
     off = max(rows[key]["errors"]["film_um"] for key in rows if rows[key]["family"] != "model, ours")
-    ghosts = results("flare_speed")
-    theirs = next(r for r in ghosts["beside"] if r["tracer"].startswith("flaresim"))["ns_min"]
-    ours = next(r for r in ghosts["rows"] if r["lens"] == "laikin_double_gauss_50")["compiled_min"]
     return Answer(
         "peers",
         "How does it compare with other programs?",
         f"exact rays {short(best / exact)} times as fast as the next program",
-        f"On the same 100,000 rays our exact lens as C takes {short(exact)} ns a ray, the fastest other program "
-        f"{short(best, 3)} ({short(best / exact)} times as long), and all agree on the film within {short(off)} um. "
-        f"With transmittance ours takes {short(whole)} ns, and a tracer for this one lens, written by hand in AVX, "
-        f"{short(hand)}, for it averages polarisation where ours follows it; ghosts take {short(ours)} ns a ray "
-        f"where flaresim takes {short(theirs, 3)}.",
+        f"On the same 100,000 rays our exact lens as C takes {short(exact)} ns a ray and the fastest other program "
+        f"{short(best, 3)} ns ({short(best / exact)} times as long); all agree on the film within {short(off)} um. "
+        f"With transmittance our lens takes {short(whole)} ns, while a tracer written by hand in AVX for this one lens "
+        f"takes {short(hand)} ns, since it averages the polarisation that ours follows.",
         "Time of one ray through the 50 mm f/1.8 double Gauss, each program at its fastest setting.",
         draw,
         "program|precision|ns a ray|RMS um on the film",
         table,
-        [("python -m experiments rays", "rays.md"), ("python -m experiments flare", "flare_speed.md")],
-        "One thread, the same film and pupil points for all; the error is against our tracer in float64. " + MACHINE,
+        [("python -m experiments rays", "rays.md")],
+        "All programs take the same film and pupil points on one thread. The error is against our tracer in float64. "
+        + MACHINE,
         [
+            ("docs/pages/results/flare.md", "ghosts beside flaresim"),
             ("experiments/results/gpu_day.md", "the same programs on a GPU: `python -m experiments gpu-day`"),
             (
                 "experiments/results/collection.md",
@@ -445,7 +442,7 @@ def tracer() -> Answer:
             "float32 at the extremes",
             f"{len(cases)} cases",
             str(sum(r["beyond"] for r in cases)),
-            "statuses that differ off an edge",
+            "statuses that differ away from edges",
         ],
         [
             "wild numbers, all languages",
@@ -457,11 +454,11 @@ def tracer() -> Answer:
     return Answer(
         "tracer",
         "Is the exact tracer right?",
-        f"float32 within {short(worst)} um, no ray off 50 digits",
-        f"Of {read:,} public lens files {agree[1]} agree with ray-optics in focal length, image plane and chief "
-        "rays within 1e-4 of their size, and each of the others differs by something that ray-optics is known to "
-        f"leave out. Float32, which cameras use, stays within {short(worst)} um of float64 on the film (99th "
-        f"percentile of the worst of {len(rows)} lenses), and float64 within {off * 1e6:.1g} nm of 50 digits.",
+        f"float32 within {short(worst)} um on the film",
+        f"Of {read:,} public lens files {agree[1]} agree with ray-optics within 1e-4 in focal length, image plane and "
+        "chief rays, and each of the others differs by something that ray-optics is known to leave out. Float64 stays "
+        f"within {off * 1e6:.1g} nm of 50 digits; float32, which cameras use, stays within {short(worst)} um of "
+        f"float64 on the film (99th percentile of the rays, worst of {len(rows)} lenses).",
         "Float32 beside float64 on the film, for every lens file, from the best lens to the worst.",
         draw,
         "held against|cases|found|what it is",
@@ -472,8 +469,8 @@ def tracer() -> Answer:
             ("python -m experiments extremes", "extremes.md"),
             ("python -m experiments wild", "wild.md"),
         ],
-        "The extremes are f/0.6 to f/45, 220 degrees, grazing rays, total reflection, 380 and 780 nm and steep "
-        "aspheres.",
+        "The extremes are f/0.6 to f/45, a field of 220 degrees, grazing rays, total reflection, 380 and 780 nm and "
+        "steep aspheres.",
         [
             ("experiments/results/transmittance.md", "what averaging over polarisation would cost"),
             ("experiments/results/passage.md", "the share of camera rays that pass the lens"),
@@ -525,19 +522,19 @@ def lens_files() -> Answer:
         "lens-files",
         "How right is a lens file?",
         f"distortion within {short(statistics.median(shape))}% (median of primes)",
-        f"Held against photographs of the products, {len(shape)} primes keep the shape of the distortion within "
+        f"Beside photographs of {len(shape)} primes, the shape of the distortion is right within "
         f"{short(statistics.median(shape))}% of the image height (median; 90% within {short(tenth(shape, 0.9))}%), "
-        f"where the distortion itself is {short(itself)}%. Light wide open is off by "
-        f"{short(statistics.median(found['light wide open, stops']))} stops (median), and by "
-        f"{short(statistics.median(found['the same, rims fitted to photographs']))} with rims fitted to the "
-        "photographs, for patents draw rims and do not state them.",
+        f"where the distortion itself has a median of {short(itself)}%. Wide open the light is off by "
+        f"{short(statistics.median(found['light wide open, stops']))} stops (median), because patents do not state "
+        f"rims, and by {short(statistics.median(found['the same, rims fitted to photographs']))} stops with rims "
+        "fitted to the photographs.",
         "Distortion of lens files beside that of photographs, from the best lens to the worst.",
         draw,
         "what|lenses|median|90% have less than",
         table,
         [("python -m experiments photographs FOLDER", "photographs.md")],
-        "Photographs are those behind lensfun's profiles; the lens files are Zemax files of a public collection "
-        "(OpticsDatabase). Differences are root mean squares over image heights.",
+        "The photographs are those behind lensfun's profiles. The lens files are Zemax files of a public collection, "
+        "OpticsDatabase. Differences are root mean squares over image heights.",
         [
             ("experiments/results/faults.md", "tables broken on purpose, and whether that is seen"),
             ("experiments/results/alarms.md", "alarms on tables as they are"),
@@ -551,7 +548,7 @@ def lens_files() -> Answer:
 
 def dispersion() -> Answer:
     rows = results("dispersion")["rows"]
-    kinds = {"four": "four wavelengths a path", "lateral": "lateral colour alone"}
+    kinds = {"four": "four wavelengths", "lateral": "lateral colour alone"}
 
     def gains(kind: str, key: str) -> list[float]:
         return [r[kind][key] for r in rows]
@@ -581,30 +578,30 @@ def dispersion() -> Answer:
 
     table = [
         line("noise of luminance, one wavelength", [r["one"]["mean"] for r in rows]),
-        line("noise of luminance, four", [r["four"]["mean"] for r in rows]),
-        line("noise of luminance, lateral alone", [r["lateral"]["mean"] for r in rows]),
+        line("noise of luminance, four wavelengths", [r["four"]["mean"] for r in rows]),
+        line("noise of luminance, lateral colour alone", [r["lateral"]["mean"] for r in rows]),
         *(
-            line(f"gain in {what}, {'four' if kind == 'four' else 'lateral'}", gains(kind, key))
-            for kind in kinds
-            for what, key in (("channels", "gain_channels"), ("luminance", "gain"))
+            line(f"gain in {what}, {name}", gains(kind, key))
+            for kind, name in kinds.items()
+            for what, key in (("colour channels", "gain_channels"), ("luminance", "gain"))
         ),
     ]
     return Answer(
         "dispersion",
         "How noisy is dispersion?",
         f"equal noise {span(gains('four', 'gain_channels'))} times sooner",
-        "A path carries four wavelengths, each from its own film point, and reaches equal noise in the colour "
-        f"channels {span(gains('four', 'gain_channels'))} times as fast as with one wavelength (median "
-        f"{short(statistics.median(gains('four', 'gain_channels')))}). Its luminance has "
-        f"{span([r['four']['mean'] for r in rows])} times the variance of a thin lens, which has no dispersion at "
-        "all.",
+        "Paths of four wavelengths, each from its own film point, reach equal noise in the colour channels "
+        f"{span(gains('four', 'gain_channels'))} times as fast as paths of one wavelength (median "
+        f"{short(statistics.median(gains('four', 'gain_channels')))}). Their luminance has "
+        f"{span([r['four']['mean'] for r in rows])} times the variance of a thin lens, which has no dispersion.",
         "Gain of four wavelengths a path over one, a dot for each of three scenes and six lenses.",
         draw,
         "what|median|least|most",
         table,
         [("python -m experiments dispersion", "dispersion.md")],
-        "Noise is the variance over that of a thin lens; gains are ratios of times to equal variance. Three scenes "
-        "through six exact lenses as C, 16 samples, one thread. " + MACHINE,
+        "Noise is the variance over that of a thin lens. A gain is the ratio of the times to equal variance. "
+        "*Lateral colour alone* is `--dispersion lateral`, without longitudinal colour. Three scenes "
+        "through six exact lenses as C, 16 samples a pixel, one thread. " + MACHINE,
         [
             (
                 "experiments/results/osl_noise.md",
@@ -657,8 +654,8 @@ def pictures() -> Answer:
         "What does a real lens cost in a picture?",
         f"{span(times)} times the time of a thin lens",
         f"In our renderer a picture through the exact lens as C takes {span(times)} times as long as one through a "
-        f"thin lens, whose picture stays wrong by a FLIP of {span(thin)} however long it runs. A network's picture "
-        f"is off by {span(net)}, and saves at most {share(max(saved))} of the time: use the exact lens there.",
+        f"thin lens, which stays wrong by a FLIP of {span(thin)} however long it runs. A picture through a network "
+        f"is wrong by {span(net)} and takes at most {share(max(saved))} less time: use the exact lens here.",
         "Error against seconds: the thin lens stops where its picture is wrong.",
         draw,
         "camera, FLIP of its picture|" + "|".join(s["scene"] for s in scenes),
@@ -667,8 +664,8 @@ def pictures() -> Answer:
             ("python -m experiments equal-time", "equal_time.md"),
             ("python -m experiments render", "render_times/README.md"),
         ],
-        "The 50 mm f/1.8 double Gauss, 160 x 90 pixels, one wavelength a path, against 4,096 samples; FLIP is "
-        "between mean pictures of the same random numbers. " + MACHINE,
+        "The 50 mm f/1.8 double Gauss, 160 x 90 pixels, one wavelength a path, against 4,096 samples a pixel. FLIP "
+        "compares mean pictures of the same random numbers. " + MACHINE,
         [
             (
                 "experiments/results/gallery/README.md",
@@ -718,20 +715,20 @@ def blur() -> Answer:
         "blur",
         "How close is the blur of a plate?",
         f"FLIP {span(flips)} from the path-traced lens",
-        "A sharp plate with depth, blurred by `neurolens defocus`, differs from the path-traced lens by a FLIP of "
-        f"{span(flips)}, where a path-traced thin lens differs by {span(thin)}. It takes "
-        f"{span([r['cpu_s'] for r in rows])} CPU seconds where the path tracer takes "
+        "A sharp plate with depth, blurred by `neurolens defocus`, differs from a path-traced picture through the same "
+        f"lens by a FLIP of {span(flips)}; a path-traced thin lens differs by {span(thin)}. `defocus` takes "
+        f"{span([r['cpu_s'] for r in rows])} CPU seconds, and the path tracer "
         f"{span([r['render_cpu_s'] for r in rows], 3)}.",
         "FLIP from the path-traced lens against CPU time, six scenes.",
         draw,
-        "scene|FLIP|thin lens|CPU s|path tracer, s",
+        "scene|FLIP, `defocus`|FLIP, thin lens|CPU s, `defocus`|CPU s, path tracer",
         table,
         [
             ("python -m experiments defocus", "defocus.md"),
             ("python -m experiments defocus --checks", "defocus_checks.md"),
         ],
-        "A 50 mm f/1.4 wide open, 480 pixels wide, plates of 512 samples against 1,024. Measured with 64 samples a "
-        "pixel of `defocus`, whose default is 128 now. " + MACHINE,
+        "A 50 mm f/1.4 wide open, pictures 480 pixels wide. Plates have 512 samples a pixel, path-traced pictures "
+        "1,024. `defocus` took 64 samples a pixel; its default is 128 now. " + MACHINE,
         [("docs/pages/how-to/defocus.md", "blur a plate yourself")],
     )
 
@@ -765,15 +762,15 @@ def blender() -> Answer:
     return Answer(
         "blender",
         "What does a lens cost in Blender?",
-        f"{short(rows['ols-36']['over'])} times a thin lens a camera ray",
+        f"a camera ray takes {short(rows['ols-36']['over'])} times a thin lens's",
         f"In Cycles a camera ray through a model takes {short(rows['ols-36']['over'])} times as long as through a "
-        f"thin lens in OSL, where the exact lens takes {short(rows['exact, 12 refractions']['over'])} times at 12 "
-        f"refractions and {short(rows['exact, 33 refractions']['over'])} at 33. A whole picture of a room takes "
-        f"{short(rooms['ols-36']['over'], 3)} times as long as with Cycles's own depth of field, and "
-        f"{short(rooms['ols-36, one colour']['over'], 3)} times where dispersion is off.",
-        "Time of one camera ray in Cycles over that of a thin lens in OSL, before a white sky.",
+        f"thin lens in OSL; through an exact lens it takes {short(rows['exact, 12 refractions']['over'])} times as "
+        f"long at 12 refractions and {short(rows['exact, 33 refractions']['over'])} at 33. A whole picture of a room "
+        f"takes {short(rooms['ols-36']['over'], 3)} times as long as with Cycles's own depth of field, and "
+        f"{short(rooms['ols-36, one colour']['over'], 3)} times with dispersion off.",
+        "Time of one camera ray in Cycles over that through a thin lens in OSL, before a white sky.",
         draw,
-        "camera|time over a thin lens|RMS um",
+        "camera|time over a thin lens|RMS um on the film",
         table,
         [
             ("python -m experiments osl --blender-python PYTHON", "osl_speed.md"),
@@ -819,11 +816,11 @@ def flare() -> Answer:
 
     own = [r["compiled_min"] for r in rows]
     table = [
-        ["ghost ray, ns", span(own), f"flaresim {short(beside, 3)}", "on the first lens"],
+        ["ghost ray, ns", span(own), short(beside, 3), "flaresim, on the first lens"],
         ["ten million photons, s", span(times), "7,867 to 9,017", "Keshmirian 2008, his machine"],
-        ["first dark ring of a star", share(ring), "0", "off Airy's, worst"],
+        ["first dark ring of a star", share(ring), "0", "worst difference from Airy's ring"],
         *(
-            [f"veil of a double Gauss, {coating}", share(value), "\u2013", "of white, all ahead bright"]
+            [f"veil of a double Gauss, {coating}", share(value), "\u2013", "share of white, all ahead bright"]
             for coating, value in veil.items()
         ),
     ]
@@ -831,12 +828,12 @@ def flare() -> Answer:
         "flare",
         "How fast and how right is flare?",
         f"{span(own)} ns a ghost ray",
-        f"A ghost ray takes {span(own)} ns on one core, by lens; flaresim, a public tracer, takes "
-        f"{short(beside, 3)} ns on the first of them. Stars by diffraction have their first dark ring within "
+        f"Through five lenses a ghost ray takes {span(own)} ns on one core; flaresim, a public tracer, takes "
+        f"{short(beside, 3)} ns through the first of them. The first dark ring of a star lies within "
         f"{share(ring)} of Airy's, and ten million photons through a zoom take {span(times)} s.",
         "Time of one ray of one pair of reflections at one wavelength.",
         draw,
-        "what|ours|other|note",
+        "what|ours|other|what the other is",
         table,
         [
             ("python -m experiments flare", "flare_speed.md"),

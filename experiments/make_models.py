@@ -166,14 +166,19 @@ def chosen(library: Library, names: Sequence[str]) -> tuple[Entry, ...]:
 
 _HEAD = """# Models that ship
 
-Made by `python -m experiments models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
-64 coefficients per vector output, and of the historical ones and of 34 by name the best network of two layers of 16 units after
-600 iterations, over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
-of a few lenses also faster ones. Errors on held-out rays (`neurolens.studies.rays`), micrometres at an image radius of
-21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime and as C compiled here, with stop, rims and transmittance;
-speed-up of onnxruntime over the compiled exact tracer doing the same work in the same run; "–" was not timed, and the times of the others are
-of models of as many coefficients that were fitted before glasses of two figures had a partial dispersion (`--times` takes them again). Check a model with
-`neurolens evaluate models/FILE`; `make bench` holds those of the first lenses to the speed-ups that the index promises."""  # noqa: E501
+`python -m experiments models` made these models from experiments/models.toml. Every lens of lenses/ has the best
+polynomial of at most 64 coefficients per vector output. The historical lenses and 34 lenses by name also have the
+best network of two layers of 16 units, after 600 iterations. A few lenses have faster models, too. A model holds for
+the whole lit film, the full aperture, focus from infinity to near, and all wavelengths for which the glasses are
+known.
+
+- **Errors** are those of held-out rays (`neurolens.studies.rays`), in micrometres at an image radius of 21.6 mm.
+  Every card was checked on fresh rays. `neurolens evaluate models/FILE` checks a model again.
+- **Times** are ns a ray on one core, in onnxruntime and as C compiled here, with stop, rims and transmittance. "–"
+  was not timed. The other times are of earlier models with as many coefficients, which were fitted before glasses of
+  two figures had a partial dispersion. `--times` takes them again.
+- **Speed-up** is that of onnxruntime over the compiled exact tracer, doing the same work in the same run.
+  `make bench` holds the models of the first lenses to the speed-ups that the index promises."""
 
 
 def _reference(key: str) -> Callable[[Row], Any]:
@@ -223,7 +228,7 @@ def _summary(rows: Sequence[Row], model: str) -> str:
     """One line a kind of lens: number, median and range."""
     kinds = ((k, v) for k, v in errors_by_kind(rows, model).items() if v)
     parts = [f"{len(v)} {k} {statistics.median(v):.3g} ({min(v):.3g} to {max(v):.3g})" for k, v in kinds]
-    return f"RMS of {model} on each lens's own film, um, median and range: {', '.join(parts)}." if parts else ""
+    return f"RMS error of {model} on each lens's own film in um, median (range): {', '.join(parts)}." if parts else ""
 
 
 def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> None:
