@@ -149,7 +149,7 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
-    """Z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film z, to first order."""
+    """The z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film z, to first order."""
     data = first_order(lens)
     front, rear = data.front_efl_mm, data.efl_mm
     extension = film_z - data.rear_principal_z_mm - rear  # Newton: f f' / extension is how far beyond the front focus
