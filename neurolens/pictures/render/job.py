@@ -355,8 +355,7 @@ def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int 
 
 
 def expected_light(scene: Scene) -> Spectrum:
-    """Estimate the spectrum (nm, radiance relative to D65) of a scene's light; its surroundings count as all its
-    lamps."""
+    """Estimate the spectrum (nm, radiance relative to D65) of a scene's light; surroundings count as all lamps."""
     fine = SpectralRange(*scene.settings.camera.wavelength_nm, _FINE)
     lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
     for name, emission, area in _lamps(scene):
