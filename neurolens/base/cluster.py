@@ -1,8 +1,8 @@
-"""The executor of a Dask cluster, see `base.tasks`; and tasks that read and write files where these files are not.
+"""The executor of a Dask cluster (see `base.tasks`), and tasks whose files travel with them to its workers.
 
-Files travel to the task, and what it writes comes back. Such a task is a dataclass. Its paths lie below a folder of the
-worker in the shape that they have here, so that scenes find their pictures. It has the attribute `out`, the file or
-folder that it writes; what it writes beside `out` comes back, too.
+A task's input files travel to the worker, and the files that it writes come back. Such a task is a dataclass. On the
+worker its paths lie below a folder in the shape that they have here, so that scenes find their pictures. Its attribute
+`out` names the file or folder that it writes; what it writes beside `out` comes back, too.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure
 
 R = TypeVar("R")
 _MOST = 4096  # tasks in flight: each has a thread here that waits for it
-_ASK_EVERY_S = 1.0  # how many workers there are
+_ASK_EVERY_S = 1.0  # between two counts of the workers
 _TIMEOUT, _POLL_S = "10s", 5.0
-_ANSWERED_S = 5.0  # until a worker's answer has gone
+_ANSWERED_S = 5.0  # in which a worker's answer can leave before the worker ends
 _LOST = "the Dask scheduler is lost: what is done is kept, the same command goes on"
 _KILLED = "its worker was killed, again and again: did the memory run out?"
 _ALONE = threading.Lock()  # in a worker: tasks set options of the whole process, such as torch's threads
@@ -120,7 +120,8 @@ class Dask(ThreadPoolExecutor):
         raise NeurolensError(_KILLED)
 
     def _sent_and_awaited(self, client: Any, work: Callable[..., Any], args: Any, named: Any) -> Any:
-        """The outcome of a task; it would be awaited for ever where the client was closed meanwhile."""
+        """Send a task and return its outcome; TimeoutError once the client is closed, for no outcome would ever
+        come."""
         sent = [self._shared(client, each) if isinstance(each, Shared) else each for each in args]
         future = client.submit(_answer, work, __version__, self._limit_s, sent, named, pure=False)
         try:
@@ -155,7 +156,7 @@ def _answer(work: Callable[..., Any], version: str, limit_s: float, args: Any, n
 
 
 def _in_time(work: Callable[..., Any], limit_s: float, args: Any, named: Any) -> Any:
-    """The answer, or Failed after a time: then the worker ends once it has answered, as no thread can be stopped."""
+    """Run a task, or give Failed after a time: then the worker ends after its answer, for no thread can be stopped."""
     pool = ThreadPoolExecutor(1)
     try:
         return pool.submit(work, *args, **named).result(limit_s)
@@ -200,7 +201,7 @@ class _Cluster:
             raise NeurolensError(f"--dask {address}: {one_line(str(error), 600)}; expected {expected}") from None
 
     def _started(self, workers: int) -> Any:
-        """Workers of this machine, for this process alone: a scheduler runs any code that it is sent.
+        """Start workers on this machine for this process alone, because a scheduler runs any code that it is sent.
 
         Keys that live as long as the cluster keep other users of the machine out; nothing is served over HTTP.
         """
@@ -232,7 +233,7 @@ _THEN = (1980, 1, 1, 0, 0, 0)  # the same files are the same bytes
 
 
 def packed(files: Mapping[str, Path] | Iterable[Path]) -> bytes:
-    """Files as bytes, by name, or by their absolute path."""
+    """Pack files into bytes, under the names given, or else under their absolute paths."""
     named = files if isinstance(files, Mapping) else {os.path.abspath(path): path for path in files}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
@@ -242,7 +243,7 @@ def packed(files: Mapping[str, Path] | Iterable[Path]) -> bytes:
 
 
 def unpack(data: bytes, folder: Path) -> list[Path]:
-    """Write packed files below a folder, each whole or not at all; their paths."""
+    """Write packed files below a folder, each whole or not at all, and return their paths."""
     written = []
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         for name in archive.namelist():
@@ -271,14 +272,17 @@ def with_paths(value: T, move: Callable[[Path], Path]) -> T:
 
 
 def absolute(task: T) -> T:
-    """A task as it travels: with absolute paths."""
+    """Return a task with absolute paths, as it travels to a worker."""
     return with_paths(task, lambda path: Path(os.path.abspath(path)))
 
 
 def run_with_files(work: Callable[[Any], object], files: Shared, task: Any) -> bytes:
-    """Run `work(task)` beside files that were packed by their absolute paths; the files that it wrote, packed.
+    """Run `work(task)` on a worker, and return the files that it wrote, packed.
 
-    Progress and warnings go nowhere. Paths in the message of a NeurolensError are those of the machine that asked.
+    Args:
+        files: the task's inputs, packed by their absolute paths.
+
+    Progress and warnings are not shown. Paths in the message of a NeurolensError are those of the machine that asked.
     """
     root = Path(_unpacked(files.data).name)
     task = with_paths(task, lambda path: root / str(path).lstrip("/"))
@@ -300,7 +304,7 @@ def run_with_files(work: Callable[[Any], object], files: Shared, task: Any) -> b
 
 @lru_cache(maxsize=2)
 def _unpacked(files: bytes) -> TemporaryFolder:
-    """The files of a run, unpacked once in a worker."""
+    """Unpack the files of a run, once in a worker."""
     folder = TemporaryFolder()
     unpack(files, Path(folder.name))
     return folder

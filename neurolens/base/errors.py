@@ -13,7 +13,7 @@ import neurolens
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 _LONGEST = 400  # characters of a value or field in a message
-# What brings a package that the base install lacks: an extra of pyproject.toml, by the name that is imported.
+# The extra of pyproject.toml that installs a package, by the name under which the package is imported.
 EXTRAS = {
     **dict.fromkeys(("torch", "scipy", "matplotlib", "contourpy", "flip_evaluator"), "train"),
     **dict.fromkeys(("distributed", "dask", "cryptography"), "dask"),
@@ -25,17 +25,17 @@ EXTRAS = {
 
 
 def printable(text: str) -> str:
-    """Text for a terminal: what could command it, or turn the writing round, as \\u and four digits."""
+    """Return a text that a terminal can show: what controls it or reverses the writing becomes \\u and digits."""
     return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def without_controls(text: str) -> str:
-    """A text for files: without the characters that XML has not, nor USD an escape for."""
+    """Return a text for files, without the characters that XML forbids and USD cannot escape."""
     return _NOT_XML.sub("", text)
 
 
 def one_line(text: str, most: int) -> str:
-    """A text on one line, cut to `most` characters, for a terminal."""
+    """Return a text as one line of at most `most` characters that is safe on a terminal."""
     shown = printable(" ".join(text[: 4 * most].split()))
     return shown if len(shown) <= most else f"{shown[: most - 3]}..."
 
@@ -121,7 +121,7 @@ def installed() -> Iterator[None]:
 
 
 def reason(error: BaseException) -> str:
-    """What an error says, of one of the system with its file; the error of a full disk names none."""
+    """Return what an error says; an error of the system begins with the file's name, where it has one."""
     if text := missing(error):
         return text
     if not isinstance(error, OSError):

@@ -1,8 +1,8 @@
-"""Files: written whole or not at all, read only where they are regular and of bounded size; caches; hashes; saved work.
+"""Files written whole or not at all, and read only where they are regular and not too large; caches and saved work.
 
-Saved arrays, and what they are of, are a zip of numpy arrays (an .npz), stored as they are, and of `about.json`. Each
+Saved arrays are an uncompressed zip (an .npz) of numpy arrays and of `about.json`, which says what they belong to. Each
 array must have the size and the header that its reader expects before a byte reaches memory, and zip's checksums find
-damaged data. Whether `about.json` is that of the same work is the reader's to check.
+damaged data. Whether `about.json` describes the same work is for the reader to check.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ except ModuleNotFoundError:  # Windows
 
 _LARGEST_LIST, _CHECKSUM = 1 << 24, "checksum"
 _LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
-_ABANDONED_S = 24 * 3600.0  # nothing is written for a day
-_cleaned = set[Path]()  # folders of thousands of files are not searched at each one
-_FOLDER, _LOCK = "neurolens-", ".neurolens-lock"  # of temporary folders
+_ABANDONED_S = 24 * 3600.0  # no write takes so long
+_cleaned = set[Path]()  # each once a process, for a folder may hold thousands of files
+_FOLDER, _LOCK = "neurolens-", ".neurolens-lock"  # names of temporary folders, and of the lock in each
 _DIGEST = 32  # bytes of SHA-256
-# Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
+# O_NONBLOCK: the opening of a FIFO does not wait for its writer. A system that lacks a flag does not need it.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 
-CHUNK_BYTES = 16 << 20  # of saved arrays that are copied at a time
+CHUNK_BYTES = 16 << 20  # of a saved array, copied at a time
 _ABOUT, _LARGEST_ABOUT = "about.json", 8 << 20
 # RuntimeError: deep JSON; ArithmeticError: an integer beyond floats.
 _UNREADABLE = (zipfile.BadZipFile, KeyError, TypeError, AttributeError, EOFError, RuntimeError, ArithmeticError)
@@ -59,7 +59,7 @@ _noted: ContextVar[set[Path] | None] = ContextVar("_noted", default=None)
 
 @contextmanager
 def noted_files() -> Iterator[set[Path]]:
-    """Collect the files that are opened for reading inside the block, absolute paths; none of caches."""
+    """Collect the absolute paths of files opened for reading inside the block, except those of caches."""
     found: set[Path] = set()
     before = _noted.set(found)
     try:
@@ -71,8 +71,11 @@ def noted_files() -> Iterator[set[Path]]:
 
 
 def library() -> Path:
-    """The folder of what ships beside the code, lenses/, models/ and experiments/scenes/: the checkout's; of an
-    installed package, share/neurolens in the environment (the user's, pip's --target); else the working folder."""
+    """Return the folder that has lenses/, models/ and experiments/scenes/, which ship beside the code.
+
+    In a checkout it is the checkout. An installed package has share/neurolens in the environment, in the user's folder,
+    or in pip's --target. Where neither is found, it is the working folder.
+    """
     code = Path(__file__).parents[2]
     shares = (Path(sys.prefix), Path(site.getuserbase()), code)
     roots = (code, *(share / "share" / "neurolens" for share in shares))
@@ -155,7 +158,7 @@ def _remove_abandoned(new: Path) -> None:
 
 
 def open_regular(path: str | Path) -> BufferedReader:
-    """A regular file opened for reading; a FIFO or a device is refused, not waited for.
+    """Open a regular file for reading; a FIFO or a device is refused, not waited for.
 
     Raises:
         OSError: missing, not regular, not readable, or a name that no file can have.
@@ -175,10 +178,11 @@ def open_regular(path: str | Path) -> BufferedReader:
 def read_bytes(
     path: str | Path, most: int, expected: str = "a file", place: tuple[str | Path, str] | None = None
 ) -> bytes:
-    """The content of a user's file: regular, of at most `most` bytes.
+    """Read a user's file, which must be regular and have at most `most` bytes.
 
     Args:
-        expected: what it should be, for messages: "a lens file". place: file and field that name it, if not itself.
+        expected: what the file should be, for messages ("a lens file").
+        place: the file and the field that messages name, where another file names this one.
 
     Raises:
         InputError: missing, not regular, unreadable or larger.
@@ -198,9 +202,9 @@ def read_bytes(
 
 
 def cache_folder(name: str = "") -> Path:
-    """`neurolens` in $XDG_CACHE_HOME or ~/.cache, or a folder of that name in it.
+    """Return `neurolens` in $XDG_CACHE_HOME or ~/.cache, or the folder `name` in it.
 
-    A folder that is not this user's alone is replaced by one of this process: others could put code there.
+    A folder to which others can write is replaced by a temporary one of this process, for they could put code there.
     """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "neurolens"
     own = _is_own_folder(folder) and _is_own_folder(folder / name)
@@ -266,9 +270,9 @@ def seal(temporary: Path, mode: int = 0o600) -> None:
 
 
 def sealed_bytes(path: Path) -> bytes | None:
-    """The content of a file of a cache; None where there is none, a damaged one, or one that others could write."""
+    """Return the content of a cache's file; None where it is missing, damaged, or open to others' writing."""
     try:
-        if not _mine(path.lstat()):  # nor a link, which everybody could write
+        if not _mine(path.lstat()):  # a link is refused, too: everybody could write to it
             return None
         with open_regular(path) as file:
             data = file.read()
@@ -281,7 +285,7 @@ def sealed_bytes(path: Path) -> bytes | None:
 def keep_newest(new: Path, most: int) -> None:
     """Keep `new` and the files written nearest before it, and remove the other files of its suffix from a cache.
 
-    A clock that went back leaves files of the future: they go as the oldest do.
+    Files dated in the future, which a clock that went back leaves, count as the oldest.
     """
     with suppress(OSError):
         now = new.stat().st_mtime
@@ -303,10 +307,10 @@ def safe_name(text: str) -> str:
 
 
 def place_inside(folder: Path, entry: str) -> Path:
-    """The path of an archive's entry in a folder.
+    """Return the path of an archive's entry inside a folder.
 
     Raises:
-        ValueError: a name that leads out of the folder, or none that a file can have.
+        ValueError: the name leads out of the folder, or no file can have it.
     """
     root = folder.resolve()
     if not (path := (root / entry).resolve()).is_relative_to(root) or path == root or "\\" in entry:
@@ -315,25 +319,28 @@ def place_inside(folder: Path, entry: str) -> Path:
 
 
 def sha256_of(path: str | Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
+    """Return the hexadecimal SHA-256 of a file."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def fingerprint_of(values: Sequence[Any]) -> str:
-    """Hexadecimal SHA-256 of values as JSON with sorted keys."""
+    """Return the hexadecimal SHA-256 of values, written as JSON with sorted keys."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def atomic_write_text(path: str | Path, text: str) -> None:
-    """Write `text` (UTF-8) to `path` atomically; bytes of names that are no UTF-8 are written as \\u and digits, which
-    TOML could not read again (`tomlfile.format_value` refuses them)."""
+    """Write `text` (UTF-8) to `path` atomically.
+
+    Bytes of file names that are no UTF-8 are written as \\u and digits. TOML could not read these again, so that
+    `tomlfile.format_value` refuses such names.
+    """
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write JSON atomically, its folder made; ValueError where a number is not finite."""
+    """Write JSON atomically and make its folder. Raises ValueError where a number is not finite."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     atomic_write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
@@ -344,7 +351,7 @@ def write_kept(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def read_kept(path: Path) -> dict[str, Any] | None:
-    """The data that `write_kept` wrote; None where the file is missing or was damaged."""
+    """Return the data that `write_kept` wrote, or None where the file is missing or damaged."""
     try:
         data = json.loads(read_bytes(path, _LARGEST_LIST))
         return data if data.pop(_CHECKSUM) == fingerprint_of([data]) else None
@@ -353,9 +360,9 @@ def read_kept(path: Path) -> dict[str, Any] | None:
 
 
 def kept_in_cache(name: str, most: int, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The data that an earlier run has kept in the cache under this name, else new data, kept if they can be.
+    """Return the data that the cache has under this name; else make them, and keep them where that is possible.
 
-    Of files with this suffix the cache holds the newest `most`.
+    The cache keeps the newest `most` files of this suffix.
     """
     place = cache_folder() / name
     if (data := read_kept(place)) is None:
@@ -367,10 +374,10 @@ def kept_in_cache(name: str, most: int, make: Callable[[], dict[str, Any]]) -> d
 
 
 def read_rows(path: Path, what: str) -> list[Mapping[str, Any]]:
-    """The rows of a small table: CSV with a header, or JSON (.json), a list of objects; `what` says what it is.
+    """Read a small table: CSV with a header, or JSON (.json) with a list of objects. `what` names the rows in messages.
 
     Raises:
-        InputError: no such file, one too large, or one that is no such table. Cells without a column are "(one more)".
+        InputError: the file is missing, too large or no such table. Cells without a column stand under "(one more)".
     """
     data = read_bytes(path, _LARGEST_LIST, what)
     try:
@@ -387,12 +394,14 @@ def read_rows(path: Path, what: str) -> list[Mapping[str, Any]]:
 def write_arrays(
     path: Path, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any] | tuple[NDArray[Any], Iterable[Any]]]
 ) -> None:
-    """Write arrays by name, each given as it is, or as one of its shape and type with its parts along the first axis.
+    """Write named arrays and `about` to a file.
+
+    An array is given whole, or as a pair: any array of its shape and type, and its parts along the first axis.
 
     Raises:
-        OSError: it cannot be written; an older file is still there. InputError: an `about` that no reader takes.
+        OSError: the file cannot be written; an older one stays. InputError: `about` is longer than readers accept.
     """
-    import numpy as np  # help of the command line does without
+    import numpy as np  # imported late, for the help of the command line does without it
 
     text = json.dumps(about)
     _check_length(path, len(text))
@@ -408,13 +417,16 @@ def write_arrays(
 
 @contextmanager
 def read_arrays(path: Path, names: Iterable[str] = ()) -> Iterator[tuple[Any, Callable[..., NDArray[Any]]]]:
-    """Yield `about`, and what reads an array by its name, of a file that has arrays of these names, or of any.
+    """Open a file of saved arrays: yield its `about`, and a function that reads an array by its name.
 
-    With `into` it reads only an array of that shape and type, which it fills and returns.
+    With `into` the function reads only an array of that shape and type; it fills that array and returns it.
+
+    Args:
+        names: the arrays that the file must hold; none accepts any.
 
     Raises:
-        OSError: it cannot be opened. ValueError: damaged, incomplete, or a mistake that the block meets in its content.
-        InputError: an `about` that is too long.
+        OSError: the file cannot be opened. ValueError: it is damaged or incomplete, or the block found a mistake in its
+            content. InputError: its `about` is too long.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -437,8 +449,8 @@ class Kept:
     """Keeps the state of long work in a file every few seconds, for a later run of the very same work.
 
     Args:
-        path: the file; None keeps nothing. key: hash of everything that decides the work. every_s: seconds between two
-            states.
+        path: the file; None keeps nothing. key: a hash of everything that decides the work. every_s: seconds between
+            two saved states.
     """
 
     def __init__(self, path: Path | None, key: str, every_s: float) -> None:
@@ -447,7 +459,7 @@ class Kept:
         self._written = self._began
 
     def load(self) -> tuple[dict[str, Any], list[NDArray[Any]]] | None:
-        """State and arrays as saved, or None where there is no file, or a damaged one, or one of other work."""
+        """Return the saved state and arrays, or None where the file is missing, damaged or of other work."""
         with suppress(OSError, ValueError):
             if self._path is not None:
                 with read_arrays(self._path) as (about, read):
@@ -458,7 +470,7 @@ class Kept:
         return None
 
     def save(self, state: Mapping[str, Any], arrays: Sequence[NDArray[Any]], *, now: bool = False) -> None:
-        """Write a state (JSON-able) and arrays, if the last write is some seconds ago or `now` asks for it."""
+        """Write a state (JSON-able) and arrays, if the last write is `every_s` ago or `now` asks for it."""
         if self._path is not None and (now or time.monotonic() - self._written >= self._every_s):
             spent_s = self._spent_s + time.monotonic() - self._began  # by earlier runs, too
             about = {"key": self._key, "state": state, "spent_s": spent_s, "arrays": len(arrays)}

@@ -1,7 +1,7 @@
-"""HTML, and files of other programs, from the templates of this package, so that no text of a stranger's file runs.
+"""Fills this package's templates: HTML and files of other programs. No text of a stranger's file can run as code.
 
-Templates, styles and scripts are files of `templates/` and of `programs/view/page/`. A template puts a style or a
-script of theirs into the page as it is, by `text(name) | safe`. A link needs more than escaping: see `local_url`.
+Templates, styles and scripts are files of `templates/` and of `programs/view/page/`. A template puts one of these
+styles or scripts into the page unescaped, by `text(name) | safe`. A link needs more than escaping: see `local_url`.
 Every value of HTML and XML is escaped. Templates of other languages (NAME.jinja) take numbers as they are, and refuse
 a text that no filter has quoted: `literal` for Python, USD and JSON, `line` for a line of Markdown or of a comment.
 """
@@ -25,12 +25,12 @@ _FOLDERS = [Path(__file__).parents[1] / name for name in ("templates", "programs
 
 
 def html(template: str, **values: Any) -> str:
-    """The page of a template of this package with values in it."""
+    """Return the page that a template of this package makes of values."""
     return "".join(html_parts(template, **values))
 
 
 def html_parts(template: str, **values: Any) -> Iterator[str]:
-    """The same page part by part, so that rows of a generator are never all in memory."""
+    """Yield the same page in parts, so that a generator's rows are never all in memory."""
     return _templates().get_template(template).generate(**values)
 
 
@@ -57,19 +57,19 @@ def _is_markup(name: str | None) -> bool:
 
 @pass_eval_context
 def _checked(context: Any, value: Any) -> Any:
-    """The value of an expression, refused where it is a text that could be read as code."""
+    """Return the value of an expression; a text that could be read as code is refused."""
     if not context.autoescape and type(value) is str:  # `safe` makes another type of it
         raise TypeError(f"{value[:40]!r} needs a filter that quotes it")
     return without_controls(value) if type(value) is str else value
 
 
 def text_of(name: str) -> str:
-    """A style, a script or a shader, for pages that need no other file."""
+    """Return the text of a style, a script or a shader, for pages that need no other file."""
     return next(folder / name for folder in _FOLDERS if (folder / name).is_file()).read_text(encoding="utf-8")
 
 
 def local_url(folder: Path, file: Any) -> str | None:
-    """Relative URL of a file inside `folder`; None if it is missing or its resolved path lies outside."""
+    """Return the relative URL of a file inside `folder`; None if it is missing or its resolved path lies outside."""
     if not file:
         return None
     root = folder.resolve()

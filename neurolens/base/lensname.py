@@ -35,7 +35,7 @@ _FORMATS = "a lens file of any format (see neurolens convert --help)"
 
 
 class Named(NamedTuple):
-    """A kind of camera, "" or as `split_kind` has it, and a file; a camera without a lens has none."""
+    """A kind of camera ("" or one that `split_kind` knows) and a file, which a camera without a lens lacks."""
 
     kind: str
     file: Path | None
@@ -45,41 +45,41 @@ class Named(NamedTuple):
 
 
 def split_kind(text: str) -> tuple[str, str]:
-    """The kind of camera in front of a word, with its colon, and the word; file names may have colons of their own."""
+    """Split a word into its kind of camera, with the colon, and the rest; file names may have colons of their own."""
     text = text.removeprefix(_FUSED)
     kind = next((k for k in IDEAL_OF if text.startswith(k)), "")
     return kind, text.removeprefix(kind)
 
 
 def is_model(file: str | Path) -> bool:
-    """True for a file that is an exported model by its name; any other file is read as a lens."""
+    """Return whether a file is an exported model, by its name; any other file is read as a lens."""
     return Path(file).suffix.lower() == ".onnx"
 
 
 def lens_id_of(file: str | Path) -> str:
-    """The id of a lens by the name of its file: letters, digits, "-" and "_", so that it can begin any file's name."""
+    """Return a lens's id from its file's name: letters, digits, "-" and "_", which can begin any file's name."""
     return re.sub(r"[^\w-]+", "_", Path(file).stem).strip("_") or "lens"
 
 
 def year_of(source: str) -> int | None:
-    """The first year that a source names: the lens's own stands before that of a book that reprints it."""
+    """Return the first year that a source names: a lens's own year stands before that of a book that reprints it."""
     found = _YEAR.search(source)
     return None if found is None else int(found[1] or _SHOWA + int(found[2]))
 
 
 def maker_of(designer: str) -> str:
-    """The maker among those whom a lens file names as designers, who stand before the company."""
+    """Return the maker from a lens file's designers, where persons stand before their company."""
     return designer.rpartition(",")[2].strip()
 
 
 def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> Named:
-    """Resolve an argument that names a lens. A file comes first, then a name that ships, then a folder (of a run).
+    """Find what an argument names: first a file, then a name that ships, then the folder of a run.
 
     Args:
-        models: whether models are taken. cameras: whether kinds of cameras are, and files of `neurolens plan`.
+        models: whether a model is accepted. cameras: whether kinds of cameras and files of `neurolens plan` are.
 
     Raises:
-        InputError: no such file or name; the message has the nearest one.
+        InputError: there is no such file or name; the message offers the nearest name.
     """
     if cameras and text in IDEAL:
         return Named(str(text), None)
@@ -107,13 +107,13 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
 
 
 def of_words(text: str, known: Sequence[str]) -> list[str]:
-    """The names that hold each word, the shortest first: canon_rf_50mm_f1_2_l_usm of RF 50mm f/1.2."""
+    """Return the known names that hold each word, shortest first: "RF 50mm f/1.2" finds canon_rf_50mm_f1_2_l_usm."""
     words = re.findall(r"[^\W_]+", text.lower().replace("f/", "f"))
     return sorted((name for name in known if words and all(word in name for word in words)), key=len)
 
 
 def _planned(path: Path) -> str | None:
-    """The camera in a file of `neurolens plan`; None in other files."""
+    """Return the camera that a file of `neurolens plan` names; None for other files."""
     with suppress(InputError):  # the reader of lenses reports it
         camera = read_toml(path).get("camera")
         return camera if isinstance(camera, str) and camera != "none" else None
@@ -121,6 +121,6 @@ def _planned(path: Path) -> str | None:
 
 
 def _beside(path: Path) -> Iterator[str]:
-    """The files of the folder in which a file is missing, as the argument would name them."""
+    """Yield the files in the folder where a file is missing, written as the argument would name them."""
     with suppress(OSError):
         yield from sorted(str(path.parent / entry.name) for entry in os.scandir(path.parent) if entry.is_file())

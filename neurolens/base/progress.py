@@ -12,12 +12,12 @@ from typing import Protocol, TextIO
 
 from neurolens.base.errors import printable
 
-# A plan is trusted like one that held for so many seconds.
+# The planned times weigh as much as so many seconds of measured times.
 _TRUST_S = 20.0
 
 
 class Report(Protocol):
-    """Called by a stage with the fraction done and, if the stage has its own estimate, the seconds left."""
+    """A stage calls this with the fraction done and, if it has its own estimate, the seconds left."""
 
     def __call__(self, fraction: float, seconds_left: float | None = None) -> None: ...
 
@@ -35,14 +35,14 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Reports the stages of a run, one line each:
+    """Reports the stages of a run, a line for each:
 
         progress = Progress({"trace ray pairs": 2, "fit": 60})
         with progress.stage("trace ray pairs") as report:
             report(0.3)
 
-    On a terminal the line is rewritten in place; elsewhere a line is printed at most every `interval_s`, and one when
-    the stage ends.
+    On a terminal the line is rewritten in place. Elsewhere a line is printed at most every `interval_s`, and when the
+    stage ends.
 
     Args:
         plan: expected seconds of the coming stages; measured times correct the remaining plan.
@@ -73,7 +73,7 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Report]:
-        """Time one stage; gives the function that reports the fraction done, from 0 to 1."""
+        """Time one stage; yields the function that reports the fraction done, from 0 to 1."""
         expected = self._waiting.pop(name, None)
         began = self._clock()
         self._printed_at = began  # the first line comes after a whole interval: short stages print one line only
@@ -82,7 +82,7 @@ class Progress:
             share = min(max(float(fraction), 0.0), 1.0)
             elapsed = self._clock() - began
             left = seconds_left
-            if left is None and share > 0.02:  # from its pace, once it has one
+            if left is None and share > 0.02:  # estimated from its pace, once it has one
                 left = elapsed * (1 / share - 1)
             elif left is None and expected is not None:
                 left = max(expected * self._pace() - elapsed, 0.0)
@@ -110,11 +110,11 @@ class Progress:
         self._show(text, last=True)
 
     def _pace(self) -> float:
-        """Measured over expected seconds of the finished stages; a few short stages predict long ones poorly."""
+        """Return measured over expected seconds of finished stages, damped: short stages predict long ones poorly."""
         return (self._taken_s + _TRUST_S) / (self._expected_s + _TRUST_S)
 
     def _total(self, left: float) -> str:
-        """The time left of the whole run, where more stages wait."""
+        """Return the words on the time left for the whole run; none in its last stage."""
         if not self._waiting:
             return ""
         return f" (in all {duration(left + self._pace() * sum(self._waiting.values()))} left)"

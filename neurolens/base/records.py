@@ -1,4 +1,4 @@
-"""The records of a run, as in `results.json`, with units in the keys; shares are fractions of 1.
+"""The records of a run, as `results.json` has them. Their keys end in units; shares are fractions of 1.
 
 What was not measured is absent or null, never a made-up number. For infinity and NaN see `plain`.
 """
@@ -20,7 +20,7 @@ from neurolens.base.files import write_json
 
 SCHEMA_VERSION = 1
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
-# A timing is noisy where the median of its rounds is more than so many times the least: other work ran beside it.
+# A timing is noisy where the median of its rounds is more than this times the least: other work ran beside it.
 NOISY = 1.1
 
 
@@ -35,7 +35,7 @@ class Timing(TypedDict, total=False):
 
 
 class ExactRecord(TypedDict, total=False):
-    """One exact tracer on the clock; `available` is false, with a `reason`, where it cannot run."""
+    """One exact tracer's timing; `available` is false, with a `reason`, where it cannot run."""
 
     name: str
     ns_per_ray: Timing | None
@@ -49,20 +49,21 @@ class Results:
 
     Attributes:
         lens, domain: flat tables of figures with units in their keys.
-        models: name, family (of `plots.FAMILIES`), file relative to the run folder,
-            `measure.CARD_KEYS`, stopped_down and zones as of `measure.Findings`, poor (errors that are visible in a
-            picture), coefficients_per_vector (A and B terms both count),
-            parameters (of the whole model, rims included), bytes, fit_s, load_s, ns_per_ray (`Timing`) in onnxruntime,
-            fused_ns_per_ray as C, fused_speedup and break_even_rays (of it, against the exact lens as C), note.
-        target: of `target_record`, where an error was asked for.
+        models: a record each, with the keys name, family (of `plots.FAMILIES`), file relative to the run folder,
+            `measure.CARD_KEYS`, stopped_down and zones (see `measure.Findings`), poor (errors that are visible in a
+            picture), coefficients_per_vector (A and B terms both count), parameters (of the whole model, rims
+            included), bytes, fit_s, load_s, ns_per_ray (`Timing`) in onnxruntime, fused_ns_per_ray as C, fused_speedup
+            and break_even_rays (as C, against the exact lens as C), note.
+        target: what `target_record` gives, where an error was asked for.
         settings: the resolved configuration.
-        exact: exact tracers on the clock.
-        cameras: renders of a scene through a camera: name, scene, render_s, camera_s (inside the camera) and its share,
+        exact: timed exact tracers.
+        cameras: renders of a scene, each with name, scene, render_s, camera_s (inside the camera) and its share,
             ns_per_ray of the camera alone, samples, width and height in pixels, threads.
-        images: name, scene, camera, file_png and file_exr relative to the run folder, samples; except of the exact
-            lens, `scenes.ImageErrors`.
+        images: a record each, with name, scene, camera, file_png and file_exr relative to the run folder, samples, and,
+            except for the exact lens, `scenes.ImageErrors`.
         image_settings: `scenes.SETTINGS`.
-        figures: file, relative to the run folder, title, caption; wide where it goes across the page.
+        figures: a record each, with file relative to the run folder, title, caption; wide where it fills the page's
+            width.
         started: ISO 8601.
     """
 
@@ -87,7 +88,7 @@ class Results:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that a result depends on."""
-    from importlib.metadata import PackageNotFoundError, version  # a third of the time of --help
+    from importlib.metadata import PackageNotFoundError, version  # its import takes a third of the time of --help
 
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
@@ -103,7 +104,7 @@ def noisy(timing: Mapping[str, Any] | None) -> bool:
 
 
 def time_of(model: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The timing that tables, plots and advice use of a model: as C where that was measured, else in onnxruntime."""
+    """Return the timing that tables, plots and advice use: as C where that was measured, else in onnxruntime."""
     return model.get("fused_ns_per_ray") or model.get("ns_per_ray") or {}
 
 
@@ -113,10 +114,10 @@ def write_results(path: str | Path, results: Results) -> None:
 
 
 def plain(value: Any, strict: bool = True) -> Any:
-    """`value` with only what JSON knows: scalars and arrays of numpy and torch as numbers and lists, paths as text.
+    """Return `value` in JSON's own types: scalars and arrays of numpy and torch become numbers and lists, paths text.
 
-    Infinity is the text "infinity" or "-infinity", NaN is null; unless `strict` both stay floats. Of a path that is no
-    UTF-8, the bytes that are no letters become \\u and four digits.
+    Infinity becomes the text "infinity" or "-infinity" and NaN null; unless `strict` both stay floats. In a path that
+    is no UTF-8, the bytes that are no letters become \\u and four digits.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(item, strict) for key, item in value.items()}
@@ -145,7 +146,7 @@ def break_even_rays(
 
 
 def reaches(record: Mapping[str, Any], most: float, key: str = "rms_um") -> bool:
-    """True if a model's film-equivalent RMS is at most `most`."""
+    """Return whether a model's film-equivalent RMS, or its figure `key`, is at most `most`."""
     found = record.get(key)
     return found is not None and bool(found <= most)
 
@@ -162,13 +163,13 @@ def target_record(models: Sequence[Mapping[str, Any]], within_um: float) -> dict
 
 
 def error_of(record: Mapping[str, Any]) -> tuple[float, float]:
-    """A sort key: the error in micrometres, or the angle where all rays lie beyond 60 degrees."""
+    """Return a sort key: the error in micrometres, or the angle where all rays lie beyond 60 degrees."""
     found = (record.get("rms_um"), record.get("direction_rms_deg"))
     return tuple(math.inf if v is None else v for v in found)  # type: ignore[return-value]
 
 
 def program() -> str:
-    """The first words of a command line that runs here: "neurolens" if it is on the PATH, else as this one began."""
+    """Return how a command line begins here: "neurolens" if it is on the PATH, else the words that began this one."""
     if shutil.which("neurolens"):
         return "neurolens"
     started = sys.argv[0]
@@ -176,7 +177,7 @@ def program() -> str:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points that no other betters, by rising first coordinate; smaller is better in both.
+    """Return the indices of the points that no other point betters, by rising first coordinate; less is better in both.
 
     A point is bettered by one that is at most equal in both coordinates and smaller in one. Points with a NaN are left
     out; equal points are all kept.

@@ -43,7 +43,7 @@ from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_u
 from neurolens.base.units import WORTH, as_float, in_unit
 
 T = TypeVar("T")
-_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)  # which evaluates every annotation anew
+_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)  # cached, for each call evaluates every annotation anew
 # Bounds that every input keeps: beyond them searches take minutes or find no light.
 F_NUMBER = 0.1, 10_000.0
 FOCAL_MM = 1e-3, 1e6
@@ -63,31 +63,31 @@ _NAMES = {
 
 
 def within(bounds: tuple[float, float], value: float) -> bool:
-    """True for a value between two bounds, False for NaN."""
+    """Return whether a value lies between two bounds; NaN does not."""
     return bounds[0] <= value <= bounds[1]
 
 
 def said(bounds: tuple[float, float]) -> str:
-    """The bounds in words: "from 0.1 to 10000"."""
+    """Return the bounds in words: "from 0.1 to 10000"."""
     return f"from {bounds[0]:g} to {bounds[1]:g}"
 
 
 @dataclass(frozen=True)
 class Option:
-    """The option of a command line that a field is.
+    """The option of a command line that a field stands for.
 
     Attributes:
         about: the help; `add_options` adds the default where the help does not mention one, and texts for {}.
         within: the smallest and the largest value of a number; the largest may be inf. unit: what the number is, for
             messages.
         option: name of the option ("reflections") and of the parsed argument, where it is not the field's.
-        short: a short name ("-o"). old: earlier names, which still work and which help does not show; as a mapping,
-            with a function that converts the text of their value, or with the value for which they stand.
+        short: a short name ("-o"). old: earlier names, which still work but are not in the help. A mapping gives for
+            each name the function that converts the text of its value, or the value for which the name stands.
         metavar: placeholder of the value in the help.
         kind: converts the text of a value, where the type of the field does not.
         nargs: as argparse has it; without it a tuple is an option that may be repeated.
         positional: whether it is an argument without a name. apart: options with the same word exclude each other.
-        title: of the group of options in the help.
+        title: that of its group of options in the help.
         last: above 0 for what help shows after all other options, in this order.
         written: whether it is a path that a command writes.
     """
@@ -109,24 +109,28 @@ class Option:
 
 
 def setting(default: Any, about: str, **details: Any) -> Any:
-    """A field of a settings dataclass that is also an option, see `Option`; a default of `...` must be given."""
+    """Declare a field of a settings dataclass that is also an option (`Option`); with the default `...` it is
+    required."""
     metadata = {"option": Option(about, **details)}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
 def setting_of(cls: Any, name: str, default: Any = None) -> Any:
-    """A field that is the same option as one of another class, with another default."""
+    """Declare a field that is the same option as a field of another class, with another default."""
     return field(default=default, metadata=cls.__dataclass_fields__[name].metadata)
 
 
 def group(title: str, **more: Any) -> Any:
-    """A field that is a dataclass of options, under a title in the help; further arguments as of `add_options`."""
+    """Declare a field that is a dataclass of options under a title in the help; `more` goes to `add_options`."""
     return field(metadata={"group": title, "more": more})
 
 
 def check_bounds(settings: Any, what: str) -> None:
-    """Refuse numbers out of the bounds of their fields, and texts that are not among those of their type, for
-    `__post_init__`; raises InputError about `what`."""
+    """Refuse numbers out of their fields' bounds, and texts that their types do not list; called in `__post_init__`.
+
+    Raises:
+        InputError: about `what`.
+    """
     hints = _hints(type(settings))
     for f in fields(settings):
         value, option, (kind, _) = getattr(settings, f.name), f.metadata.get("option"), _kind(hints[f.name])
@@ -139,7 +143,7 @@ def check_bounds(settings: Any, what: str) -> None:
 
 
 def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
-    """Type of an argument: the number of a text where it is `good`, which NaN and digits beyond any float never are."""
+    """Make the type of an argument: a number for which `good` is true. NaN and numbers beyond any float are refused."""
 
     def convert(text: str) -> T:
         try:
@@ -160,7 +164,7 @@ def between(low: float, high: float, unit: str, kind: Callable[[str], Any] = flo
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """Type of an argument that is an integer from `least` to `most`."""
-    largest = (1 << 63) - 1 if most is None else most  # what generators of random numbers take
+    largest = (1 << 63) - 1 if most is None else most  # the largest that generators of random numbers take
     expected = _expected(int, (least, math.inf if most is None else most), "an integer")
     return number(int, lambda value: least <= value <= largest, expected)
 
@@ -189,7 +193,7 @@ def add_options(
 
     Args:
         parser: a parser, or a group of its arguments.
-        names: these fields alone. defaults: of this command, where they differ from those of the fields.
+        names: if any are given, only these fields. defaults: those of this command, where the fields have others.
         unset: whether all options have the default None.
         texts: for some fields, what replaces {} in their help.
         root: the parser that gets the groups of arguments, where `parser` is a group.
@@ -220,7 +224,7 @@ def add_options(
 
 
 def titled(parser: argparse._ActionsContainer, title: str) -> argparse._ActionsContainer | None:
-    """The group of a title, which is made once; None without a title."""
+    """Return the parser's group with this title, which is made once; None without a title."""
     named = (group for group in parser._action_groups if group.title == title)
     return (next(named, None) or parser.add_argument_group(title)) if title else None
 
@@ -228,7 +232,7 @@ def titled(parser: argparse._ActionsContainer, title: str) -> argparse._ActionsC
 def _details(
     f: Any, option: Option, hint: Any, default: Any, text: str | None
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """The names and the other arguments of `add_argument`."""
+    """Return the names and the other arguments for `add_argument`."""
     (kind, many), required = _kind(hint), default is dataclasses.MISSING
     about = option.about if text is None else option.about.format(text)
     if not (required or "default" in about or default is None or default is False or default == ()):
@@ -259,7 +263,7 @@ def _details(
 
 
 def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False) -> T:
-    """Settings with the values of the options of `add_options`, and the defaults of those that were not added.
+    """Make settings from the options of `add_options`; options that were not added have their defaults.
 
     Args:
         unset: whether options that were not given are None in the result.
@@ -277,9 +281,9 @@ def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False)
 
 
 def changed(settings: Any, *, unset: bool = False) -> dict[str, Any]:
-    """The options of settings whose values are not their defaults, by their spelling: {"--f-number": 4.0}.
+    """Return the options whose values are not their defaults, by their spelling: {"--f-number": 4.0}.
 
-    `unset`: whether the default of all is None, as of `add_options`.
+    `unset`: whether every option's default is None, as in `add_options`.
     """
     found: dict[str, Any] = {}
     for f in _options(type(settings)):
@@ -296,19 +300,21 @@ def _options(cls: type) -> list[Any]:
 
 
 def spelling(f: Any, option: Option) -> str:
-    """The option that a field is, "--f-number"."""
+    """Return how the option of a field is written: "--f-number"."""
     unit = _UNIT.fullmatch(f.name)
     return f"--{option.option or (unit[1] if unit else f.name).replace('_', '-')}"
 
 
 def _dest(f: Any, option: Option) -> str:
-    """The attribute of the parsed arguments."""
+    """Return the attribute of the parsed arguments that holds an option."""
     return f.name if option.positional else (option.option or f.name).replace("-", "_")
 
 
 def _kind(hint: Any) -> tuple[Any, bool]:
-    """The type of one value, the first of several, and whether the field takes many: of `int | None` int, of
-    `tuple[str, ...]` str."""
+    """Return the type of one value, and whether a field takes many: of `tuple[str, ...]` str and True.
+
+    Of a union it is the first type that is not None.
+    """
     kinds = [kind for kind in get_args(hint) if kind is not NoneType]
     if NoneType in get_args(hint):
         return _kind(kinds[0])
@@ -368,8 +374,8 @@ def _override_value(dotted: str, text: str) -> Any:
 def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: str = "") -> T:
     """An instance of the dataclass `cls` from the tables of a TOML file.
 
-    Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning. `cls.keys_read`,
-    where there is one, takes other spellings of values.
+    Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning. A class may have a
+    function `keys_read`, which first rewrites other spellings of values.
 
     Args:
         file: source of the data, for messages.
@@ -420,7 +426,7 @@ def _join(prefix: str, name: str) -> str:
 
 
 def _in_unit_of(name: str, value: Any) -> Any:
-    """The number of a text with a unit, "6ft", in the unit that a field's name ends with; other values as they are."""
+    """Convert a text with a unit ("6ft") to a number in the unit that the field's name ends with; keep other values."""
     if isinstance(value, str) and (unit := _UNIT.fullmatch(name)) and (plain := in_unit(unit[2], str)(value)) != value:
         with suppress(ValueError):  # two numbers
             return float(plain)
@@ -428,7 +434,7 @@ def _in_unit_of(name: str, value: Any) -> Any:
 
 
 def _convert(value: Any, kind: Any, file: str | Path, place: str) -> Any:
-    """`value` as the type `kind`, or an InputError."""
+    """Return `value` as the type `kind`, or raise an InputError."""
     origin, args = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return _convert_union(value, args, file, place)
@@ -451,7 +457,7 @@ def _convert(value: Any, kind: Any, file: str | Path, place: str) -> Any:
 
 
 def _convert_scalar(value: Any, kind: Any) -> Any:
-    """`value` as bool, int, float, str or Path; None where it is not one. A bool is no number, NaN neither."""
+    """Return `value` as bool, int, float, str or Path, else None. A bool is no number, nor is NaN."""
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         try:
             return None if math.isnan(value) else float(value)
@@ -465,7 +471,7 @@ def _convert_scalar(value: Any, kind: Any) -> Any:
 
 
 def _convert_union(value: Any, kinds: tuple[Any, ...], file: str | Path, place: str) -> Any:
-    """The first kind that fits; the text "none" is None where None is allowed, as TOML has no null."""
+    """Return the value as the first type that fits. The text "none" is None where that is allowed: TOML has no null."""
     if type(None) in kinds and (value is None or value == "none"):
         return None
     inner = [kind for kind in kinds if kind is not type(None)]
@@ -510,5 +516,5 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def to_toml(config: Any) -> str:
-    """The resolved settings as TOML, every default written out; `read_config` gives the same settings back."""
+    """Return the resolved settings as TOML, with every default; `read_config` gives the same settings back."""
     return format_toml(to_dict(config))

@@ -27,12 +27,12 @@ _REASONS = {
 
 
 def blocked(surface: int, reason: int) -> int:
-    """Status of a ray that ends at `surface` (0-based, from the scene): MISSED, RIM or TOTAL_REFLECTION."""
+    """Return the status of a ray that ends at `surface` (0-based, from the scene): MISSED, RIM or TOTAL_REFLECTION."""
     return 4 * (surface + 1) + reason
 
 
 def surface_of(status: int) -> int | None:
-    """Surface that ended a ray of this status, or None when no surface did."""
+    """Return the surface that ended a ray of this status, or None where none did."""
     return status // 4 - 1 if status >= 4 else None
 
 
@@ -42,7 +42,7 @@ def reason_of(status: int) -> int | None:
 
 
 def describe(status: int) -> str:
-    """Text of a status, for messages and tables."""
+    """Return the text of a status, for messages and tables."""
     if status == PASSED:
         return "passed"
     if status == OUTSIDE_DOMAIN:

@@ -1,6 +1,6 @@
-"""Runs tasks: here, in a process for each, in forked processes, or on a cluster. Also handles signals.
+"""Executors of tasks: in this process, in a process for each, in forked processes. Also the handling of signals.
 
-They have the interface of `concurrent.futures`: `submit` returns a `Future`, and `wait` and `as_completed` of the
+All have the interface of `concurrent.futures`: `submit` returns a `Future`, and `wait` and `as_completed` of the
 standard library take it. `run_each` hands out the answers of any number of tasks while only a few of them wait in
 memory. An answer must depend on its task alone, because a cluster starts a task again when its worker was lost::
 
@@ -40,7 +40,7 @@ R = TypeVar("R")
 _LONGEST = 3000  # characters of a reason
 _POLL_S, _POLL_PARENT_S, _PATIENCE_S = 0.05, 0.5, 5.0
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
-# Another thread that starts a process asks all processes for their exit codes, which can be read only once.
+# A thread that starts a process asks all processes for their exit codes, which can be read only once: one at a time.
 _STARTING = threading.Lock()
 # Signals that ask a command to end: Ctrl-C, SIGTERM, and SIGHUP, which a terminal sends when it closes.
 ASKING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -137,7 +137,7 @@ class Processes(ThreadPoolExecutor):
 
 
 class Forked(ThreadPoolExecutor):
-    """Runs tasks of one function in processes that are forked from this one: each has all that it holds without a copy.
+    """Runs tasks of one function in processes that are forked from this one and share all that it holds, uncopied.
 
     Args:
         work: the function of all tasks. jobs: how many processes; each is pinned to a core if there is one for each.
@@ -187,7 +187,7 @@ class Forked(ThreadPoolExecutor):
 def in_order(threads: int, work: Callable[[T], R], tasks: Iterable[T]) -> Iterator[R]:
     """Run `work(task)` for each task in threads of this process, and yield the answers in the order of the tasks.
 
-    Tasks are taken while a thread is free. Where the iteration ends early, the tasks under way are the last.
+    A task is taken whenever a thread is free. Where the iteration ends early, no further task starts.
     """
     with ThreadPoolExecutor(threads) as pool:
         running = deque[Future[R]]()
@@ -252,7 +252,7 @@ def _result(future: Future[Any]) -> Any:
 
 
 def failure(error: Exception) -> Failed:
-    """The reason that an error gives, in one line: errors travel between processes as text."""
+    """Return the reason that an error gives, in one line: errors travel between processes as text."""
     if isinstance(error, NeurolensError) or missing(error):
         return Failed(one_line(reason(error), _LONGEST))
     if isinstance(error, MemoryError):
@@ -270,7 +270,7 @@ def _outcome(work: Callable[..., Any], args: Any, named: Any) -> Any:
 
 
 def answer_of(outcome: Any) -> Any:
-    """The answer that another process has sent, or NeurolensError with the reason of its failure."""
+    """Return the answer that another process sent. Raises NeurolensError with the reason where the task failed."""
     if isinstance(outcome, Failed):
         raise NeurolensError(outcome.reason)
     return outcome
@@ -283,9 +283,11 @@ def cores() -> int:
 
 @cache
 def keep_memory() -> None:
-    """Let the C library (glibc) keep the memory of arrays, once a process, up to the sizes that it comes to by itself.
+    """Let the C library (glibc) keep the memory of freed arrays, up to the sizes that it would come to by itself.
 
-    Else it gives that of every larger array back, and a trace spends half of its time on getting pages anew. Dask's
+    Otherwise it returns the memory of every larger array, and a trace spends half of its time on getting pages again.
+    Dask's nannies set MALLOC_TRIM_THRESHOLD_, which also stops the C library from raising these sizes. One call serves
+    the whole process.
     nannies ask for memory to be given back (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth.
     """
     with suppress(AttributeError, OSError):  # another C library
@@ -295,7 +297,8 @@ def keep_memory() -> None:
 
 
 def _context(modules: list[str]) -> Any:
-    """Processes are forked from a small server, which has imported the modules of the first task and has no threads."""
+    """Return what starts processes: forks of a small server without threads, which imported the first task's
+    modules."""
     kind = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context: Any = multiprocessing.get_context(kind)
     if kind == "forkserver":
@@ -311,7 +314,7 @@ def _exit_code(process: Any) -> int:
 
 
 def _end_of(process: Any) -> str:
-    """How a process ended that has given no answer."""
+    """Say how a process ended that has given no answer."""
     code = _exit_code(process)
     if code >= 0:
         return f"ended with code {code}"
@@ -333,7 +336,7 @@ def _serve(pipe: Any, work: Callable[..., Any], number: int, jobs: int, parent: 
 
 
 def _end_with(parent: int) -> None:
-    """End this process once its parent is gone, whatever it does: a killed parent can ask nobody to stop."""
+    """End this process once its parent is gone, whatever it is doing: a killed parent can tell nobody to stop."""
     while os.getppid() == parent:
         time.sleep(_POLL_PARENT_S)
     os._exit(1)
@@ -348,7 +351,7 @@ def _work(pipe: Any, work: Callable[..., Any], args: Any, named: Any) -> None:
 
 
 def _end_unread(pipe: int) -> None:
-    """End this process once no process is left that reads from the pipe: one that was killed cannot ask it to end."""
+    """End this process once nobody reads from the pipe any more: a reader that was killed cannot ask it to end."""
     if hasattr(select, "poll"):
         waiting = select.poll()
         waiting.register(pipe, 0)  # errors alone, such as a closed end
@@ -358,10 +361,10 @@ def _end_unread(pipe: int) -> None:
 
 @contextmanager
 def handled(by: Callable[[int], None]) -> Iterator[dict[int, Any]]:
-    """Call `by` with the number of a signal of `ASKING` inside the block; yields the handlers of before.
+    """Call `by` with the number of a signal of `ASKING` inside the block; yields the previous handlers.
 
-    Signals that are ignored, as `nohup` has it, stay so. Only the main thread can handle signals: in others nothing
-    changes.
+    Signals that are ignored, as `nohup` does, stay ignored. Only the main thread can handle signals; in other threads
+    nothing changes.
     """
 
     def handler(number: int, _: object) -> None:
@@ -414,12 +417,12 @@ class Stopping:
 
 
 class Unfinished(Exception):
-    """Leaves the block of a `Stopping`, and a stage of the progress without its final line."""
+    """Leaves the block of a `Stopping`, and a stage of the progress without printing its last line."""
 
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Keep the signals of `ASKING` waiting inside the block, and for ever from processes and threads started there."""
+    """Hold back the signals of `ASKING` inside the block, and for ever in processes and threads that start there."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -431,7 +434,7 @@ def held() -> Iterator[None]:
 
 
 def end_at_once() -> None:
-    """In a process started inside `held`: signals that were not ignored end it, those that wait now too."""
+    """Let signals that were not ignored end a process started inside `held`, those that wait now included."""
     for number in ASKING:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)
@@ -440,7 +443,7 @@ def end_at_once() -> None:
 
 
 def _leave_closed_terminal() -> None:
-    """Let what is still printed go nowhere: writing to a closed terminal is an error, in the midst of saving."""
+    """Discard what is still printed: writing to a closed terminal is an error, which would interrupt saving."""
     for descriptor in (1, 2):
         try:
             os.write(descriptor, b"")

@@ -21,7 +21,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """The tables of a TOML file.
+    """Return the tables of a TOML file.
 
     Raises:
         InputError: no regular file, unreadable, larger than `MAX_BYTES`, not UTF-8, broken TOML, empty, or refused by
@@ -42,7 +42,11 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, file: str | Path) -> dict[str, Any]:
-    """The tables of a text; ValueError or RecursionError: no TOML; InputError: refused by `check_tree`."""
+    """Return the tables of a TOML text.
+
+    Raises:
+        ValueError, RecursionError: it is no TOML. InputError: refused by `check_tree`.
+    """
     # The parser's time grows with the square of the parts of a dotted key.
     if any(piece.count(".") > _DEEPEST for piece in re.split(r"[=,{}\[\]\n]", text)):
         raise ValueError(f"a key of more than {_DEEPEST} parts")
@@ -52,7 +56,7 @@ def parse_toml(text: str, file: str | Path) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, file: str | Path) -> Any:
-    """The values of a text of strict JSON, of which every number is finite and no object has a key twice.
+    """Return the values of a text of strict JSON: every number is finite, and no object has a key twice.
 
     Raises:
         ValueError, RecursionError: no JSON. InputError: refused by `check_tree`.
@@ -77,7 +81,7 @@ def parse_json(text: str | bytes, file: str | Path) -> Any:
 
 
 def check_tree(data: Any, file: str | Path) -> None:
-    """Refuse what no file of ours holds, in data of TOML or JSON: it would fail where it is used, without its place.
+    """Refuse data of TOML or JSON that no file of ours holds: it would fail later, where its place is not known.
 
     Raises:
         InputError: tables and lists more than 100 deep, integers of more than 64 bits, texts with zero bytes or halves
@@ -105,7 +109,7 @@ def check_tree(data: Any, file: str | Path) -> None:
 
 
 def suggestion(word: str, known: Sequence[str]) -> str:
-    """ "; did you mean ...?" for the nearest known key, else empty; a key that only lacks its unit counts as near."""
+    """Return "; did you mean ...?" with the nearest known key, or nothing; a key that only lacks its unit is near."""
     near = [key for key in known if key.startswith(word + "_")] or get_close_matches(word, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
@@ -122,7 +126,7 @@ def reject_unknown(file: str | Path, where: str, data: Mapping[str, Any], known:
 
 
 def format_value(value: Any) -> str:
-    """One TOML value on one line; floats and texts come back bit for bit.
+    """Return a TOML value on one line, from which floats and texts are read back bit for bit.
 
     Raises:
         TypeError: a value that TOML has no form for. InputError: a name whose bytes are no UTF-8.
@@ -145,12 +149,12 @@ def format_value(value: Any) -> str:
 
 
 def format_key(key: str) -> str:
-    """A key, quoted only where it must be."""
+    """Return a key, quoted only where it must be."""
     return key if _BARE_KEY.fullmatch(key) else format_value(key)
 
 
 def format_toml(data: Mapping[str, Any], table: str = "") -> str:
-    """A whole TOML text: plain values first, then each table under its heading."""
+    """Return a whole TOML text: plain values first, then each table under its heading."""
     plain = {k: v for k, v in data.items() if not isinstance(v, Mapping)}
     lines = [f"{format_key(k)} = {format_value(v)}\n" for k, v in plain.items()]
     for key, value in data.items():

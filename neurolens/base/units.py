@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import TypeVar
 
 T = TypeVar("T")
-# What units are worth, by dimension: a value may be typed with any unit of its option's dimension.
+# The worth of units, by dimension: a value may be typed with any unit of its option's dimension.
 WORTH: tuple[dict[str, float], ...] = (
     {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3, "ft": 0.3048, "in": 0.0254, '"': 0.0254},
     {"deg": 1, "\N{DEGREE SIGN}": 1, "rad": 180 / math.pi},
@@ -21,7 +21,7 @@ _QUANTITY = re.compile(r"([-+]?[\d.]+(?:e[-+]?\d+)?) ?([^\d\s.,]+)", re.IGNORECA
 
 
 def as_float(text: str) -> float:
-    """The number of a text; ValueError, too, where its digits are beyond any float, which is not infinity."""
+    """Return the number of a text. Raises ValueError also for digits beyond any float, which are not infinity."""
     value = float(text)
     if math.isinf(value) and re.search(r"\d", text):
         raise ValueError(f"{text[:40]} is too large")
@@ -29,9 +29,9 @@ def as_float(text: str) -> float:
 
 
 def in_unit(unit: str, convert: Callable[[str], T]) -> Callable[[str], T]:
-    """Type of an argument whose numbers may have a unit: in_unit("m", float)("6ft") is 1.8288; `unit` "f" takes f/2.
+    """Make the type of an argument whose numbers may have a unit: in_unit("m", float)("6ft") is 1.8288.
 
-    Units may be typed in capitals: 2M is 2 m, for no option has a use for megametres.
+    With `unit` "f" it takes f/2. Units may be typed in capitals: 2M is 2 m, for no option has a use for megametres.
     """
     worth = next((worth for worth in WORTH if unit in worth), {})
 

@@ -1,4 +1,4 @@
-"""The reverse mode of a program: what gradients by its results are by its inputs.
+"""Reverse-mode differentiation of programs: from gradients by the results to gradients by the inputs.
 
 From the gradient of a number by every result, one pass from the last step back to the first gives its gradient by every
 input. Each kind of step has one rule. The whole takes two to three times the operations of the program itself, however
@@ -35,7 +35,8 @@ _RULES: dict[str, Rule] = {
     "sub": lambda g, y, x: [g, -g],
     "mul": lambda g, y, x: [g * x[1], g * x[0]],
     "div": _divided,
-    # 0 at the root of 0, where film points on the axis are: their radius has no slope, and none is told from infinity.
+    # 0 at the root of 0, which film points on the axis meet: their radius has no slope there, and the rule gives
+    # infinity.
     "sqrt": lambda g, y, x: [_where(y, y.program.literal(0.0), 0.0, g * 0.5 / y)],
     "floor": lambda g, y, x: [None],
     "max": lambda g, y, x: [_where(x[0], x[1], 0.0, g), _where(x[0], x[1], g, 0.0)],
@@ -54,12 +55,13 @@ def adjoint(program: Program, outputs: Collection[str], inputs: Collection[str])
     too, and gradients of rays that do not pass are 0. Tables are constants.
 
     Args:
-        program: of one table of coefficients.
+        program: one with a single coefficient table.
         outputs: names of results that the number depends on.
-        inputs: names of inputs, in the order of the gradients; of one that the program does not take that is 0.
+        inputs: names of inputs, in the order of the gradients. The gradient by a name that the program does not take is
+            0.
 
     Raises:
-        ValueError: a program whose coefficients follow a state or a band.
+        ValueError: the program's coefficients follow a state or a band.
     """
     if program.tables != 1 or program.mixture is not None:
         raise ValueError("adjoint: expected a program of one table of coefficients")
@@ -97,7 +99,7 @@ def adjoint(program: Program, outputs: Collection[str], inputs: Collection[str])
 
 
 def _moving(program: Program, names: Collection[str]) -> set[int]:
-    """The steps that follow the inputs of these names."""
+    """Return the numbers of the steps that depend on the inputs of these names."""
     moving = set[int]()
     for k in program.live():
         step = program.steps[k]

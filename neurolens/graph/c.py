@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurolens.graph.program import Argument, Mixture, Program, Step
 
-BLOCK = 256  # rays
+BLOCK = 256  # rays in a block
 PART, ROWS = 28, 128  # steps of a part, and rays that it does at a time: its numbers stay in the first cache
 _DOUBLE = ContextVar("_DOUBLE", default=False)  # whether literals are those of double precision
 
@@ -29,17 +29,17 @@ def _parts(file: str) -> dict[str, Template]:
 
 
 def part(file: str, key: str, /, **values: object) -> str:
-    """A text of `parts.h` or `parts.shading`, which the line "//// KEY" precedes, with its ${places} filled."""
+    """Return a text of `parts.h` or `parts.shading`, the one below the line "//// KEY", with its ${places} filled."""
     return _parts(file)[key].substitute(values)
 
 
 def comment_of(lines: Sequence[str]) -> str:
-    """Lines of a comment that begins with /* and ends with */."""
+    """Return lines as one comment, between /* and */."""
     return "\n".join(f" * {line}".rstrip() for line in lines).replace("*/", "* /")
 
 
 def literal(value: float) -> str:
-    """A float32 number in nine digits, which give it back exactly; negative ones in brackets."""
+    """Write a float32 number in nine digits, which give it back exactly; negative numbers stand in brackets."""
     text = repr(float(value)) if _DOUBLE.get() else f"{np.float32(value):.9g}"
     if "." not in text and "e" not in text:
         text += ".0"
@@ -48,14 +48,14 @@ def literal(value: float) -> str:
 
 @dataclass(frozen=True)
 class Signature:
-    """Names of a written function.
+    """What a written function is called, what it takes and what it gives.
 
     Attributes:
-        name: of the function. per_ray, per_call: inputs, in order.
-        outputs: floats in order; then comes status, where the program has one.
-        bands: wavelengths of the coefficient tables; a function of several takes `band`, a number from 0.
-        tables: each is an array [cells, columns], which its number of cells follows, NAME_cells.
-        state: names of the numbers of a state, of which NAME_at makes the argument `state`.
+        name: the function's. per_ray, per_call: names of inputs, in order.
+        outputs: names of floats, in order; a status follows where the program has one.
+        bands: how many wavelengths have a coefficient table; a function of several takes `band`, which counts from 0.
+        tables: names of arrays [cells, columns]; behind each the function takes its number of cells, NAME_cells.
+        state: names of a state's numbers, from which NAME_at makes the argument `state`.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Signature:
 
     @staticmethod
     def of(program: Program, name: str) -> Signature:
-        """The inputs that a program names, in its order, and its outputs."""
+        """Name the inputs that a program takes, in its order, and its outputs."""
         steps = [program.steps[k] for k in program.live()]
         per_ray, per_call = (
             tuple(s.name for s in steps if s.kind == "input" and s.per_call is whole) for whole in (False, True)
@@ -90,10 +90,11 @@ class Signature:
 
 @dataclass(frozen=True)
 class Extras:
-    """What stands beside the function of a file, under names that begin with the function's.
+    """What a file holds besides its function, under names that begin with the function's.
 
     Attributes:
-        constants: numbers, by name. functions: of numbers that give one, by name: programs of one output.
+        constants: numbers, by name. functions: by name, programs of one output, each written as a function of its
+            inputs.
     """
 
     constants: Mapping[str, float] = field(default_factory=dict)
@@ -110,12 +111,14 @@ class Writer:
         name: of the written function, with which the names of its helpers begin.
 
     Attributes:
-        table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
-        texts: an expression for each kind of step, of its arguments; {name} and {macro} are the function's.
-        place: a coefficient of the table, by its number.
-        declared, kind: an argument and the word for a float. let: the words before a number's name. between: arguments.
-        header: of a function, by its name, arguments and kind.
-        lookup: a number of a table of the caller. own_lookup: one of a table of the program, if that differs.
+        table: coefficients that differ between tables, in the order of their use; each is a row of one value a table.
+        texts: an expression for each kind of step, from its arguments; {name} and {macro} are the function's.
+        place: the expression of a coefficient in the table, from its number.
+        declared: the declaration of an argument. kind: the word for a float. let: the word before a new number's name.
+            between: what separates arguments.
+        header: the head of a function, from its name, arguments and kind.
+        lookup: the expression that reads a caller's table. own_lookup: that for a table of the program's own, if it
+            differs.
     """
 
     texts: ClassVar[dict[str, str]] = {
@@ -143,7 +146,7 @@ class Writer:
         self.program, self.name, self.table = program, name, list[tuple[float, ...]]()
 
     def value(self, argument: Argument) -> str:
-        """A step's name, a number, or a place in the table of coefficients."""
+        """Write an argument: a step's name, a number, or a place in the table of coefficients."""
         if isinstance(argument, int):
             step = self.program.steps[argument]
             return step.name if step.kind == "input" else f"t{argument}"
@@ -154,11 +157,11 @@ class Writer:
         return self.place.format(self.table.index(argument))
 
     def output(self, name: str) -> str:
-        """The expression of an output."""
+        """Write the expression of an output."""
         return self.value(self.program.outputs[name].argument)
 
     def step(self, step: Step) -> str:
-        """The expression of a step."""
+        """Write the expression of a step."""
         values = [self.value(a) for a in step.arguments]
         if step.kind != "lookup":
             return self.texts[step.kind].format(*values, name=self.name, macro=self.name.upper())
@@ -174,26 +177,26 @@ class Writer:
         )
 
     def steps(self) -> list[str]:
-        """The steps of the program as lines."""
+        """Write the steps of the program as lines."""
         steps = [(k, self.program.steps[k]) for k in self.program.live()]
         return [f"    {self.let} t{k} = {self.step(step)};" for k, step in steps if step.kind != "input"]
 
     def one_number(self, name: str) -> str:
-        """A function `name` of the inputs of the program that gives its one output."""
+        """Write a function `name` of the program's inputs that returns its one output."""
         (output,) = self.program.outputs
         header = self.function(name, (self.program.steps[k] for k in self.program.live()), self.kind)
         return "\n".join([header, "{", *self.steps(), f"    return {self.output(output)};", "}\n"])
 
     def function(self, name: str, steps: Iterable[Step], kind: str) -> str:
-        """The header of a function of the inputs among these steps."""
+        """Write the head of a function that takes the inputs among these steps."""
         inputs = self.between.join(self.declared.format(s.name, self.kind) for s in steps if s.kind == "input")
         return self.header.format(name, inputs, kind, macro=self.name.upper())
 
     def state_parts(self, mixture: Mixture, table: Sequence[Sequence[float]]) -> dict[str, Any]:
-        """The parts of the function that makes a state; this is the writer of `mixture.program`.
+        """Write the parts of the function that makes a state; `self` writes `mixture.program`.
 
         Args:
-            table: coefficients that differ between the nodes, [n, nodes].
+            table: [n, nodes] coefficients that differ between the nodes.
         """
         rows = np.array(table or [[0.0] * mixture.transform.shape[1]]) @ mixture.transform.T
         return {
@@ -209,16 +212,16 @@ class Writer:
 
 
 class PartWriter(Writer):
-    """Writes a program as functions of few steps for a block of rays, with rows for the numbers that wait.
+    """Writes a program as functions of few steps on a block of rays; numbers for later functions wait in rows.
 
-    In one loop over whole rays a core mostly waits: each surface needs the ray from the one before, and the next rays
-    are farther off than it looks ahead. In loops of few steps it works on several rays at a time.
+    In one loop over whole rays a core mostly waits: each surface needs the ray from the one before, and the next ray's
+    steps are farther off than a core looks ahead. In loops of few steps it works on several rays at a time.
     """
 
     def __init__(self, program: Program, signature: Signature, macro: str) -> None:
         super().__init__(program, signature.name)
         self.signature, self.macro, self.same = signature, macro, program.same_for_all()
-        self.here, self.row = set[int](), dict[int, int]()  # the steps of this part; rows of numbers that wait
+        self.here, self.row = set[int](), dict[int, int]()  # the steps of this part; the rows in which numbers wait
 
     def value(self, argument: Argument) -> str:
         if not isinstance(argument, int) or argument in self.same or argument in self.here:
@@ -226,7 +229,7 @@ class PartWriter(Writer):
         return f"waiting[{self.row[argument]}][i]" if argument in self.row else f"{super().value(argument)}[i]"
 
     def functions(self) -> tuple[str, str]:
-        """The functions of the parts, and the loop that calls them."""
+        """Write the functions of the parts, and the loop that calls them."""
         parts, free, rows = self.program.in_parts(PART), list[int](), 0
         last = {a: n for n, steps in enumerate(parts) for k in steps for a in self.program.steps[k].arguments}
         outputs, written = dict(self.program.outputs), list[tuple[str, str]]()
@@ -246,9 +249,9 @@ class PartWriter(Writer):
         return "".join(text for text, _ in written), loop
 
     def _function(self, number: int, lines: Sequence[str], made: Sequence[str]) -> tuple[str, str]:
-        """The function of one part, and its call."""
+        """Write the function of one part, and its call."""
         s, pointer, before = self.signature, f"*{self.macro}_RESTRICT", list[str]()
-        for k in sorted(self.same, reverse=True):  # what others are made of comes before them
+        for k in sorted(self.same, reverse=True):  # each comes after what it is made of
             if self.program.steps[k].kind != "input" and re.search(rf"\bt{k}\b", " ".join([*before, *lines])):
                 before.insert(0, f"    const float t{k} = {self.step(self.program.steps[k])};\n")
         words = set(re.findall(r"\w+", " ".join([*before, *lines])))
@@ -270,11 +273,11 @@ class PartWriter(Writer):
 
 
 def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
-    """The text of a header.
+    """Write a program as the text of a C header.
 
     Args:
-        name: of the function, an identifier.
-        comment: lines on the model, for its head.
+        name: the function's, an identifier.
+        comment: lines about the model, for the head of the file.
         extras: what else the header holds.
     """
     signature = Signature.of(program, name)
@@ -317,7 +320,7 @@ _IN_DOUBLE = {
 
 
 def write_double(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
-    """Write what `write_c` writes, in double precision; absorption stays as exact as in single."""
+    """Write what `write_c` writes, in double precision; absorption keeps the precision of single."""
     token = _DOUBLE.set(True)
     try:
         text = write_c(program, name, comment, extras)
@@ -334,13 +337,13 @@ def in_double(text: str) -> str:
 
 
 def _numbers(name: str, rows: NDArray[np.float64]) -> str:
-    """A table as one array."""
+    """Write a table as one array."""
     lines = ",\n".join(", ".join(literal(v) for v in row) for row in rows)
     return f"\nstatic const float {name}[{rows.size}] = {{\n{lines}}};\n"
 
 
 def _functions(s: Signature, macro: str, body: list[str], results: list[str], parts: tuple[str, str] | None) -> str:
-    """The struct of results, the function of one ray, and the one over arrays, which may be in parts."""
+    """Write the struct of results, the function of one ray, and the one over arrays, which may run in parts."""
     pointer, band, guard, chosen = f"*{macro}_RESTRICT", list[str](), list[str](), list[str]()
     if s.state:
         band, chosen = [f"const {s.name}_state {pointer} state"], ["state"]
@@ -369,17 +372,17 @@ def _functions(s: Signature, macro: str, body: list[str], results: list[str], pa
 
 
 def padded_columns(columns: int) -> int:
-    """How many floats a group of columns of a table takes in compiled code: whole registers."""
+    """Return how many floats a group of a table's columns takes in compiled code: whole registers."""
     return -(-columns // 8) * 8
 
 
 def write_blocks(program: Program, name: str) -> str:
-    """A function of arrays for a program with lookups, in three loops on what fits the first cache.
+    """Write a program with lookups as a function of arrays: three loops over blocks of rays that fit the first cache.
 
-    Compilers make vectors of the loops before and after the lookups; of lookups themselves they make none, or slow
-    ones. NAME(count, per_ray, per_call, table, cells, outputs, status) takes pointers in the order of the signature;
-    groups of the table's columns are padded to `padded_columns`. A table of the program's own is NAME_table, of
-    NAME_table_cells.
+    Compilers vectorise the loops before and after the lookups; the lookups themselves they vectorise slowly or not at
+    all. NAME(count, per_ray, per_call, table, cells, outputs, status) takes pointers in the order of the signature.
+    Groups of the table's columns are padded to `padded_columns`. A table of the program's own is NAME_table, with
+    NAME_table_cells cells.
     """
     if not any(program.steps[k].kind == "lookup" for k in program.live()):
         return _block_of_rays(program, name)
@@ -423,7 +426,7 @@ def write_blocks(program: Program, name: str) -> str:
 
 
 def _block_of_rays(program: Program, name: str) -> str:
-    """The function of `write_blocks` for a program without lookups, which takes no table."""
+    """Write the function of `write_blocks` for a program without lookups, which takes no table."""
     once, rest = program.of_the_call()
     parts = ((program, ""), (once, "_once"), (rest, "_each"))
     whole, same, each = (Signature.of(p, f"{name}{part}") for p, part in parts)

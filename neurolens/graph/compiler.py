@@ -82,7 +82,7 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
     words = [*_words(compiler), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"]
     done = _run(words, source, TMPDIR=str(_with_room(*places)))
     if done.returncode or not library.is_file() or not library.stat().st_size:
-        # Linkers that write to mapped memory say nothing, but end by a signal.
+        # On a full disk, linkers that write to mapped memory print nothing; a signal ends them.
         full = [str(place) for place in places if not _has_room(place)]
         if full or "No space left" in done.stderr:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), " and ".join(full or map(str, places)))
@@ -96,7 +96,7 @@ def _has_room(folder: Path) -> bool:
 
 
 def _with_room(*folders: Path) -> Path:
-    """The first folder whose disk has room, or else the first."""
+    """Return the first folder whose disk has room, else the first of all."""
     return next(filter(_has_room, folders), folders[0])
 
 
@@ -126,21 +126,21 @@ def _end(child: subprocess.Popen[str]) -> None:
 
 
 def c_source(file: str, **constants: object) -> str:
-    """The text of a .c file ("pictures/flare/area.c"), after a #define for each constant that Python knows."""
+    """Return the text of a .c file ("pictures/flare/area.c"), after a #define for each of the constants."""
     defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
     return defines + (Path(__file__).parents[1] / file).read_text(encoding="utf-8")
 
 
 def load_compiled(source: str, told: Callable[[str], None] | None = None) -> ctypes.CDLL:
-    """The library of a source, which is compiled once for this machine and kept in `cache_folder`.
+    """Load the library of a source, which is compiled once for this machine and kept in `cache_folder`.
 
-    `told`: takes the end of a line, how long it took and where the library is kept, if one was compiled.
+    `told` is called after a compilation, with the end of a line: how long it took and where the library is kept.
 
     A library of another user, or a damaged one, is compiled again. Where the disk of the cache is full, it goes to the
     folder of temporary files, for this process; a compiler itself works in whichever of the two has room.
 
     Raises:
-        InputError: as `compile_c`; a library that cannot be loaded.
+        InputError: as `compile_c`, and where a library cannot be loaded.
     """
     with _ONE_AT_A_TIME:
         return _loaded(source, told)
@@ -168,7 +168,7 @@ def _loaded(source: str, told: Callable[[str], None] | None) -> ctypes.CDLL:
 
 
 def _key(source: str) -> str:
-    """A hash of a source, its flags, the compiler and the processor: a library for another one may crash here."""
+    """Hash a source with the flags, the compiler and the processor: a library for another processor may crash here."""
     made_by = _compiler_and_processor(find_compiler())
     return hashlib.sha256("\0".join((source, *FLAGS, made_by)).encode()).hexdigest()[:32]
 

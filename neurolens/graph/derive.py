@@ -32,9 +32,9 @@ def derivative(output: str, by: str) -> str:
 
 
 def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tuple[str, int]]) -> Graph:
-    """The graph with its outputs and, for each output and input row, `derivative(output, row)`, of the output's rows.
+    """Add derivatives to a graph's outputs: of each output by each input row, with as many rows as the output.
 
-    At a choice (select, max, min, clip) the derivative is that of the value that was chosen.
+    They are named by `derivative`. At a choice (select, max, min, clip) the derivative is that of the chosen value.
 
     Args:
         outputs: the outputs to differentiate. inputs: names and rows of the inputs to differentiate by.
@@ -42,7 +42,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
     g = Graph()
     values: dict[int, Value] = {}  # by the old graph's numbers
     known: list[dict[int, Value]] = [{} for _ in inputs]  # derivatives by the new graph's numbers, by direction
-    chains: dict[int, tuple[int, Value]] = {}  # a function of one value: that one, and the derivative by it
+    chains: dict[int, tuple[int, Value]] = {}  # of a function of one value: that value, and the derivative by it
     names: dict[tuple[str, int], str] = {}
     for number, node in enumerate(graph.nodes):
         x = [values[k] for k in node.inputs]
@@ -77,7 +77,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
 
 
 def _factors(x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]) -> list[Moved]:
-    """Derivatives of an operation's values by the one value that they all depend on."""
+    """Return the derivatives of an operation's values by the one value that they all depend on."""
     one = x[0].graph.constant(1.0)
     return [
         None if all(d[i] is None for d in moves) else chains[v.number][1] if v.number in chains else one
@@ -88,7 +88,7 @@ def _factors(x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[
 def _base(
     node: Node, x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]
 ) -> int | None:
-    """The one value, of as many rows, that an operation row by row depends on; None if there are several, or none.
+    """Return the one varying value that a row-by-row operation depends on, where it has as many rows; else None.
 
     The derivative by that value serves all directions.
     """
@@ -116,7 +116,7 @@ def _times(a: Moved, b: Value) -> Moved:
 
 
 def _column(value: Value) -> tuple[Array, tuple[Value, Array] | None] | None:
-    """Two or more rows of numbers, or of numbers plus others times a value of the call, as columns; else None."""
+    """Return rows that are numbers, or numbers plus others times a value of the call, as columns; else None."""
     g, node, rows = value.graph, value.node, list(range(value.rows))
     if node.kind == "take":
         node, rows = g.nodes[node.inputs[0]], list(node.static)
@@ -136,7 +136,7 @@ def _is_one(value: Value) -> bool:
 
 
 def _is_zero(value: Value) -> bool:
-    """Whether all rows are 0 for any rays: constants, and rows of matrices that hold nothing."""
+    """Return whether all rows are 0 for any rays: zero constants, and rows of zero matrices."""
     g, node, rows = value.graph, value.node, list(range(value.rows))
     if node.kind == "take":
         node, rows = g.nodes[node.inputs[0]], list(node.static)
@@ -175,7 +175,7 @@ def _affine(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Mov
 
 
 def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    """The result is linear in x where the derivative of x is the same for all rays."""
+    """Differentiate sums of products: linear in x where the derivative of x is the same for all rays."""
     g, dx = y.graph, d[0]
     assert dx is not None
     column = _column(dx)
@@ -191,7 +191,7 @@ def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> 
 
 
 def _linear(node: Node, dx: Array) -> Array:
-    """The derivative of a quadratic along dx [K] as a matrix [R, K] on x."""
+    """Return the derivative of a quadratic along dx [K], as a matrix [R, K] on x."""
     matrix = np.zeros((node.rows, len(dx)))
     for r, form in enumerate(node.static):
         for i, j in form:
@@ -201,7 +201,7 @@ def _linear(node: Node, dx: Array) -> Array:
 
 
 def partial_derivatives(exponents: Exponents, weight: Array) -> tuple[Exponents, Array]:
-    """A polynomial of exponents [M, V] and weights [R, M] with its partial derivatives.
+    """Join a polynomial of exponents [M, V] and weights [R, M] with its partial derivatives.
 
     Returns exponents [M', V] that hold the monomials of all of them, and weights [1 + V, R, M']: the polynomial's,
     then those of each derivative.
@@ -283,26 +283,27 @@ _BY_ROWS = frozenset(
     ("add", "sub", "mul", "div", "neg", "sqrt", "tanh", "abs", "max", "min", "clip", "select", "series")
 )
 
-# A step that did not help is repeated at this share of its length.
+# A step that did not help is tried again at this share of its length.
 SHORTER = 0.25
-# The unknowns stay within this, each: scaled so that passing rays fill the unit disc.
+# Each unknown stays within this: unknowns are scaled so that passing rays fill the unit disc.
 REACH = 2.0
 _HUGE = 3e38
 
 
 def with_jacobian(system: Graph) -> Graph:
-    """A system, of inputs `unknown` (and others) and output `residual`, with the columns of its Jacobian as outputs."""
+    """Add the columns of the Jacobian to the outputs of a system from `unknown` (and other inputs) to `residual`."""
     unknowns = next(node.rows for node in system.nodes if node.name == "unknown")
     return with_derivatives(system, ["residual"], [("unknown", k) for k in range(unknowns)])
 
 
 @dataclass(frozen=True)
 class Solved:
-    """The result of an iteration.
+    """The result of `limited_newton`.
 
     Attributes:
         last: unknowns after the last step, whose residual is not known yet.
-        best: unknowns of the smallest residual before that. size: its squared length. None of zero steps.
+        best: of all unknowns before these, those of the smallest residual; None after no step.
+        size: the squared length of that residual; None after no step.
     """
 
     last: Value
@@ -310,7 +311,7 @@ class Solved:
     size: Value | None
 
     def judged(self, size: Value) -> tuple[Value, Value]:
-        """The best unknowns, and the squared length of their residual, from that of the last unknowns."""
+        """Return the best unknowns and the squared length of their residual, from that of the last unknowns."""
         if self.best is None or self.size is None:
             return self.last, size
         g, better = size.graph, size <= self.size
@@ -318,10 +319,11 @@ class Solved:
 
 
 def limited_newton(system: Graph, given: Mapping[str, Value], start: Value, steps: int, limit: float) -> Solved:
-    """Append so many steps from `start` (2 or 4 rows).
+    """Append `steps` steps of Newton's method, from `start` (2 or 4 rows).
 
     Args:
-        system: a graph from `unknown`, and the inputs `given`, to `residual`, of as many rows.
+        system: a graph with the inputs `unknown` and `given` and the output `residual`, which has as many rows as
+            `unknown`.
         limit: the longest step, in units of the unknowns.
     """
     g, both = start.graph, with_jacobian(system)
@@ -342,14 +344,14 @@ def limited_newton(system: Graph, given: Mapping[str, Value], start: Value, step
 
 
 def _limited(step: Value, limit: float) -> Value:
-    """A step no longer than the limit, and none where it is not finite: a singular Jacobian gives no direction."""
+    """Return a step no longer than the limit; none where it is not finite: a singular Jacobian gives no direction."""
     g, square = step.graph, step.graph.square(step)
     shorter = step * (limit / square.sqrt().maximum(limit))
     return g.select(square <= _HUGE, shorter, 0.0)
 
 
 def solve(columns: Sequence[Value], b: Value) -> Value:
-    """x of columns x = b; not finite where the matrix is singular, or the leading block of its last unknowns is."""
+    """Solve columns x = b. Where the matrix or the block of its last unknowns is singular, x is not finite."""
     rows = _eliminated([*columns, b])
     x: list[Value] = []
     for k, row in enumerate(rows):
@@ -361,13 +363,13 @@ def solve(columns: Sequence[Value], b: Value) -> Value:
 
 
 def determinant(columns: Sequence[Value]) -> Value:
-    """The determinant of the matrix with these columns."""
+    """Return the determinant of the matrix with these columns."""
     pivots = [row[k] for k, row in enumerate(_eliminated(columns))]
     return reduce(mul, pivots)
 
 
 def _eliminated(columns: Sequence[Value]) -> list[list[Value]]:
-    """The rows of a matrix, to the right of whose diagonal the last unknowns are eliminated, the very last first."""
+    """Return the rows of a matrix made lower triangular: the last unknown is eliminated first."""
     count = columns[0].rows
     rows = [[column[i] for column in columns] for i in range(count)]
     for k in range(count - 1, 0, -1):

@@ -19,11 +19,11 @@ Rows = Any
 
 
 def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
-    """The outputs of a graph, [R, N] each ([R, 1] where the same for all rays).
+    """Return the outputs of a graph, [R, N] each, or [R, 1] where they are the same for all rays.
 
     Args:
-        inputs: by name, [R, N] or, of the call, [R, 1]: all numpy arrays or all torch tensors of one floating dtype.
-            Torch follows its gradients. Tables [cells, columns] are read fastest where columns are contiguous.
+        inputs: by name, [R, N], or [R, 1] for inputs of the call; all numpy arrays or all torch tensors of one floating
+            dtype. Torch follows its gradients. Tables [cells, columns] are read fastest where columns are contiguous.
 
     Raises:
         KeyError: an input that is missing.
@@ -48,8 +48,10 @@ _PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], _Plan]] = WeakKeyDiction
 
 
 def _plan(graph: Graph) -> _Plan:
-    """Numbers of the nodes that the outputs need, in order, each with those that nothing after it needs; kept while a
-    graph stays."""
+    """Return the numbers of the nodes that the outputs need, in order, each with the values that are then done with.
+
+    A plan is kept as long as its graph.
+    """
     wanted = (len(graph.nodes), *(v.number for v in graph.outputs.values()))
     kept = _PLANS.get(graph)
     if kept is None or kept[0] != wanted:
@@ -90,7 +92,7 @@ class _Space:
         return x.astype(np.int32 if whole else self.like.dtype)
 
     def broadcast(self, rows: list[Rows]) -> list[Rows]:
-        """Rows of the call repeated for all rays, where others are of rays."""
+        """Repeat rows of the call for all rays, where other rows are of rays."""
         width = max(r.shape[1] for r in rows) if all(r.shape[1] for r in rows) else 0
         if self.torch:
             return [r.expand(r.shape[0], width) if r.shape[1] != width else r for r in rows]

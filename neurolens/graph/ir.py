@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Exponents = NDArray[np.int64]
-# Rows of a quadratic: the pairs of rows of x whose products are summed.
+# One row of a quadratic: the pairs of rows of x whose products are summed.
 Form = tuple[tuple[int, int], ...]
 
 
@@ -39,8 +39,8 @@ class Node:
 
     Attributes:
         kind: an operator of the module's table. inputs: numbers of earlier nodes.
-        rows: of its value. per_call: whether it is the same for all rays of a call.
-        name: of an input.
+        rows: how many its value has. per_call: whether it is the same for all rays of a call.
+        name: an input's.
         arrays: its numbers, float64 (exponents int64). static: what is neither a value nor a coefficient.
     """
 
@@ -131,13 +131,13 @@ class Value:
         return self.graph.each("and", self, other)
 
     def between(self, low: ArrayLike, high: ArrayLike) -> Value:
-        """1 where low <= value <= high, 0 elsewhere and for NaN; one number a row, or one for all."""
+        """Return 1 where low <= value <= high, else 0, also for NaN; a bound is one number, or one a row."""
         limits = np.broadcast_to(np.stack([low, high]).T, (self.rows, 2)).astype(np.float64)
         return self.graph.add("between", (self,), self.rows, arrays=(limits,))
 
 
 Operand = Value | ArrayLike
-# Done at once on numbers.
+# Computed at once where all operands are numbers.
 _FOLDED: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative}
 
 
@@ -160,7 +160,7 @@ class Graph:
         static: tuple[Any, ...] = (),
         per_call: bool | None = None,
     ) -> Value:
-        """Append a node of any kind; `per_call` None: where all of its inputs are."""
+        """Append a node of any kind. With `per_call` None it is the same for all rays if all its inputs are."""
         numbers = tuple(v.number for v in inputs)
         if kind == "and":
             for one, other in (inputs, inputs[::-1]):
@@ -175,7 +175,7 @@ class Graph:
         return Value(self, self._known[key])
 
     def _holds(self, truth: Value) -> bool:
-        """Whether a truth is the test of a number that lies between its limits."""
+        """Return whether a truth always holds, because it tests a number that lies between its limits."""
         if truth.node.kind != "between" or (tested := self.inputs_of(truth.number)[0].node).kind != "constant":
             return False
         low, high = truth.node.arrays[0].T
@@ -204,7 +204,7 @@ class Graph:
         return self.add("lookup", (table, index, weights), rows, static=tuple(range(rows)), per_call=False)
 
     def constant(self, value: ArrayLike, *label: str) -> Value:
-        """Numbers, one a row. Equal numbers of one label, by default none, are one node."""
+        """Return numbers, one a row. Equal numbers with equal labels are one node."""
         array = np.atleast_1d(np.asarray(value, np.float64))
         return self.add("constant", (), len(array), arrays=(array,), static=label, per_call=True)
 
@@ -224,7 +224,7 @@ class Graph:
     def take(self, x: Value, rows: Sequence[int]) -> Value:
         if list(rows) == list(range(x.rows)):
             return x
-        if x.node.kind == "concat":  # from the part that holds them all, or the parts that they are
+        if x.node.kind == "concat":  # taken from the one part that holds all rows, or made of the parts themselves
             parts, ends = self.inputs_of(x.number), [0]
             for part in parts:
                 if all(ends[-1] <= r < ends[-1] + part.rows for r in rows):
@@ -313,7 +313,7 @@ class Graph:
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 
     def like(self, node: Node, inputs: Sequence[Value]) -> Value:
-        """Append the operation of a node of any graph to these inputs, which may be numbers where its own were not."""
+        """Append the operation of any graph's node to these inputs, which may be numbers where its own were not."""
         if node.kind in _FOLDED:
             return self.each(node.kind, *inputs)
         if node.kind == "select":
@@ -337,7 +337,7 @@ class Graph:
         return [Value(self, k) for k in self.nodes[number].inputs]
 
 
-# Any row of these needs all rows of their inputs, but of the rows that an affine adds.
+# Any row of these needs all rows of their inputs, except the rows that an affine adds.
 _WHOLE = frozenset(("affine", "polynomial", "quadratic", "first_failure", "lookup"))
 
 
@@ -376,8 +376,10 @@ def live_rows(graph: Graph, outputs: Mapping[str, Value]) -> dict[int, set[int]]
 
 
 def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
-    """The graph of these outputs alone (None: of its own), without the rows of matrices and polynomials that nothing
-    needs."""
+    """Return the graph of these outputs alone (None: of its own).
+
+    Rows of matrices and polynomials that nothing needs are left out.
+    """
     wanted = dict(graph.outputs if outputs is None else outputs)
     live = live_rows(graph, wanted)
     new = Graph()
@@ -385,7 +387,7 @@ def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
     kept: dict[int, list[int]] = {}  # the old rows that it holds, in order
 
     def rows_of(number: int, rows: Collection[int]) -> Value:
-        """New value of old rows; a single row stands for any."""
+        """Return the new value of old rows; a single row stands for any."""
         known = kept[number]
         if graph.nodes[number].rows == 1:
             return place[number]
@@ -413,7 +415,7 @@ def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
 
 
 def _kept_rows(new: Graph, node: Node, rows: list[int], inputs: list[Value]) -> Value:
-    """A node that computes some of its rows."""
+    """Append a node that computes some of a node's rows."""
     cut = {"affine": 0, "quadratic": 0, "between": 0, "polynomial": 1}.get(node.kind, len(node.arrays))
     arrays = [a if k < cut else a[rows] for k, a in enumerate(node.arrays)]
     by_row = node.kind in ("quadratic", "lookup")
@@ -423,7 +425,7 @@ def _kept_rows(new: Graph, node: Node, rows: list[int], inputs: list[Value]) -> 
 
 
 def same_structure(graphs: Sequence[Graph]) -> bool:
-    """Whether graphs differ in their numbers alone, so that one set of operations serves all of them."""
+    """Return whether graphs differ in their numbers alone, so that one set of operations serves all of them."""
 
     def shape(graph: Graph) -> list[Any]:
         bare = []

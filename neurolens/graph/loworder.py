@@ -1,4 +1,4 @@
-"""Few polynomial terms in place of a lens's derivatives, and of its tests whether a ray passes.
+"""Replaces a lens's derivatives, and its tests of whether a ray passes, by polynomials of few terms.
 
 A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: an error of a few
 percent does no harm. Derivatives of the graph itself double its work; polynomials of some ten terms each are a few
@@ -22,12 +22,14 @@ from neurolens.graph.ir import Graph, Node, Value, live_rows, pruned
 from neurolens.graph.program import FILM_X_Y
 
 Array = NDArray[np.float64]
-_DEGREE, _DEGREE_WAVE = 4, 2  # in film and pupil point, alone and times the wavelength's variable
-_STOP, _MOST_TERMS = 0.005, 16  # of an output: the error that is good enough, as a share of its group's; terms
+_DEGREE, _DEGREE_WAVE = 4, 2  # in film and pupil point: of terms without and with the wavelength's variable
+# for each output: the error that is good enough, as a share of its group's size; the most terms
+_STOP, _MOST_TERMS = 0.005, 16
 WORST = 0.03  # RMS error, as a share of a derivative, above which there is no such graph
-_FEWEST, _ENOUGH = 500, 8_000  # rays that pass, to fit to, and rays of which every second, third ... is taken
-_STEP_MM = 1e-4  # of differences, in double precision
-_ONE_WAVELENGTH = 1e-3  # relative spread of 1 / wavelength^2 below which it is one
+# passing rays: the fewest for a fit; of more than `_ENOUGH` only every second, third ... is taken
+_FEWEST, _ENOUGH = 500, 8_000
+_STEP_MM = 1e-4  # the step of differences, in double precision
+_ONE_WAVELENGTH = 1e-3  # below this relative spread of 1 / wavelength^2 all wavelengths count as one
 _GROUPS = (slice(0, 3), slice(3, 6))  # rows of point and direction: each has one scale
 _NAMES = [derivative("scene_ray", by) for by in FILM_X_Y]
 
@@ -37,8 +39,8 @@ class LowOrder:
     """A graph with the derivatives of `scene_ray` by the film point (`derive.derivative`).
 
     Attributes:
-        error: RMS over the fitted rays of the error of a derivative (the point's or the direction's 3 x 2 matrix,
-            Frobenius norm) over its size, the larger of the two. terms: of all outputs.
+        error: relative RMS error over the fitted rays of the point's or the direction's derivatives (a 3 x 2 matrix,
+            Frobenius norm), the larger of the two. terms: how many all outputs have together.
     """
 
     graph: Graph
@@ -47,7 +49,7 @@ class LowOrder:
 
 
 def with_film_derivatives(graph: Graph) -> Graph:
-    """The graph of a lens with the derivatives of `scene_ray` by the film point: the graph's own, not fitted ones."""
+    """Add the derivatives of `scene_ray` by the film point to a lens's graph: its own, not fitted ones."""
     return with_derivatives(graph, ["scene_ray"], [("rays", row) for row in range(len(FILM_X_Y))])
 
 
@@ -57,7 +59,7 @@ def with_low_order_derivatives(
     """Fit the derivatives of a lens's graph by orthogonal matching pursuit, each until it is good enough.
 
     Args:
-        samples: inputs of rays that cover those of later calls, [rows, N] or, of the call, [rows, 1].
+        samples: inputs of rays that cover those of later calls, [rows, N], or [rows, 1] for inputs of the call.
         enough, worst: see `_STOP` and `WORST`.
 
     Returns None where low orders are not enough, as for a strong lens, or too few rays pass.
@@ -73,11 +75,11 @@ def low_orders(
     worst: float = WORST,
     reach_mm: float = 0.0,
 ) -> list[LowOrder] | None:
-    """`with_low_order_derivatives` of a lens in several states, which share the terms and have their own weights.
+    """Fit as `with_low_order_derivatives`, for several states of a lens, which share terms but not weights.
 
     Args:
-        reach_mm: distance of the nearest object: errors of the point's derivatives are shares of those that the
-            direction's make of them there, where that is more.
+        reach_mm: distance of the nearest object. Errors of the point's derivatives are taken relative to how far the
+            direction's derivatives move the ray there, where that is more.
     """
     states = [_Fitted.of(graph, given) for graph, given in zip(graphs, samples, strict=True)]
     if any(state is None for state in states):
@@ -97,8 +99,12 @@ def low_orders(
 
 @dataclass(frozen=True)
 class _Fitted:
-    """A lens in one state while it is fitted: `products` [M, N], monomials of these exponents of the rays that pass,
-    the derivatives `wanted` [6, 2, N], and the weights [6, 2, M]."""
+    """A lens in one state while it is fitted.
+
+    Attributes:
+        products: [M, N] monomials of `exponents`, of the rays that pass.
+        wanted: [6, 2, N] derivatives. weights: [6, 2, M] of the fit.
+    """
 
     graph: Graph
     samples: Mapping[str, NDArray[np.float32]]
@@ -111,7 +117,7 @@ class _Fitted:
 
     @staticmethod
     def of(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> _Fitted | None:
-        """The start of a fit; None where too few rays pass."""
+        """Start a fit; None where too few rays pass."""
         thinner = slice(None, None, max(1, samples["rays"].shape[1] // _ENOUGH))
         doubles = {name: rows[:, thinner].astype(np.float64) for name, rows in samples.items()}
         status = evaluate(graph, doubles)["status"][0]
@@ -129,11 +135,12 @@ class _Fitted:
         products = np.prod(columns ** exponents[:, :, None], axis=1)
         weights = np.zeros((6, 2, len(exponents)))
         wanted = np.broadcast_to(wanted, (6, 2, len(passed)))[..., passed]
-        samples = {name: rows.astype(np.float32) for name, rows in doubles.items()}  # as it will be used
+        # in the precision in which it will be used
+        samples = {name: rows.astype(np.float32) for name, rows in doubles.items()}
         return _Fitted(found, samples, passed, variables, exponents, products, wanted, weights)
 
     def finished(self, used: NDArray[np.bool_], reach_mm: float) -> LowOrder:
-        """The graph with its derivatives, by the monomials that any state uses."""
+        """Return the graph with its derivatives, written in the monomials that any state uses."""
         weights = self.weights[..., used].transpose(1, 0, 2).reshape(12, -1)
         rows = self.graph.polynomial(self.exponents[used], weights, self.variables)
         self.graph.outputs |= dict(zip(_NAMES, self.graph.split(rows, (6, 6)), strict=True))
@@ -145,7 +152,7 @@ class _Fitted:
 
 
 def _slopes(graph: Graph, samples: Mapping[str, Array]) -> Array:
-    """Derivatives [6, 2, N] of `scene_ray` by the film point, as differences: quicker than to write their graph."""
+    """Return derivatives [6, 2, N] of `scene_ray` by the film point, as differences, which is quicker than a graph."""
     found = []
     for row in range(2):
         step = np.zeros((5, 1))
@@ -166,16 +173,20 @@ def _rms(values: Array) -> float:
 
 
 def _error(found: Array, wanted: Array, size: Array) -> float:
-    """The RMS over rays of the error (Frobenius norm) over a size [N]."""
+    """Return the RMS over rays of the error (Frobenius norm) over a size [N]."""
     return _rms(np.linalg.norm(found - wanted, axis=(0, 1)) / np.maximum(size, 1e-30))
 
 
 def _variables(g: Graph, rays: Array) -> tuple[Array, Value]:
-    """Film and pupil point and, if the lens disperses, 1 / wavelength^2 less its mean: as numbers [V, N] and value."""
+    """Return the variables of the monomials as numbers [V, N] and as a value of the graph.
+
+    They are film and pupil point and, if the lens disperses, 1 / wavelength^2 less its mean.
+    """
     inputs = g.input("rays", 5)
     if 4 in live_rows(g, g.outputs).get(inputs.number, ()):
         wave = (1000 / rays[4]) ** 2
-        if np.ptp(wave) > _ONE_WAVELENGTH * wave.mean():  # else a constant, which there is already
+        # a single wavelength adds only a constant, which there is already
+        if np.ptp(wave) > _ONE_WAVELENGTH * wave.mean():
             inverse = 1000.0 / inputs[4]
             varying = inverse * inverse + -float(wave.mean())
             return np.stack([*rays[:4], wave - wave.mean()]), g.concat(inputs[0:4], varying)
@@ -225,18 +236,24 @@ def pursue(
 
 Truths = NDArray[np.bool_]
 _TEST_DEGREE, _TEST_TERMS = 3, 20
-_NEAR = 0.03  # of a test's value: what lies nearer to 0 decides
-_GATE, _SMOOTH = 1.5e-3, 1e-3  # weighted RMS error of a test, and of others relative to their size
-_CHANGED, _LOST = 5e-3, 3e-3  # of the rays that pass, that new tests may tell otherwise, and by how much fewer or more
-_ZONES = 4  # of the film, as many rays in each, in which they may be so few, with the stop open and with any
-_IDLE = 5e-4  # of the rays, that tests which are left out stop alone
+_NEAR = 0.03  # A value of a test this near to 0 decides about its ray.
+_GATE, _SMOOTH = 1.5e-3, 1e-3  # weighted RMS errors: of a test; of other rows, relative to their size
+# of the rays that pass: how many new tests may judge otherwise; by how much their number may change
+_CHANGED, _LOST = 5e-3, 3e-3
+# of the film, with as many rays in each; `_LOST` holds in each of them, with the stop open and with any stop
+_ZONES = 4
+_IDLE = 5e-4  # of the rays: a test that alone stops no more than these is left out
 _UNIT = 1e-4  # by which squared lengths of directions may differ from 1
 
 
 @dataclass(frozen=True)
 class _GateSamples:
-    """Samples of one graph: values [R, N] of the node whose rows are fitted, monomials [M, N] of its variables, weights
-    [R, N] of errors, and which rays pass."""
+    """Samples of one graph.
+
+    Attributes:
+        values: [R, N] of the node whose rows are fitted. products: [M, N] monomials of its variables.
+        weights: [R, N] of errors. passed: [N] which rays pass.
+    """
 
     graph: Graph
     values: Array
@@ -246,16 +263,16 @@ class _GateSamples:
 
 
 def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np.float32]]]) -> list[Graph] | None:
-    """Graphs of a lens, in one state or in several, with tests, stop point and transmittance of few terms.
+    """Return graphs of a lens, in one state or several, whose tests, stop point and transmittance have few terms.
 
     Their status says whether a ray passes, but no longer which rim stops it. They test no domain, for rays are those
     that the camera samples.
 
     Args:
-        samples: inputs of the rays of a camera, as of `low_orders`.
+        samples: inputs of the rays of a camera, as for `low_orders`.
 
     Returns None where the lens is no surrogate of a few variables, where its directions may not be of unit length, or
-    where so few terms change the answer for too many rays.
+    where the few terms change the answer for too many rays.
     """
     number = _shared(graphs[0])
     variables = None if number is None else _forms(graphs[0], number)
@@ -277,7 +294,7 @@ def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np
     for weights in (
         fitted,
         dict[int, list[Array]](),
-    ):  # where few terms do not do, idle tests are left out all the same
+    ):  # where few terms are not enough, idle tests are left out all the same
         made = [_written(s, number, variables, exponents, idle, {r: w[k] for r, w in weights.items()})
                 for k, s in enumerate(known)]  # fmt: skip
         if all(_same(_passed(g, given), s.passed, given) for g, s, given in zip(made, known, samples, strict=True)):
@@ -286,7 +303,7 @@ def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np
 
 
 def _low_row(seen: Sequence[_GateSamples], row: int, good: float) -> tuple[list[Array], bool]:
-    """Weights [M] of few monomials in each state, and whether they come as near as `good`."""
+    """Fit a row by few monomials: weights [M] in each state, and whether their error is at most `good`."""
     columns, wanted = [s.products * s.weights[row] for s in seen], [s.values[row] * s.weights[row] for s in seen]
     chosen, own = pursue(columns, wanted, [good] * len(seen), _TEST_TERMS)
     weights = [np.zeros(len(c)) for c in columns]
@@ -297,7 +314,7 @@ def _low_row(seen: Sequence[_GateSamples], row: int, good: float) -> tuple[list[
 
 
 def _same(found: Truths, wanted: Truths, samples: Mapping[str, NDArray[np.float32]]) -> bool:
-    """Check that two tests agree on nearly all rays, and pass as many in every zone."""
+    """Return whether two tests agree on nearly all rays, and pass nearly as many in every zone."""
     order = np.argsort(np.hypot(*samples["rays"][:2]))
     stop = np.broadcast_to(samples["stop_radius_mm"][0], wanted.shape)
     good = np.sum(found != wanted) <= _CHANGED * wanted.sum()
@@ -310,7 +327,7 @@ def _same(found: Truths, wanted: Truths, samples: Mapping[str, NDArray[np.float3
 
 
 def _shared(graph: Graph) -> int | None:
-    """The node that gives rows to where rays go, and other rows to the rest."""
+    """Return the node of which some rows say where rays go, and other rows the rest."""
     kept = live_rows(graph, {"scene_ray": graph.outputs["scene_ray"]})
     every = live_rows(graph, graph.outputs)
     shared = [
@@ -321,14 +338,14 @@ def _shared(graph: Graph) -> int | None:
 
 
 def _forms(graph: Graph, number: int) -> int | None:
-    """The node of the forms that a polynomial or a network is a function of."""
+    """Return the node of the quadratic forms that a polynomial or a network is a function of."""
     while graph.nodes[number].kind in ("polynomial", "affine", "tanh"):
         number = graph.nodes[number].inputs[0]
     return number if graph.nodes[number].kind == "quadratic" else None
 
 
 def _gates(graph: Graph, number: int) -> dict[int, int]:
-    """The rows that are tested to be at most 0, and the places of their tests."""
+    """Return the rows that are tested to be at most 0, each with the place of its test."""
     found = {}
     for place, k in enumerate(_tests(graph).inputs[::2]):
         test = graph.nodes[k]
@@ -343,7 +360,7 @@ def _tests(graph: Graph) -> Node:
 
 
 def _idle(seen: Sequence[_GateSamples], gates: Mapping[int, int]) -> set[int]:
-    """Rows whose tests alone stop next to no ray."""
+    """Return the rows whose tests stop hardly a ray that the others pass."""
     idle: set[int] = set()
     while left := [g for g in gates if g not in idle]:
         lost = dict.fromkeys(left, 0.0)
@@ -361,14 +378,14 @@ def _gate_samples(
     graph: Graph, number: int, variables: int, gates: Collection[int], exponents: NDArray[np.int64],
     samples: Mapping[str, NDArray[np.float32]],
 ) -> _GateSamples | None:  # fmt: skip
-    """None where a direction is not of unit length."""
+    """Take the samples of one graph; None where a direction is not of unit length."""
     wanted = {"values": Value(graph, number), "variables": Value(graph, variables), "ray": graph.outputs["scene_ray"]}
     given = evaluate(pruned(graph, wanted), samples)
     if not (np.abs(np.square(given["ray"][3:], dtype=np.float64).sum(0) - 1) <= _UNIT).all():
         return None
     values, x = (given[name].astype(np.float64) for name in ("values", "variables"))
     weights = np.repeat(1 / np.sqrt(np.mean(values**2, axis=1, keepdims=True)), values.shape[1], 1)
-    for g in gates:  # what others stop need not be told exactly
+    for g in gates:  # rays that other tests stop need not be judged exactly
         far = [values[g], *(values[other].clip(0) for other in gates if other != g)]
         weights[g] = np.prod([1 / np.hypot(1, v / _NEAR) for v in far], axis=0)
     return _GateSamples(graph, values, np.prod(x ** exponents[:, :, None], axis=1), weights, _passed(graph, samples))
@@ -383,7 +400,7 @@ def _written(
     state: _GateSamples, number: int, variables: int, exponents: NDArray[np.int64], idle: Collection[int],
     weights: Mapping[int, Array],
 ) -> Graph:  # fmt: skip
-    """The graph with rows of a node as polynomials with these weights [M], by row, and without idle tests."""
+    """Write rows of a node as polynomials with these weights [M], by row, and leave out idle tests."""
     graph, g, place, rows = state.graph, Graph(), list[Value](), list(weights)
     for k, node in enumerate(graph.nodes):
         value = g.like(node, [place[i] for i in node.inputs])

@@ -29,8 +29,8 @@ class Mixing:
     """How a state mixes the constants of the graphs of its nodes.
 
     Attributes:
-        graph: of the call: input `state`, and output `features`; inputs and outputs of other names stand before the
-            inputs of those names.
+        graph: of the call, from the input `state` to the output `features`. Its other outputs replace the inputs of the
+            same names.
         transform: [K, nodes]: features @ transform are the weights of the nodes.
     """
 
@@ -44,17 +44,17 @@ def write_onnx(
     mixing: Mixing | None = None,
     shapes: Mapping[str, Sequence[int]] | None = None,
 ) -> bytes:
-    """The ONNX file of a graph, or of the graphs of a state's nodes.
+    """Write a graph, or the graphs of a state's nodes, as an ONNX file.
 
     Args:
-        metadata: its entries.
-        mixing: with several graphs.
-        shapes: first axes of outputs whose rows are to be cut further. Outputs of one row have the shape [N].
+        metadata: entries of the file.
+        mixing: how a state mixes several graphs.
+        shapes: for some outputs, the axes into which their rows are cut. Outputs of one row have the shape [N].
 
     Raises:
         InputError: numbers that float32 cannot hold; graphs that differ in more than numbers.
     """
-    # Twice: what the first finds to be parts of other values leaves these without use.
+    # Twice: the first pass finds parts that can be taken from other values, and so leaves values without a use.
     kept = [pruned(pruned(g)) for g in ([graphs] if isinstance(graphs, Graph) else graphs)]
     if not same_structure(kept):
         raise InputError("export", "nodes", "(graphs that differ)", "models of one structure at every node")
@@ -76,7 +76,7 @@ def _shape(node: Node) -> list[int | str]:
 
 @dataclass(frozen=True)
 class _Linear:
-    """weight [T, R, K] @ value + bias [T, R], not yet written: an affine that takes it folds it into its product."""
+    """weight [T, R, K] @ value + bias [T, R], not yet written: an affine of it folds the weight into its own matrix."""
 
     value: str
     weight: Array
@@ -85,7 +85,7 @@ class _Linear:
 
 @dataclass(frozen=True)
 class _Longer:
-    """A value of more rows: before its own row `at`, sums of pairs of its rows stand."""
+    """A value with further rows: sums of pairs of its rows stand before its own row `at`."""
 
     name: str
     at: int
@@ -104,14 +104,15 @@ class _Writer:
         self.tensors: dict[str, bytes] = {}
         self.results: list[tuple[str, int, list[int | str]]] = []
         self.known: dict[int, str | _Linear | _Longer] = {}
-        self.linear: dict[int, _Linear] = {}  # of known values, written or not
+        self.linear: dict[int, _Linear] = {}  # values that are known to be linear, written or not
         self.inputs: dict[str, str] = {}
         self._constants: dict[tuple[bytes, str, tuple[int, ...]], str] = {}
         self._moved: dict[tuple[bytes, tuple[int, ...]], tuple[str, Array, tuple[int, ...]]] = {}
-        self._squares: dict[int, tuple[str, dict[tuple[int, int], int]]] = {}  # rows of squares, of x_i and x_i + x_j
+        # tensors of squares of x_i and x_i + x_j, with their rows
+        self._squares: dict[int, tuple[str, dict[tuple[int, int], int]]] = {}
 
     def body(self, shapes: Mapping[str, Sequence[int]]) -> list[bytes]:
-        """All nodes that the results need, and with them the constants and results."""
+        """Return all nodes that the results need, with the constants and results."""
         if self.mixing is not None:
             names = {n.name for n in self.mixing.graph.nodes if n.kind == "input"}
             self.inputs = {name: f"{name}_in_state" for name in names & set(self.mixing.graph.outputs)}
@@ -123,7 +124,8 @@ class _Writer:
         for name, value in graph.outputs.items():
             self._result(name, self.name(value.number), value.node, shapes.get(name))
         needed, nodes = {name for name, *_ in self.results}, list[bytes]()
-        for inputs, outputs, written in reversed([*self._state(), *self.nodes]):  # onnxruntime would run all of them
+        # without those that nothing needs: onnxruntime would run them
+        for inputs, outputs, written in reversed([*self._state(), *self.nodes]):
             if needed.intersection(outputs):
                 needed.update(inputs)
                 nodes.append(written)
@@ -148,7 +150,7 @@ class _Writer:
         self.results.append((name, INT32 if node.kind == "whole" else FLOAT, axes))
 
     def shifted(self, node: Node) -> _Linear | None:
-        """A sum or a product of a linear value and numbers; None for all else."""
+        """Return the sum or product of a linear value and numbers; None for all else."""
         pair, kinds = [self.linear.get(k) for k in node.inputs], [self.graphs[0].nodes[k].kind for k in node.inputs]
         at = next((i for i in (0, 1) if pair[i] and kinds[1 - i] == "constant"), None)
         if at is None or (value := pair[at]) is None or node.rows != self.graphs[0].nodes[node.inputs[at]].rows:
@@ -188,7 +190,7 @@ class _Writer:
         return self._constants[key]
 
     def numbers(self, stack: Array) -> str:
-        """Numbers [T, ...] of each graph: a constant where they agree, else a value that follows the state."""
+        """Return numbers [T, ...] of each graph: a constant where they agree, else a value that follows the state."""
         if len(stack) == 1 or (stack == stack[0]).all():
             return self.const(stack[0])
         assert self.mixing is not None
@@ -221,7 +223,7 @@ class _Writer:
         return names[0] if len(names) == 1 else self.op("Concat", *names, axis=0)
 
     def _state(self) -> list[tuple[Sequence[str], Sequence[str], bytes]]:
-        """The nodes that make the values that follow the state: all of them by one product, cut and shaped."""
+        """Return the nodes that make all values that follow the state: one product, which is then cut and shaped."""
         if self.mixing is None:
             return []
         if not self._moved and "features" in self.mixing.graph.outputs:
@@ -251,7 +253,7 @@ class _Writer:
 
 def _input(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
     name = w.inputs.get(node.name, node.name)
-    if node.per_call and node.rows > 1:  # in columns, as all that is of the call
+    if node.per_call and node.rows > 1:  # as a column, like all values of the call
         return w.op("Reshape", name, w.const([-1, 1], np.int64))
     return name
 
@@ -273,7 +275,7 @@ def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
         elif of_rays and nodes[k].per_call:
             zeros = w.const(np.zeros((nodes[k].rows, nodes[of_rays[0]].rows)))
             name = w.op("Add", w.op("MatMul", zeros, w.name(of_rays[0])), name)
-        elif nodes[k].per_call and nodes[k].rows == 1:  # [1], to stand in a column
+        elif nodes[k].per_call and nodes[k].rows == 1:  # [1] becomes a part of a column
             name = w.op("Reshape", name, w.const([1, 1], np.int64))
         names.append(name)
     return w.concat(names)
@@ -292,7 +294,7 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
             for m in (weight, arrays[2])
         )
         column = w.graphs[0].nodes[node.inputs[0]].kind == "constant"
-        if column:  # times the weight before the state or the call is known
+        if column:  # is multiplied by the weights here, before state and call are known
             columns = np.stack([g.nodes[node.inputs[0]].arrays[0] for g in w.graphs])[:, :, None]
             base, change = base @ columns, change @ columns
         matrix = w.op("Add", w.op("Mul", w.name(node.inputs[1]), w.numbers(change)), w.numbers(base))
@@ -319,7 +321,7 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
 
 
 def _mixed_pairs(graph: Graph, number: int) -> list[tuple[int, int]]:
-    """Pairs of different rows of a value whose products its quadratics ask for."""
+    """Return pairs of different rows of a value whose products its quadratics take."""
     quadratics = (n for n in graph.nodes if n.kind == "quadratic" and n.inputs[0] == number)
     return sorted({p for n in quadratics for form in n.static for p in form if p[0] != p[1]})
 
@@ -347,12 +349,12 @@ def _quadratic(w: _Writer, number: int, node: Node, arrays: list[Array]) -> _Lin
 
 
 def _places(longer: _Longer, rows: int, sums: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
-    """Where the squares of rows (i, i) and of sums of two rows (i, j) stand."""
+    """Return where the squares of rows (i, i) and of sums of two rows (i, j) stand."""
     return {(i, i): longer.place(i) for i in range(rows)} | {pair: longer.at + k for k, pair in enumerate(sums)}
 
 
 def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """Monomials of degree 2, 3 to 4, 5 to 8 ... are each the product of two lower ones, gathered from their blocks."""
+    """Monomials of degree 2, 3 to 4, 5 to 8 ... are each a product of two lower ones, gathered from their blocks."""
     exponents, weight = node.arrays[0], arrays[1]
     used = (weight != 0).any((0, 1))
     table = {tuple(e): weight[:, :, k] for e, k in zip(exponents[used].tolist(), np.flatnonzero(used), strict=True)}
@@ -428,7 +430,7 @@ def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> 
 
 
 def _lookup(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """Columns are taken one by one, so that rays are the last axis: Gather copies cells, three times as slow."""
+    """Take columns one by one, so that rays are the last axis: to gather whole cells takes three times as long."""
     table, index, weights = (w.name(k) for k in node.inputs)
     nodes = [w.graphs[0].nodes[k] for k in node.inputs]
     (columns, indices, count), own = (n.rows for n in nodes), nodes[0].arrays
@@ -453,7 +455,7 @@ def _lookup(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 
 def _table(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """A table by columns."""
+    """Write a table by columns."""
     return w.numbers(arrays[0].swapaxes(1, 2)) if arrays else w.op("Transpose", node.name)
 
 
@@ -482,7 +484,7 @@ _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _L
 
 
 def _products(w: _Writer, blocks: list[Block], pairs: dict[Exponent, Pair]) -> Block:
-    """One block of products whose left factors lie in one block, and whose right factors lie in one block."""
+    """Write one block of products: their left factors lie in one block, and so do their right factors."""
     factors = []
     for side in (0, 1):
         wanted = [pair[side] for pair in pairs.values()]

@@ -18,16 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base.errors import InputError
 from neurolens.base.status import OUTSIDE_DOMAIN
 
-# select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
-# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0. pick(t, x, y),
-# which only `of_the_call` makes, is x where t is 1, y where it is 0, bit by bit. lookup(indices ..., weights ...) is
-# the sum of each weight times its group's column of a table, in the cells at the indices (`Graph.lookup`).
+# select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x cut to [-limit, limit];
+# NaN becomes one of the two ends (not in GLSL). Its limit is a number above 0. pick(t, x, y), which only `of_the_call`
+# makes, is x where t is 1, y where it is 0, bit by bit. lookup(indices ..., weights ...) is the sum of each weight
+# times its group's column of a table, in the cells at the indices (`Graph.lookup`).
 KINDS = {
     "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "floor": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3,
     "select": 4, "pick": 3,
 }  # fmt: skip
 
-# Names of the rows of inputs and outputs: first of a lens, in millimetres and nanometres of the lens frame.
+# Names of the rows of inputs and outputs. Of a lens, in millimetres of the lens frame and nanometres:
 RAY = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm")
 FILM_X_Y, WAVELENGTH = RAY[:2], "wavelength_nm"
 FILM_Z, STOP_RADIUS = "film_z_mm", "stop_radius_mm"  # for a whole call
@@ -66,8 +66,10 @@ class Step:
     """One assignment: an operation of `KINDS`, or "input".
 
     Attributes:
-        name: of an input, or of the table that a lookup reads. per_call: whether an input is one number for all rays.
-        column, columns: of each group of the table's columns, and how many these are. indices: how many.
+        name: an input's, or that of the table that a lookup reads. per_call: whether an input is one number for all
+            rays.
+        column: of a lookup, the place in each group of columns. columns: how many a group has. indices: how many it
+            takes.
     """
 
     kind: str
@@ -79,7 +81,7 @@ class Step:
     indices: int = 1
 
     def at_indices(self, arguments: Sequence[T]) -> list[tuple[T, Sequence[T]]]:
-        """Each index of a lookup with its weights, from its arguments, or from values in place of these."""
+        """Return each index of a lookup with its weights, from its arguments, or from values that stand for them."""
         count = (len(arguments) - self.indices) // self.indices
         starts = range(self.indices, len(arguments), count)
         return [(index, arguments[k : k + count]) for index, k in zip(arguments, starts, strict=False)]
@@ -120,7 +122,7 @@ Number = Expr | float | ArrayLike
 
 
 def rules_of(library: Any) -> dict[str, Callable[..., Any]]:
-    """What the steps of programs do to arrays of a library, numpy or torch; each adds its own choices."""
+    """Return what each kind of step does to arrays of a library, numpy or torch; callers add their choices."""
     return {
         "neg": lambda a: -a,
         "add": lambda a, b: a + b,
@@ -129,7 +131,7 @@ def rules_of(library: Any) -> dict[str, Callable[..., Any]]:
         "div": lambda a, b: a / b,
         "sqrt": library.sqrt,
         "floor": library.floor,
-        "max": lambda a, b: library.where(a > b, a, b),  # as sources have it: of NaN, the second
+        "max": lambda a, b: library.where(a > b, a, b),  # NaN gives the second, as in written sources
         "min": lambda a, b: library.where(a < b, a, b),
         "fma": lambda a, b, c: a * b + c,
     }
@@ -144,7 +146,7 @@ _FOLDED = rules_of(np) | {
 
 @dataclass(frozen=True)
 class Mixture:
-    """How the numbers of a state are mixed from those of its nodes, each of which has a coefficient table.
+    """How the numbers of a state are mixed from those of the nodes, each of which has a coefficient table.
 
     Attributes:
         program: from the state's own numbers to outputs `feature_0` ..., and `inside`, 1 where the state is in range.
@@ -167,10 +169,10 @@ class Program:
 
     Attributes:
         tables: how many coefficient tables there are, the length of every literal.
-        mixture: mixes the tables by a state; None: `band` chooses one. Of numbers that differ between tables that are
-            mixed, only sums may have been folded.
+        mixture: mixes the tables by a state; without it `band` chooses one. Numbers that differ between tables that are
+            mixed may be folded into sums alone.
         own_tables: numbers [cells, columns] that lookups read and that no caller gives, by name.
-        tanhs: the steps that are the tanh of another one, whose slope is known (`adjoint`), with that one.
+        tanhs: steps that are the tanh of another step, and that step: their slope is known (`adjoint`).
     """
 
     tables: int = 1
@@ -185,12 +187,12 @@ class Program:
         return self._append(Step("input", (), name, per_call))
 
     def lookup(self, table: str, columns: int, column: int, indices: Sequence[Expr], weights: Sequence[Expr]) -> Expr:
-        """A column of each group of `columns` in the cells at some indices: the weighted sum over all of them."""
+        """Append a lookup: the weighted sum, over indices and groups, of one column of each group of `columns`."""
         arguments = tuple(e.argument for e in (*indices, *weights))
         return self._append(Step("lookup", arguments, table, column=column, columns=columns, indices=len(indices)))
 
     def literal(self, value: ArrayLike) -> Expr:
-        """A number, or one for each table.
+        """Return a number, or one for each table.
 
         Raises:
             InputError: a number that float32 cannot hold.
@@ -205,7 +207,7 @@ class Program:
         return value if isinstance(value, Expr) else self.literal(value)
 
     def op(self, kind: str, *values: Number) -> Expr:
-        """Append an operation, unless a simpler one does: equal steps are shared, and literals folded in float64."""
+        """Append an operation, unless a simpler one does. Equal steps are shared, and literals folded in float64."""
         arguments = [self.expr(v) for v in values]
         if kind == "clamp" and (arguments[1].literal is None or min(arguments[1].literal) <= 0):
             raise ValueError("clamp: expected a limit that is a number above 0")
@@ -217,7 +219,7 @@ class Program:
         return self.op("fma", a, b, c)
 
     def sum(self, a: Expr, b: Expr) -> Expr:
-        """a + b; a product among them and the sum are one operation."""
+        """Add two values, in one operation where one of them is a product."""
         for term, other in ((a, b), (b, a)):
             step = self.steps[term.argument] if isinstance(term.argument, int) else None
             if step is not None and step.kind == "mul":
@@ -281,7 +283,7 @@ class Program:
         return None
 
     def live(self) -> list[int]:
-        """The numbers of the steps that any output needs, in order."""
+        """Return the numbers of the steps that any output needs, in order."""
         wanted = {e.argument for e in self.outputs.values() if isinstance(e.argument, int)}
         for k in range(len(self.steps) - 1, -1, -1):
             if k in wanted:
@@ -289,9 +291,9 @@ class Program:
         return sorted(wanted)
 
     def in_order_of_need(self) -> Program:
-        """The same program with every product right before the first sum that uses it, so that few registers wait.
+        """Return the same program with every product right before the first sum that uses it, so that few values wait.
 
-        Sums (fma) keep their order, for a row of a matrix product after the other would need all products at once.
+        Sums (fma) keep their order: if one row of a matrix product followed the other, all products would wait at once.
         """
         order: dict[int, None] = {}
         live = self.live()
@@ -306,8 +308,10 @@ class Program:
         return self._rewritten(order=order)
 
     def with_shorter_sums(self, parts: int = 3, least: int = 8) -> Program:
-        """The same program but for rounding, with sums of at least so many products in parts: a sum that is added up
-        in turn keeps a core waiting after every product."""
+        """Return the program with long sums in parts: a sum that is added up in turn keeps a core waiting.
+
+        Only rounding differs. A sum is long if it has `least` products or more.
+        """
         totals: dict[int, list[Expr]] = {}
         sums = self._sums(least)
 
@@ -327,7 +331,7 @@ class Program:
         return self._rewritten(shorter)
 
     def with_shared_inverses(self) -> Program:
-        """The same program but for rounding, with one division where several numbers are divided by the same."""
+        """Return the program with one division where several numbers are divided by the same; only rounding differs."""
         live = [self.steps[k] for k in self.live()]
         uses = Counter(step.arguments[1] for step in live if step.kind == "div")
 
@@ -339,7 +343,7 @@ class Program:
         return self._rewritten(shared)
 
     def with_single_cells(self) -> Program:
-        """The same program but for rounding, with each lookup as a sum of lookups of one number each."""
+        """Return the program with each lookup as a sum of lookups of one number each; only rounding differs."""
 
         def single(k: int, step: Step, given: Sequence[Expr]) -> Expr | None:
             if step.kind != "lookup":
@@ -367,8 +371,10 @@ class Program:
         return 2 * max(ready.values(), default=0) > len(live) + 144
 
     def in_parts(self, size: int) -> list[list[int]]:
-        """The steps that differ between rays, in runs of about `size`; choices as soon as they can be made, because all
-        that a late one needs would wait for it."""
+        """Return the steps that differ between rays, in runs of about `size`.
+
+        Choices come as soon as they can be made, because everything that a late choice needs would wait for it.
+        """
         same, place = self.same_for_all(), dict[int, int]()
         for k in self.live():
             needed = [place[a] for a in self.steps[k].arguments if isinstance(a, int)]
@@ -380,10 +386,11 @@ class Program:
     def _rewritten(
         self, rule: Callable[[int, Step, Sequence[Expr]], Expr | None] | None = None, order: Iterable[int] = ()
     ) -> Program:
-        """The same program in another order of its live steps, or with other steps in place of some.
+        """Return the same program with its live steps in another order, or with other steps in place of some.
 
         Args:
-            rule: from a step's number, the step and its new arguments to what replaces it; None keeps the step.
+            rule: takes a step's number, the step and its new arguments, and returns what replaces it; None keeps the
+                step.
         """
         found, place = Program(self.tables, mixture=self.mixture, own_tables=self.own_tables), dict[int, Expr]()
 
@@ -400,8 +407,10 @@ class Program:
         return found
 
     def _sums(self, least: int) -> dict[int, tuple[int, int]]:
-        """The steps of sums of at least so many products, each of which only the next one uses: for each, the last
-        step of its sum, and how many steps come before it."""
+        """Find sums of at least `least` products, each of which only the next step uses.
+
+        Returns, for each of their steps, the last step of its sum, and how many steps of the sum come before it.
+        """
         live = self.live()
         uses = Counter(a for k in live for a in self.steps[k].arguments)
         uses.update(e.argument for e in self.outputs.values())
@@ -414,13 +423,13 @@ class Program:
         return {k: (steps[-1], number) for steps in long for number, k in enumerate(steps)}
 
     def around_lookups(self) -> tuple[Program, list[Step], Program]:
-        """The steps that lookups need, the lookups, and the steps after them, which take the results as inputs.
+        """Split a program at its lookups: the steps that they need, the lookups, and the steps after them.
 
-        The first program has outputs `index_0` ..., `weight_0` ..., and `step_K` that the last takes; for a lookup the
-        last takes `column_C`.
+        The first program has outputs `index_0` ..., `weight_0` ..., and each `step_K` that the last program takes. The
+        last takes the result of a lookup as `column_C`.
 
         Raises:
-            ValueError: no lookups, or others than columns of one table at the same indices.
+            ValueError: there are no lookups, or they read more than columns of one table at the same indices.
         """
         live = self.live()
         lookups = [self.steps[k] for k in live if self.steps[k].kind == "lookup"]
@@ -442,7 +451,7 @@ class Program:
         return before, lookups, last
 
     def same_for_all(self) -> set[int]:
-        """The live steps that are the same for all rays of a call."""
+        """Return the live steps that are the same for all rays of a call."""
         same = set[int]()
         for k in self.live():
             step = self.steps[k]
@@ -452,9 +461,9 @@ class Program:
         return same
 
     def of_the_call(self) -> tuple[Program, Program]:
-        """The steps that are the same for all rays of a call, with outputs `once_K`, and the rest, which takes these.
+        """Split off the steps that are the same for all rays of a call: their outputs `once_K` are inputs of the rest.
 
-        Compilers do not vectorise loops that choose by a value that stays the same: such choices become `pick`.
+        Compilers do not vectorise loops whose choices follow a value that stays the same: such choices become `pick`.
         """
         same = self.same_for_all()
 
@@ -485,7 +494,7 @@ class Program:
         return {kind: kinds.count(kind) for kind in sorted(set(kinds) - {"input"})}
 
     def evaluate(self, inputs: Mapping[str, ArrayLike], table: int = 0) -> dict[str, NDArray[np.float32]]:
-        """The results in float32, step by step as written sources compute them (fma rounds once).
+        """Compute the results in float32, step by step as written sources do (fma rounds once).
 
         Args:
             inputs: rows [N] by their names, tables [cells, columns] and, for a mixture, the numbers of the state.
@@ -496,7 +505,8 @@ class Program:
         def value(argument: Argument) -> NDArray[np.float32]:
             if not isinstance(argument, tuple):
                 return found[argument]
-            if weights is None or all(v == argument[0] for v in argument):  # which no rounding moves
+            # equal in all tables, so that mixing must not round it
+            if weights is None or all(v == argument[0] for v in argument):
                 return np.asarray(np.float32(argument[table]))
             return np.asarray(np.float32(weights @ argument))
 

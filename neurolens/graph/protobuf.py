@@ -1,4 +1,4 @@
-"""Protocol Buffers: messages taken apart and put together, and the few messages of ONNX that models need.
+"""Protocol Buffers: messages read and written, with the few messages of ONNX that models need.
 
 The package onnx takes half a second to load, and a model file needs little of it. Field numbers are those of
 onnx.proto3 of the ONNX project; the format is that of the encoding guide of Protocol Buffers, without groups.
@@ -59,7 +59,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def message(fields: Iterable[tuple[int, int, Any]]) -> bytes:
-    """The bytes of a message of these fields: number, wire type and value, as `walk` yields them."""
+    """Return the bytes of a message of these fields: number, wire type and value, as `walk` yields them."""
     return b"".join(_encoded(*field) for field in fields)
 
 
@@ -80,7 +80,7 @@ def _as_varint(value: int) -> bytes:
 
 
 def _message(*fields: tuple[int, int | str | bytes]) -> bytes:
-    """A message of fields whose wire type follows from their values: whole numbers, texts, messages."""
+    """Return a message of fields whose wire type follows from their values: whole numbers, texts, messages."""
     typed = (
         (n, _VARINT, v) if isinstance(v, int) else (n, _BYTES, v if isinstance(v, bytes) else v.encode())
         for n, v in fields
@@ -91,7 +91,7 @@ def _message(*fields: tuple[int, int | str | bytes]) -> bytes:
 def node_proto(
     kind: str, inputs: Sequence[str], outputs: Sequence[str], name: str, domain: str = "", **attributes: int
 ) -> bytes:
-    """A node of a graph: an operator, of the first set or the `domain`'s, with its whole-number attributes."""
+    """Return a node of a graph: an operator of ONNX, or of `domain`, with its whole-number attributes."""
     packed: list[tuple[int, int | str | bytes]] = [
         (5, _message((1, key), (3, value), (20, _INT_ATTRIBUTE))) for key, value in attributes.items()
     ]
@@ -99,14 +99,14 @@ def node_proto(
 
 
 def tensor_proto(array: NDArray[Any], name: str) -> bytes:
-    """A constant: float32, int32 or int64."""
+    """Return a constant: float32, int32 or int64."""
     kind = _DATA_TYPES["f" if array.dtype.kind == "f" else str(array.dtype.itemsize)]
     raw = array.astype(array.dtype.newbyteorder("<")).tobytes()
     return _message(*((1, int(size)) for size in array.shape), (2, kind), (8, name), (9, raw))
 
 
 def value_proto(name: str, kind: int, shape: Sequence[int | str]) -> bytes:
-    """An input or an output of a graph; a dimension without a fixed size is a name."""
+    """Return an input or an output of a graph; a dimension without a fixed size is a name."""
     dimensions = _message(*((1, _message((1 if isinstance(size, int) else 2, size))) for size in shape))
     return _message((1, name), (2, _message((1, _message((1, kind), (2, dimensions))))))
 

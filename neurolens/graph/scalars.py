@@ -21,19 +21,20 @@ from neurolens.graph.program import Expr, Program, row_names
 Array = NDArray[np.float64]
 # A truth as pairs (a, b): it holds where a <= b in all of them.
 Tests = list[tuple[Expr, Expr]]
-# Weights of matrices: each is a step, and compilers take minutes; onnxruntime multiplies larger matrices by blocks.
+# The most weights of matrices: each becomes a step, for which compilers take minutes; onnxruntime takes larger ones.
 MOST_WEIGHTS = 20_000
-_CHAIN = 16  # tests, of which the first failure is found from the last one on, with fewer operations
-_ROWS = 8  # of a matrix product at a time, of 16 registers; fewer would wait for one another
+# tests up to which one choice waits for the next, which takes fewer operations than parts
+_CHAIN = 16
+_ROWS = 8  # of a matrix product at a time, on 16 registers; fewer would wait for one another
 
 
 def lower(graphs: Graph | Sequence[Graph], fixed: Mapping[str, ArrayLike] | None = None) -> Program:
-    """The program of a graph, or of several graphs of one structure, each of which has a coefficient table.
+    """Write a graph, or several of one structure with a coefficient table each, as a program.
 
     Inputs and outputs are named row by row, see `program.row_names`. Inputs that nothing needs are left out.
 
     Args:
-        fixed: inputs of the call that are numbers, which are folded in.
+        fixed: numbers for inputs of the call, which are folded in.
 
     Raises:
         InputError: graphs that differ in more than numbers, or with more than `MOST_WEIGHTS`; numbers that float32
@@ -52,7 +53,7 @@ class _Lowering:
     def __init__(self, graphs: Sequence[Graph], fixed: Mapping[str, ArrayLike]) -> None:
         self.graphs, self.fixed = graphs, fixed
         self.program = Program(tables=len(graphs))
-        self.rows: list[list[Any]] = []  # Expr, or Tests for truths, of every row of every node
+        self.rows: list[list[Any]] = []  # of every node: Expr, or Tests for truths
         for number, node in enumerate(graphs[0].nodes):
             given = [self.rows[k] for k in node.inputs]
             rule = _RULES.get(node.kind)
@@ -66,7 +67,7 @@ class _Lowering:
             self.program.outputs.update(zip(row_names(name, len(rows)), rows, strict=True))
 
     def _number(self, value: Expr | Tests) -> Expr:
-        """A truth as 1 or 0."""
+        """Return a truth as 1 or 0."""
         if isinstance(value, Expr):
             return value
         return self._choice(value, self.program.literal(1.0), self.program.literal(0.0))
@@ -98,7 +99,7 @@ class _Lowering:
 
 
 def _row(rows: Sequence[Any], r: int) -> Any:
-    """A single row stands for any."""
+    """Return row r; a single row stands for any."""
     return rows[r if len(rows) > 1 else 0]
 
 
@@ -110,7 +111,7 @@ def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arra
 
 
 def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    """A matrix product in groups of rows whose sums fit the registers; a column serves all rows of a group at once."""
+    """Multiply by a matrix, in groups of rows whose sums fit the registers; a column serves all rows of a group."""
     p, x = at.program, given[0]
     moving, added = node.static
     found = [p.literal(bias) for bias in arrays[1]]
@@ -132,7 +133,7 @@ def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arr
 
 
 def _moved(p: Program, s: Expr, base: Array, change: Array) -> Expr:
-    """base + s change, counted from s = 1 where it can cancel: at infinity focus of the film 1 - s is exact."""
+    """Return base + s change, written with 1 - s, which is exact at infinity focus, where the two would cancel."""
     if not base.any():
         return s * p.literal(change)
     return p.fma(p.literal(1.0) - s, p.literal(-change), p.literal(base + change)) if change.any() else p.literal(base)
@@ -149,7 +150,7 @@ def _quadratic(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[
 
 
 def _polynomial(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    """Each monomial is made once, by one multiplication, and used at once in every row: few stay in registers."""
+    """Make each monomial once, by one multiplication, and use it at once in every row: few stay in registers."""
     p, variables = at.program, given[0]
     table = _collected(variables, node.arrays[0], arrays[1])
     rows = [p.literal(c) for c in table.pop((0,) * len(variables), np.zeros((node.rows, p.tables)))]
@@ -165,7 +166,7 @@ def _polynomial(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list
 
 
 def _collected(variables: Sequence[Expr], exponents: Exponents, weight: Array) -> dict[tuple[int, ...], Array]:
-    """The coefficients [R, T] of the monomials that have any; variables that are numbers are multiplied in."""
+    """Return the coefficients [R, T] of the monomials that occur; variables that are numbers are multiplied in."""
     numbers = {v: np.array(e.literal) for v, e in enumerate(variables) if e.literal is not None}
     table: dict[tuple[int, ...], Array] = {}
     for e, column in zip(exponents.tolist(), np.moveaxis(weight, 1, 0), strict=True):
@@ -207,8 +208,11 @@ def _first_failure(at: _Lowering, node: Node, given: list[list[Expr]], arrays: l
 
 
 def _first_of(p: Program, tests: list[tuple[Expr, Expr, float]]) -> Expr:
-    """The code of the first test that fails. Of many tests none should wait for the last: where all codes before a
-    place are above those behind it, the larger one is the first."""
+    """Return the code of the first test that fails.
+
+    With many tests none should wait for the last. They are cut where all codes before are above those behind, so that
+    the larger of two results is the first failure's.
+    """
     status = p.literal(0.0)
     if not tests:
         return status
@@ -248,7 +252,7 @@ Made = tuple[Exponent, Pair | None]  # a monomial and the two that it is the pro
 
 
 def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
-    """An order in which every monomial is a variable (None) or the product of two before it.
+    """Return an order in which every monomial is a variable (None) or the product of two before it.
 
     Factors that exist anyway are taken first, else those that add least. The order is depth first: the factors of a
     monomial were made just before it.
@@ -272,14 +276,14 @@ def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
 
 
 def _splits(e: Exponent) -> Iterator[Pair]:
-    """All pairs of monomials whose product is e, the right one of no higher degree."""
+    """Yield all pairs of monomials whose product is e, the right one of no higher degree."""
     for right in product(*(range(k + 1) for k in e)):
         if 0 < sum(right) <= sum(e) // 2:
             yield tuple(a - b for a, b in zip(e, right, strict=True)), right
 
 
 def _depth_first(nodes: list[Exponent], factors: dict[Exponent, Pair], wanted: set[Exponent]) -> list[Made]:
-    """Nodes in an order with factors first; each node is followed by those that waited for it alone."""
+    """Order nodes with factors first; each node is followed by those that waited for it alone."""
     waiting: dict[Exponent, set[Exponent]] = {e: set(pair) for e, pair in factors.items()}
     order: list[Made] = []
     stack = [e for e in reversed(nodes) if e not in factors]
@@ -300,7 +304,7 @@ def level_of(e: Exponent) -> int:
 
 
 def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[Exponent, Pair]]:
-    """Every monomial as a product of two of lower levels: {level: {monomial: (left, right)}}; greedy.
+    """Plan every monomial as a product of two of lower levels, greedily: {level: {monomial: (left, right)}}.
 
     Factors that are wanted anyway come first, then small right factors; factors that are missing are added.
     """
@@ -326,7 +330,7 @@ def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[E
 
 
 def by_block(blocks: Sequence[Block], pairs: dict[Exponent, Pair]) -> list[dict[Exponent, Pair]]:
-    """Products grouped by the blocks in which their two factors lie."""
+    """Group products by the blocks in which their two factors lie."""
     home = {e: i for i, (_, known) in enumerate(blocks) for e in known}
     groups: dict[tuple[int, int], dict[Exponent, Pair]] = {}
     for e, (a, b) in sorted(pairs.items()):
@@ -335,7 +339,7 @@ def by_block(blocks: Sequence[Block], pairs: dict[Exponent, Pair]) -> list[dict[
 
 
 def blocks_alone(blocks: Sequence[Block]) -> int:
-    """How many blocks matrix products take one by one; the others are joined, where copying costs less."""
+    """Return how many blocks matrix products take one by one; the others are joined, where copying costs less."""
     copy_row, one_product = 0.27, 2.5  # ns a ray, measured in onnxruntime (12 outputs)
     best, alone = math.inf, 0
     for first in range(len(blocks)):

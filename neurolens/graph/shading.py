@@ -1,10 +1,10 @@
-"""Programs in shading languages: one writer, and of each language the texts in which it differs from GLSL.
+"""Programs in shading languages: one writer, and for each language the texts in which it differs from GLSL.
 
 The contract is that of the C header. The results of a ray are a structure NAME_ray where that is a language's habit,
 else arguments. Tables of the caller are textures of one float a texel, a cell a line, or buffers.
 
-Open Shading Language differs more (`write_osl`): a shader calls no functions of others, has no structs and no literals
-with a suffix. What it reads from the renderer is text of the caller.
+Open Shading Language differs more (`write_osl`): a shader calls no functions of other files, has no structs, and its
+literals have no suffix. What it reads from the renderer is text of the caller.
 """
 
 from __future__ import annotations
@@ -33,15 +33,17 @@ class Glsl(Writer):
     """GLSL; the other languages replace some of its texts.
 
     Attributes:
-        about: for the comment at the top. head: what follows it, or a text of `parts.shading`. cell: another, which
-            lookups in tables of the caller need.
-        given, out: a declared argument and a declared result. table_of: a table of the caller as an argument.
-        ray: whether the results are a structure. field: of one. variable: a structure that is to be filled.
-        whole, truth, let_whole: the words for such numbers, and before the name of one. to_whole: a float as one.
-            band: one of so many.
-        number: a constant. array: of numbers, after the word `constant` or `local`. row: an array in a structure.
-        within: whether arrays stand within functions alone. loops: whether a state is made from an array of numbers,
-            which compilers of some languages copy for each ray, else by statements.
+        about: a line for the comment at the top. head: what follows it, or the key of a text in `parts.shading`. cell:
+            a further head, where the caller's tables are looked up.
+        given, out: the declaration of an argument and of a result. table_of: that of a caller's table.
+        ray: whether the results are a structure. field: the declaration of one in it. variable: that of a structure to
+            fill.
+        whole, truth: the words for integers and truths. let_whole: the word before a new integer's name. to_whole: a
+            float made an integer. band: the argument `band`, kept below a number.
+        number: a constant. array: an array of numbers, after the word `constant` or `local`. row: an array in a
+            structure.
+        within: whether arrays may stand only within functions. loops: whether a state is made in loops over an array,
+            which compilers of some languages copy for each ray; else by statements.
     """
 
     about = "For GLSL 3.30, GLSL ES 3.00 (with highp floats) and later."
@@ -50,7 +52,7 @@ class Glsl(Writer):
     texts: ClassVar = Writer.texts | {
         "sqrt": "sqrt({0})", "floor": "floor({0})", "clamp": "max(min({0}, {1}), -{1})"
     }  # fmt: skip
-    # NaN is less than nothing in no language.
+    # Clamped as an integer, so that an index of NaN, too, reads a cell of the table.
     lookup = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize({table}, 0).y - 1)), 0).r"
     own_lookup = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
     header, given, out, table_of = "{2} {0}({1})", "in {}", "out {}", "in highp sampler2D {}"
@@ -65,12 +67,12 @@ class Glsl(Writer):
         return {"name": self.name, "macro": self.name.upper()}
 
     def file(self, comment: Sequence[str], extras: Extras) -> str:
-        """The text of a file; arguments as in `c.write_c`."""
+        """Write a file; arguments as in `c.write_c`."""
         about = textwrap.wrap(f"{self.about} {_CAUTION}", 110)
         return f"/*\n{comment_of([*comment, '', *about])}\n */\n{self.code(extras)}"
 
     def code(self, extras: Extras) -> str:
-        """The text without the comment."""
+        """Write the file without its comment."""
         program, kind, s = self.program, type(self), Signature.of(self.program, self.name)
         self.place = "state.c[{}]" if s.state else f"{self.name}_table[band_first + {{}}]"
         steps = self.steps()
@@ -92,14 +94,14 @@ class Glsl(Writer):
         return text + self._ray(s, [f"    {table}" for table in tables if self.within] + steps)
 
     def listed(self, name: str, texts: Iterable[str], before: str | None = None) -> str:
-        """An array; a constant, unless another word comes `before` it."""
+        """Write an array: a constant, unless another word comes `before` it."""
         values = [text.strip(" \n()") for text in texts]
         rows = ",\n    ".join(", ".join(values[i : i + 8]) for i in range(0, len(values), 8))
         word = self.constant.format(**self.known) if before is None else before
         return word + self.array.format(name, len(values), rows)
 
     def state(self, mixture: Mixture, table: Sequence[Sequence[float]]) -> str:
-        """The structure of a state and the function that makes it; arguments as in `c.Writer.state_parts`."""
+        """Write the structure of a state and the function that makes it; arguments as in `c.Writer.state_parts`."""
         parts = self.state_parts(mixture, table)
         kind, numbers, features = f"{self.name}_state", parts["rows"].split(","), parts["features"]
         fields = [self.field.format(self.declared.format("inside", self.truth)), self.row.format("c", parts["count"])]
@@ -121,7 +123,7 @@ class Glsl(Writer):
         )  # fmt: skip
 
     def _ray(self, s: Signature, body: list[str]) -> str:
-        """The function of a ray, and the structure of its results."""
+        """Write the function of a ray, and the structure of its results."""
         place, values = "ray." * self.ray, {o: self.output(o) for o in s.outputs}
         kinds = dict.fromkeys(s.outputs, self.kind)
         if s.status:
@@ -167,7 +169,7 @@ class Hlsl(Glsl):
 
 
 class Slang(Hlsl):
-    """Slang is HLSL to this extent; tables are buffers, which it has on every target."""
+    """Slang, which is HLSL as far as this goes; its tables are buffers, which it has on every target."""
 
     about, cell = "For Slang.", "slang_cell"
     table_of = "StructuredBuffer<float> {}"
@@ -208,10 +210,11 @@ class Cuda(Glsl):
     number, array, constant = "#define {} {}", "float {0}[{1}] = {{\n    {2}\n}};", "{macro}_TABLE "
 
     def kernel(self) -> str:
-        """The text of `code` and a kernel of arrays, NAME_rays(in, call, tables ..., out, n).
+        """Write `code` and a kernel of arrays, NAME_rays(in, call, tables ..., out, n).
 
-        `in` has the inputs of a ray as rows of n numbers, `call` those of the whole call, a table is its numbers and
-        its cells; `out` gets the results as rows, the status, a number there, last. On the host it is a loop.
+        `in` has the inputs of a ray, as rows of n numbers. `call` has those of the whole call. A table is two
+        arguments, its numbers and its cells. `out` gets the results as rows; the last is the status, as a number. On
+        the host it is a loop.
         """
         s = Signature.of(self.program, self.name)
         rows = [f"in[{k} * rows + i]" for k in range(len(s.per_ray))]
@@ -236,7 +239,7 @@ class Vex(Glsl):
     number, array, constant, within = "#define {} {}", "float {0}[] = {{\n    {2}\n}};", "", True
 
     def code(self, extras: Extras) -> str:
-        """Literals have no suffix here."""
+        """Write the file without its comment; literals of VEX have no suffix."""
         if self.program.mixture is not None:
             expected = "one state (--zoom), or another language"
             raise InputError("export", "to", "vex (of a range of zoom or focus)", expected)
@@ -249,10 +252,10 @@ LANGUAGES = {"glsl": Glsl, "slang": Slang, "hlsl": Hlsl, "wgsl": Wgsl, "cuda": C
 def write_shading(
     language: type[Glsl], program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING
 ) -> str:
-    """The text of a file in a language; arguments as in `c.write_c`.
+    """Write a program as a file of a language; arguments as in `c.write_c`.
 
     Raises:
-        InputError: a program of many states in VEX.
+        InputError: the program has many states, and the language is VEX.
     """
     return language(program, name).file(comment, extras)
 
@@ -264,7 +267,8 @@ write_glsl = partial(write_shading, Glsl)
 
 TEMPORARY = re.compile(r"\bt(\d+)\b")
 _SUFFIX = re.compile(r"(\d\.?(?:e[+-]\d+)?)f\b")
-_STATEMENTS, _TOGETHER = 9000, 64  # the compiler of OSL takes 10,000; numbers that a statement declares beyond that
+# OSL's compiler takes 10,000 statements; beyond ours, one statement declares so many numbers
+_STATEMENTS, _TOGETHER = 9000, 64
 _KINDS = {"position": "point", "throughput": "color"}
 
 
@@ -273,7 +277,8 @@ class Parameter:
     """A number that the user of a shader sets.
 
     Attributes:
-        name, label, help: what code and users call it, and what it does. default: an int makes it one.
+        name, label, help: what code and users call it, and what it does. default: where it is an int, so is the
+            parameter.
         low, high: of the slider. widget: "boolean", or "mapper" with `options` (NAME:NUMBER|...).
     """
 
@@ -287,7 +292,7 @@ class Parameter:
     options: str = ""
 
     def text(self) -> str:
-        """Its declaration."""
+        """Write its declaration."""
         kind = "int" if isinstance(self.default, int) else "float"
         metadata = [f'string label = "{self.label}"', f'string help = "{self.help}"']
         if self.widget:
@@ -299,7 +304,7 @@ class Parameter:
 
 
 class Osl(Writer):
-    """Choices are functions: otherwise they are branches, which cost a tenth of a whole camera."""
+    """Writes choices as functions: as branches, they would cost a tenth of a whole camera."""
 
     texts: ClassVar = Writer.texts | {
         "sqrt": "sqrt({0})", "floor": "floor({0})", "max": "max({0}, {1})", "min": "min({0}, {1})",
@@ -317,12 +322,12 @@ def write_osl(
     frame: str,
     outputs: Sequence[str],
 ) -> str:
-    """The text of a shader.
+    """Write a program as a shader.
 
     Args:
-        comment: lines of its head. parameters: of the user.
+        comment: lines of its head. parameters: those that the user sets.
         frame: statements that set a float for each input of the program.
-        outputs: of three rows each, NAME_0 to NAME_2 of the program.
+        outputs: names of three rows each; the program has them as NAME_0 to NAME_2.
 
     A state's numbers are mixed in the shader, which costs nothing where the renderer knows the state when it compiles.
     """
@@ -346,8 +351,10 @@ def write_osl(
 
 
 def urgent(lines: Sequence[str]) -> list[str]:
-    """Lines `float tN = ...;`, those first from which the longest chain of others leads on, so that few wait for one
-    another: compilers of shaders, which make no vectors of them, keep much of the order that they are given."""
+    """Sort lines `float tN = ...;`: first those from which the longest chain of others leads on.
+
+    So few lines wait for one another. Compilers of shaders make no vectors of them and keep much of the given order.
+    """
     numbers = [[int(n) for n in TEMPORARY.findall(line)] for line in lines]
     ahead: defaultdict[int, int] = defaultdict(int)
     for own, *arguments in reversed(numbers):
@@ -357,7 +364,7 @@ def urgent(lines: Sequence[str]) -> list[str]:
 
 
 def _mixed(mixture: Mixture, writer: Osl) -> str:
-    """The state's features `s0` ..., and the coefficients `c0` ... that differ between tables, mixed by these."""
+    """Write the features `s0` ... of the state, and the coefficients `c0` ... that differ between tables."""
     state = Osl(mixture.program, "")
     names = [state.output(name) for name in mixture.program.outputs if name != "inside"]
     text = "\n".join(f"    {line.strip()}" for line in state.steps())
@@ -369,14 +376,14 @@ def _mixed(mixture: Mixture, writer: Osl) -> str:
 
 
 def _together(lines: Sequence[str]) -> list[str]:
-    """The same declarations of floats in fewer statements."""
+    """Write the same declarations of floats in fewer statements."""
     names = [line.strip().removeprefix("float ").removesuffix(";") for line in lines]
     parts = (names[k : k + _TOGETHER] for k in range(0, len(names), _TOGETHER))
     return ["    float " + ",\n      ".join(part) + ";" for part in parts]
 
 
 def plain(text: str) -> str:
-    """C's literals without the suffix."""
+    """Return C's literals without their suffix."""
     return _SUFFIX.sub(r"\1", text)
 
 

@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 # Passing rays cross the front surface within its rim; a little more, for the model's own error.
 _FRONT_REACH = 1.02
 _SAG_MM = 1e-6
-_SERIES = 3e-8  # of a direction: float32's last bit
-_TILT = 1e-7  # of the front's normal
+_SERIES = 3e-8  # error of a direction's series: float32's last bit
+_TILT = 1e-7  # error of the series of the front's tilt
 _GRAZING = 1e-12  # least squared cosine of a ray that leaves the front surface
 
 
@@ -41,10 +41,11 @@ class Form:
     """How a graph is to be written, by what reads it.
 
     Attributes:
-        gate_scale: factor on all tests of rims: in ONNX any failure then exceeds every status code.
-        sag_terms: most terms of the front surface as a series, where a square root costs more; 0: never a series.
-        exact: for float64: series hold 1e-14.
-        monic: whether a factor on v saves a pass over the rays; where products and sums are one, nothing.
+        gate_scale: factor on all tests of rims, so large in ONNX that any failure exceeds every status code.
+        sag_terms: most terms of a series for the front surface, used where a square root costs more; 0: no series.
+        exact: whether series hold 1e-14, for float64.
+        monic: whether to scale v so that series are monic. That saves a pass over the rays, except where a product and
+            a sum are one operation.
         wavelength: whether rays always come with a wavelength, which then is tested.
     """
 
@@ -62,12 +63,12 @@ EXACT = Form(sag_terms=0, exact=True, wavelength=True)
 
 @dataclass(frozen=True)
 class Parts:
-    """The outputs of a graph besides the scene ray and the test of the domain.
+    """Which outputs a graph has besides the scene ray and the test of the domain.
 
     Attributes:
-        transmittance: the transmittance.
-        stop: the crossing with the stop as an output.
-        vignetting: status of the stop and of the rims.
+        transmittance: whether it is an output.
+        stop: whether the crossing with the stop is an output.
+        vignetting: whether the status tells of the stop and of the rims.
     """
 
     transmittance: bool = True
@@ -79,7 +80,7 @@ ALL, RAY_ONLY = Parts(), Parts(False, False, False)
 
 
 def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
-    """The graph of a model."""
+    """Write the graph of a model."""
     g = Graph()
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
     radius = g.input("stop_radius_mm", per_call=True) if parts.vignetting else None
@@ -105,10 +106,10 @@ def add_outputs(
     form: Form,
     parts: Parts = ALL,
 ) -> Value:
-    """Set a model's outputs but the status, which is returned, of what its core gives (in `units_of`).
+    """Make a model's outputs from what its core gives (in `units_of`); the status is returned, the others are set.
 
     Args:
-        inside: whether a ray is within the domain. radius: of the stop; without one neither stop nor rims are tested.
+        inside: whether a ray is within the domain. radius: of the stop; without it neither stop nor rims are tested.
     """
     g = inside.graph
     g.outputs["scene_ray"] = scene_ray(model, values, series, form)
@@ -125,13 +126,14 @@ def add_outputs(
 
 
 def light_field(g: Graph, e: Encoding, rays: Value, film_z: Value) -> Field:
-    """The light field of rays: their planes centred and scaled; the film position moves the matrix that does it.
+    """Return the light field of rays: crossings with two planes, centred and scaled by one matrix.
 
-    With a = (film plane - pupil plane) / (film z - pupil plane), p = u + (film - u) a crosses the film's plane.
+    The film position moves that matrix. With a = (film plane - pupil plane) / (film z - pupil plane), the ray crosses
+    the film's plane at p = u + (film - u) a.
     """
 
     def rows(along: float) -> Array:
-        """[4, 4] from film x, y and pupil x, y."""
+        """Return rows [4, 4] of the matrix from film x, y and pupil x, y."""
         film, pupil = np.array([1.0, 0.0]), np.array([0.0, 1.0])
         p = along * film + (1 - along) * pupil
         matrix = np.zeros((4, 4))
@@ -149,14 +151,14 @@ def light_field(g: Graph, e: Encoding, rays: Value, film_z: Value) -> Field:
 
 
 def wavelength_row(e: Encoding, wavelength_nm: Value) -> Value:
-    """v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half."""
+    """Return v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half."""
     return (1000 / math.sqrt(e.w_half)) / wavelength_nm
 
 
 def within_domain(model: LensModel, rays: Value, film_z: Value, radius: Value | None, form: Form) -> Value:
-    """Whether film point, pupil point, wavelength, film position and stop lie in the domain; false for NaN.
+    """Return whether film point, pupil point, wavelength, film position and stop lie in the domain; NaN does not.
 
-    What is the same for all rays of a call decides once: no film point is within a square radius of -1.
+    Film position and stop are tested once a call: where they fail, film points must lie within a squared radius of -1.
     """
     g, d = rays.graph, model.domain
     near, far = d.film_z_mm
@@ -171,7 +173,7 @@ def within_domain(model: LensModel, rays: Value, film_z: Value, radius: Value | 
 
 
 def _tests(model: LensModel, values: CoreValues, radius: Value, form: Form) -> list[tuple[tuple[Value, Value], int]]:
-    """Tests of stop and rims, as camera rays meet them: the last surface first, at one surface as in `base.status`."""
+    """Return the tests of stop and rims as camera rays meet them: last surface first, at each as in `base.status`."""
     g = radius.graph
     crossing = _scaled(form, g.square(values.vectors[STOP]), radius * radius)
     tests = [(crossing, st.blocked(model.lens.stop_index, st.RIM))]
@@ -187,11 +189,13 @@ def _scaled(form: Form, value: Value, limit: Value) -> tuple[Value, Value]:
 
 @dataclass(frozen=True)
 class DirectionSeries:
-    """(v sinc|v|, -cos|v|) as polynomials in t = |kappa v|^2, up to an angle; or the root of a slope's.
+    """How a core's direction vector v becomes a unit direction.
+
+    It is (v sinc|v|, -cos|v|) by polynomials in t = |kappa v|^2, up to an angle; where v is a slope, a root is taken.
 
     Attributes:
         kappa: factor on v that makes the polynomial of sinc monic, which saves an operation a ray.
-        angle: rays that would pass with a longer v (rad) lie outside the domain: no ray of the lens has one.
+        angle: a ray with a longer v (rad) lies outside the domain, because no ray of the lens has one.
         sinc, minus_cos: coefficients, lowest first; kappa v times sinc(t) is the direction's x and y. None: v is a
             slope.
     """
@@ -203,7 +207,7 @@ class DirectionSeries:
 
     @staticmethod
     def of(model: LensModel, form: Form) -> DirectionSeries:
-        """The series of a model up to its largest angle; no series for slopes."""
+        """Choose the series of a model up to its largest angle; slopes need none."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
         angle = model.angle
@@ -211,14 +215,14 @@ class DirectionSeries:
 
     @staticmethod
     def exact(angle: float = math.pi) -> DirectionSeries:
-        """Taylor's; 12 terms hold 1e-14 to 130 degrees."""
+        """Return Taylor's series; its 12 terms hold 1e-14 up to 130 degrees."""
         k = np.arange(12)
         cos = (-1.0) ** k / np.array([math.factorial(2 * i) for i in k], np.float64)
         return DirectionSeries(1.0, angle, cos / (2 * k + 1), -cos)
 
     @staticmethod
     def fitted(angle: float, monic: bool = True) -> DirectionSeries:
-        """The shortest that hold float32's last bit up to an angle (rad); `monic`: the factor that saves a pass."""
+        """The shortest series that hold float32's last bit up to an angle (rad); with `monic` v is scaled for them."""
         sinc = fit_series(lambda t: np.sinc(np.sqrt(t) / np.pi), angle**2, _SERIES / max(angle, 0.1))
         minus_cos = fit_series(lambda t: -np.cos(np.sqrt(t)), angle**2, _SERIES)
         if not monic:
@@ -230,7 +234,7 @@ class DirectionSeries:
         return DirectionSeries(kappa, angle, scaled, minus_cos / kappa ** (2.0 * np.arange(len(minus_cos))))
 
     def decode(self, vector: Value) -> Value:
-        """Unit direction (3 rows) of kappa v (2 rows)."""
+        """Return the unit direction (3 rows) of kappa v (2 rows)."""
         g = vector.graph
         t = g.square(vector)
         if self.sinc is None or self.minus_cos is None:  # (dx, dy) = slope / sqrt(1 + slope^2), dz = -1 / sqrt(..)
@@ -240,7 +244,7 @@ class DirectionSeries:
 
 
 def scene_ray(model: LensModel, values: CoreValues, series: DirectionSeries, form: Form) -> Value:
-    """Position on the front surface (mm) and unit direction, 6 rows."""
+    """Return the position on the front surface (mm) and the unit direction, 6 rows."""
     g, position = values.transmittance.graph, values.vectors[POSITION]
     z = g.affine(np.zeros((1, 2)), position) if model.front is None else sag(position, model.front, form)
     direction = series.decode(values.vectors[DIRECTION]) if values.unit is None else values.unit
@@ -251,22 +255,22 @@ def scene_ray(model: LensModel, values: CoreValues, series: DirectionSeries, for
 
 
 def refracted(position: Value, inside: Value, index: Value, front: Surface) -> Value:
-    """Unit direction (3 rows) of a ray beyond the front surface, of that inside the glass; see `tilt_series`."""
+    """Return the unit direction (3 rows) in front of the lens from that inside the front glass; see `tilt_series`."""
     g, tilt = position.graph, tilt_series(front)
     assert tilt is not None
     across = position * (g.series(g.square(position), tilt) if len(tilt) > 1 else float(tilt[0]))
     normal = g.concat(across, -(1.0 - g.square(across)).maximum(0.0).sqrt())
     cosine = index * g.dot(inside, normal)
-    # Of no length but 1, by a little, where the model's ray is beyond the grazing one.
+    # Where the model's ray is beyond the grazing one, this makes the direction's length differ a little from 1.
     square = (cosine * cosine - index * index + 1.0).maximum(_GRAZING)
     way = inside * index + normal * (square.sqrt() - cosine)
     return way * (1.0 / g.square(way).sqrt())
 
 
 def tilt_series(front: Surface) -> Array | None:
-    """Power series in the squared height h^2 (mm^2) of the sine of a round surface's tilt over h.
+    """Return sin(tilt) / h of a round surface at the height h, as a power series in h^2 (mm^2).
 
-    None: not round, no glass behind it, or no short series fits.
+    It is None where the surface is not round, where no glass is behind it, and where no short series fits.
     """
     figure = front.figure
     if figure.axis or figure.power or float(front.n_d) == 1.0:
@@ -285,9 +289,9 @@ def tilt_series(front: Surface) -> Array | None:
 
 
 def sag(position: Value, surface: Surface, form: Form) -> Value:
-    """z of a surface at x and y: a short series in the squared height where one holds it, else with a square root.
+    """Return z of a surface at x and y: by a short series in the squared height where one holds it, else by a root.
 
-    Beyond the end of a conic finite, without meaning.
+    Beyond the end of a conic the value is finite, without meaning.
     """
     g = position.graph
     axes = {None: (0, 1), "x": (0,), "y": (1,)}[surface.figure.axis]
@@ -314,7 +318,7 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
 
 
 def _turned(position: Value, curve: Value, surface: Surface) -> Value:
-    """z of a toroid from that of its curve; see `optics.trace.shapes.sag_mm`."""
+    """Return z of a toroid from that of its curve; see `optics.trace.shapes.sag_mm`."""
     assert surface.figure.across is not None
     c, a2 = 1 / surface.figure.across[0], position.graph.square(position[int(surface.figure.axis == "x")])
     way = 1.0 - curve * c
@@ -325,7 +329,7 @@ def _with_polynomial(z: Value, h2: Value, surface: Surface) -> Value:
     powers, curve = {int(p): float(a) for p, a in surface.figure.powers}, curve_of(surface)
     if not powers:
         return z
-    if curve.centred is not None:  # those that float32 does not carry
+    if curve.centred is not None:  # powers that float32 does not carry
         return z + polynomials(Graphs(z.graph), curve, h2, order=0)[0] * h2
     rim, even = surface.semi_diameter_mm, all(p % 2 == 0 for p in powers)
     h, step = (h2 * rim**-2, 2) if even else ((h2 * rim**-2).sqrt(), 1)
@@ -336,7 +340,7 @@ def _with_polynomial(z: Value, h2: Value, surface: Surface) -> Value:
 
 
 def fit_series(function: Callable[[Array], Array], upper: float, tolerance: float) -> Array:
-    """Power series of the lowest degree that holds the tolerance on [0, upper] (Chebyshev interpolation)."""
+    """Fit a power series of the lowest degree that holds the tolerance on [0, upper] (Chebyshev interpolation)."""
     t = np.linspace(0, upper, 400)
     for degree in range(1, 16):
         fit = np.polynomial.Chebyshev.interpolate(function, degree, [0, upper])
@@ -346,7 +350,7 @@ def fit_series(function: Callable[[Array], Array], upper: float, tolerance: floa
 
 
 def _series_in(function: Callable[[Array], Array], reach: float, tolerance: float) -> Array | None:
-    """Power series on [0, reach] that holds twice the tolerance, or None; fitted in units of `reach`."""
+    """Fit a power series, in units of `reach`, that holds twice the tolerance on [0, reach]; None where none does."""
     series = fit_series(lambda s: function(s * reach), 1.0, tolerance)
     t = np.linspace(0, 1, 1000)
     off = np.abs(np.polynomial.Polynomial(series)(t) - function(t * reach)).max()

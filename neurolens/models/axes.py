@@ -140,7 +140,7 @@ class Axis:
 
 
 def product(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
-    """The nodes of all axes together, the last axis fastest."""
+    """List the nodes of all axes together, the last axis fastest."""
     return list(itertools.product(*(axis.nodes for axis in axes)))
 
 
@@ -156,7 +156,7 @@ def weights(axes: Sequence[Axis], state: Sequence[float]) -> Array:
 
 
 def _kron(arrays: Iterable[Array]) -> Array:
-    """Kronecker's product of them all."""
+    """Return Kronecker's product of all arrays."""
     total: Array = np.ones(1)
     for array in arrays:
         total = np.asarray(np.kron(total, array), np.float64)
@@ -206,7 +206,7 @@ def state_graph(axes: Sequence[Axis]) -> tuple[Graph, Array]:
 
 
 def mixture_of(axes: Sequence[Axis]) -> Mixture:
-    """How a program with a table for each node follows the state, whose numbers are arguments (`state_names`)."""
+    """Return how a program with a table for each node follows the state; its numbers are arguments (`state_names`)."""
     graph, transform = state_graph(axes)
     g = Graph()
     g.outputs = g.inline(graph, {STATE: g.concat(*(g.input(name, per_call=True) for name in state_names(axes)))})
@@ -214,7 +214,7 @@ def mixture_of(axes: Sequence[Axis]) -> Mixture:
 
 
 def _axis_features(axis: Axis, value: Value) -> Value:
-    """[K rows] as `Axis.features`, T_j by their recurrence."""
+    """Append `Axis.features` [K rows] to a graph; T_j by their recurrence."""
     g, (factor, offset) = value.graph, axis.pieces
     coordinate = 1.0 / value if axis.reciprocal else value
     t = (coordinate * factor + offset).clip(-1.0, 1.0)

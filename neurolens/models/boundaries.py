@@ -1,8 +1,8 @@
 """Fits of the stop crossing, the transmittance and the gates, which follow those of position and direction.
 
-Polynomials use the terms that are there anyway, networks their last hidden layer. Both get more terms where the
-boundaries or the transmittance need them: absorption and coatings change with the wavelength faster than any ray's path
-does, and near grazing rays faster with the ray.
+Polynomials use the terms that position and direction have anyway, networks their last hidden layer. Both get more terms
+where the boundaries or the transmittance need them: absorption and coatings change with the wavelength faster than any
+ray's path does, and near grazing rays faster with the ray.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from neurolens.models.terms import (
 # Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
 # the stop crossing in stop radii.
 GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
-STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
+STOP_KEPT = 0.04  # least share of that squared error to which a grown polynomial may be held for the stop crossing
 MOST_BOUNDARY_TERMS = 64
-# Polynomials leave out what a boundary or the transmittance can do without: while it errs by less than this share of
-# those errors, or by hardly more than with all terms. At a quarter hardly more rays were clipped wrongly than with all;
-# networks clipped more, and keep all. Of the transmittance, which nothing is decided by, a larger share is enough.
+# Polynomials drop terms of a boundary or of the transmittance while it errs by less than this share of those errors, or
+# by at most `_NEARLY` times as much as with all terms. At a quarter hardly more rays were clipped wrongly than with all
+# terms. Networks clipped more, and keep all. For the transmittance, which decides nothing, a larger share is enough.
 NEEDED_SHARE, _NEARLY, _THROUGH_SHARE = 0.25, 1.2, 0.6
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
@@ -45,8 +45,8 @@ TRANSMITTANCE_ERROR = 2.5e-4  # RMS at which no term is added
 _TRANSMITTANCE_RAYS = 6000
 _TRANSMITTANCE_DEGREE, _MOST_W = 7, 8  # of the candidates
 _LEAST_GAIN = 0.03  # a term must take away this share of the squared error left
-# A far ray that passes all fitted gates is fitted with this value of one gate, or its own where that is less than a rim
-# radius twice over; first with this weight, which doubles while it still passes, up to the last.
+# A far ray that passes all fitted gates is added to the fit of one gate: with its own value there, kept between these
+# two, or with the first where that is not known. Its weight doubles while it still passes, from the first to the last.
 _TARGET, _MOST_TARGET = 0.1, 1.0
 _WEIGHT, _MOST_WEIGHT = 0.03, 1.0
 _ROUNDS = 8
@@ -66,7 +66,7 @@ def features_of(exponents: Exponents, hidden: Features | None = None) -> Feature
 
 
 def fit_stop(data: Prepared, features: Features) -> Tensor:
-    """[2 M]: A and B of the stop crossing (in stop radii) on M features, from rays on both sides of rims."""
+    """Fit A and B [2 M] of the stop crossing (in stop radii) on M features, to rays on both sides of rims."""
     crossing, weight = stop_crossing(data)
     field = data.boundary_field
     columns = vector_columns(features(field), field)
@@ -74,7 +74,7 @@ def fit_stop(data: Prepared, features: Features) -> Tensor:
 
 
 def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
-    """[2, N] crossings of the boundary rays in stop radii, and their weights [N]."""
+    """Return where the boundary rays cross the stop, [2, N] in stop radii, and their weights [N]."""
     pairs, lens = data.boundary, data.pairs.lens
     crossing = torch.stack([pairs.cross_x[lens.stop_index], pairs.cross_y[lens.stop_index]]) / lens.stop_radius_mm
     return crossing, data.boundary_weights[1]
@@ -83,12 +83,12 @@ def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
 def invariant_core(
     data: Prepared, exponents: Exponents, columns: Sequence[int], coefficients: Tensor, *, sparse: bool = False
 ) -> InvariantPolynomial:
-    """The polynomial on these monomials with all that is fitted on them after position and direction.
+    """Make a polynomial on these monomials, with all that is fitted on them after position and direction.
 
     Args:
-        columns: places of the chosen ones among m p (first M) and m u (M more).
-        coefficients: [2, C] of those, of position and direction.
-        sparse: whether the rest has only the terms that it needs.
+        columns: the chosen columns, as places among m p (the first M) and m u (M more).
+        coefficients: [2, C] of those columns, for position and for direction.
+        sparse: whether the other outputs have only the terms that they need.
     """
     ab, features = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64), features_of(exponents)
     ab[:STOP, list(columns)] = coefficients
@@ -98,7 +98,7 @@ def invariant_core(
 
 
 def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
-    """[2 M] and [1 + G, M] as `fit_stop` and `solve_scalars` give them, with the features that each needs."""
+    """Fit as `fit_stop` ([2 M]) and `solve_scalars` ([1 + G, M]) do, each output on the features that it needs."""
     stop, *gates = (fit.needed() for fit in _boundary_fits(data, features))
     crossing, weight = stop_crossing(data)
     rows = vector_columns(features(data.boundary_field), data.boundary_field)
@@ -112,13 +112,13 @@ def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
 
 
 def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] | None = None) -> Tensor:
-    """[1 + G, M]: transmittance on the passing rays, each gate on those that get as far, most on those that it decides.
+    """Fit [1 + G, M]: the transmittance to passing rays, each gate to those that reach it, most to those it decides.
 
     Args:
-        kept: the features that the transmittance and each gate has; all without.
+        kept: the features that the transmittance and each gate may use; None: all.
 
     Raises:
-        InputError: no more rays near the boundaries than terms.
+        InputError: there are no more rays near the boundaries than terms.
     """
     pairs = data.pairs
     train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
@@ -134,14 +134,14 @@ def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] 
 
 
 def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidden: Features | None = None) -> Exponents:
-    """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
+    """Choose further exponents [K, 4], where the given ones [M, 4] fit the stop crossing or a gate badly; often none.
 
-    Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
+    Forward selection goes by the gain of all those boundaries together, in squares of the error that each may have.
 
     Args:
-        first: the exponents before those were grown for position and direction alone, which takes nothing from the stop
-            crossing: where those meet it better it is met as well.
-        hidden: the features of a network's last hidden layer, which are held to a share of the errors.
+        first: the exponents before growth, which serves position and direction alone. Where these meet the stop
+            crossing better than is asked, it is to be met as well.
+        hidden: the features of a network's last hidden layer; with them the errors asked for are smaller.
     """
     added = further(invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive), exponents)
     allowed, most, share = 1.0, MOST_BOUNDARY_TERMS, 1.0
@@ -160,7 +160,7 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidde
 
 
 def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Exponents:
-    """[K, 4] further exponents, at most `most`, by forward selection beside those given [M, 4]; often none."""
+    """Choose at most `most` further exponents [K, 4] by forward selection beside the given [M, 4]; often none."""
     rays = data.pairs.train.select(slice(0, _TRANSMITTANCE_RAYS))
     if most == 0 or len(rays) < 2 * (len(exponents) + most):
         return exponents[:0]
@@ -181,17 +181,17 @@ def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Expo
 
 
 class _BoundaryFit:
-    """One boundary's normal equations: `blocks` columns a term (A and B of a vector, or one)."""
+    """One boundary's normal equations, with `blocks` columns for each term (two for A and B of a vector, or one)."""
 
     def __init__(self, sweep: Sweep, terms: int, scale: float, start: int) -> None:
-        """Take the first `start` of the terms in; `scale` makes 1 of the squared error that is allowed."""
+        """Take the first `start` of the terms in; `scale` turns the squared error that is allowed into 1."""
         self.sweep, self.terms, self.scale, self.blocks = sweep, terms, scale, sweep.count // terms
         for term in range(start):
             self.add(term)
 
     @property
     def error(self) -> float:
-        """Mean squared error over the square of the one allowed."""
+        """Return the mean squared error over the square of the one allowed."""
         return self.sweep.residual * self.scale
 
     def add(self, term: int) -> None:
@@ -200,7 +200,7 @@ class _BoundaryFit:
                 self.sweep.add(column)
 
     def needed(self) -> list[int]:
-        """The columns left when the cheapest are dropped one by one, as long as the error allows it."""
+        """Return the columns left when the cheapest are dropped one by one, as long as the error allows it."""
         sweep, most = self.sweep, max(NEEDED_SHARE**2, _NEARLY * self.error)
         while len(sweep.chosen) > 1 and self.error + float((costs := sweep.costs()).min()) * self.scale <= most:
             sweep.drop(sweep.chosen[int(costs.argmin())])
@@ -211,14 +211,14 @@ class _BoundaryFit:
 
 
 def needed_for(sweep: Sweep, error: float) -> list[int]:
-    """The fewest columns of A and B of a vector with this squared residual, or with hardly more than all leave."""
+    """The fewest columns (A and B of a vector) that leave this squared residual, or hardly more than all leave."""
     sweep.restart([])
     terms = sweep.count // 2
     return _BoundaryFit(sweep, terms, NEEDED_SHARE**2 / max(error, 1e-300), terms).needed()
 
 
 def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: float = 0.0) -> list[int]:
-    """Terms by forward selection until no fit errs by more than allowed, or no term gains that share of the errors."""
+    """Select terms forwards until no fit errs by more than allowed, or no term removes `least_gain` of the errors."""
     chosen: list[int] = []
     while fits and len(chosen) < most:
         scores = np.sum([fit.scores() for fit in fits], axis=0)
@@ -235,9 +235,9 @@ def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: f
 def _boundary_fits(
     data: Prepared, features: Features, start: int | None = None, which: list[int] | None = None, stop_share: float = 1
 ) -> list[_BoundaryFit]:
-    """The fits of the stop crossing and of every gate, or some `which` of them, with the first `start` terms in.
+    """Fit the stop crossing and every gate, or `which` of them, with the first `start` terms taken in.
 
-    `stop_share`: of the squared error that the stop crossing may have otherwise.
+    `stop_share`: what share of the squared error otherwise allowed the stop crossing may have.
     """
     crossing, weight = stop_crossing(data)
     values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
@@ -257,12 +257,12 @@ def _boundary_fits(
 
 
 class GateFit:
-    """Gates [G] on features [M, N], each with weights, and features, of its own."""
+    """G gates on features [M, N], each with weights of its own, and with features of its own choice."""
 
     def __init__(
         self, features: Tensor, values: Tensor, weights: Tensor, kept: Sequence[list[int]] | None = None
     ) -> None:
-        """Fit values [G, N] with weights [G, N]; `kept`: the features that each gate has, all without."""
+        """Fit values [G, N] with weights [G, N]; `kept`: the features that each gate may use, None for all."""
         self._terms = len(features)
         all_of_them = [_turn(features, list(range(self._terms)))] * len(values) if kept is None else []
         self._turns = all_of_them or [_turn(features, columns) for columns in kept or ()]
@@ -279,17 +279,17 @@ class GateFit:
         return torch.linalg.solve(gram + ridge * torch.eye(len(gram), dtype=gram.dtype), self._moments[gate])
 
     def coefficients(self) -> Tensor:
-        """[G, M]."""
+        """Return the coefficients [G, M]."""
         found = [turn @ solution for turn, solution in zip(self._turns, self._solutions, strict=True)]
         return torch.stack(found) if found else torch.empty((0, self._terms), dtype=torch.float64)
 
     def block(self, features: Tensor, values: Tensor, reached: Tensor) -> None:
-        """Fit again until rays that do not pass are blocked by one gate at least.
+        """Fit again until at least one gate blocks each ray that does not pass.
 
         Args:
             features: [M, N] of those rays.
             values: [G, N] of the gates. `reached` [G, N]: whether the ray gets so far that the value is known. A gate
-                that does not block a ray is never made to; one that the ray does not reach may be.
+                is never made to block a ray that it is known to let pass; a gate that a ray does not reach may be.
         """
         blocks = (values > 0) | ~reached
         if not values.numel():
@@ -301,7 +301,7 @@ class GateFit:
             passing = (fitted <= 0).all(0) & blocks.any(0)
             if not passing.any():
                 return
-            # The gate that truly blocks it, before others; of several the one whose fit is nearest to blocking it.
+            # First a gate that truly blocks it; of several the one whose fit is nearest to blocking it.
             rank = torch.where(blocks, fitted, -math.inf) + torch.where(reached & (values > 0), 1e6, 0.0)
             gate = rank.argmax(0)
             for g in range(len(values)):
@@ -321,12 +321,14 @@ class GateFit:
 
 
 def _turn(features: Tensor, kept: list[int]) -> Tensor:
-    """[M, K] that makes orthogonal columns of some of the features [M, N], so that normal equations keep their digits;
-    what depends on others is left out."""
+    """Return a matrix [M, K] that makes orthogonal columns of the features `kept` among [M, N].
+
+    So normal equations keep their digits. Features that depend on others are left out.
+    """
     norms = features[kept].norm(dim=1).clamp_min(1e-300)
     _, triangle = torch.linalg.qr((features[kept] / norms[:, None]).T)
     _, sizes, right = torch.linalg.svd(triangle, full_matrices=False)
-    large = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
+    large = sizes > _DEPENDENT * sizes[:1]  # relative to the largest, where there is any ray
     found = features.new_zeros((len(features), int(large.sum())))
     found[kept] = (right[large] / sizes[large, None]).T / norms[:, None] * math.sqrt(features.shape[1])
     return found

@@ -68,7 +68,7 @@ def read_metadata(path: str | Path) -> dict[str, str]:
 
 
 def _entry(data: Any) -> tuple[str, str]:
-    """Key and text of an entry of metadata. Raises ValueError, TypeError: it is none."""
+    """Return key and text of an entry of metadata. Raises ValueError or TypeError where it is none."""
     texts = {_KEY: "", _VALUE: ""}
     for number, wire, value in walk(memoryview(data)):
         if wire != _MESSAGE or number not in texts:
@@ -169,7 +169,7 @@ def _is_list(value: Any, holds: Callable[[Any], bool], least: int = 0, most: flo
 
 
 def _are_errors(value: Any, depth: int = 3) -> bool:
-    """Figures by name, those of parts of the rays in tables of their own; lists are for readers."""
+    """Return whether these are figures by name, with tables inside for parts of the rays; lists are for readers."""
     return isinstance(value, dict) and all(
         v is None
         or isinstance(v, (bool, str, list))
@@ -277,7 +277,7 @@ def _check_places(where: str, card: Mapping[str, Any], rules: Mapping[str, Rule]
 
 @np.errstate(over="ignore")
 def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
-    """[3, R] low, high, half of the boxes in a card's bounds.
+    """Return low, high and half [3, R] of the boxes in a card's bounds.
 
     Raises:
         InputError: no three lists of equal length, or numbers that float32 cannot hold.
@@ -292,22 +292,22 @@ def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
 
 
 def axes_of(card: Mapping[str, Any]) -> tuple[Axis, ...]:
-    """State axes of a checked card; none for a model of one state."""
+    """Return the state axes of a checked card; none for a model of one state."""
     states = card.get("states")
     return tuple(Axis.from_dict(a) for a in states["axes"]) if states else ()
 
 
 def default_state(card: Mapping[str, Any]) -> tuple[float, ...]:
-    """The state whose lens and domain stand in the card itself."""
+    """Return the state whose lens and domain stand in the card itself."""
     states = card.get("states")
     return tuple(float(v) for v in states["default"]) if states else ()
 
 
 def card_at(card: Mapping[str, Any], axes: Sequence[Axis], state: Sequence[float]) -> dict[str, Any]:
-    """The card with lens and domain at a state, mixed from their tables at the nodes.
+    """Return the card with its lens and domain at a state, mixed from their tables at the nodes.
 
-    What the graph uses as a square is mixed as a square, what it uses as a reciprocal as a reciprocal: table and graph
-    then agree to rounding.
+    What the graph uses as a square is mixed as a square, and what it uses as a reciprocal as a reciprocal. So table and
+    graph agree to rounding.
 
     Raises:
         InputError: another number of values than axes, or one out of range.
@@ -346,7 +346,7 @@ def state_for(
 
 
 def _zoom_mm(path: Any, axis: Axis, zoom: str | float) -> float:
-    """Focal length of a zoom position: its name in the source, or a number within the range."""
+    """Return the focal length of a zoom position, which is a name in the source or a number within the range."""
     low, high = axis.range
     named = dict(axis.stated)
     try:
@@ -360,7 +360,7 @@ def _zoom_mm(path: Any, axis: Axis, zoom: str | float) -> float:
 
 
 def mix_domain(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, Any]:
-    """The domain (as `models.model.Domain.to_dict` writes it) of a state whose nodes weigh `weights` [K].
+    """Mix the domain (as `models.model.Domain.to_dict` writes it) of a state from nodes with weights [K].
 
     Wavelengths and the nearest object are those of the first node; the distances in focus are mixed as 1 / distance.
     """
@@ -376,7 +376,7 @@ def mix_domain(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, 
 
 
 def _mix_lens(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, Any]:
-    """The card's table of the lens at a state.
+    """Mix the card's table of the lens at a state.
 
     The power 1 / f, the front focal distance over f and the back focal plane are sums of products of the gaps: they
     are mixed, and the principal planes follow.
@@ -400,6 +400,6 @@ def _mixed_fields(tables: Sequence[Mapping[str, Any]], weights: Array, *names: s
 
 
 def _mixed(values: Sequence[ArrayLike], weights: Array) -> Any:
-    """Weighted sum of numbers or lists; exactly the value of a node whose weight is 1."""
+    """Return the weighted sum of numbers or lists; exactly a node's value where its weight is 1."""
     total = weights @ np.asarray(values, dtype=np.float64)
     return float(total) if total.ndim == 0 else total.tolist()

@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 POSITION, DIRECTION, STOP = 0, 1, 2
 
 
-# Invariants as pairs of the rows p_x, p_y, u_x, u_y: rho, sigma, tau; of two mirrors those of x, then those of y.
+# Invariants as pairs of the rows p_x, p_y, u_x, u_y: rho, sigma, tau. Of two mirrors those of x, then of y.
 ROUND: tuple[Form, ...] = (((0, 0), (1, 1)), ((0, 2), (1, 3)), ((2, 2), (3, 3)))
 MIRROR: tuple[Form, ...] = tuple(((a, b),) for i in (0, 1) for a, b in ((i, i), (i, 2 + i), (2 + i, 2 + i)))
 
@@ -53,11 +53,11 @@ class LightField(NamedTuple):
     w: Tensor
 
     def __len__(self) -> int:
-        """Rays."""
+        """Return the number of rays."""
         return self.w.shape[0]
 
     def invariants(self, mirror: bool = False) -> Tensor:
-        """[4, N]: rho, sigma, tau, w; of two mirrors [7, N]: p_x^2, p_x u_x, u_x^2, the same of y, w."""
+        """Return rho, sigma, tau, w [4, N]; with `mirror` [7, N] p_x^2, p_x u_x, u_x^2, the same of y, w."""
         import torch
 
         rows = (*self.p, *self.u)
@@ -66,7 +66,7 @@ class LightField(NamedTuple):
 
 
 def angle_vector(dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
-    """[2, N] v = theta (dx, dy) / |(dx, dy)| with theta from -z: smooth through 90 degrees, equivariant."""
+    """Return v = theta (dx, dy) / |(dx, dy)| [2, N] with theta from -z: smooth through 90 degrees, equivariant."""
     import torch
 
     sine = torch.hypot(dx, dy)
@@ -82,7 +82,7 @@ class Field:
 
     Attributes:
         planes: rows p_x, p_y, u_x, u_y, and v where w = v^2 + w_bias.
-        w_bias: see planes. w: the wavelength's variable itself, where there is no v. Neither: w is 0.
+        w_bias: see `planes`. w: the wavelength's variable itself, where there is no v. Without both, w is 0.
     """
 
     planes: Value
@@ -102,7 +102,7 @@ class Field:
         return self.w is not None or self.planes.rows == 5
 
     def products(self, forms: Sequence[Form]) -> Value:
-        """Sums of products of the rows p, u; below them w, where it varies."""
+        """Return sums of products of the rows p and u, and below them w where it varies."""
         g = self.planes.graph
         if self.w is not None:
             return g.concat(g.quadratic(self.planes, forms), self.w)
@@ -111,7 +111,7 @@ class Field:
         return g.quadratic(self.planes, forms)
 
     def colour(self) -> Value:
-        """w, where it varies."""
+        """Return w where it varies."""
         return self.w if self.w is not None else self.planes.graph.quadratic(self.planes, [((4, 4),)], [self.w_bias])
 
 
@@ -123,7 +123,7 @@ class Units:
     gates: float = 1.0
 
     def scalars(self, count: int) -> Array:
-        """Factors [count] on transmittance and gates."""
+        """Return the factors [count] on the scalars: transmittance, then gates."""
         return np.array([1.0, *[self.gates] * (count - 1)])
 
 
@@ -148,7 +148,7 @@ CORES: dict[str, type[Core]] = {}
 
 
 def stored_as(name: str) -> Callable[[_CoreType], _CoreType]:
-    """A decorator of a core's class: the name that model files carry for it."""
+    """Return a decorator of a core's class; it gives the class the name that model files carry."""
 
     def register(kind: _CoreType) -> _CoreType:
         CORES[name] = kind
@@ -158,7 +158,7 @@ def stored_as(name: str) -> Callable[[_CoreType], _CoreType]:
 
 
 class Core:
-    """Base of all cores; their numbers are float64 numpy arrays. `basis` is a word for cards."""
+    """The base of all cores; their numbers are float64 numpy arrays. `basis` is a word for cards."""
 
     basis: ClassVar[str] = "invariants"
 
@@ -167,11 +167,11 @@ class Core:
         raise NotImplementedError
 
     def fixed(self, w: float) -> Self:
-        """The same core for one value of w, which then is 0."""
+        """Return the same core for one value of w, as a core that takes w = 0."""
         raise InputError("export", "fix", type(self).__name__, "nothing fixed: a published method is written whole")
 
     def keep(self, scalars: Sequence[int]) -> Self:
-        """The same core with these of its scalars only."""
+        """Return the same core with these of its scalars only."""
         raise InputError("export", "fix", type(self).__name__, "nothing fixed: a published method is written whole")
 
     @property
@@ -181,7 +181,7 @@ class Core:
 
     @property
     def coefficients_per_vector(self) -> int:
-        """Coefficients that one of position and direction costs, the larger of the two (A and B terms both count)."""
+        """Return the coefficients of position or of direction, whichever has more (A and B terms both count)."""
         return self.coefficients
 
     def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
@@ -207,7 +207,7 @@ class Core:
 
 
 def symmetric(rows: Value, field: Field, scalars: int) -> CoreValues:
-    """A p + B u of three vectors, from rows A of each, B of each (of x, then y, with mirrors), then the scalars."""
+    """Make vectors A p + B u and scalars of rows: A of each vector, B of each (with mirrors of x, then y), scalars."""
     g, wide = rows.graph, (rows.rows - scalars) // 6
     *ab, transmittance, gates = g.split(rows, [wide] * 6 + [1, scalars - 1])
     p, u = field.p, field.u
@@ -216,7 +216,7 @@ def symmetric(rows: Value, field: Field, scalars: int) -> CoreValues:
 
 
 class _Symmetric(Core):
-    """A p + B u, with A, B and the scalars polynomials in invariants: `ab` [3, 2, .., M] and `scalars` [S, M].
+    """Polynomials in invariants for the scalars and for A and B of A p + B u: `ab` [3, 2, .., M], `scalars` [S, M].
 
     The last column of the exponents is that of w.
     """
@@ -242,7 +242,7 @@ class _Symmetric(Core):
         return int((self.ab != 0).sum() + (self.scalars != 0).sum())
 
     def rows(self, g: Graph, field: Field, units: Units) -> Value:
-        """Rows A of the three vectors, B of them, scalars; terms in w are left out where it is 0."""
+        """Return rows A of the three vectors, B of them, scalars; terms in w are left out where it is 0."""
         ab = self.ab * np.array(units.vectors).reshape(3, *[1] * (self.ab.ndim - 1))
         scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
         a, b = (ab[:, k].reshape(-1, len(self.exponents)) for k in (0, 1))
@@ -271,7 +271,7 @@ class InvariantPolynomial(_Symmetric):
     _forms = ROUND
 
     def plus(self, ab: Array, scalars: Array) -> InvariantPolynomial:
-        """With constants [3, 2] and [S] added."""
+        """Return the core with constants [3, 2] and [S] added."""
         constant = (self.exponents == 0).all(1)
         if constant.any():
             return replace(
@@ -307,7 +307,7 @@ class MirrorPolynomial(_Symmetric):
 
     @cached_property
     def coefficients_per_vector(self) -> int:
-        """The coefficients of a vector's two components together, the larger of position and direction."""
+        """Count the coefficients of a vector's two components together, the larger of position and direction."""
         return int((self.ab[:2] != 0).sum((1, 2, 3)).max())
 
 
@@ -319,8 +319,8 @@ class Network(Core):
     Attributes:
         hidden: weight [units, inputs] and bias [units] of each tanh layer; the first takes scaled invariants.
         output: weight [6 + S, units] and bias [6 + S]; rows 2 v and 2 v + 1 are A and B of vector v, then the scalars.
-            The bias of those rows is the constant part of A and B. Of a lens with cylinders 12 + S rows: A and B of x,
-            then of y, of each vector.
+            The bias of those rows is the constant part of A and B. A lens with cylinders has 12 + S rows: for each
+            vector A and B of x, then of y.
         shift, scale: [4] each: the network sees (invariants - shift) * scale; [7] of a lens with cylinders.
     """
 
@@ -331,16 +331,16 @@ class Network(Core):
 
     @property
     def mirror(self) -> bool:
-        """Whether it is of a lens with cylinders."""
+        """Return whether it stands for a lens with cylinders."""
         return len(self.shift) == 7
 
     @property
     def ab_rows(self) -> int:
-        """Outputs before the scalars."""
+        """Return the number of outputs before the scalars."""
         return 12 if self.mirror else 6
 
     def rows(self, g: Graph, field: Field, units: Units, added: Value | None = None) -> Value:
-        """Rows A of the three vectors, B of them, scalars; plus `added`, whose rows have the same order."""
+        """Return rows A of the three vectors, B of them, scalars; `added`, whose rows have the same order, is added."""
         h = field.products(MIRROR if self.mirror else ROUND)
         for k, (weight, bias) in enumerate(self.hidden):
             if k == 0:  # shift and scale are folded into it; without dispersion the last invariant is 0
@@ -360,7 +360,7 @@ class Network(Core):
         return symmetric(self.rows(g, field, units), field, len(self.output[1]) - self.ab_rows)
 
     def fixed(self, w: float) -> Self:
-        # It is shown w = 0: the shift makes that the wanted one.
+        # Its input is then w = 0, which the shift makes the wanted value.
         shift = self.shift.copy()
         shift[-1] -= w
         return replace(self, shift=shift)
@@ -375,7 +375,7 @@ class Network(Core):
 
 
 class Composite(Core):
-    """A core of several."""
+    """A core that is made of several."""
 
     parts: tuple[Any, ...]
 
@@ -419,8 +419,8 @@ class Residual(Composite):
 class Refracted(Composite):
     """A core whose rays end inside the front glass: the refraction there follows exactly, by `assemble.refracted`.
 
-    Where rays leave the front surface at grazing angles their direction turns as the square root of what is left to the
-    grazing ray. No polynomial follows that, while the direction inside the glass is as smooth as anywhere.
+    Where rays leave the front surface at grazing angles, their direction turns as the square root of the distance to
+    the grazing ray. No polynomial follows that, while the direction inside the glass is as smooth as anywhere.
 
     Attributes:
         parts: the one core; its direction vector is the angle vector of the ray inside the glass.

@@ -1,4 +1,4 @@
-"""Models as ONNX files with their cards: of one state, or of a zoom's (and internal focus's) range; inverse maps.
+"""Writes models with their cards as ONNX files: of one state, of a range of zoom or focus, and inverse maps.
 
 A card is one JSON string: what the model is, where it holds and how well. `models.card` reads and checks it.
 """
@@ -76,13 +76,13 @@ def export_onnx(
 
     Args:
         errors: held-out errors for the card, JSON-able.
-        derivatives: further outputs, scene_ray_d_film and scene_ray_d_pupil [2, 6, N]: of the scene ray per mm of the
-            film point's (of the pupil point's) x, then y.
+        derivatives: whether to write two more outputs, scene_ray_d_film and scene_ray_d_pupil [2, 6, N]: the
+            derivatives of the scene ray by x and by y of the film point, and of the pupil point, per mm.
 
     Returns the path.
 
     Raises:
-        InputError: weights or errors that are not finite; two gates for one reason on one surface, or one on the stop.
+        InputError: weights or errors are not finite; two gates have one reason on one surface; a gate is on the stop.
     """
     _check_gates(model)
     metadata = {CARD_KEY: card_to_json(card_of(model, errors or {})), MODEL_KEY: coefficients_text([model])}
@@ -142,8 +142,8 @@ def export_inverse(
 def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:
     """Write a model of many states with its card.
 
-    As `export_onnx`, with one more input: state [A], a number for every axis, in its unit. A state out of range puts
-    every ray outside the domain.
+    It differs from `export_onnx` by one more input: state [A], a number for every axis, in its unit. A state out of
+    range puts every ray outside the domain.
 
     Args:
         errors: held-out errors for the card, JSON-able.
@@ -170,7 +170,7 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
 
 
 def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
-    """States at which a client may check itself: the far end, and two where no node is."""
+    """Return states at which a client may check itself: the far end, and two where no node is."""
     shares = ((0.31, 0.62), (0.77, 0.38))
     ends = [a.range for a in model.axes]
     inner = [tuple(lo + (hi - lo) * s for (lo, hi), s in zip(ends, share, strict=False)) for share in shares]
@@ -215,7 +215,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
 
 
 def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
-    """The card's table of the lens; its film is that of the domain nearest to where the lens has it."""
+    """Return the card's table of the lens; its film is the domain's film plane nearest to the lens's own."""
     near, far = domain.film_z_mm
     data = first_order(lens)
     curvature = float(lens.surfaces[0].curvature)
@@ -244,12 +244,12 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
 def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict[str, Any]:
     """Rays with the answers of the float64 model, by which a client checks its own evaluation.
 
-    Rays within 0.01 of any boundary (relative; 0.001 where no passing ray is further from all) are left out, and rays
-    whose status float32 changes. For every status that the model gives there are up to `others` rays. `rounding` is
-    what float32 may cost: of position and stop crossing in mm, of direction and transmittance; eight times what it
-    costs the reference evaluator on these rays.
+    Left out are rays within 0.01 of any boundary (relative; 0.001 where no passing ray is further from all), and rays
+    whose status float32 changes. For every status that the model gives there are up to `others` rays. `rounding` is the
+    error that float32 may cause: of position and stop crossing in mm, of direction and of transmittance. It is eight
+    times what the reference evaluator errs on these rays.
     """
-    # In some domains few rays pass, and in some far wider ones all of those are near the boundaries.
+    # In some domains few rays pass; some are so wide that all passing rays lie near the boundaries.
     for count, least in ((20_000, 0.01), (600_000, 0.01), (600_000, 0.001)):
         rays, out, clear = _clear_rays(model, count, least)
         if bool((clear & (out.status == st.PASSED)).any()):

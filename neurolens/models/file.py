@@ -59,7 +59,7 @@ _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "des
 _NOWHERE = -1.0  # a film position in no domain, which replaces that of the call where the state is out of range
 DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
 _DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError, RuntimeError)
-# Errors of reference rays that are allowed at least; of position and stop crossing, for each mm of the focal length.
+# Every reference ray may err by this; in position and stop crossing by this for each mm of the focal length.
 _OFF = 1e-5
 
 
@@ -69,9 +69,9 @@ class ModelFile:
 
     Attributes:
         path: the file.
-        card: what `models.card` wrote.
-        nodes: a model for every node of the axes, in the order of `models.axes.product`; one without axes. Their
-            coefficients are rounded to float32, and their lens is that of the first node.
+        card: its card, as `models.export` writes it.
+        nodes: a model for every node of the axes, in the order of `models.axes.product`, or one model without axes.
+            Their coefficients are rounded to float32, and their lens is that of the first node.
     """
 
     path: Path
@@ -80,11 +80,11 @@ class ModelFile:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """State variables of a model of many states."""
+        """Return the state variables; none for a model of one state."""
         return axes_of(self.card)
 
     def at(self, state: Sequence[float] = ()) -> LensModel:
-        """The model of one state. Raises InputError: another number of values than axes, or one out of range."""
+        """Return the model of one state. Raises InputError: too many values or too few, or one out of range."""
         return mixed(self.nodes, weights(self.axes, state)) if self.axes else self.nodes[0]
 
 
@@ -114,7 +114,7 @@ def read_model(path: str | Path) -> ModelFile:
 
 @contextmanager
 def damage_said(file: str | Path, what: str = "its coefficients are damaged") -> Iterator[None]:
-    """Errors of reading damaged data as a ModelError."""
+    """Turn errors of reading damaged data into a ModelError."""
     try:
         yield
     except ModelError:
@@ -181,7 +181,7 @@ def check_size(core: Any) -> None:
 
 
 def _check_reference(model: ModelFile) -> None:
-    """Compute the card's reference rays, at every state that has some: a changed coefficient shows."""
+    """Compute the card's reference rays at every state that has some, where a changed coefficient shows."""
     states = model.card.get("states") or {}
     references = [(default_state(model.card), model.card.get("reference"))]
     references += [(tuple(r["state"]), r) for r in states.get("reference", ())]
@@ -351,7 +351,8 @@ def _unpacked(packed: Any, depth: int, left: list[int]) -> Any:
     form = "f4" if "f4" in packed else "u1"
     array = np.frombuffer(base64.b64decode(packed[form], validate=True), f"<{form}").reshape(packed["shape"])
     if form == "u1":
-        if array.size and int(array.sum(-1).max()) > _MAX_DEGREE:  # whoever writes terms as products would not end
+        # the writers that make terms of products would not end
+        if array.size and int(array.sum(-1).max()) > _MAX_DEGREE:
             raise ValueError(f"a term of degree {int(array.sum(-1).max())}, expected at most {_MAX_DEGREE}")
         return array.astype(np.int64)
     if not np.isfinite(array).all():
@@ -360,12 +361,12 @@ def _unpacked(packed: Any, depth: int, left: list[int]) -> Any:
 
 
 def _numbers(kind: Any, packed: dict[str, Any]) -> Any:
-    """A dataclass of numbers, some of them None."""
+    """Read a dataclass of numbers, some of them None."""
     return kind(**{key: None if value is None else float(value) for key, value in packed.items()})
 
 
 def packed_lens(lens: Lens) -> dict[str, Any]:
-    """A prescription without its other states and notes; numbers as they are, infinity as a word."""
+    """Pack a prescription without its other states and notes; numbers stay as they are, infinity becomes a word."""
     rows = []
     for surface in lens.surfaces:
         row = {}

@@ -1,8 +1,8 @@
-"""Fits: settings in, a complete model out, of one state of a lens or of many (zoom, internal focus).
+"""Fits: from settings to a complete model, of one state of a lens or of many (zoom, internal focus).
 
-A `StateSpace` says which states: the axes of a lens file, and its lens and domain at every state. Models of many states
-have one structure; every number of the model at a state is interpolated between nodes (see `models.axes`), so that
-it is a plain `LensModel`. A core is linear in its numbers: its error at a state is at most a small multiple (the
+A `StateSpace` says which states: it has the axes of a lens file, and its lens and domain at every state. Models of many
+states have one structure; every number of the model at a state is interpolated between nodes (see `models.axes`), so
+that it is a plain `LensModel`. A core is linear in its numbers: its error at a state is at most a small multiple (the
 Lebesgue constant) of the nodes' errors, plus the error of interpolating the exact lens itself.
 
 A fit of many states chooses one support and the same gates for all nodes; the coefficients of each node are fitted on
@@ -103,7 +103,7 @@ def fit_model(
 
 
 def as_model(prepared: Prepared, core: Core, settings: ModelSettings, fit_s: float) -> LensModel:
-    """A complete model of a core that was fitted in `fit_s` seconds to the prepared pairs."""
+    """Make a complete model of a core that was fitted to the prepared pairs in `fit_s` seconds."""
     pairs = prepared.pairs
     model = LensModel(
         lens=pairs.lens,
@@ -154,25 +154,25 @@ _FEWER = 1
 _SAME = 1e-3  # focal lengths that differ by less than this share are one
 # Zoom positions at which the common near limit of internal focus is sought.
 _LIMITS = 9
-_GAP_MM, _MOST = 1e-4, 12  # error of interpolated gaps that is enough, and the highest degree tried for it
-_BETWEEN = (0.08, 0.35, 0.5, 0.77, 0.93)  # of the way from knot to knot: where gaps are measured
+_GAP_MM, _MOST = 1e-4, 12  # an error of interpolated gaps that is small enough; the highest degree tried for it
+_BETWEEN = (0.08, 0.35, 0.5, 0.77, 0.93)  # where gaps are measured, as shares of the way from knot to knot
 # Nodes that choose the support and the gates; the others only fit coefficients.
 _CHOOSERS = 7
-_PASSES = 2  # of replacement
+_PASSES = 2  # passes of replacement
 
 
 @dataclass(frozen=True)
 class StateSpace:
-    """The states of a lens that one model is of.
+    """The states of a lens that one model covers.
 
     Attributes:
         lens: the lens as its file gives it, or scaled.
         axes: zoom, internal focus, or both in this order.
-        zoom: state of the file where zoom is no axis.
-        f_number: None is the widest stop of each state.
+        zoom: the state of the file, where zoom is no axis.
+        f_number: None takes the widest stop of each state.
         film_radius_mm: None takes the lit film of each state.
-        focus_m: object distances (far, near) that moving the film reaches, the same in every state or following from
-            the lens. Without effect where internal focus is an axis.
+        focus_m: object distances (far, near) that moving the film reaches, the same in every state, or a function of
+            the lens. They have no effect where internal focus is an axis.
         wavelength_nm: shortest and longest.
     """
 
@@ -190,18 +190,18 @@ class StateSpace:
 
     @cached_property
     def _planes_mm(self) -> Array:
-        """The tightest pupil plane at every knot of the axes."""
+        """Find the tightest pupil plane at every knot of the axes."""
         return np.array([self._domain(state, None).pupil_z_mm for state in product(self._knots)])
 
     def _settings(self, state: Sequence[float]) -> tuple[str | float | None, float | None]:
-        """Zoom position, and the distance (m) of internal focus where that is an axis."""
+        """Return the zoom position, and the distance (m) of internal focus where that is an axis."""
         values = dict(zip((a.name for a in self.axes), state, strict=True))
         vergence = values.get("focus")
         focus_m = None if vergence is None else 1 / vergence if vergence > 0 else math.inf
         return values.get("zoom", self.zoom), focus_m
 
     def lens_at(self, state: Sequence[float]) -> Lens:
-        """The exact lens at a state; with internal focus, focused there, else at infinity focus."""
+        """Return the exact lens at a state; focused there where internal focus is an axis, else at infinity focus."""
         return self._lens(*self._settings(state))
 
     def _lens(self, zoom: str | float | None, focus_m: float | None) -> Lens:
@@ -211,9 +211,9 @@ class StateSpace:
         return set_lens(self.lens, zoom=zoom, f_number=self.f_number, focus_mode="internal", focus_m=distance)
 
     def domain_at(self, state: Sequence[float]) -> Domain:
-        """The domain of a state: the full lit film, and the film positions that focusing by the film needs.
+        """Return the domain of a state: the full lit film, and the film positions that focusing by the film needs.
 
-        Its pupil plane is straight between the knots: the tightest one of every state by itself would jump.
+        Its pupil plane is interpolated linearly between the knots: the tightest plane of every state would jump.
         """
         return self._domain(state, float(weights(self._knots, state) @ self._planes_mm))
 
@@ -238,9 +238,9 @@ class StateSpace:
 
 
 def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
-    """The whole range of a zoom: focal length in mm, smooth between the states of the file.
+    """Return the axis of a zoom's whole range: focal length in mm, smooth between the states of the file.
 
-    `degree` None follows from the range.
+    With `degree` None it follows from the range.
 
     Raises:
         InputError: a file with fewer than two zoom states.
@@ -261,7 +261,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
 
 
 def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree: int = FOCUS_DEGREE) -> Axis:
-    """Internal focus from infinity to the near limit that all the zoom positions given reach: vergence in 1/m.
+    """The axis of internal focus: vergence (1/m) from infinity to the near limit of all the zoom positions given.
 
     Raises:
         InputError: a file without focus states.
@@ -271,7 +271,7 @@ def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree:
 
 
 def axes_of(lens: Lens, *, zoom: bool, internal: bool, state: str | float | None = None) -> tuple[Axis, ...]:
-    """The axes asked for: the zoom's whole range, internal focus, or both.
+    """Return the axes asked for: the zoom's whole range, internal focus, or both.
 
     Args:
         state: the zoom position where `zoom` is False.
@@ -299,7 +299,7 @@ class StateModel:
 
     Attributes:
         space: the states, and the exact lens at each.
-        nodes: one model a node, in the order of `models.axes.product`; of one structure: they differ in numbers.
+        nodes: one model a node, in the order of `models.axes.product`; they differ in numbers alone.
         fit_s: seconds that the whole fit took.
     """
 
@@ -319,11 +319,11 @@ class StateModel:
 
     @property
     def first_state(self) -> State:
-        """The first end of every axis: what a model shows where no state is asked for."""
+        """Return the first end of every axis: what a model shows where no state is asked for."""
         return tuple(a.range[0] for a in self.axes)
 
     def at(self, *state: float) -> LensModel:
-        """The model of one state; InputError as `models.axes.weights`."""
+        """Return the model of one state; raises InputError as `models.axes.weights`."""
         first = self.nodes[0]
         return replace(
             mixed(self.nodes, weights(self.axes, state)),
@@ -334,10 +334,10 @@ class StateModel:
 
 
 def gap_axis(first: Axis, lens_at: Callable[[float], Lens]) -> tuple[Axis, float]:
-    """An axis with nodes enough for the gaps of the lens at its values, and their largest error in mm between nodes.
+    """Return an axis with enough nodes to interpolate the lens's gaps, and their largest error (mm) between nodes.
 
     Args:
-        first: the axis, of the least degree that is tried.
+        first: the axis with the least degree that is tried.
     """
 
     def vertices_mm(value: float) -> Array:
@@ -361,7 +361,7 @@ def gap_axis(first: Axis, lens_at: Callable[[float], Lens]) -> tuple[Axis, float
 
 @dataclass(frozen=True)
 class StateSettings:
-    """How a model of many states is fitted: see `ModelSettings`; rays are those of each node."""
+    """How a model of many states is fitted: see `ModelSettings`; `rays` are those of each node."""
 
     terms: int = 64
     degree: int = 7
@@ -401,7 +401,7 @@ def fit_states(
         needed = {g for p in chosen.values() for g in p.gates}
         gates = tuple(sorted(needed, key=lambda g: (-g.surface, g.reason)))
         # Scales and chief ray are those of all nodes: a node's own follow its domain, which need not be smooth in the
-        # state; nor would be the lens in them.
+        # state, and so would make models that are not smooth in it either.
         encodings = [d.encoding for d in chosen.values()]
         largest = {key: max(getattr(e, key) for e in encodings) for key in ("film_scale_mm", "pupil_scale_mm")}
         scales = replace(encodings[0], chief=sum(e.chief for e in encodings) / len(encodings), **largest)
@@ -426,12 +426,12 @@ def _pairs(space: StateSpace, state: State, settings: StateSettings) -> RayPairs
 
 
 def _scaled_like(scales: Encoding, own: Encoding) -> Encoding:
-    """The planes of a node with the scales of all."""
+    """Return a node's encoding: its own planes, with the scales of all nodes."""
     return replace(scales, film_plane_z_mm=own.film_plane_z_mm, pupil_plane_z_mm=own.pupil_plane_z_mm)
 
 
 def _choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[Exponents, list[int]]:
-    """One support for all nodes: orthogonal least squares by the sum of the nodes' gains, then replacement.
+    """Choose one support for all nodes: orthogonal least squares by the sum of their gains, then replacement.
 
     Returns the exponents [M, 4] kept and the columns of `vector_columns` chosen among them (m p, then m u).
     """
@@ -451,7 +451,7 @@ def _choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[
 def _fit_node(
     data: Prepared, exponents: Exponents, columns: list[int], stop_mm: float, settings: StateSettings
 ) -> LensModel:
-    """The model of one node; its stop crossing is in units of `stop_mm`, the same at every node."""
+    """Fit the model of one node; its stop crossing is in units of `stop_mm`, the same at every node."""
     pairs, train, scales = data.pairs, data.train, scales_of(data.pairs.lens)
     vectors = vector_columns(monomials(train.field.invariants(), exponents), train.field)[columns]
     core = invariant_core(data, exponents, columns, solve(vectors, train.vectors[:STOP].flatten(1)))

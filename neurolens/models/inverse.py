@@ -53,14 +53,14 @@ from neurolens.models.model import Domain, Encoding, LensModel
 from neurolens.optics.trace.surfaces import front_rays
 
 STEPS = 3
-# A solution counts where its residual is below this: of the stop's radius; of the front's radius and in radians.
+# A solution counts where its residual is below this: in stop radii; in front radii and radians.
 TOLERANCE = 1e-4
 # Longest Newton step: of the radius of the pupil (and of the film).
 LIMIT = 0.35
 _BATCH = 16384  # rays that numpy takes through a graph at once
 # Degree of the guesses of round lenses and of those with cylinders, and passing rays of their fit.
 _DEGREE, _MIRROR_DEGREE, _RAYS = 6, 3, 8000
-_ROUNDS = 40  # of drawing as many rays, until enough of them pass
+_ROUNDS = 40  # of drawing as many rays again, until enough of them pass
 _MARGIN = 0.1  # of the half widths of the boxes that rays are drawn from
 _RIDGE = 1e-11  # relative
 # The guess of the stop is fitted where the stop's image has at least this share of its usual area.
@@ -86,7 +86,7 @@ class Guess:
 
     @staticmethod
     def fitted(a: Array, b: Array, w: Array, z: Array, wanted: Array, *, mirror: bool) -> Guess:
-        """The guess of vectors `wanted` [K, 2, N] from a and b [2, N], by least squares over all terms."""
+        """Fit the guess of vectors `wanted` [K, 2, N] from a and b [2, N], by least squares over all terms."""
         rows, forms = [*a, *b], MIRROR if mirror else ROUND
         products = [sum(rows[i] * rows[j] for i, j in form) for form in forms]
         exponents = _exponents(_MIRROR_DEGREE if mirror else _DEGREE, len(forms), bool(w.any()), bool(z.any()))
@@ -102,7 +102,7 @@ class Guess:
         return Guess(exponents, np.stack(ab, 2))
 
     def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
-        """The vectors, 2 rows each, of a and b, the p and u of `light`; z None: it is 0."""
+        """Append the vectors, 2 rows each, that it makes of p and u of `light` and of z; where z is None it is 0."""
         wide, last = self.ab.shape[2], self.exponents.shape[1] - 1
         variables = [v for v in range(last) if v < last - 1 or light.dispersive]
         x = light.products(MIRROR if wide == 2 else ROUND)
@@ -115,7 +115,7 @@ class Guess:
 
 
 def _exponents(degree: int, invariants: int, dispersive: bool, moves: bool) -> Exponents:
-    """Exponents up to a total degree in the invariants; w and z multiply lower degrees only."""
+    """Return exponents up to a total degree in the invariants; w and z multiply lower degrees only."""
     powers = itertools.product(
         *([range(degree + 1)] * invariants), range(3 if dispersive else 1), range(3 if moves else 1)
     )
@@ -165,7 +165,7 @@ class InverseModel:
         self, film_xy_mm: ArrayLike, stop_xy_mm: ArrayLike, wavelength_nm: ArrayLike, film_z_mm: ArrayLike,
         stop_radius_mm: float | None = None, steps: int = STEPS,
     ) -> InverseRays:  # fmt: skip
-        """The rays from film points [2, N] through stop points [2, N], in the precision of the film points.
+        """Find the rays from film points [2, N] through stop points [2, N], in the precision of the film points.
 
         Args:
             wavelength_nm, film_z_mm: [N], or one for all. stop_radius_mm: None takes the widest.
@@ -181,7 +181,7 @@ class InverseModel:
         self, origin_mm: ArrayLike, direction: ArrayLike, wavelength_nm: ArrayLike, film_z_mm: ArrayLike,
         stop_radius_mm: float | None = None, steps: int = STEPS,
     ) -> InverseRays:  # fmt: skip
-        """The camera rays of light that comes along scene rays; other arguments and errors as of `through_stop`.
+        """Find the camera rays of light that comes along scene rays; other arguments and errors as of `through_stop`.
 
         Args:
             origin_mm: [3, N], a point of each ray before or on the front surface, lens frame.
@@ -194,7 +194,7 @@ class InverseModel:
         front, solid = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=waves[0])
         given = np.concatenate([front, waves]).astype(origin.dtype)
         out = self._solved("scene", {"front_rays": given}, film_z_mm, stop_radius_mm, steps)
-        with np.errstate(all="ignore"):  # area of direction vectors to solid angle
+        with np.errstate(all="ignore"):  # from the area of direction vectors to solid angle
             return out._replace(density=out.density / solid)
 
     def _solved(
@@ -216,7 +216,7 @@ class InverseModel:
 
 
 def _checked(rows: int, **arrays: ArrayLike) -> list[Array]:
-    """The arrays as floats of one precision, [rows, N] each. Raises InputError: another shape."""
+    """Return arrays as floats of one precision, [rows, N] each. Raises InputError: another shape."""
     found = [np.asarray(a) for a in arrays.values()]
     for name, array in zip(arrays, found, strict=True):
         if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape != (rows, found[0].shape[-1]):
@@ -226,14 +226,14 @@ def _checked(rows: int, **arrays: ArrayLike) -> list[Array]:
 
 
 def _each(name: str, value: ArrayLike, rays: Array, kind: Any = np.float64) -> Array:
-    """The value of every ray, [1, N]. Raises InputError: neither one number nor N."""
+    """Return the value of every ray, [1, N]. Raises InputError: neither one number nor N."""
     if np.size(value) not in (1, rays.shape[1]):
         raise InputError("inverse", name, f"({np.shape(value)})", "one number, or one a ray")
     return np.broadcast_to(np.asarray(value, kind), (1, rays.shape[1]))
 
 
 def inverse_of(model: LensModel) -> InverseModel:
-    """The inverse maps of a model, their first guesses fitted to rays that it passes.
+    """Make the inverse maps of a model; their first guesses are fitted to rays that it passes.
 
     Raises:
         InputError: a model without rays that pass, or whose core gives no direction vector.
@@ -268,7 +268,7 @@ def _inputs(model: LensModel, rays: Array, film_z: Array) -> dict[str, Array]:
 
 
 def _d_stop(model: LensModel, rays: Array, film_z: Array) -> Array:
-    """[N, 2, 2] derivatives of the stop crossing by the pupil point."""
+    """Return the derivatives [N, 2, 2] of the stop crossing by the pupil point."""
     graph = with_derivatives(model.graph, ["stop_xy_mm"], [("rays", 2), ("rays", 3)])
     out = evaluate(graph, _inputs(model, rays, film_z))
     columns = [np.broadcast_to(out[derivative("stop_xy_mm", row)], (2, len(film_z))) for row in RAY[2:]]
@@ -276,7 +276,7 @@ def _d_stop(model: LensModel, rays: Array, film_z: Array) -> Array:
 
 
 def passing_rays(model: LensModel, count: int = _RAYS, seed: int = 0) -> tuple[Array, Array]:
-    """At most so many rays [5, N] of the domain that the model passes, with their film planes [N].
+    """Return at most `count` rays [5, N] of the domain that the model passes, with their film planes [N].
 
     Raises:
         InputError: no ray passes.
@@ -296,7 +296,7 @@ def passing_rays(model: LensModel, count: int = _RAYS, seed: int = 0) -> tuple[A
 
 
 def _drawn(domain: Domain, count: int, rng: np.random.Generator) -> Array:
-    """[6, N] rays from the boxes of a domain about the rays that pass, and their film planes."""
+    """Draw rays [6, N] from a domain's boxes about the rays that pass; the last row is their film planes."""
     b, (share, turn, across, along, colour, place) = domain.bounds, rng.random((6, count))
     radius, turn = domain.film_radius_mm * np.sqrt(share), 2 * np.pi * turn
     table = np.linspace(0, b.film_radius_mm, len(b.low_mm))
@@ -312,7 +312,7 @@ def _drawn(domain: Domain, count: int, rng: np.random.Generator) -> Array:
 
 
 def convergence(inverse: InverseModel, rays: Array, film_z: Array, steps: int = STEPS) -> dict[str, Any]:
-    """How often the inverse maps find the model's own passing rays, of these [5, N], in their precision.
+    """Measure how often the inverse maps find the model's own rays: those of `rays` [5, N] that pass, in its precision.
 
     Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that is another
     ray of the same stop point, or scene ray, because the map is folded there).
@@ -333,7 +333,7 @@ def convergence(inverse: InverseModel, rays: Array, film_z: Array, steps: int = 
 
 
 def front_index(model: LensModel) -> list[float] | None:
-    """Power series in 1 / lambda^2 (1/um^2) of the front glass's index, where direction vectors are those inside it."""
+    """Return the front glass's index as a power series in 1 / lambda^2 (1/um^2); None where rays end outside."""
     if not isinstance(model.core, Refracted):
         return None
     e, series = model.encoding, np.polynomial.Polynomial(model.core.index)
@@ -348,7 +348,7 @@ def _exact_graph(inverse: InverseModel, name: str, steps: int) -> Graph:
 
 
 def stop_system(model: LensModel) -> Graph:
-    """Where the ray through a pupil point crosses the stop, less the point asked for, in stop radii.
+    """Return the system of the stop: where a ray crosses it, less the point asked for, in stop radii.
 
     Inputs `unknown`: the pupil point, centred on the chief ray through the film point and scaled as the model's u;
     `film` (mm), `wanted` (stop point, in stop radii), `wavelength_nm`, `film_z_mm`. Output `residual`.
@@ -369,7 +369,7 @@ def _pupil_rays(e: Encoding, film: Value, u: Value, wavelength: Value) -> Value:
 
 
 def scene_system(model: LensModel) -> Graph:
-    """Position and direction vector of the ray of u and p, less those asked for, scaled as the model's.
+    """The system of the scene ray: its position and direction vector less those asked for, in the model's scales.
 
     Inputs `unknown`: u, then p: directions follow p most and positions u, and the solver wants that order; `wanted`,
     `wavelength_nm`. Output `residual`.
@@ -388,7 +388,7 @@ def scene_system(model: LensModel) -> Graph:
 
 
 def _light(e: Encoding, vectors: list[Value], wavelength: Value) -> Field:
-    """A light field whose p and u are these."""
+    """Return a light field whose p and u are these."""
     g = wavelength.graph
     if not e.w_half:
         return Field(g.concat(*vectors))
@@ -396,7 +396,7 @@ def _light(e: Encoding, vectors: list[Value], wavelength: Value) -> Field:
 
 
 def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -> Graph:
-    """The map from stop points to camera rays.
+    """Write the map from stop points to camera rays.
 
     Inputs stop_rays (film x, y, stop x, y in mm, wavelength in nm), film_z_mm, stop_radius_mm. Outputs rays (film x, y,
     pupil x, y, wavelength), density, those of the model, and where the form is exact `residual`. An exact graph gives
@@ -420,7 +420,7 @@ def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -
 
 
 def scene_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -> Graph:
-    """The map from scene rays to camera rays: as `stop_graph`, but for its input and what density is of.
+    """Write the map from scene rays to camera rays: `stop_graph` with another input, and another meaning of density.
 
     Input front_rays: x and y on the front surface (mm), direction vector of the model (angle vector in rad, or slope;
     inside the front glass where `front_index` says so), wavelength. Density is mm^2 of film times mm^2 of the pupil
@@ -450,7 +450,7 @@ def scene_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) 
     values = CoreValues(vectors, outputs["transmittance"], outputs.get("gates"), index=outputs.get("index"))
     status = add_outputs(model, values, inside, radius, series, form)
     area = determinant([g.concat(*(outputs[derivative(n, f"planes_{k}")] for n in _SCENE)) for k in planes]).abs()
-    # Of (p, u), scaled, per mm^2 and (kappa rad)^2.
+    # The determinant is of scaled (p, u), per mm^2 and (kappa rad)^2.
     factor = e.film_scale_mm**2 * math.prod(e.pupil_scales_mm) * series.kappa**2
     off = g.concat(*vectors[:2]) * (1 / np.repeat([model.scales.position_mm, series.kappa], 2)) - wanted
     return _finished(g, rays, g.outputs, back * back * factor / area, status, size or g.square(off), form)
@@ -460,7 +460,7 @@ _SCENE = ["position", "direction"]
 
 
 def _core_graph(model: LensModel, light: Field, units: Units) -> Graph:
-    """A core from planes such as those of `light`."""
+    """Return the graph of a core that takes planes such as those of `light`."""
     g = Graph()
     values = model.core.build(g, Field(g.input("planes", light.planes.rows), light.w_bias), units)
     g.outputs = dict(zip((*_SCENE, "stop"), values.vectors, strict=True)) | {"transmittance": values.transmittance}
@@ -472,13 +472,13 @@ def _core_graph(model: LensModel, light: Field, units: Units) -> Graph:
 
 
 def scaled_film_z(model: LensModel, film_z: Any) -> Any:
-    """The film plane, a value or an array, from -1 (nearest) to 1; None where there is one only."""
+    """Scale the film plane, a value or an array, to -1 (nearest) to 1; None where there is one only."""
     near, far = model.domain.film_z_mm
     return (film_z - (near + far) / 2) * (2 / (far - near)) if far > near else None
 
 
 def _solve(system: Graph, inputs: dict[str, Value], first: Value, steps: int, form: Form) -> tuple[Value, Value | None]:
-    """Unknowns, and the squared length of their residual where the form is exact."""
+    """Return the unknowns, and the squared length of their residual where the form is exact."""
     solved = limited_newton(system, inputs, first, steps, LIMIT)
     if not form.exact:
         return solved.last, None
@@ -489,8 +489,8 @@ def _solve(system: Graph, inputs: dict[str, Value], first: Value, steps: int, fo
 def _finished(
     g: Graph, rays: Value, out: dict[str, Value], density: Value, status: Value, size: Value, form: Form
 ) -> Graph:
-    """The graph with its outputs; `size` is the squared length of the residual."""
-    if density.node.per_call:  # of first-order models
+    """Return the graph with its outputs; `size` is the squared length of the residual."""
+    if density.node.per_call:  # as in first-order models
         density = density + rays[4] * 0.0
     status = g.select(size <= TOLERANCE**2, status, float(st.NO_SOLUTION)).whole()
     g.outputs = {"rays": rays, **out, "density": density, "status": status}

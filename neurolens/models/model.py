@@ -49,7 +49,7 @@ class Domain:
         stop_radius_mm: the widest stop for which the surrogate is fitted.
         bounds: where passing rays lie on the pupil plane, by film radius (for sampling in a render).
         nearest_m: distance from the film of the nearest object in view, where one lies before the plane in focus; None:
-            the nearest focus. It changes no ray, only what an error of position counts in a fit.
+            the nearest focus. It changes no ray, but says how much an error of position counts in a fit.
     """
 
     film_radius_mm: float
@@ -73,7 +73,7 @@ class Domain:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Domain:
-        """The inverse of `to_dict`; what was written before `nearest_m` existed has none."""
+        """Make a domain from what `to_dict` gives; data from before `nearest_m` existed have none."""
         table = {f.name: data["bounds"][f.name] for f in fields(PupilBounds)}
         bounds: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
         pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
@@ -83,7 +83,7 @@ class Domain:
 
 @dataclass(frozen=True)
 class Encoding:
-    """From raw millimetres and nanometres to the light field.
+    """How raw millimetres and nanometres become the light field.
 
     Attributes:
         film_plane_z_mm, pupil_plane_z_mm: the two planes (lens frame).
@@ -91,7 +91,8 @@ class Encoding:
         film_scale_mm, pupil_scale_mm: largest |p| and |u - k p| of the domain's passing rays.
         w_middle, w_half: w = (1 / lambda^2 - middle) / half in 1/um^2; the index is linear in 1 / lambda^2 (Cauchy).
             half is 0 for a lens without known dispersion, and then w = 0.
-        chief_y, pupil_scale_y_mm: of y where the lens has cylinders, and then the two above are of x; None: of both.
+        chief_y, pupil_scale_y_mm: those of y, where the lens has cylinders; the two above are then those of x. None:
+            the two above hold for both.
     """
 
     film_plane_z_mm: float
@@ -116,7 +117,7 @@ class Encoding:
 
     @property
     def chiefs(self) -> tuple[float, float]:
-        """k of x and of y."""
+        """Return k (see `chief`) of x and of y."""
         return self.chief, self.chief if self.chief_y is None else self.chief_y
 
     @property
@@ -125,7 +126,7 @@ class Encoding:
         return self.pupil_scale_mm, self.pupil_scale_mm if self.pupil_scale_y_mm is None else self.pupil_scale_y_mm
 
     def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:
-        """Crossings with the two planes in mm, [2, N] each."""
+        """Return the crossings with the two planes in mm, [2, N] each."""
         import torch
 
         u = torch.stack([rays.pupil_x, rays.pupil_y])
@@ -145,7 +146,7 @@ class Encoding:
 
     @staticmethod
     def mixed(encodings: Sequence[Encoding], weights: Array) -> Encoding:
-        """The encoding of a state: planes are mixed as they are, scales by their reciprocals, as the graph has them."""
+        """The encoding of a state: planes are mixed as they are, scales by their reciprocals, as in the graph."""
 
         def mean(value: Callable[[Encoding], float]) -> float:
             return float(weights @ np.array([value(e) for e in encodings]))
@@ -186,7 +187,7 @@ class Scales:
 
 
 class Prediction(NamedTuple):
-    """The answers of a model for N rays; lens frame, mm. The ray is meaningful where the status is 0."""
+    """What a model answers for N rays; lens frame, mm. The ray is meaningful where the status is 0."""
 
     rays: Rays
     transmittance: Tensor
@@ -196,7 +197,7 @@ class Prediction(NamedTuple):
 
 
 def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
-    """The outputs of a model's graph for `count` rays."""
+    """Make a prediction of the outputs of a model's graph for `count` rays."""
     from neurolens.optics.trace.surfaces import Rays
 
     scene, power, stop, status = (out[n].expand(-1, count) for n in OUTPUTS)
@@ -216,9 +217,9 @@ class LensModel:
         fit_s: seconds that the fit took.
         direction: what the core's direction vector is: the angle vector, or the slope for first-order models.
         angle: largest angle (rad) between the axis and the rays that the exact lens passes, enlarged by 5%; see
-            `targets.with_angle`. A core's direction vector is no longer than that. Where it is, as a network's may be
-            far from the rays of its fit, the ray lies outside the domain. Where all rays point forwards the angle stays
-            below a right one; of a `Refracted` core it is that inside the glass. pi refuses nothing.
+            `targets.with_angle`. A ray whose direction vector comes out longer, as a network's may far from the rays of
+            its fit, lies outside the domain. Where all rays point forwards the angle stays below a right one. A
+            `Refracted` core's angle is that inside the glass. With pi no ray is refused.
     """
 
     lens: Lens
@@ -250,7 +251,7 @@ class LensModel:
         return {"rays": rays.rows, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
 
     def checked_radius_mm(self, stop_radius_mm: float | None) -> float:
-        """The stop radius asked for, or the domain's. Raises InputError: a stop wider than the model was fitted for."""
+        """The stop radius asked for, or the domain's. Raises InputError: it is wider than the model was fitted for."""
         if stop_radius_mm is not None and not 0 <= stop_radius_mm <= DOMAIN_SLACK * self.domain.stop_radius_mm:
             expected = f"0 to {self.domain.stop_radius_mm:.6g} mm, the widest stop of the fit"
             raise InputError(self.method, "stop_radius_mm", stop_radius_mm, expected)
@@ -258,17 +259,17 @@ class LensModel:
 
     @cached_property
     def graph(self) -> Graph:
-        """For evaluation in float64: inputs and outputs as `assemble` says."""
+        """Write the graph for evaluation in float64: inputs and outputs as `assemble` says."""
         return model_graph(self, EXACT)
 
     @property
     def front(self) -> Surface | None:
-        """The surface on which scene rays are taken; None: the plane of its vertex, of first-order models."""
+        """The surface on which scene rays are taken; None where it is the plane of its vertex (first-order models)."""
         return None if self.direction == "slope" else self.lens.surfaces[0]
 
     @property
     def wavelength_limits_nm(self) -> tuple[float, float]:
-        """Wavelengths accepted: those of the domain with their slack; any for glass without dispersion."""
+        """The wavelengths accepted: those of the domain with their slack; any where the dispersion is unknown."""
         if not self.lens.dispersive:
             return ANY_WAVELENGTH_NM
         low, high = self.domain.wavelength_nm
@@ -276,13 +277,13 @@ class LensModel:
 
 
 def with_one_angle(models: Sequence[LensModel]) -> list[LensModel]:
-    """Models of one structure with the largest angle of them all, so that their graphs are of one structure, too."""
+    """Give models of one structure the largest angle of them all, so that their graphs are of one structure, too."""
     angle = max(model.angle for model in models)
     return [replace(model, angle=angle) for model in models]
 
 
 def mixed(nodes: Sequence[LensModel], weights: Array) -> LensModel:
-    """The model of a state between nodes [K] of one structure whose weights are [K]; its lens is that of the first.
+    """Mix nodes [K] of one structure by weights [K] into the model of a state; its lens is the first node's.
 
     Raises:
         InputError: nodes that differ in more than numbers.
@@ -296,7 +297,7 @@ def mixed(nodes: Sequence[LensModel], weights: Array) -> LensModel:
 
 
 def mix(values: Sequence[Any], weights: Array) -> Any:
-    """Weighted sum of float arrays wherever they stand in equal structures of dataclasses and tuples.
+    """Return the weighted sum of float arrays, wherever they stand in equal structures of dataclasses and tuples.
 
     Raises:
         InputError: structures that differ in anything but those numbers.

@@ -1,4 +1,4 @@
-"""Small networks with the symmetry of the lens (after NeuroLens, Zheng and Zheng 2017b), and the course of a training.
+"""Fits small networks with the symmetry of the lens (after NeuroLens, Zheng and Zheng 2017b); trainings can go on.
 
 Several starts run on few rays; then the best goes on, on as many rays as it takes not to overfit: a smooth lens is
 learnt from 2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on rays that the fit
@@ -45,7 +45,7 @@ from neurolens.models.targets import (
 from neurolens.models.terms import pinned_threads
 
 # What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop; and, for each mm of
-# the film radius, for a transmittance of 1 and for a gate of 1 (a rim radius twice over). They only decide which
+# the film radius, for a transmittance of 1 and for a gate of 1 (about half a rim's radius). They only decide which
 # features the hidden layers learn: the last layer is solved for each output by itself.
 _STOP_UM_PER_MM, _TRANSMITTANCE_UM, _GATE_UM = 30.0, 20.0, 10.0
 # Training ends at an RMS of this share of the film radius: float32 itself, which evaluates the model, has eps 1.2e-7.
@@ -54,13 +54,13 @@ FEWEST_RAYS, _RAYS = 2000, 16_000
 STARTS = 3  # with random weights
 # Each start gets this share of the steps before the best goes on.
 _TRIAL_STEPS = 0.1
-# Steps between looks at the error on rays not fitted (and between checkpoints).
+# Steps between two looks at the error on rays that are not fitted (and between checkpoints).
 _BURST = 10
 # More rays, when the RMS on rays not fitted is larger than that on the fitted ones by this factor.
 _GAP = 1.15
 # Fewest rays near the boundaries for each term that may be added for them.
 _RAYS_A_TERM = 4
-# Converged, when so many bursts in a row lower the loss by less than this share each.
+# A training has converged when so many bursts in a row lower the loss by less than this share each.
 _LITTLE, _IDLE = 0.01, 3
 # A training's state is kept (`base.files`) every few seconds; another schema starts anew.
 _SCHEMA, EVERY_S = 2, 3.0
@@ -104,10 +104,10 @@ def fit_network(
 
 
 def with_boundary_terms(data: Prepared, network: Network) -> Network | Residual:
-    """The network, with a sparse polynomial added to its stop crossing and gates where those need it.
+    """Return the network, with a sparse polynomial added to its stop crossing and gates where those need it.
 
-    The terms are chosen and the rows fitted as those of a polynomial are, with the hidden units as further features;
-    all other rows stay as they are. Lenses with cylinders need none: of those the networks are the better kind.
+    The terms are chosen and their rows fitted as those of a polynomial, with the hidden units as further features. All
+    other rows stay as they are. Networks of lenses with cylinders get none, for they are the better kind there.
     """
     if data.encoding.mirror or len(data.boundary) < _RAYS_A_TERM * MOST_NETWORK_TERMS:
         return network
@@ -134,7 +134,7 @@ def with_boundary_terms(data: Prepared, network: Network) -> Network | Residual:
 
 
 def _problem(data: Prepared, base: InvariantPolynomial | None) -> tuple[Problem, Tensor, Tensor]:
-    """The weighted fit, and shift and scale [4] of the invariants."""
+    """Set up the weighted fit, and shift and scale [4] of the invariants."""
     pairs, boundary = data.pairs, data.boundary
     train = pairs.train.select(slice(0, max(_RAYS - len(boundary), _RAYS - _RAYS // 2)))
     boundary = boundary.select(slice(0, _RAYS - len(train)))
@@ -147,7 +147,7 @@ def _problem(data: Prepared, base: InvariantPolynomial | None) -> tuple[Problem,
 
 
 def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> tuple[Tensor, ...]:
-    """Invariants [4, N] and the fields of `Problem` after the inputs, rays last."""
+    """Return the invariants [4, N] and the fields of `Problem` after the inputs, rays last."""
     lens, domain, gates = data.pairs.lens, data.pairs.domain, data.gates
     targets, gate = targets_of(lens, data.encoding, pairs), gate_values(lens, gates, pairs)
     passes = (pairs.status == st.PASSED).to(torch.float64)
@@ -172,12 +172,12 @@ def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> t
 
 @dataclass
 class _Course:
-    """The course of a training but for the weights: plain numbers, which a checkpoint keeps.
+    """How far a training is, without its weights: plain numbers, which a checkpoint keeps.
 
     Attributes:
         start: the start that runs, or `STARTS` once the best goes on.
         taken: steps of the present start, or of the best; on twice the rays a step counts twice.
-        bursts: of the best. level: how often its rays were doubled.
+        bursts: how many the best has had. level: how often its rays were doubled.
         least: loss of the best start so far. previous: loss after the last burst.
         damping, growth: see `OptimiserState`.
         idle: bursts in a row that gained little.
@@ -210,7 +210,7 @@ class _Training:
         self._problem, self._settings, self._enough = problem, settings, enough
         self._checkpoint, self._progress = checkpoint, progress
         halvings = max(0, (len(problem) // FEWEST_RAYS).bit_length() - 1)
-        self._levels = [2**k for k in range(halvings, -1, -1)]  # a fit sees every so many-th ray
+        self._levels = [2**k for k in range(halvings, -1, -1)]  # at a level a fit sees every n-th ray
         self._short = max(1, round(_TRIAL_STEPS * settings.steps))
         self._course, self._optimiser, self._champion = _Course(), self._start(0), list[Tensor]()
         if (saved := checkpoint.load()) is not None:
@@ -221,7 +221,7 @@ class _Training:
         self._take_rays()
 
     def run(self) -> Projection:
-        """Train; the last layer fits all rays."""
+        """Train, and fit the last layer to all rays."""
         while not self._course.ended:
             if self._course.start < STARTS:
                 self._try_start()
@@ -241,7 +241,7 @@ class _Training:
         self._validation = self._problem.every(4, first=1) if level + 1 < len(self._levels) else None
 
     def _burst(self, steps: int) -> Projection:
-        """At most `_BURST` steps, each counted by its rays."""
+        """Take at most `_BURST` steps, each counted by its rays."""
         course, each = self._course, self._levels[0] // self._levels[self._course.level]
         count = min(_BURST, -(-(steps - course.taken) // each))
 
@@ -254,7 +254,7 @@ class _Training:
         return best
 
     def _try_start(self) -> None:
-        """A burst of one of the starts; the end of its trial compares it with the best so far."""
+        """Run a burst of one of the starts; the end of its trial compares it with the best so far."""
         course, best = self._course, self._burst(self._short)
         if course.taken < self._short and not self._optimiser.stuck:
             return
@@ -264,7 +264,7 @@ class _Training:
         self._optimiser = self._start(course.start) if course.start < STARTS else OptimiserState(self._champion)
 
     def _go_on(self) -> None:
-        """A burst of the best start; then more rays, or the end."""
+        """Run a burst of the best start; then take more rays, or end."""
         course, best = self._course, self._burst(self._settings.steps)
         course.bursts += 1
         course.idle = course.idle + 1 if best.loss > (1 - _LITTLE) * course.previous else 0
@@ -285,7 +285,7 @@ class _Training:
 
 
 def random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[Tensor]:
-    """Uniform weights (Glorot and Bengio 2010) and biases that spread the bends of tanh over the data."""
+    """Draw uniform weights (Glorot and Bengio 2010), and biases that spread the bends of tanh over the data."""
     generator = torch.Generator().manual_seed(seed)
     changes = (inputs != inputs[0]).any(0)
     hidden, width = [], inputs.shape[1]
@@ -304,7 +304,7 @@ def random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[Te
 
 
 def _fingerprint(tensors: list[Tensor], settings: dict[str, Any]) -> str:
-    """SHA-256 of everything that decides the weights: the data, the settings and the version of torch."""
+    """Hash everything that decides the weights (SHA-256): the data, the settings and the version of torch."""
     digest = hashlib.sha256(json.dumps([settings, str(torch.__version__), _SCHEMA], sort_keys=True).encode())
     for tensor in tensors:
         digest.update(str(tuple(tensor.shape)).encode())
@@ -313,7 +313,7 @@ def _fingerprint(tensors: list[Tensor], settings: dict[str, Any]) -> str:
 
 
 def training_s(path: Path | None) -> float:
-    """Seconds that a model's training took, all runs of it together; 0 where no file has them."""
+    """Return the seconds that all runs of a model's training took together; 0 where no file has them."""
     with suppress(OSError, ValueError):
         if path is not None:
             with read_arrays(path) as (about, _):

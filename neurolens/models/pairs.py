@@ -1,4 +1,4 @@
-"""Domains, the camera rays (film, pupil, wavelengths, film positions) that a surrogate stands for; their exact images.
+"""Domains, which are the camera rays that a surrogate stands for, and pairs: rays of a domain with their exact images.
 
 Ray pairs are sampled from a domain and traced in float64, in five splits.
 """
@@ -23,7 +23,7 @@ from neurolens.optics.setting.focusing import film_range_mm
 from neurolens.optics.setting.pupils import camera_rays, image_radius_mm, pupil_bounds
 from neurolens.optics.trace.rays import CHUNK, Rays, trace
 
-_PUPIL_MARGIN = 1.05  # of the disc on the pupil plane beyond that of all passing rays
+_PUPIL_MARGIN = 1.05  # radius of the pupil disc over that of the disc of all passing rays
 # Film positions of sampled rays, both limits of focus among them: a picture has one film position, and so has a call of
 # an exported model.
 _FILM_PLANES = 17
@@ -31,7 +31,7 @@ _FILM_PLANES = 17
 SPARSE = 0.3
 # Boxes are enlarged by this share of their half width on every side, so that rays just beyond a rim are among them.
 _BOX_MARGIN = 0.15
-_EDGE = 0.03  # of the film radius
+_EDGE = 0.03  # width of the film's edge, as a share of its radius
 # Another pupil plane is taken where so many times more of the disc passes; each plane tried is this factor further from
 # the film than the one before, out to so many focal lengths.
 _BETTER, _STEP, _REACH = 1.25, 1.02, 20
@@ -53,7 +53,7 @@ class FilmRays:
 
     @property
     def rows(self) -> Tensor:
-        """[5, N] as graphs take them: all but the film plane."""
+        """Return rows [5, N] as graphs take them: all but the film plane."""
         return torch.stack([self.film_x, self.film_y, self.pupil_x, self.pupil_y, self.wavelength_nm])
 
     def select(self, index: Tensor | slice) -> FilmRays:
@@ -76,15 +76,15 @@ def domain_of(
     film_z_mm: tuple[float, float] | None = None,
     pupil_z_mm: float | None = None,
 ) -> Domain:
-    """The domain of a lens at its present stop.
+    """Return the domain of a lens at its present stop.
 
     Args:
         film_radius_mm: None takes the lit film (see `pupils.image_radius_mm`).
-        focus_m: two object distances from the film; the domain holds every film plane between theirs, the paraxial
-            images and those of least spot.
-        wavelength_nm: None takes `Lens.light_nm`. Without any known dispersion `Lens.reference_nm` replaces it.
+        focus_m: two object distances from the film. The domain holds every film plane between theirs: those of the
+            paraxial image and those of least spot.
+        wavelength_nm: None takes `Lens.light_nm`, or `Lens.reference_nm` where no dispersion is known.
         nearest_m: distance from the film of the nearest object in view; None takes the nearest focus.
-        film_z_mm: film planes, of a lens that was focused otherwise; None follows from `focus_m`.
+        film_z_mm: film planes of a lens that was focused otherwise; None follows from `focus_m`.
         pupil_z_mm: plane of the pupil points; None takes the one on which the pupil is tightest.
 
     Raises:
@@ -123,7 +123,7 @@ def domain_of(
 
 
 def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float:
-    """The plane of `bounds`, or the one on which a disc holds the passing rays of all film points most tightly.
+    """Return the plane of `bounds`, or the one on which a disc holds the passing rays of all film points most tightly.
 
     The pupil of a fisheye or of a condenser walks as the film point moves, and the pupil of a lens that is almost
     telecentric on the film's side lies far away: on the plane of the paraxial exit pupil, or of the rear vertex in its
@@ -135,7 +135,7 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
     lit = [(i * step, low, high, half) for i, (low, high, half) in enumerate(rows) if low < high]
 
     def spread(distance: float) -> float:
-        """Radius of the disc over the distance from the film: its square goes with the disc's share of solid angle."""
+        """The disc's radius over the distance from the film, whose square follows the disc's share of solid angle."""
         s = distance / here
         boxes = ((r + (low - r) * s, r + (high - r) * s, half * s) for r, low, high, half in lit)
         return max(max(abs(a), abs(b), math.hypot((a + b) / 2, h)) for a, b, h in boxes) / distance
@@ -149,7 +149,7 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
-    """z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
+    """The z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film z, to first order."""
     data = first_order(lens)
     front, rear = data.front_efl_mm, data.efl_mm
     extension = film_z - data.rear_principal_z_mm - rear  # Newton: f f' / extension is how far beyond the front focus
@@ -171,7 +171,7 @@ def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmR
 
 
 def _drawn(domain: Domain, count: int, seed: int, skip: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Scrambled Sobol points: four numbers of every ray [4, N], its film plane and its wavelength."""
+    """Draw scrambled Sobol points: four numbers of every ray [4, N], its film plane and its wavelength."""
     engine = SobolEngine(6, scramble=True, seed=seed)
     if skip:
         engine.fast_forward(skip)
@@ -187,14 +187,14 @@ def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 
 
 def draw(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
-    """At most `count` rays of a domain, uniform where any passes, and the number of uniform rays they stand for."""
+    """Draw at most `count` rays of a domain, uniform where any passes, and say how many uniform rays they stand for."""
     if lit_share(domain) < SPARSE:
         return sample_lit(domain, count, seed, skip)
     return sample_domain(domain, count, seed, skip), float(count)
 
 
 def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
-    """Rays that meet everything that blocks light.
+    """Draw rays that meet everything that blocks light.
 
     They are uniform over the domain; where little of it passes, as many lie near the passing rays; and a tenth as many
     start at the edge of the first and the last film plane, where a rim may just begin to block.
@@ -213,7 +213,7 @@ def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
 def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
     """Rays of the same distribution as `sample_domain`, but from the boxes of `Domain.bounds` alone.
 
-    Returns fewer than `count` rays, because the corners of a box may lie outside the disc; and the number of rays of
+    Returns fewer than `count` rays, because the corners of a box may lie outside the disc, and the number of rays of
     `sample_domain` that they stand for.
     """
     edges, low, high, half, area = _boxes(domain)
@@ -231,14 +231,14 @@ def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[Fi
 
 
 def lit_share(domain: Domain) -> float:
-    """Share of the domain's rays within the boxes that `sample_lit` draws from (above 1: it gains nothing)."""
+    """Return the share of the domain's rays in the boxes of `sample_lit` (above 1 these gain nothing)."""
     edges, *_, area = _boxes(domain)
     held = ((edges[1:] ** 2 - edges[:-1] ** 2) * area).sum()
     return float(held) / (domain.film_radius_mm**2 * math.pi * domain.pupil_radius_mm**2)
 
 
 def _boxes(domain: Domain) -> tuple[Tensor, ...]:
-    """Edges of rings of the film [K + 1]; the enlarged box of each ring's passing rays: low, high, half, area [K]."""
+    """The edges [K + 1] of rings of the film, and low, high, half, area [K] of each ring's box of passing rays."""
     b = domain.bounds
     low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (b.low_mm, b.high_mm, b.half_mm))
     dark = low >= high
@@ -295,13 +295,13 @@ class PairSet:
         return len(self.inputs)
 
     def columns(self) -> tuple[Tensor, ...]:
-        """All tensors, in the order of `of_columns`; rays last."""
+        """Return all tensors, in the order of `of_columns`; rays last."""
         surfaces = (self.cross_x, self.cross_y, self.meets, self.refracts)
         return (*self.inputs.columns(), *self.scene, self.transmittance, self.status, *surfaces)
 
     @staticmethod
     def of_columns(columns: Iterable[Tensor]) -> PairSet:
-        """The set of such tensors."""
+        """Make a set of tensors such as `columns` gives."""
         c = tuple(columns)
         return PairSet(FilmRays(*c[:6]), Rays(*c[6:12]), *c[12:])
 
@@ -320,7 +320,8 @@ class RayPairs:
         edge: rays that miss a surface or are totally reflected, and before that are no further from the rims than the
             rays of `rim`; at most half as many as the settings ask for `rim`. Figures of surfaces that a ray never
             reached are 0.
-        far: other rays that do not pass, so that models block those, too; as many, and with such zeros.
+        far: other rays that do not pass, so that models block those, too; at most as many as `edge`, with the same
+            zeros.
         tested: rays drawn until `train` was full, so that len(train) / tested is the share of the disc that passes.
     """
 
@@ -339,7 +340,7 @@ def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
     """Exact images of camera rays, with every crossing."""
     rays = camera_rays(inputs.film_x, inputs.film_y, inputs.film_z, inputs.pupil_x, inputs.pupil_y, pupil_z)
     every, parts = range(len(lens.surfaces)), []
-    fields = rays.x.new_empty(4, len(every), len(rays.x))  # most of the memory of a lens with many surfaces: had once
+    fields = rays.x.new_empty(4, len(every), len(rays.x))  # most of the memory of a lens with many surfaces: taken once
     for start in range(0, len(rays.x), CHUNK):
         here = slice(start, start + CHUNK)
         with torch.no_grad():
@@ -360,10 +361,10 @@ def make_pairs(
 ) -> RayPairs:  # fmt: skip
     """Sample a domain and trace it in float64 until `train` and `held_out` are full.
 
-    `rim`, `edge` and `far` come from the rays drawn for `train`, as many as those hold.
+    `rim`, `edge` and `far` are filled from the rays drawn for `train`, as far as these go.
 
     Raises:
-        InputError: an empty split, a stop with blades or a mask (models give the crossing with it instead), or fewer
+        InputError: a split is empty, the stop has blades or a mask (models give the crossing with it instead), or fewer
             than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
@@ -415,12 +416,13 @@ def make_pairs(
 
 
 def _blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
-    """[N] bool for each split of `RayPairs` about boundaries: the rays that belong there."""
+    """Return which rays [N] belong in each split of `RayPairs` that is about boundaries."""
     radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
     near = batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2
     refracts = (batch.meets > 0) & (batch.refracts > 0)
     whole = refracts.all(0)
-    # Not by status alone: a ray that a rim stops may be lost at a later surface. A lost ray comes back along the axis.
+    # Not by status alone: a ray that a rim stops may be lost at a later surface. The tracer returns a lost ray on the
+    # axis.
     rim = whole & torch.isfinite(batch.cross_x).all(0) & ~_lost(batch) & near.all(0)
     edge = ~whole & (~(reached(batch) & refracts) | near).all(0)
     return {"rim": rim, "edge": edge, "far": ~(rim | edge | (batch.status == st.PASSED))}
@@ -436,12 +438,12 @@ def reached(pairs: PairSet) -> Tensor:
 
 
 def _lost(pairs: PairSet) -> Tensor:
-    """[N] bool: rays whose status is a missed surface or total reflection."""
+    """Return which rays [N] have the status of a missed surface or of total reflection."""
     return (pairs.status >= 4) & (pairs.status % 4 != st.RIM)
 
 
 def _unreached_as_zero(lost: PairSet) -> PairSet:
-    """Lost rays with 0 for what they never reached, where tracing them further gave figures without meaning."""
+    """Put 0 for what lost rays never reached, where tracing them further gave figures without meaning."""
     arrived = reached(lost)
     meets = lost.meets.where(arrived, 0.0)
     met = arrived & (meets > 0)

@@ -1,7 +1,7 @@
-"""Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement; and first order.
+"""Polynomial surrogates: dense, by matching pursuit, by orthogonal least squares with replacement; and first order.
 
 One choice of monomials serves position and direction, by the film-equivalent error in the nearest focused plane and at
-infinity; by orthogonal least squares each then keeps the terms that it needs. The stop crossing, the transmittance and
+infinity. Orthogonal least squares then keeps for each the terms that it needs. The stop crossing, the transmittance and
 the gates are fitted on the monomials that are computed anyway.
 The thin and the thick lens that renderers use today have the same form: their rays follow the ideal (collinear) map of
 the prescription's focal length and principal planes; stop and rims are fitted as quadratic forms, which is what
@@ -70,7 +70,8 @@ Shift = tuple[float, float]
 _CHOICE_RAYS = 10_000
 _SURPLUS = 1.5  # terms before elimination over terms kept
 _POSITION_SHARE = 2 / 3  # the position may err by this share of the direction's error, both weighed
-# Growth goes on while directions err by more than this, a round taking away at least a share of the squared residual.
+# Growth goes on while directions err by more than this, for so many more rounds, each of which must take away this
+# share of the squared residual. The last number: passes of replacement.
 FINE_DEG, _MORE_ROUNDS, _LEAST_FALL, _PASSES = 0.002, 4, 0.03, 3
 # The search for planes: rays of a trial fit, degree of its candidates; multiples of u in p and of p in u (scaled, see
 # `shifted`) from which it starts, its steps, and the farthest of those multiples.
@@ -82,7 +83,7 @@ _MOST_CANDIDATES = 2500  # more would take too long to choose from
 
 
 def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomial:
-    """Fit by one of `POLYNOMIALS`.
+    """Fit by the method of the settings, one of `POLYNOMIALS`.
 
     Raises:
         InputError: an unknown method, fewer than two terms, or too few training rays.
@@ -133,7 +134,7 @@ def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
 
 
 def _grown(exponents: Exponents, chosen: list[int], *, dispersive: bool) -> Exponents:
-    """The exponents [M, 4], and below them those of the chosen columns raised by one in each variable."""
+    """Return the exponents [M, 4], and below them those of the chosen columns raised by one in each variable."""
     parents = exponents[sorted({k % len(exponents) for k in chosen})]
     children = np.concatenate([parents + step for step in np.eye(4, dtype=np.int64)[: 4 if dispersive else 3]])
     return np.concatenate([exponents, further(children, exponents)])
@@ -142,10 +143,10 @@ def _grown(exponents: Exponents, chosen: list[int], *, dispersive: bool) -> Expo
 def _grown_on(
     data: Prepared, exponents: Exponents, chosen: list[int], sweep: Callable[[Exponents], Sweep], terms: int
 ) -> tuple[Exponents, list[int]]:
-    """The exponents and columns after more rounds, each from the chosen terms and what they give alone.
+    """Choose in more rounds, each among the chosen terms and their products; returns exponents and columns.
 
-    Rounds end where directions err by less than `FINE_DEG`, or where one takes off less than `_LEAST_FALL`. Searches of
-    several widths, from the chosen terms and from none, because each ends in another place.
+    Rounds end where directions err by less than `FINE_DEG`, or where one takes off less than `_LEAST_FALL`. Each
+    searches with several widths, from the chosen terms and from none, because each search ends in another place.
     """
     fine = math.radians(FINE_DEG) * film_equivalent_weights(data.pairs.lens, data.pairs.domain)[1]
     for _ in range(_MORE_ROUNDS):
@@ -200,7 +201,7 @@ def ideal_map(lens: Lens, encoding: Encoding, method: ParaxialMethod) -> Tensor:
 
 
 def fit_paraxial(data: Prepared, method: ParaxialMethod) -> InvariantPolynomial:
-    """A model whose rays are first order; its direction vector is a slope (see `LensModel.direction`)."""
+    """Fit a model whose rays are first order; its direction vector is a slope (see `LensModel.direction`)."""
     exponents = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], dtype=np.int64)
     ab = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     ab[[POSITION, DIRECTION], :, 0] = ideal_map(data.pairs.lens, data.encoding, method)
@@ -212,7 +213,7 @@ def fit_paraxial(data: Prepared, method: ParaxialMethod) -> InvariantPolynomial:
 
 
 def shifted(encoding: Encoding, passing: PairSet, shift: Shift) -> Encoding:
-    """The encoding with q = p - m u for p and u - k q for u, for shift (k, m), scaled by the rays of `passing`.
+    """Return the encoding with q = p - m u for p and u - k q for u, for shift (k, m), scaled by the rays of `passing`.
 
     q is the crossing with another plane up to scale, so that only plane, chief and scales change.
     """
@@ -245,15 +246,15 @@ def _proper(encoding: Encoding, shift: Shift) -> bool:
 
 
 def fit_planes(pairs: RayPairs, encoding: Encoding, terms: int, position_weight: float) -> Encoding:
-    """Search the planes in which a polynomial of `terms` coefficients per vector output is best. Deterministic.
+    """Search for the planes in which a polynomial of `terms` coefficients per vector output is best.
 
     A ray's crossings with any two planes carry the same information, and a polynomial of full degree in them spans the
     same functions, because the change is linear. A sparse one does not: its variables should follow the lens's own (its
-    field, and where the ray crosses its stop). So the p plane and the multiple of p that is taken from u are searched,
-    for the least film-equivalent residual of a sparse fit. Nothing changes in the evaluator.
-
-    The encoding itself is among the trials; it comes back where none does better, or where there are too few rays for
-    a trial to mean anything.
+    same functions, because the change is linear. A sparse one does not: its variables should follow the lens's own (its
+    field, and where the ray crosses its stop). So the search moves the p plane, and the multiple of p that is taken
+    from u, to the least film-equivalent residual of a sparse fit. Nothing changes in the evaluator. The encoding itself
+    is among the trials; it comes back where none does better, or where there are too few rays for a trial to mean
+    anything. The search is deterministic.
     """
     rays = pairs.train.select(slice(0, _TRIAL_RAYS))
     if encoding.mirror or len(rays) < 4 * _SURPLUS * terms:
@@ -312,7 +313,7 @@ def mirror_exponents(degree: int, axis: int, *, dispersive: bool = True) -> Expo
 
 
 def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPolynomial:
-    """The polynomial of a lens with cylinders. Position and direction share terms, x and y have their own.
+    """Fit the polynomial of a lens with cylinders. Position and direction share terms, x and y have their own.
 
     Args:
         method: "ols" (orthogonal least squares with replacement) or "omp" (matching pursuit).
@@ -336,7 +337,7 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
     outputs = film_equivalent(pairs.lens, pairs.domain, train.vectors)
     field = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field))
     supports: list[Exponents] = []
-    sides = []  # of every column chosen, whether it is one of u
+    sides = []  # whether each chosen column is one of u
     for axis in (0, 1):
         candidates = next(
             e
@@ -365,7 +366,7 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
 
 
 def _scalar_terms(*, dispersive: bool) -> Exponents:
-    """Terms for transmittance and gates: every invariant, and high powers of w, for glass that absorbs blue."""
+    """Return terms for transmittance and gates: every invariant, and high powers of w, for glass that absorbs blue."""
     units = np.eye(7, dtype=np.int64)
     w = units[6]
     plain = [w * k for k in range(8 if dispersive else 1)]

@@ -62,13 +62,14 @@ class Problem:
         return [getattr(self, f.name) for f in fields(self)]
 
     def every(self, step: int, first: int = 0) -> Problem:
-        """Every `step`-th ray from the `first`."""
+        """Return every `step`-th ray, beginning with `first`."""
         inputs, *rest = self.tensors
         return Problem(inputs[first::step], *(t[..., first::step] for t in rest))
 
     @cached_property
     def curvature(self) -> Tensor:
-        """[N, 3 V + S] second derivatives of half a ray's loss by its outputs: AA, AB, BB of a vector; each scalar."""
+        """Second derivatives of half a ray's loss by its outputs, [N, 3 V + S]: AA, AB, BB of each vector, each
+        scalar."""
         pairs = ((self.p, self.p), (self.p, self.u), (self.u, self.u))
         dots = torch.stack([(a * b).sum(1) for a, b in pairs], 1)  # [1 or V, 3, N]
         vectors = (self.vector_weights**2)[:, None] * dots
@@ -76,7 +77,7 @@ class Problem:
 
     @cached_property
     def pull(self) -> Tensor:
-        """[N, rows] the slope of half a ray's loss at outputs of zero, negated."""
+        """[N, rows] the negated slope of half a ray's loss where all outputs are zero."""
         dots = torch.stack([(self.vectors * self.p).sum(1), (self.vectors * self.u).sum(1)], 1)  # [V, 2, N]
         vectors = (self.vector_weights**2)[:, None] * dots
         return torch.cat([vectors.flatten(0, 1), self.scalar_weights**2 * self.scalars]).T.contiguous()
@@ -166,7 +167,7 @@ def _with_ones(x: Tensor) -> Tensor:
 
 
 def _squares(a: Tensor) -> Tensor:
-    """Products of every pair of columns once."""
+    """Return the product of every pair of columns, once."""
     i, j = torch.triu_indices(a.shape[1], a.shape[1])
     return a[:, i] * a[:, j]
 
@@ -186,7 +187,7 @@ class OptimiserState:
 
     Attributes:
         hidden: [units, inputs + 1] of each layer.
-        damping, growth: of the next step, and the factor on the damping if that helps nothing.
+        damping, growth: the damping of the next step, and the factor on it if that step does not help.
     """
 
     hidden: list[Tensor]
@@ -319,13 +320,13 @@ def _products(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _symmetric(a: Tensor) -> Tensor:
-    """The upper triangles of [n, k, k]."""
+    """Return the upper triangles of matrices [n, k, k]."""
     i, j = torch.triu_indices(a.shape[1], a.shape[1])
     return a[:, i, j]
 
 
 def _block(total: Tensor, left: tuple[int, ...], right: tuple[int, ...]) -> Tensor:
-    """Block of the normal equations between two layers of shapes (units, inputs), from its sums over rays.
+    """Return the block of the normal equations between two layers of shapes (units, inputs), from its sums over rays.
 
     `total` is [unit pairs, input pairs], in upper triangles where both layers are the same.
     """

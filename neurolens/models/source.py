@@ -1,4 +1,4 @@
-"""Source code of models, C99 or a shading language, the card as a comment on top; and what a scene fixes of them.
+"""Source code of models in C99 or a shading language, the card as a comment on top; and what a scene fixes in them.
 
 Only fixing needs torch.
 """
@@ -79,12 +79,12 @@ FREE = Fix()
 
 
 def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
-    """The model for what is fixed: one for each wavelength, of one structure, or one where the wavelength stays free.
+    """Return models for what is fixed: one for each wavelength, all of one structure, or one where that stays free.
 
-    One wavelength folds every power of w into the coefficients: for pictures in one colour of light (a laser line, a
-    filter, a measurement at the d line), or one model a channel where dispersion within a channel does not count.
-    Pictures in white light take the whole model. A film position and a stop narrow the domain; rims that then block
-    nothing go.
+    One wavelength folds every power of w into the coefficients. That serves pictures in one colour of light (a laser
+    line, a filter, a measurement at the d line), or one model a channel where dispersion within a channel does not
+    count. Pictures in white light take the whole model. A film position and a stop narrow the domain; rims that then
+    block nothing are left out.
 
     Raises:
         InputError: a wavelength, film position or stop outside the model's domain; too many wavelengths, or one twice.
@@ -137,7 +137,7 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
 
 @dataclass(frozen=True)
 class Written:
-    """A file that was written: its function, and float operations of one ray (a fused multiply-add is one)."""
+    """A written file, with its function and the float operations of one ray (a fused multiply-add is one)."""
 
     path: Path
     signature: Signature
@@ -159,13 +159,13 @@ def export_source(
     """Write a model, one for each of several fixed wavelengths, or one of many states, as one function.
 
     Args:
-        models: one; one for each wavelength; or one for every node of a card with states (zoom, internal focus): then
-            the state is an argument, which NAME_at makes of numbers.
+        models: one model; one for each wavelength; or one for every node of a card with states (zoom, internal focus).
+            In the last case the state is an argument, which NAME_at makes of numbers.
         language: of `WRITERS`.
         card: of the model, for the comment.
         parts, fix: see `fused_program`.
         name: of the function; None takes the lens's id.
-        extras, notes: what else the file holds, and lines of the comment on it.
+        extras, notes: what else the file holds, and lines of the comment about that.
 
     Raises:
         InputError: another language, a name that is no identifier, numbers that float32 cannot hold, a card that lacks
@@ -197,7 +197,7 @@ def checked_name(language: str, lens_id: str, name: str | None) -> str:
 
 
 def _taken(word: str) -> bool:
-    """Whether a word has a meaning in a language, or in the code that is written."""
+    """Return whether a word has a meaning in a language, or in the code that is written."""
     reserved = {*_WORDS, *RAY, *SCENE_RAY, *STOP, WAVELENGTH, FILM_Z, STOP_RADIUS, TRANSMITTANCE, STATUS}
     return word in reserved or word.removesuffix("f") in dir(math) or _PATTERNS.fullmatch(word) is not None
 
@@ -211,7 +211,7 @@ def write_program(
 
 
 def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FREE) -> Program:
-    """The program of a model, or of several that differ only in their coefficients (one for each wavelength).
+    """Write the program of a model, or of several that differ only in their coefficients (one for each wavelength).
 
     Inputs: `program.RAY`, then wavelength_nm where rays depend on it, film_z_mm unless fixed, and stop_radius_mm unless
     fixed or without vignetting. Outputs: `program.SCENE_RAY`; transmittance, stop_x_mm and stop_y_mm as asked for;
@@ -228,7 +228,7 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
 
 
 def identifier(text: str) -> str:
-    """A name of a function made from any text."""
+    """Make the name of a function from any text."""
     word = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:80]
     return word if word[:1].isalpha() and not _taken(word) else f"lens_{word}"
 
@@ -236,7 +236,7 @@ def identifier(text: str) -> str:
 def comment_of(
     card: Mapping[str, Any], domain: Mapping[str, Any], waves: Sequence[Sequence[float]], fix: Fix, gates: Sequence[int]
 ) -> list[str]:
-    """The card in lines of text, for this domain, its bands of wavelengths and the status codes of its gates."""
+    """Write the card as lines of text, for this domain, its bands of wavelengths and the status codes of its gates."""
     lens, fit, d = card["lens"], card["fit"], domain
     lines = [
         f"{lens['name']}: {fit['method']}, written by neurolens {neurolens.__version__}.",
@@ -278,7 +278,7 @@ def comment_of(
 
 
 def lines_of(texts: Sequence[str]) -> list[str]:
-    """Texts as lines of a comment."""
+    """Write texts as lines of a comment."""
     flat = [" ".join(printable(str(text)).split()) for text in texts]
     return [part for line in flat for part in textwrap.wrap(line, _WIDTH, break_long_words=False)]
 

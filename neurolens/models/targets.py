@@ -1,11 +1,11 @@
-"""The input of a fit: gates, settings, ray pairs with their exact vectors and scalars, scaled, and weights.
+"""What a fit takes: gates, settings, and ray pairs with their exact vectors and scalars, scaled and weighted.
 
 Gates are the rims and discriminants that a model must test. A rim is tested at the ray's crossing with its surface. A
 ray that misses a surface or is totally reflected has no crossing; there the sign of the discriminant decides (of the
 intersection, or of Snell's law). It is smooth across the boundary, because it depends only on the ray that arrives.
 
 Of a lens whose rays leave the front surface at grazing angles, polynomials are fitted up to the front glass, and models
-refract there exactly (`cores.Refracted`): near grazing the direction outside turns as the square root of what is left
+refract there exactly (`cores.Refracted`): near grazing the direction outside turns as the square root of the distance
 to the grazing ray. Networks follow that themselves, and measured worse when their error was that inside the glass.
 """
 
@@ -49,25 +49,26 @@ from neurolens.optics.trace.surfaces import entered
 
 # Rays of the boundary fits are mixed by this seed: networks use the first of them.
 _MIXING_SEED = 1
-# Gates of either kind; rims end when this share of the blocked rays, discriminants when this share of all rays is left.
+# The most gates of either kind. Rims are added until this share of the blocked rays is left unexplained, discriminants
+# until this share of all rays is.
 _MOST_GATES, _UNEXPLAINED = 10, 1e-4
 
 # Only the neighbourhood of a boundary decides who passes: weights fall off beyond this distance from it, in units of
-# the gate (half as much of a rim's radius).
+# the gate (one of which is about half a rim's radius).
 BOUNDARY_WIDTH = 0.03
-# The stop crossing is wanted to the same share of the opening down to this one, in stop radii: four stops.
+# The stop crossing may err by the same share of any opening down to this one, in stop radii: four stops.
 STOPPED_DOWN = 0.25
 
 
 def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
-    """[G, N] bool: rays of which the gate's value is known, because they get as far as its surface (and to its rim)."""
+    """Return of which rays a gate's value is known [G, N]: they get as far as its surface (and to its rim)."""
     arrives = reached(pairs)
     rows = [arrives[g.surface] & (pairs.meets[g.surface] > 0 if g.reason == st.RIM else True) for g in gates]
     return torch.stack(rows) if rows else torch.empty((0, len(pairs)), dtype=torch.bool)
 
 
 def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
-    """[G, N] exact values of the gates, positive where the surface stops the ray; 0 where it never gets there."""
+    """The exact values [G, N] of the gates: positive where the surface stops the ray, 0 where it never gets there."""
     rows = []
     for gate in gates:
         k = gate.surface
@@ -81,7 +82,7 @@ def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
 
 
 def _beyond_rim(surface: Surface, height: Tensor) -> Tensor:
-    """[N] a rim's gate at crossings `height` [N] mm from the axis: the height's square over the rim's, less 1.
+    """Return a rim's gate [N] at crossings `height` [N] mm from the axis: the height's square over the rim's, less 1.
 
     On a sphere whose equator lies within reach of the rays near the rim, the square turns back there and cannot be
     fitted. The gate is then the depth over the rim's depth, less 1, which agrees to first order and never turns.
@@ -96,7 +97,7 @@ def _beyond_rim(surface: Surface, height: Tensor) -> Tensor:
 
 
 def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tuple[Tensor, Tensor]:
-    """Weights of the rays of `boundary_rays` in the fits of the gates [G, N] and of the stop crossing [N].
+    """Weigh the rays of `boundary_rays` for the fits of the gates [G, N] and of the stop crossing [N].
 
     A gate decides where its value is near 0 and no other boundary stops the ray. The stop crossing counts wherever the
     ray passes, because the stop may be closed, and more near the middle, where an error meets smaller openings. Rays
@@ -121,7 +122,7 @@ def _near(distance: Tensor) -> Tensor:
 
 
 def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
-    """The rays that the gates are fitted on: those near the rims, and lost rays where a gate is about those."""
+    """Return the rays to which gates are fitted: those near the rims, and lost rays where a gate is about those."""
     if all(gate.reason == st.RIM for gate in gates) or not len(pairs.edge):
         return pairs.rim
     both = join_pairs([pairs.rim, pairs.edge])
@@ -129,14 +130,14 @@ def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
 
 
 def choose_gates(lens: Lens, blocked: PairSet, drawn: int | None = None) -> tuple[Gate, ...]:
-    """The boundaries that block anything in the domain: the one that explains most blocked rays, then the next.
+    """Choose the boundaries that block anything in the domain: the one that explains most blocked rays, then the next.
 
     Rims come first, by the rays that refract all the way; then, for what the rims leave, discriminants. A gate of total
     reflection covers the rays that miss the same surface, whose discriminant is lower still.
 
     Args:
         blocked: rays that did not pass, of uniform ones over the domain.
-        drawn: number of those uniform rays; None: of `blocked`.
+        drawn: how many uniform rays were drawn; None takes the number of `blocked`.
 
     Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
     """
@@ -157,7 +158,7 @@ def choose_gates(lens: Lens, blocked: PairSet, drawn: int | None = None) -> tupl
 
 
 def _greedy(stops: Tensor, enough: int) -> list[int]:
-    """Rows of [K, N] bool: the one with most entries, then the one with most of the rest, until `enough` or fewer."""
+    """Choose rows of [K, N] bool: the one with most entries, then the one with most of the rest, down to `enough`."""
     chosen: list[int] = []
     while stops.shape[1] and len(chosen) < _MOST_GATES:
         counts = stops.sum(1)
@@ -170,7 +171,7 @@ def _greedy(stops: Tensor, enough: int) -> list[int]:
 
 
 def explained(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
-    """[N] bool: rays that a gate, exact, or the stop would stop."""
+    """Return which rays [N] the stop or an exact gate would stop."""
     stop = Gate(lens.stop_index, st.RIM)
     return (gate_values(lens, (*gates, stop), pairs) > 0).any(0)
 
@@ -209,7 +210,7 @@ class ModelSettings:
     planes: bool = setting(True, "whether methods of `PLANES_SEARCHED` search the planes of the light field")
     units: int = setting(16, "units of each layer of a network", within=(1, 512))
     layers: int = setting(2, "layers of a network", within=(1, 8))
-    # Never a time, so that the load of a machine changes no byte. On n times the fewest rays a step counts n.
+    # A count, not a time, so that the load of a machine changes no byte. A step on n times the fewest rays counts n.
     steps: int = setting(400, "most iterations of a network's training", within=(1, 100_000))
     seed: int = setting(0, "of a network's first weights")
 
@@ -240,7 +241,7 @@ class ModelSettings:
 
 
 def scales_of(lens: Lens) -> Scales:
-    """Front-surface positions in units of the front rim, stop crossings in units of the stop."""
+    """Return the scales of a lens: positions in units of the front rim, stop crossings in units of the stop."""
     return Scales(lens.surfaces[0].semi_diameter_mm, lens.stop_radius_mm)
 
 
@@ -260,7 +261,7 @@ class Targets:
 
 
 def targets_of(lens: Lens, encoding: Encoding, pairs: PairSet) -> Targets:
-    """Targets of rays that reach the scene."""
+    """Return the targets of rays that reach the scene."""
     scales, scene, stop = scales_of(lens), pairs.scene, lens.stop_index
     vectors = torch.empty((3, 2, len(pairs)), dtype=scene.x.dtype)
     vectors[POSITION] = torch.stack([scene.x, scene.y]) / scales.position_mm
@@ -301,7 +302,7 @@ class Prepared:
 
 
 def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
-    """Micrometres on the film per unit of scaled position and per radian, first order.
+    """Return the micrometres on the film per unit of scaled position and per radian, to first order.
 
     A direction error d moves the image by f d; a position error e on the front surface moves a point in the nearest
     focused plane by e, and so its image by e times the magnification there; objects nearer than that plane count where
@@ -316,14 +317,14 @@ def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
 
 
 def film_equivalent(lens: Lens, domain: Domain, vectors: Tensor) -> Tensor:
-    """[2, 2, N] micrometres on the film of vectors [3, 2, N]: in the nearest focused plane, and at infinity."""
+    """Return errors on the film [2, 2, N] (um) of vectors [3, 2, N]: in the nearest focused plane, and at infinity."""
     position, direction = film_equivalent_weights(lens, domain)
     at_infinity = direction * vectors[DIRECTION]
     return torch.stack([at_infinity + position * vectors[POSITION], at_infinity])
 
 
 def weighed_apart(lens: Lens, domain: Domain, vectors: Tensor, position_weight: float) -> Tensor:
-    """[2, 2, N] what decides which terms a fit keeps: direction in micrometres on the film, and position.
+    """Return what decides which terms a fit keeps [2, 2, N]: direction (um on the film), and position.
 
     Position counts `position_weight` times what first order makes of it (see `film_equivalent_weights`): the point on
     the front surface matters by itself too, for objects near the lens and for what stands on the front rim.
@@ -333,7 +334,7 @@ def weighed_apart(lens: Lens, domain: Domain, vectors: Tensor, position_weight: 
 
 
 def fit_encoding(domain: Domain, passing: PairSet, *, mirror: bool = False) -> Encoding:
-    """Centre and scale by the passing rays of a domain; `mirror`: x and y by themselves, for lenses with cylinders."""
+    """Centre and scale by the passing rays; with `mirror` x and y by themselves, for lenses with cylinders."""
     plain = Encoding(domain.film_z_mm[0], domain.pupil_z_mm, 0.0, 1.0, 1.0, 0.0, 0.0)
     p, u = plain.planes(passing.inputs)
     axes = [slice(0, 1), slice(1, 2)] if mirror else [slice(0, 2)]
@@ -367,7 +368,7 @@ def grazes(pairs: RayPairs) -> bool:
 
 
 def inside_front(lens: Lens, pairs: PairSet) -> PairSet:
-    """The same rays with the directions that they have inside the front glass; as they were where rays end before."""
+    """Return the rays with their directions inside the front glass; rays that end earlier stay as they were."""
     front, scene = lens.surfaces[0], pairs.scene
     n, outside = np.asarray(_index(lens, pairs.inputs.wavelength_nm.numpy())), torch.stack(scene[3:]).numpy()
     with np.errstate(all="ignore"):
@@ -377,12 +378,12 @@ def inside_front(lens: Lens, pairs: PairSet) -> PairSet:
 
 
 def _index(lens: Lens, wavelength_nm: Any) -> Any:
-    """The index of the front glass over that of the medium in front of it."""
+    """Return the index of the front glass over that of the medium in front of it."""
     return index_of(lens.surfaces[0], wavelength_nm) / index_of(lens.object_medium, wavelength_nm)
 
 
 def index_series(lens: Lens, encoding: Encoding) -> Array:
-    """[K] the relative index of the front glass as a power series in the encoding's w, to float32's last bit."""
+    """Return the front glass's relative index as a power series [K] in the encoding's w, to float32's last bit."""
     if not encoding.dispersive:
         return np.array([float(lens.surfaces[0].n_d) / float(lens.object_medium.n_d)])
     w = np.linspace(-1, 1, 200)
@@ -432,11 +433,12 @@ def prepare(pairs: RayPairs) -> Prepared:
 
 # A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
 IDLE_SHARE, _IDLE_RAYS = 1e-5, 200_000
-_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300  # sampled for the largest angle of a lens; fewer passing rays do not show it
+# rays that are sampled for the largest angle of a lens; fewer passing rays than the second do not show it
+_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300
 
 
 def with_angle(model: LensModel) -> LensModel:
-    """The model with the largest angle of its lens's rays, by a sample of the domain; see `LensModel.angle`."""
+    """Return the model with the largest angle of its lens's rays in a sample of the domain; see `LensModel.angle`."""
     rays, _ = draw(model.domain, _ANGLE_RAYS, seed=5)
     with torch.no_grad():
         exact = trace_pairs(model.lens, rays, model.domain.pupil_z_mm)
@@ -453,9 +455,9 @@ def with_angle(model: LensModel) -> LensModel:
 
 
 def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
-    """The models without the gates that block (next to) nothing that the others and the stop let through.
+    """Leave out the gates that block (next to) nothing that the others and the stop let through.
 
-    Which surface a status names may change with that: the first of those left. `share`: see `IDLE_SHARE`.
+    A status may then name another surface: the first of those left. `share`: see `IDLE_SHARE`.
     """
     left, blocked = list(range(len(models[0].gates))), torch.cat([_blocked(m) for m in models], 1)  # the stop first
     while left:
@@ -472,7 +474,7 @@ def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE)
 
 
 def _blocked(model: LensModel) -> Tensor:
-    """[1 + G, N] bool: which of the stop and the gates block each ray of the domain."""
+    """Return which of the stop and the gates [1 + G, N] block each ray of the domain."""
     with torch.no_grad():
         vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
     stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2

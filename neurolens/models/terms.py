@@ -59,7 +59,7 @@ def ordered(rows: Sequence[tuple[int, ...]]) -> Exponents:
 
 
 def united(supports: Sequence[Exponents]) -> tuple[Exponents, list[list[int]]]:
-    """Every exponent of several supports once, in the order in which they come, and the places of each support's."""
+    """Join supports: every exponent once, in order of first appearance, and the places of each support's own."""
     number: dict[tuple[int, ...], int] = {}
     columns = [[number.setdefault(tuple(map(int, e)), len(number)) for e in support] for support in supports]
     return np.array(list(number), dtype=np.int64), columns
@@ -73,7 +73,7 @@ def further(candidates: Exponents, known: Exponents) -> Exponents:
 
 
 def kept(exponents: Exponents, chosen: Sequence[int]) -> tuple[Exponents, list[int]]:
-    """Exponents that chosen columns of `vector_columns` need, and where those columns are among these exponents'."""
+    """Return the exponents that chosen columns of `vector_columns` need, and where those columns are among them."""
     count = len(exponents)
     rows = sorted({k % count for k in chosen})
     number = {k: i for i, k in enumerate(rows)}
@@ -81,14 +81,14 @@ def kept(exponents: Exponents, chosen: Sequence[int]) -> tuple[Exponents, list[i
 
 
 def vector_columns(features: Tensor, field: LightField) -> Tensor:
-    """[2 M, 2 N] columns m p and m u of features m [M, N]; both components of a ray stand in one row of 2 N entries."""
+    """Columns m p and m u [2 M, 2 N] of features m [M, N]; a row of 2 N entries has both components of each ray."""
     return torch.cat([torch.cat([features * v[0], features * v[1]], 1) for v in (field.p, field.u)])
 
 
 def vector_gram(
     features: Tensor, field: LightField, outputs: Tensor
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gram matrix [2 M, 2 M] of the columns of `vector_columns`, and their products [2 M, R] with outputs [R, 2, N].
+    """Return the Gram matrix [2 M, 2 M] of `vector_columns`, and the columns' products [2 M, R] with outputs [R, 2, N].
 
     Formed from rho, sigma and tau, since (m p).(m' u) = m m' sigma: the long columns are never stored.
     """
@@ -101,7 +101,7 @@ def vector_gram(
 
 
 def _products(features: Tensor, weights: Tensor) -> Tensor:
-    """[M, M] sums over rays of features [M, N] times each other, weighted by [N]: symmetric, a third is not summed."""
+    """Sum products of features [M, N] over rays, weighted by [N]: [M, M] is symmetric, and a third is not summed."""
     gram = features.new_empty((len(features), len(features)))
     size = -(-len(features) // 3)
     for start in range(0, len(features), max(size, 1)):
@@ -112,11 +112,11 @@ def _products(features: Tensor, weights: Tensor) -> Tensor:
 
 
 def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Least squares: coefficients [R, C] with coefficients @ columns [C, N] near outputs [R, N], rows weighted by [N].
+    """Solve least squares: coefficients [R, C] for which coefficients @ columns [C, N] is near outputs [R, N].
 
-    A ridge stands for the rounding of float32, in which models are evaluated: each term then errs by about `ROUNDING`
-    of its own size, and the sum of these squares is part of what is minimised. So dependent columns share their effect
-    instead of blowing up, and columns that are 0 get 0.
+    `weights` [N] are those of the rays. A ridge stands for the rounding of float32, in which models are evaluated: each
+    term then errs by about `ROUNDING` of its own size, and the sum of these squares is part of what is minimised. So
+    dependent columns share their effect instead of blowing up, and columns that are 0 get 0.
     """
     if weights is not None:
         columns, outputs = columns * weights, outputs * weights
@@ -191,7 +191,7 @@ class Sweep:
 
     @property
     def residual(self) -> float:
-        """Sum over problems and outputs of the squared residual."""
+        """Return the squared residual, summed over problems and outputs."""
         return sum(float(np.diag(table)[self.count :].sum()) for table in self._tables)
 
     def add(self, k: int) -> None:
@@ -240,7 +240,7 @@ class Sweep:
         return np.where(usable, gain, -1.0)
 
     def _needed(self, table: Floats) -> Floats | float:
-        """[M] what must be left of each candidate for every chosen column to keep a share of `SPANNED` beside it."""
+        """What must be left of each candidate [M], so that every chosen column keeps a share of `SPANNED` beside it."""
         if not self.chosen:
             return 0.0
         # Sweeping k in adds table[j, k]^2 / left[k] to the inverse of what is left of j, which is -table[j, j].
@@ -251,7 +251,7 @@ class Sweep:
         return np.asarray(across.max(0))
 
     def costs(self) -> Floats:
-        """[len(chosen)] how much the residual would grow without each chosen column, of the first problem."""
+        """Return how much the residual would grow without each chosen column [len(chosen)], of the first problem."""
         t, chosen = self._tables[0], self.chosen
         # The pivot of a column swept in is -1 / (what is left of it beside the others), which is at most all of it.
         return (t[chosen, self.count :] ** 2).sum(1) / np.maximum(-t[chosen, chosen], 0.999)
@@ -297,7 +297,7 @@ def replace_terms(sweep: Sweep, passes: int = 10) -> int:
         for k in list(sweep.chosen):
             with_k = sweep.residual
             sweep.drop(k)
-            # Its true gain, because the score of a term that the later ones nearly span counts as none.
+            # Its true gain: the score of a term that later ones nearly span is no measure, for it counts as none.
             gain = max(sweep.residual - with_k, 0.0)
             scores = sweep.scores("ols")
             best = int(scores.argmax())

@@ -1,1 +1,1 @@
-"""The lens in other programs."""
+"""The lens in other programs: Blender, Mitsuba, torch, compositing, browsers, and hosts that take rays."""

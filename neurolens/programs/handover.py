@@ -1,9 +1,9 @@
-"""A lens as files of the programs that follow a render: USD, OpenTrackIO, lensfun, OpenCV, nerfstudio and NVIDIA.
+"""A lens as files of programs that follow a render: USD, OpenTrackIO, lensfun, OpenCV, nerfstudio and NVIDIA.
 
-All files of a shot are of one pinhole, frame by frame, which the templates of all texts read. Its place is the entrance
-pupil, its focal length the paraxial size of the picture (of a lens with cylinders: of the y meridian, and widths are
-stretched by the squeeze). Breathing is a focal length that changes with the focus. Its f-number is this focal length
-over the entrance pupil's diameter, which gives discs of the lens's size.
+All files of a shot describe one pinhole, frame by frame, which the templates of all texts read. Its place is the
+entrance pupil. Its focal length is the paraxial size of the picture (for a lens with cylinders that of the y meridian,
+and widths are stretched by the squeeze); breathing is a focal length that changes with the focus. Its f-number is this
+focal length over the entrance pupil's diameter, which gives discs of the lens's size.
 """
 
 from __future__ import annotations
@@ -40,37 +40,37 @@ from neurolens.cameras.field import (
 from neurolens.optics.analysis import projections
 from neurolens.pictures.render.stmap import Plates, blocks, in_pixels
 
-FAR_M = 1e6  # stands for infinity where a program takes no other number
-LENSFUN_TYPES = {"equidistant": "fisheye"}  # other names are ours
-MOST_ENTRIES = 9  # of lensfun's profile of an animation
-# Entries of the profile at other apertures: so many stops below the shot's, down to this f-number, and the widest.
+FAR_M = 1e6  # replaces infinity where a program takes none
+LENSFUN_TYPES = {"equidistant": "fisheye"}  # names of lensfun's; other names are ours
+MOST_ENTRIES = 9  # of an animation, in lensfun's profile
+# Other apertures of the profile: so many stops below the shot's, down to this f-number, and the widest.
 _SMALLER, _SMALLEST = (2, 4), 23.0
-_ROUNDS = 30  # of Lawson's weights
-MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"  # of OpenTrackIO
-_GOOD_PX = 0.1  # a polynomial that leaves more gives way to a ratio of two
-_LEAST = 1e-5  # singular value over the largest: below it coefficients grow until they cancel, and the ratio has poles
-SIDE = 2049  # of NVIDIA's exit picture
-_NEAR = 1.0  # pictures beyond the edge, so that what is read between pixels is right up to it
-_TRIED = 3  # each of so many is tried
-_HELD_OUT = 50, 34  # points over the film, to which nothing is fitted
-_ALONG = 2049  # from its centre to its corner
-_BESIDE_PX = 2.0  # about where a ratio is sharpest
-OPENCV = [1, -1, 1]  # from x right, y up, z towards the scene
-CENTRAL_PX = 0.5  # if one centre leaves more anywhere, the rays of all pixels are written, too
-_CELLS, _TABLE_PX = (12, 24, 48), 0.01  # of a table's longer side; what it may leave
-_LIT = 161, 121  # points over the film, where the lit part of the picture is looked for
+_ROUNDS = 30  # of Lawson's weights in a fit
+MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"  # names of OpenTrackIO's models
+_GOOD_PX = 0.1  # a polynomial that leaves more than this is replaced by a ratio of two
+_LEAST = 1e-5  # singular value over the largest: below it coefficients grow until they cancel, and a ratio gets poles
+SIDE = 2049  # pixels of NVIDIA's exit picture
+_NEAR = 1.0  # how many pictures beyond its edge, so that values read between pixels are right up to the edge
+_TRIED = 3  # places are tried in every so many pixels
+_HELD_OUT = 50, 34  # points across and down the film to which nothing is fitted
+_ALONG = 2049  # points from its centre to its corner
+_BESIDE_PX = 2.0  # around the place where a ratio is sharpest
+OPENCV = [1, -1, 1]  # signs of x right, y up, z towards the scene in OpenCV's frame
+CENTRAL_PX = 0.5  # where one centre leaves more anywhere, the rays of all pixels are written, too
+_CELLS, _TABLE_PX = (12, 24, 48), 0.01  # cells along a table's longer side; the error that it may leave
+_LIT = 161, 121  # points across and down the film at which the lit part of the picture is looked for
 AtStop = Callable[[float | None], Camera]
 Report = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """One frame.
+    """One frame's pinhole.
 
     Attributes:
-        number: of the frame; name: of it in file names, ".0001", "" for a still.
+        number: the frame's. name: what file names have for it: ".0001", "" for a still.
         focal_mm: see the module. squeeze: focal length of the y over that of the x meridian.
-        pupil_mm: from the film to the entrance pupil; focus_m: to what is in focus, at most `FAR_M`.
+        pupil_mm: from the film to the entrance pupil. focus_m: from the film to what is in focus, at most `FAR_M`.
         f_stop: see the module. t_stop: None where it is not known.
     """
 
@@ -85,7 +85,7 @@ class Pinhole:
 
     @classmethod
     def of(cls, number: str, field: Field, settings: Mapping[str, Any], focus_m: float) -> Pinhole:
-        """The pinhole of a camera's frame; `number` as file names have it."""
+        """Make the pinhole of a camera's frame; `number` is as in file names."""
         state, (x, y) = settings["lens_state"], field.frame.reach_mm
         size = y / (state["effective_focal_length_mm"] or y)
         return cls(
@@ -96,11 +96,12 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class Handed:
-    """A shot.
+    """A shot that is handed over.
 
     Attributes:
-        attributes: of the first camera, see `pictures.render.pictures.standard_attributes`; texts are a stranger's.
-        rate: frames a second, numerator and denominator. colours: names of those that have maps of their own.
+        attributes: the first camera's, see `pictures.render.pictures.standard_attributes`; its texts may come from
+            strangers.
+        rate: frames a second, as numerator and denominator. colours: names of the colours that have maps of their own.
     """
 
     attributes: Mapping[str, Any]
@@ -112,28 +113,29 @@ class Handed:
 
     @property
     def lens(self) -> str:
-        """The lens's name, not empty."""
+        """The lens's name, never empty."""
         return str(self.attributes.get("lensModel") or self.attributes["cameraModel"])
 
     @property
     def about(self) -> str:
-        """The lens by its name and the hash of its prescription; the path of its file says nothing elsewhere."""
+        """The lens by its name and the hash of its prescription; the path of its file means nothing elsewhere."""
         sha256 = self.attributes.get("lensSerialNumber")
         return f"{self.lens} (sha256 {sha256[:16]})" if sha256 else self.lens
 
     @property
     def pixel_aspect(self) -> float:
-        """The width of a pixel over its height in what it shows."""
+        """The width over the height of what a pixel shows."""
         return float(f"{self.frames[0].squeeze * self.plates.pixel_mm[0] / self.plates.pixel_mm[1]:.6g}")
 
     def film_mm(self, size: tuple[int, int], squeezed: bool = False) -> tuple[float, float]:
-        """The film of a picture of so many pixels, of the pinhole's focal length in both directions or as it is."""
+        """The film (mm) of a picture of `size` pixels: as it is if `squeezed`, else with both focal lengths equal."""
         stretch = 1.0 if squeezed else self.frames[0].squeeze
         return size[0] * self.plates.pixel_mm[0] * stretch, size[1] * self.plates.pixel_mm[1]
 
 
 def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
-    """Coefficients of r^2, r^4, r^6 of light over that on the axis, by least squares, and the worst that they leave."""
+    """Fit light, relative to the axis, by r^2, r^4, r^6 (least squares); coefficients, and the worst that they
+    leave."""
     lit = light > 0
     powers = np.stack([radius[lit] ** k for k in (2, 4, 6)], 1)
     scale = powers.max(0)
@@ -141,18 +143,19 @@ def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
     return tuple(found.tolist()), float(np.abs(powers @ found + 1 - light[lit]).max())
 
 
-# The two lookup pictures of NVIDIA's schema OmniLensDistortionLutAPI, by which a USD camera has a lens's projection.
-#
-# `enter`, of the picture's size: the direction that a pixel sees, as R, G and B; x right, y up, -z forward; where no
-# light arrives 0, 0, 1, which is behind the camera. `exit`, a square: where the picture shows a direction, as R and G
-# from 0 to 1 from its upper left corner; -1 where it shows none. Directions are folded onto the square as onto an
-# octahedron, with forward in its middle; x grows to the right, and y, which is up, from the first row to the last. The
-# side is odd: so the folds run through centres of pixels, where pictures that are read between pixels are exact.
-# NVIDIA's renderer traces rays by the first; the second serves what it projects, such as motion vectors.
+# The two lookup pictures of NVIDIA's schema OmniLensDistortionLutAPI, by which a USD camera gets a lens's projection.
+# #
+# # `enter` has the picture's size. Its R, G and B are the direction that a pixel sees (x right, y up, -z forward);
+# where no light arrives they are 0, 0, 1, which is behind the camera. `exit` is a square. Its R and G say where the
+# picture shows a direction, from 0 to 1 from its upper left corner; -1 where it does not show it. Directions are folded
+# onto the square as onto an octahedron, with forward in its middle; x grows to the right, and y, which is up, from the
+# first row to the last. The side is odd, so that the folds run through centres of pixels, where pictures that are read
+# between pixels are exact. NVIDIA's renderer traces rays by the first; the second serves what it projects, such as
+# motion vectors.
 
 
 def enter_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """The channels of the picture of directions."""
+    """Return the channels of the picture of directions."""
     planes = {name: np.empty(plates.picture[::-1], np.float32) for name in "RGB"}
     for rows, point in blocks(plates.picture, plates.pixel_mm, report):
         point = np.broadcast_to(point, (point.shape[0], plates.picture[0]))
@@ -164,7 +167,7 @@ def enter_map(field: Field, plates: Plates, report: Report = lambda share: None)
 
 
 def exit_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """The channels of the picture of places."""
+    """Return the channels of the picture of places."""
     planes = {name: np.zeros((SIDE, SIDE), np.float32) for name in "RGB"}
     across = np.asarray((np.arange(SIDE) + 0.5) * (2 / SIDE) - 1, np.float64)
     for row, down in enumerate(across):
@@ -175,7 +178,7 @@ def exit_map(field: Field, plates: Plates, report: Report = lambda share: None) 
 
 
 def folded(u: Array, v: Array) -> Array:
-    """Directions [3, N], not of unit length, at points of the square from -1 to 1."""
+    """Return directions [3, N], not of unit length, at points of the square from -1 to 1."""
     z = 1 - np.abs(u) - np.abs(v)
     out = z < 0
     x = np.where(out, (1 - np.abs(v)) * np.where(u < 0, -1, 1), u)
@@ -184,7 +187,7 @@ def folded(u: Array, v: Array) -> Array:
 
 
 def place_of(field: Field, plates: Plates, way: Array) -> Array:
-    """Where the picture shows directions [3, N] of a USD camera, 0 to 1 from the upper left; -1 where it does not."""
+    """Return where the picture shows directions [3, N] of a USD camera: 0 to 1 from the upper left, -1 where not."""
     point = field.point(way * np.array([1.0, 1.0, -1.0])[:, None])
     film = [n * p for n, p in zip(plates.picture, plates.pixel_mm, strict=True)]
     place = np.stack([point.real / film[0] + 0.5, 0.5 - point.imag / film[1]])
@@ -194,7 +197,7 @@ def place_of(field: Field, plates: Plates, way: Array) -> Array:
 
 
 def exit_residual_px(field: Field, plates: Plates, planes: Mapping[str, FloatArray]) -> float:
-    """The worst by which places that are read between four pixels of the exit picture are wrong, over the picture."""
+    """Return the worst error, over the picture, of places that are read between four pixels of the exit picture."""
     middle = np.arange(1, SIDE)[::_TRIED] * (2 / SIDE) - 1
     exact = place_of(field, plates, folded(*(c.reshape(-1) for c in np.meshgrid(middle, middle))))
     four = [p[:-1, :-1] + p[1:, :-1] + p[:-1, 1:] + p[1:, 1:] for p in (planes["R"], planes["G"])]
@@ -205,15 +208,15 @@ def exit_residual_px(field: Field, plates: Plates, planes: Mapping[str, FloatArr
 
 # OpenTrackIO 1.0.1: the numbers of OpenLensIO's lens model (SMPTE RiS-OSVP), in mm on the film.
 #
-# Undistorted places are e (1 + k1 r^2 + k3 r^4 + k5 r^6) / (1 + k2 r^2 + k4 r^4 + k6 r^6) of places e of the lens's
-# picture (the list "radial" of "Brown-Conrady D-U"; "U-D" is the other way), for a pinhole in the entrance pupil. Light
-# is 1 - (a1 r^2 + a2 r^4 + a3 r^6). A template has the rest of a sample. It leaves out where the camera stands, which
-# its tracker knows; a focus at infinity; lateral colour; distortion of lenses with cylinders or of more than a plane
-# holds.
+# Undistorted places are e (1 + k1 r^2 + k3 r^4 + k5 r^6) / (1 + k2 r^2 + k4 r^4 + k6 r^6), with e the places of the
+# lens's picture (the list "radial" of "Brown-Conrady D-U"; "U-D" is the other way), for a pinhole in the entrance
+# pupil. Light is 1 - (a1 r^2 + a2 r^4 + a3 r^6). A template has the rest of a sample. Not in it are: where the camera
+# stands, which its tracker knows; a focus at infinity; lateral colour; distortion of lenses with cylinders, or beyond
+# what a plane holds.
 
 
 def opentrackio_sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | None, float]:
-    """The sample of one frame as JSON, and the worst that its formulae leave: pixels, share of light."""
+    """Return one frame's sample as JSON, and the worst that its formulae leave: pixels (or None), share of light."""
     plane = field.field_deg <= projections.WIDEST_DEG and pinhole.squeeze == 1
     distortion, left_px = _distortions(field, shot) if plane else ([], None)
     points = lit_points(field, shot.film_mm(shot.plates.picture, squeezed=True))
@@ -233,7 +236,7 @@ def opentrackio_sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[st
 
 
 def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float]]], float]:
-    """Names of both directions with their coefficients, and the worst that they leave in pixels; of a round lens."""
+    """Fit a round lens's distortion both ways: names with coefficients, and the worst that they leave in pixels."""
     points = film_points(field, shot.film_mm(shot.plates.picture), 257)
     way = field.directions(points)
     both, found, worst = (points.real, field.frame.reach_mm[0] * way[0] / way[2]), [], 0.0
@@ -245,7 +248,7 @@ def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float
             k[: len(terms)] = np.linalg.lstsq((start * terms).T, goal - start, rcond=_LEAST)[0]
             missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) - ratio) * start
             by_mm = k.reshape(2, 3) / start[-1] ** np.array([2, 4, 6])
-            # The last place stands for 1, and is the widest.
+            # The last place is 1, the widest.
             pole = projections.has_pole(k[3:].tolist(), 1.0)
             fits.append((math.inf if pole else float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
             if fits[-1][0] < _GOOD_PX:
@@ -258,24 +261,25 @@ def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float
 
 # A lensfun profile: distortion as poly5, lateral colour as poly3, light as pa, by focal length and aperture.
 #
-# lensfun's formulae (lensfun.github.io/manual/latest/group__Lens.html), with r = 1 at half the short side of a film of
-# the profile's aspect ratio and the picture's diagonal, counted between the centres of the outer pixels: the lens's
+# lensfun's formulae (lensfun.github.io/manual/latest/group__Lens.html) take r = 1 at half the short side of a film with
+# the profile's aspect ratio and the picture's diagonal, counted between the centres of the outer pixels. The lens's
 # picture shows at r (1 + k1 r^2 + k2 r^4) what the corrected one shows at r, and red at v r + c r^2 + b r^3 what the
-# mean colour shows at r; light is 1 + k1 r^2 + k2 r^4 + k3 r^6, r = 1 in the corner. The size of the corrected picture
-# is fitted, too, for a fifth to a thirtieth of the distance that is left: it is that of a pinhole of another focal
-# length. lensfun's ptlens has one coefficient more, but version 0.3.4 computes it in fours of pixels, three of them
-# wrong by up to 0.14 pixels. Of 20 mm lenses by Canon and Nikon (f/2.8) poly5 leaves 0.67 and 0.56 pixels of 3840,
-# ptlens would leave 0.45, and a term r^7 more, as in ACM, which 0.3.4 has not, 0.43 and 0.28.
+# mean colour shows at r. Light is 1 + k1 r^2 + k2 r^4 + k3 r^6, with r = 1 in the corner. The size of the corrected
+# picture is fitted, too: it is that of a pinhole of another focal length, and leaves a fifth to a thirtieth of the
+# distance. lensfun's ptlens has one more coefficient, but version 0.3.4 computes pixels in fours, three of them wrong
+# by up to 0.14 pixels. For 20 mm lenses by Canon and Nikon (f/2.8) poly5 leaves 0.67 and 0.56 pixels of 3840, ptlens
+# would leave 0.45, and a term r^7 more, as in ACM, which 0.3.4 lacks, 0.43 and 0.28.
 #
-# Focal lengths are those of the pinhole, so that they tell a focus pull, too, for lensfun knows no breathing.
+# Focal lengths are those of the pinhole: lensfun knows no breathing, so that these tell a focus pull, too.
 
 
 class LensfunEntry(NamedTuple):
     """The profile of a lens at one focal length.
 
     Attributes:
-        focal_mm, distance_m: of the pinhole, of the plane in place. corrected_mm: of lensfun's corrected picture.
-        distortion: k1, k2. red, blue: v, c, b. light: f-number, k1, k2, k3 by aperture.
+        focal_mm: the pinhole's. distance_m: the plane that is in place. corrected_mm: the focal length of lensfun's
+            corrected picture.
+        distortion: k1, k2. red, blue: v, c, b. light: f-number, k1, k2, k3 for each aperture.
         distortion_px, colour_px, light_share: the worst that the formulae leave.
     """
 
@@ -294,7 +298,7 @@ class LensfunEntry(NamedTuple):
 def lensfun_entry(
     field: Field, camera: Camera, plane_m: float, shot: Handed, red_blue_nm: tuple[float, float], at_stop: AtStop
 ) -> LensfunEntry:
-    """The entry of one state of a round lens; `at_stop` makes its camera at another f-number, None for the widest."""
+    """Make the entry of one state of a round lens; `at_stop` makes its camera at an f-number (None: the widest)."""
     picture, pixel = shot.plates.picture, shot.plates.pixel_mm[0]
     film_mm = shot.film_mm(picture)
     corner = math.hypot(picture[0] - 1, picture[1] - 1) / 2 * pixel
@@ -304,7 +308,7 @@ def lensfun_entry(
     colours = []
     for nm in red_blue_nm:
         light = traced_light(camera, points, spectrum_of(camera, only_nm=nm), field.frame, field.target, plane_m)
-        # Where the mean colour shows what this one shows.
+        # From where the mean colour shows what this colour shows.
         colours.append(_minimax(field.picture(light.place).real / unit, points.real / unit, (1, 2, 3)))
     lights, share = _lights(field, camera, plane_m, points[3::4], corner, at_stop)
     focal, px = field.frame.reach_mm[0], unit / pixel
@@ -315,7 +319,7 @@ def lensfun_entry(
 
 
 def _minimax(x: Array, y: Array, powers: Sequence[int]) -> tuple[tuple[float, ...], float]:
-    """Coefficients of a polynomial with the least worst distance from y, by Lawson's weights, and that distance."""
+    """Fit a polynomial with the least worst distance from y, by Lawson's weights; also return that distance."""
     rows, weight = np.stack([x**p for p in powers], 1), np.ones(x.size)
     best, least = tuple[float, ...](), math.inf
     for _ in range(_ROUNDS):
@@ -332,7 +336,7 @@ def _minimax(x: Array, y: Array, powers: Sequence[int]) -> tuple[tuple[float, ..
 def _lights(
     field: Field, camera: Camera, plane_m: float, points: Complex, corner: float, at_stop: AtStop
 ) -> tuple[tuple[tuple[float, ...], ...], float]:
-    """The light by aperture, the shot's own among them, and the worst share that the formula leaves."""
+    """Return the light by aperture, also the shot's own, and the worst share that the formula leaves."""
     own = float(camera.settings["lens_state"]["f_number"])
     further = [f for k in _SMALLER if (f := float(f"{own * 2 ** (k / 2):.3g}")) < _SMALLEST]
     rows, worst, points = {}, 0.0, np.append(0j, points)
@@ -351,7 +355,7 @@ def _lights(
 def fitted_projection(
     kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
 ) -> tuple[projections.Projection, projections.Residual, dict[str, Any]]:
-    """A projection fitted to a field, what it leaves, and both as data; raises InputError as `fit`."""
+    """Fit a projection to a field: the projection, what it leaves, and both as data; raises InputError as `fit`."""
     step = [side / count for side, count in zip(film_mm, size, strict=True)]
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
@@ -363,7 +367,7 @@ def fitted_projection(
     ring = ring[(ring > 0) & (ring < fitted.widest_rad)]
     beside = field.point(np.stack([np.sin(ring), 0 * ring, np.cos(ring)]))
     points = np.concatenate([lit_points(field, film_mm, _HELD_OUT), diagonal_points(field, film_mm, _ALONG), beside])
-    points = points[field.relative_light(points) >= DIM]  # the field traces no places beyond
+    points = points[field.relative_light(points) >= DIM]  # the field traces no places beyond these
     left = projections.residual(fitted, *_shown(field, size, film_mm, points))
     rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
     data: dict[str, Any] = {
@@ -386,17 +390,17 @@ def fitted_projection(
 
 
 def _shown(field: Field, size: tuple[int, int], film_mm: tuple[float, float], point: Complex) -> tuple[Any, Any]:
-    """Unit directions [N, 3] and pixels [N, 2], in OpenCV's frame, of points of the picture."""
+    """Return unit directions [N, 3] and pixels [N, 2], in OpenCV's frame, of points of the picture."""
     return field.directions(point).T * OPENCV, _pixels(point, size, film_mm)
 
 
 def _pixels(point: Complex, size: tuple[int, int], film_mm: tuple[float, float]) -> Array:
-    """The same pixels."""
+    """Return the pixels of `_shown`."""
     return np.stack([(point.real / film_mm[0] + 0.5) * size[0], (0.5 - point.imag / film_mm[1]) * size[1]], 1) - 0.5
 
 
 def write_projection(out: Path, fitted: projections.Projection, data: dict[str, Any]) -> list[str]:
-    """Write the files of a projection; their names."""
+    """Write the files of a projection, and return their names."""
     files = {}
     if fitted.kind in ("opencv", "opencv-rational", "kannala-brandt"):
         files[out.with_name(f"{out.name}.yaml")] = html(
@@ -410,7 +414,7 @@ def write_projection(out: Path, fitted: projections.Projection, data: dict[str, 
 
 
 def _block(fitted: projections.Projection) -> dict[str, Any]:
-    """The camera as nerfstudio, or NVIDIA's f-theta, or OpenCV has it."""
+    """Return the camera as nerfstudio, NVIDIA's f-theta or OpenCV writes it."""
     size = {"w": fitted.size[0], "h": fitted.size[1]}
     if fitted.kind in ("opencv", "kannala-brandt"):
         cx, cy = (c + 0.5 for c in fitted.centre_px)
@@ -435,17 +439,17 @@ def _block(fitted: projections.Projection) -> dict[str, Any]:
 
 
 def sight(camera: Camera, field: Field, point: Complex, near_m: float) -> Array:
-    """Lines of sight [N, 6] of picture points, in OpenCV's frame about the entrance pupil on the axis.
+    """Return lines of sight [N, 6] of picture points, in OpenCV's frame about the entrance pupil on the axis.
 
-    Each leads through the centroids of the light at infinity and near: the point of it that is nearest to the origin
-    (m), and a unit direction. NaN where the picture is dark.
+    A line leads through the centroids of the light at infinity and near. It is the point of the line that is nearest to
+    the origin (m), and a unit direction; NaN where the picture is dark.
     """
     way, at = (centroids_m(camera, field, point, d) for d in (math.inf, near_m))
     return np.concatenate([at - (at * way).sum(0) * way, way]).T * (OPENCV * 2)
 
 
 def pupil_mm(camera: Camera, field: Field, near_m: float, angle_deg: Array) -> Array:
-    """Distances [N] before the film at which rays of a round lens meet the axis, by their angle to it."""
+    """Return the distances [N] before the film at which rays of a round lens meet the axis, by their angle to it."""
     angle = np.radians(angle_deg)
     point = field.point(np.stack([np.sin(angle), 0 * angle, np.cos(angle)]))
     x, _, z, dx, _, dz = sight(camera, field, point, near_m).T
@@ -455,9 +459,9 @@ def pupil_mm(camera: Camera, field: Field, near_m: float, angle_deg: Array) -> A
 def ray_table(
     camera: Camera, field: Field, size: tuple[int, int], film_mm: tuple[float, float], focus_m: float, near_m: float
 ) -> tuple[projections.RayTable, list[dict[str, float]]]:
-    """The lines of sight of a picture as a table, and by distance what it leaves at points that it was not fitted to.
+    """Tabulate the lines of sight of a picture; also return, by distance, the error at points that were not fitted.
 
-    Its cells are halved until it leaves at most `_TABLE_PX` at infinity, in focus and near, or until the longer side
+    Cells are halved until the table leaves at most `_TABLE_PX` at infinity, in focus and near, or until the longer side
     has the most of `_CELLS`.
     """
     pixel_mm = film_mm[0] / size[0], film_mm[1] / size[1]
@@ -484,7 +488,7 @@ def ray_table(
         at, way = (c.T for c in np.split(table(_pixels(tried, size, film_mm)) * (OPENCV * 2), 2, axis=1))
         left = []
         for distance_m, place in seen.items():
-            # Where the ray meets the sphere on which the centroids lie: its point is at right angles to its direction.
+            # Where the ray meets the sphere of the centroids; the ray's own point is at right angles to its direction.
             reach = np.sqrt((place**2).sum(0) - (at**2).sum(0))
             told = way if math.isinf(distance_m) else at + reach * way
             left.append({"distance_m": distance_m, **in_pixels(field.point(place) - field.point(told), pixel_mm)})
@@ -494,19 +498,19 @@ def ray_table(
 
 
 def noncentral_pays(parallax: Sequence[Mapping[str, float]]) -> bool:
-    """Whether one centre leaves more than `CENTRAL_PX` at one of these distances."""
+    """Return whether one centre leaves more than `CENTRAL_PX` at one of these distances."""
     return any(row["worst_px"] > CENTRAL_PX for row in parallax)
 
 
 def ray_table_path(out: Path) -> Path:
-    """NAME.noncentral.yaml."""
+    """Return the path NAME.noncentral.yaml."""
     return out.with_name(f"{out.name}.noncentral.yaml")
 
 
 def write_ray_table(
     out: Path, table: projections.RayTable, left: list[dict[str, float]], about: str, field: Field
 ) -> str:
-    """Write NAME.noncentral.yaml; its name."""
+    """Write NAME.noncentral.yaml, and return its name."""
     path = ray_table_path(out)
     values = {"table": table, "left": left, "before_film_mm": float(np.mean(field.frame.pupil_mm))}
     atomic_write_text(path, html("handover.noncentral.yaml.jinja", about=f"{about}, neurolens {__version__}", **values))

@@ -1,4 +1,4 @@
-"""Rays of a lens for programs that take any ray for any pixel: simulators, renderers, splats, radiance fields.
+"""Rays of a lens for programs that take any ray for any pixel: simulators, renderers, Gaussian splats, radiance fields.
 
     found = rays("laikin_double_gauss_50", (36.0, 24.0), width=240, to="newton", focus_m=1.5, f_number=1.8)
     found["camera_rays"]  # [160, 240, 16, 2, 3]: row, column, sample; origin and direction; x, y, z
@@ -41,21 +41,21 @@ from neurolens.pictures.render.settings import size_by_shape
 Arrays = dict[str, NDArray[Any]]
 Vector = tuple[float, float, float]
 LIGHT_NM = (400.0, 700.0)
-BYTES_A_RAY = 44  # at most, with three weights
-MOST_COMPACT_PX = 0.01  # by how much rays in 16 bytes may be off
-_LARGEST = (1 << 63) - 1  # what generators of random numbers take
-_PROBES, _FLATTEST = 4096, 0.17  # rays that measure it; their least cosine to the axis, of 80 degrees
+BYTES_A_RAY = 44  # the most, with three weights
+MOST_COMPACT_PX = 0.01  # how far rays in 16 bytes may be off
+_LARGEST = (1 << 63) - 1  # the largest seed that generators of random numbers take
+_PROBES, _FLATTEST = 4096, 0.17  # rays that measure this; their least cosine to the axis, that of 80 degrees
 
 
 class Host(NamedTuple):
     """How a program takes rays.
 
     Attributes:
-        axes: the directions of its camera's axes along ours (right, up, backwards).
-        arrays: its arrays of rays and their last dimensions; a single one holds origin and direction.
-        world: whether rays are in the world, else in the camera's frame.
+        axes: signs of its camera's axes along ours (right, up, backwards).
+        arrays: its arrays of rays with their last dimensions; a single array has origin and direction in it.
+        world: whether rays are in the world frame, else in the camera's.
         samples_first: whether samples are pictures of their own, [S, H, W], else [H, W, S].
-        lost: length of the direction, along the axis, of rays that the lens stops; with 0 Newton sees black.
+        lost: length of the direction (along the axis) of rays that the lens stops; with 0 Newton sees black.
     """
 
     axes: tuple[int, int, int]
@@ -65,7 +65,7 @@ class Host(NamedTuple):
     lost: float = 1.0
 
     def views(self, arrays: Arrays) -> Arrays:
-        """The same memory as [H, W, S, ...], with rays under the names origin and direction."""
+        """Return the same memory as [H, W, S, ...], with rays under the names origin and direction."""
         found = dict(arrays)
         if self.samples_first:
             found = {name: np.moveaxis(a, 0, 2) if a.ndim > 2 else a for name, a in found.items()}
@@ -87,7 +87,7 @@ HOSTS = {
 
 
 def _place(text: str) -> Vector:
-    """Type of an option: a point X,Y,Z."""
+    """Read an option that is a point X,Y,Z."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
@@ -155,12 +155,12 @@ class RaySettings:
 
     @property
     def light_nm(self) -> tuple[float, float]:
-        """The shortest and the longest wavelength."""
+        """The shortest and the longest wavelength in nm."""
         return LIGHT_NM if self.wavelengths is None else (min(self.wavelengths), max(self.wavelengths))
 
 
 def _whole(name: str, value: Any, least: int) -> int:
-    """An integer from `least` on; what is none is refused."""
+    """Return an integer of at least `least`; anything else is refused."""
     with suppress(TypeError):
         if least <= (number := operator.index(value)) <= _LARGEST:
             return number
@@ -168,7 +168,7 @@ def _whole(name: str, value: Any, least: int) -> int:
 
 
 def _numbers(values: Any) -> tuple[float, ...]:
-    """The numbers of a sequence; none where it is no sequence of numbers."""
+    """Return the numbers of a sequence; none where it is no sequence of numbers."""
     try:
         return () if isinstance(values, str) else tuple(float(value) for value in values)
     except (TypeError, ValueError, OverflowError):
@@ -179,11 +179,11 @@ def rays(
     camera: str | os.PathLike[str], film: tuple[float, float], *, width: int | None = None, height: int | None = None,
     device: Any = None, **settings: Any,
 ) -> dict[str, Any]:  # fmt: skip
-    """The rays of a picture through a lens, as `neurolens rays` writes them.
+    """Return the rays of a picture through a lens, as `neurolens rays` writes them.
 
     Args:
-        camera: a lens file, a model, the name of one, or another camera (`cameras.build.make_camera`).
-            To `neurolens.rays` a lens or camera that is set brings its settings; those of the call win.
+        camera: a lens file, a model, the name of one, or another camera (`cameras.build.make_camera`). A lens or camera
+            that is set, which `neurolens.rays` takes, too, brings its settings; those of the call win.
         film: its width and height in mm. width, height: of the picture in pixels, one or both.
         device: of torch; None gives arrays of numpy.
         settings: fields of `RaySettings`, and of `Shot` (f_number, zoom, ...; focus_m is infinity unless given).
@@ -192,15 +192,15 @@ def rays(
 
         - origin (scene units), direction (length 1): [H, W, S, 3]. newton: camera_rays [H, W, S, 2, 3]; gsplat: rays
           [S, H, W, 6]; 3dgrut: rays_ori, rays_dir [S, H, W, 3].
-        - weight: [H, W, S] or [S, H, W]; of "rgb" three a ray, of "importance" [H, W]. wavelength_nm: one a ray.
-        - to_world: [4, 4], from the host's camera frame to the world.
+        - weight: [H, W, S] or [S, H, W]; with "rgb" three for each ray, with "importance" [H, W]. wavelength_nm: one
+        for each ray. - to_world: [4, 4], from the host's camera frame to the world.
 
         With `compact`, in place of rays, origin_xy (int16) times origin_step, in the plane plane_z, and direction_xy
         (float32), whose z has the sign `ahead` (`from_compact`); weights and wavelengths are float16.
 
     Raises:
-        InputError: an unknown setting or one out of its bounds, more rays than memory holds; as `make_camera`.
-        ModelError: a model that cannot be trusted.
+        InputError: a setting is unknown or out of its bounds, memory does not hold the rays; as `make_camera`.
+        ModelError: the model cannot be trusted.
     """
     own, of_shot = ({f.name for f in fields(kind)} for kind in (RaySettings, Shot))
     for name in settings.keys() - own - of_shot:
@@ -231,11 +231,13 @@ class RayJob:
     """The rays of a picture through a camera, made some ten thousand at a time.
 
     Attributes:
-        to_world: [4, 4] from the host's camera frame to the world. passed: share of the rays that passed, once made.
-        compact_px: by how much of a pixel in the plane in focus rays of `compact` are off at most; else 0.
+        to_world: [4, 4] from the host's camera frame to the world. passed: share of the rays that passed, known when
+            all are made.
+        compact_px: by how many pixels, in the plane in focus, rays of `compact` are off at most; else 0.
 
     Raises:
-        InputError: `compact` where that is too much, or where rays run sideways; wavelengths that the camera has not.
+        InputError: rays of `compact` would be off by too much, or run sideways; the camera does not have the
+            wavelengths.
     """
 
     def __init__(self, camera: Camera, grid: PixelGrid, settings: RaySettings, focus_m: float) -> None:
@@ -259,7 +261,7 @@ class RayJob:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What a file of these rays says of itself."""
+        """Return what a file of these rays says of itself."""
         said = {f.name: getattr(self.settings, f.name) for f in fields(self.settings)}
         said |= {"version": __version__, "width": self.grid.width, "height": self.grid.height, "passed": self.passed}
         said |= {"compact_px": self.compact_px, "to_world": self.to_world, "camera": self.camera.settings}
@@ -268,8 +270,10 @@ class RayJob:
     def arrays(
         self, new: Callable[..., NDArray[Any]] = np.empty, report: Callable[[float], None] | None = None
     ) -> Arrays:
-        """All rays, as `rays` returns them; `new` makes an array of a shape and a type, `report` hears what share is
-        done."""
+        """Make all rays, as `rays` returns them.
+
+        `new` makes an array of a shape and a type; `report` is called with the share that is done.
+        """
         asked, size, count = self.settings, (self.grid.height, self.grid.width), self.settings.samples
         shape = (count, *size) if self.host.samples_first else (*size, count)
         small: Any = np.float16 if asked.compact else np.float32
@@ -296,7 +300,7 @@ class RayJob:
         return made
 
     def _part(self, pixel: NDArray[np.intp]) -> Arrays:
-        """The parts [n, S, ...] of all views for some pixels [n], and how many rays passed."""
+        """Make the parts [n, S, ...] of all views for some pixels [n]; also return how many rays passed."""
         asked, count = self.settings, self.settings.samples
         owner = np.repeat(pixel, count)
         keys = self._sampler.keys(owner, np.tile(np.arange(count), len(pixel)))
@@ -324,14 +328,14 @@ class RayJob:
         return part | {"passed": passed.sum()}
 
     def _placed(self, origin: FloatArray, direction: FloatArray) -> Arrays:
-        """Rays [3, N] of our frame as [N, 3] of the host's."""
+        """Return rays [3, N] of our frame as [N, 3] of the host's."""
         origin = (origin + self._shift) * np.float32(self.settings.units_per_m)
         if self.host.world:
             return {"origin": (self._axes @ origin).T + self.to_world[:3, 3], "direction": (self._axes @ direction).T}
         return {"origin": (origin * self._signs).T, "direction": (direction * self._signs).T}
 
     def _compact(self, origin: FloatArray, direction: FloatArray) -> Arrays:
-        """Rays [3, N] of our frame as the arrays of `compact`."""
+        """Return rays [3, N] of our frame as the arrays of `compact`."""
         steps = np.rint(_met(origin, direction, self._plane_z) / self._step)
         return {
             "origin_xy": (steps * self._signs[:2]).T.astype(np.int16),
@@ -339,7 +343,7 @@ class RayJob:
         }
 
     def _rounding(self, focus_m: float) -> tuple[float, float]:
-        """z of the plane where rays of `compact` start, and their step there, in metres in our frame.
+        """Z of the plane where rays of `compact` start, and the step of their places there, in metres in our frame.
 
         Rounding moves a ray sideways by up to a step over the root of 2, whatever its distance.
         """
@@ -353,7 +357,7 @@ class RayJob:
             raise InputError("rays", "compact", True, "rays within 80 degrees of the axis: leave it out")
         plane_z = float(found.origin_m[2, passed].mean())
         widest = np.abs(_met(found.origin_m[:, passed], found.direction[:, passed], plane_z)).max()
-        step = 2 * max(float(widest), 1e-3) / np.iinfo(np.int16).max  # twice what was met
+        step = 2 * max(float(widest), 1e-3) / np.iinfo(np.int16).max  # for twice the reach that was found
         frame, pixels = frame_of(self.camera), (self.grid.width, self.grid.height)
         pixel = min(mm / n / reach for mm, n, reach in zip(self.grid.film_mm, pixels, frame.reach_mm, strict=True))
         self.compact_px = step / math.sqrt(2) / (pixel * (focus_m - frame.pupil_mm[0] / 1e3))
@@ -367,24 +371,24 @@ _COMPACT = {"origin_xy": np.int16, "direction_xy": np.float32}
 
 
 def _met(origin: FloatArray, direction: FloatArray, plane_z: float) -> FloatArray:
-    """x and y [2, N] where rays [3, N] that run towards -z meet a plane."""
+    """Return x and y [2, N] where rays [3, N] that run towards -z meet a plane."""
     along = (origin[2] - np.float32(plane_z)) / -np.where(direction[2] < 0, direction[2], np.float32(-1))
     return origin[:2] + along * direction[:2]
 
 
 def from_compact(arrays: Mapping[str, NDArray[Any]]) -> tuple[FloatArray, FloatArray]:
-    """Origins and directions [..., 3] float32 of the arrays of `compact`, in the host's camera frame."""
+    """Return origins and directions [..., 3] float32 of the arrays of `compact`, in the host's camera frame."""
     point, way = arrays["origin_xy"] * np.float32(arrays["origin_step"]), arrays["direction_xy"]
     ahead = np.float32(arrays["ahead"]) * np.sqrt(1 - (way * way).sum(-1, keepdims=True))
     return np.concatenate([point, np.full_like(ahead, arrays["plane_z"])], -1), np.concatenate([way, ahead], -1)
 
 
 def resampled(weight: FloatArray, start: FloatArray) -> NDArray[np.intp]:
-    """Samples [n S] of rows of weights [n, S], drawn in proportion to them: numbers of the whole, row by row.
+    """Draw samples [n S] of rows of weights [n, S], in proportion to these; samples are numbered over all rows.
 
-    Systematic resampling, at places (k + start) / S of a row's sum with a number `start` [n] in [0, 1) a row: the mean
-    of any values over what is drawn is, on average, that of weight times value over the mean weight. A row of zeros
-    gives samples of its own.
+    The resampling is systematic, at places (k + start) / S of a row's sum, with a number `start` [n] in [0, 1) for each
+    row. On average, the mean of any values over the drawn samples is that of weight times value over the mean weight. A
+    row of zeros gives samples of its own.
     """
     (rows, count), row = weight.shape, np.arange(len(weight))[:, None]
     reached = np.cumsum(weight, axis=1, dtype=np.float64)

@@ -36,24 +36,26 @@ from neurolens.graph.shading import Cuda
 from neurolens.optics.lens.prescription import LINE_D_NM
 from neurolens.optics.lens.shot import Shot
 
-_SHARE, _LEAST = 0.03, 3e-3  # steps of derivatives by settings: a share of the setting, and 1/m of focus at least
+# steps of derivatives by settings, as a share of the setting; for focus at least so much, in 1/m
+_SHARE, _LEAST = 0.03, 3e-3
 _GIVEN = (*row_names("film_mm", 2), *row_names("square", 2), WAVELENGTH)
 _FOUND = (*row_names("ray", 6), "weight")
-_AWAY = 2.0  # steps from the shot's setting, beyond which rays are no longer taken as linear in it
-# Rows [R, N] of rays to results [R, N] in the order of a program's outputs.
+_AWAY = 2.0  # of these steps from the shot's setting: beyond, rays are no longer taken as linear in it
+# From rows [R, N] of rays to results [R, N] in the order of a program's outputs.
 Run = Callable[[Tensor], Tensor]
-_THREADS, _MOST = 128, 2**30  # of a block of a kernel; rays of a call, whose number is an int of C
+_THREADS, _MOST = 128, 2**30  # threads of a block of a kernel; the most rays of a call, whose number is an int of C
 
 
 class LensRays(NamedTuple):
-    """Rays of N film points, in the camera's frame (metres, origin at the film's centre, looking along -z, y up) or, of
-    a camera with a pose, in the world.
+    """Rays of N film points in the camera's frame, or in the world if the camera has a pose.
+
+    The camera's frame is in metres, with its origin at the film's centre, looking along -z, y up.
 
     Attributes:
         origin: [N, 3]. direction: [N, 3] of unit length; along the axis where the ray did not pass.
-        weight: [N], the factor of the ray's radiance: a film point's value is the mean of weight times radiance over
-            its rays. 0 where the ray did not pass.
-        status: [N] int32, see `neurolens.base.status`; that of the shot, whatever settings a call changes.
+        origin: [N, 3]. direction: [N, 3] of unit length; along the axis where the ray did not pass.
+        weight: [N] factor on the ray's radiance: a film point's value is the mean of weight times radiance over its
+            rays. 0 where the ray did not pass.
     """
 
     origin: Tensor
@@ -70,30 +72,31 @@ class LensCamera:
         rays = camera(film, torch.rand(1, 2), pose=torch.eye(4))
 
     Rays are differentiable once by film points, random numbers, wavelengths and poses, and by the settings of a call:
-    `focus_m`, `f_number` and `zoom`. A setting moves the pupil, too, whose points the random numbers fill; its
-    derivative is the difference between two cameras, one a step below and one a step above the shot. A step is 3% of
-    1 / f-number, of the zoom, or of 1 / focus (0.003 1/m at least). Within two steps rays are linear in the setting;
-    beyond, make another camera.
+    `focus_m`, `f_number` and `zoom`. A setting also moves the pupil, whose points the random numbers choose. The
+    derivative by a setting is the difference between two cameras, one a step below and one a step above the shot. A
+    step is 3% of 1 / f-number, of the zoom, or of 1 / focus (there at least 0.003 1/m). Within two steps rays are
+    linear in the setting; farther away, make another camera.
 
     Args:
-        camera: a lens file, a model, or what else `make_camera` takes for one of these.
+        camera: a lens file, a model, or another name that `make_camera` takes for one of these.
         shot: the settings of the camera.
-        device, dtype: of all results, to which what is given is converted; float64 on the CPU is for checks.
+        device, dtype: those of all results; what is given is converted to them. float64 on the CPU is for checks.
 
     Raises:
-        InputError, ModelError: as `make_camera`; a camera without a lens.
+        InputError, ModelError: as `make_camera`; the camera has no lens.
     """
 
     def __init__(
         self, camera: str | Path, shot: Shot, *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
     ) -> None:
         self.spec, self.shot = str(camera), shot
-        self.device, self.dtype = torch.empty(0, device=device).device, dtype  # a GPU with its number
+        # the device with its number, where it is a GPU
+        self.device, self.dtype = torch.empty(0, device=device).device, dtype
         self._sides: dict[str, _Sides] = {}
         self._lens = self._made(shot)
 
     def film_points(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
-        """Film points [N, 2] in mm of places [N, 2] in a picture of `size` (width, height) pixels, from its upper left.
+        """Film points [N, 2] (mm) of places [N, 2], from the upper left, in a picture of `size` (width, height) pixels.
 
         The middle of the first pixel is at (0.5, 0.5); the picture on the film stands on its head.
         """
@@ -111,18 +114,18 @@ class LensCamera:
         pose: Tensor | None = None,
         **settings: Tensor | float,
     ) -> LensRays:
-        """The rays of film points.
+        """Return the rays of film points.
 
         Args:
             film_mm: [N, 2], lens frame: x right and y up as the camera looks.
-            square: [N, 2] random numbers from 0 to 1 that choose the point in the pupil.
+            square: [N, 2] random numbers from 0 to 1, which choose the point in the pupil.
             wavelength_nm: [N], or one number.
             pose: [3, 4] or [4, 4], or one for each ray, from the camera's frame to the world.
-            settings: `focus_m`, `f_number`, `zoom` (mm), each one number, in place of the shot's.
+            settings: `focus_m`, `f_number`, `zoom` (mm), each one number that replaces the shot's.
 
         Raises:
-            InputError: tensors of other shapes; a setting that the camera does not have, or that is too far from the
-                shot's.
+            InputError: tensors have other shapes; the camera does not have a setting, or the setting is too far from
+                the shot's.
         """
         count = len(film_mm)
         film, places, light = (
@@ -138,17 +141,17 @@ class LensCamera:
         moves = [self._coordinate(name, settings[name]) for name in names]
         found: tuple[Tensor, ...] = _Rays.apply(self, names, film, places, light.expand(count), *moves)
         origin, direction, weight, status = found[0].T, found[1].T, found[2], found[3]
-        if settings:  # linear steps make directions longer
+        if settings:  # steps along tangents make directions longer
             direction = torch.nn.functional.normalize(direction, dim=1)
         if pose is not None:
             turn, place = pose[..., :3, :3], pose[..., :3, 3]
-            # Not as products of matrices, which torch may take with fewer digits.
+            # Not by a product of matrices, which torch may compute with fewer digits.
             origin = (turn * origin[..., None, :]).sum(-1) + place
             direction = (turn * direction[..., None, :]).sum(-1)
         return LensRays(origin, direction, weight, status)
 
     def _coordinate(self, name: str, value: Tensor | float) -> Tensor:
-        """How far a setting is from the shot's, in the coordinate in which rays are linear."""
+        """Return how far a setting is from the shot's, in the coordinate in which rays are linear."""
         if name not in ("focus_m", "f_number", "zoom"):
             raise InputError("LensCamera", name, value, "one of focus_m, f_number, zoom")
         number = torch.as_tensor(value).double().cpu()
@@ -176,7 +179,7 @@ class LensCamera:
         return max(_SHARE * abs(self._start(name)), _LEAST if name == "focus_m" else 0.0)
 
     def _beside(self, name: str) -> _Sides:
-        """The lenses below and above a setting; made once."""
+        """Return the lenses below and above a setting, which are made once."""
         if name not in self._sides:
             start, step = self._start(name), self._step(name)
             found, ends = [], []
@@ -206,7 +209,7 @@ class LensCamera:
 
 
 class _Lens:
-    """The camera of one shot as a program, and how it runs here: forwards, and backwards by its adjoint."""
+    """The camera of one shot as a program, and how it runs here: forwards, and by its adjoint backwards."""
 
     def __init__(self, spec: str, shot: Shot, device: torch.device, dtype: torch.dtype) -> None:
         camera = make_camera(spec, shot)
@@ -226,7 +229,7 @@ class _Lens:
 
     def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
         """Origins and directions [3, N], weights and status [N] for [N, 2], [N, 2] and [N]; without gradients."""
-        if self.compiled:  # numpy turns arrays of two columns ten times as fast as torch
+        if self.compiled:  # numpy transposes arrays of two columns ten times as fast as torch
             points, places = (np.ascontiguousarray(t.numpy().T) for t in (film, square))
             rays = self.camera.sample(points, places, np.ascontiguousarray(light.numpy()))
             return tuple(map(torch.from_numpy, (rays.origin_m, rays.direction, rays.weight, rays.status)))
@@ -236,7 +239,7 @@ class _Lens:
         return torch.where(passed, ray[:3], 0.0), torch.where(passed, ray[3:], ahead), weight, status
 
     def gradients(self, film: Tensor, square: Tensor, light: Tensor, outer: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """The gradients [N, 2], [N, 2], [N] of a number by what `outputs` is given, from those by what it gives."""
+        """A number's gradients [N, 2], [N, 2], [N] by the inputs of `outputs`, from its gradients by the results."""
         by = self._backward(torch.stack([*film.T, *square.T, light, *outer[0], *outer[1], outer[2]]))
         return by[0:2].T, by[2:4].T, by[4]
 
@@ -254,7 +257,7 @@ class _Lens:
         return adjoint(self.program, _FOUND, _GIVEN)
 
     def _run(self, program: Program, rows: Sequence[str]) -> Run:
-        """A program as a function of rows [R, N] of these names: one kernel on a GPU, C on the CPU, else by torch."""
+        """A program as a function of rows [R, N] of these names: a kernel on a GPU, C on the CPU, else in torch."""
         if self.dtype == torch.float32 and "mask" not in self._tables and self.device.type == "cpu":
             with suppress(InputError):
                 return self._as_c(program, rows)
@@ -283,7 +286,7 @@ def _check_shape(name: str, tensor: Tensor, *shapes: tuple[int, ...]) -> None:
 
 
 class _Sides(NamedTuple):
-    """Lenses below and above a setting, and how far they are from it: 0 where there is none, but the shot's own."""
+    """Lenses below and above a setting, and how far each is from it; where there is none, the shot's own at 0."""
 
     low: _Lens
     high: _Lens
@@ -291,7 +294,7 @@ class _Sides(NamedTuple):
 
 
 class _Rays(torch.autograd.Function):
-    """What `_Lens.outputs` gives, for inputs of its camera and for how far settings are from the shot's."""
+    """Applies `_Lens.outputs` to inputs of its camera, and to how far settings are from the shot's."""
 
     @staticmethod
     def forward(
@@ -343,20 +346,20 @@ _RULES = rules_of(torch) | {
 def _chosen(first: Tensor, x: Any, y: Any, dtype: torch.dtype) -> Tensor:
     if isinstance(x, Tensor) or isinstance(y, Tensor):
         return torch.where(first, x, y)
-    return first.to(dtype) * (x - y) + y  # of two numbers `where` would make float32
+    return first.to(dtype) * (x - y) + y  # from two numbers `where` would make float32
 
 
 def has_kernels(device: torch.device) -> bool:
-    """Test whether `on_gpu` can run on a device: an NVIDIA GPU, and a torch that compiles kernels (2.11 was tried)."""
+    """Whether `on_gpu` can run on a device: an NVIDIA GPU, and a torch that compiles kernels (2.11 was tried)."""
     return device.type == "cuda" and torch.version.cuda is not None and hasattr(torch.cuda, "_compile_kernel")
 
 
 def on_gpu(program: Program, rows: Sequence[str], numbers: Mapping[str, Tensor], tables: Mapping[str, Tensor]) -> Run:
-    """The program as one CUDA kernel, in float32.
+    """Return the program as one CUDA kernel, in float32.
 
     Args:
         rows: names of the inputs of a ray, in the order of the rows that the function takes.
-        numbers: inputs of the call. tables: that lookups read, [cells, columns]. Both are on the GPU.
+        numbers: inputs of the call. tables: [cells, columns] that lookups read. Both are on the GPU.
     """
     s, device = Signature.of(program, "lens"), next(iter(tables.values())).device
     kernel = _kernel(Cuda(program, "lens").kernel(), device)
@@ -388,7 +391,10 @@ def _kernel(text: str, device: torch.device) -> Any:
 def step_by_step(
     program: Program, rows: Sequence[str], numbers: Mapping[str, Tensor], tables: Mapping[str, Tensor]
 ) -> Run:
-    """The program one step after the other, in the precision of the rays; arguments as of `on_gpu`."""
+    """Return the program as a function that takes one step after the other, in the precision of the rays.
+
+    Arguments are those of `on_gpu`.
+    """
     live = program.live()
     uses = Counter(a for k in live for a in program.steps[k].arguments if isinstance(a, int))
     uses.update(e.argument for e in program.outputs.values() if isinstance(e.argument, int))
@@ -412,7 +418,7 @@ def step_by_step(
             for a in step.arguments:
                 if isinstance(a, int):
                     left[a] -= 1
-                    if not left[a]:  # its memory serves the next
+                    if not left[a]:  # its memory serves later steps
                         del found[a]
         return torch.stack([value(e.argument) + torch.zeros_like(rays[0]) for e in program.outputs.values()])
 

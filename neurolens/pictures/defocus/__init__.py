@@ -1,1 +1,1 @@
-"""Blur of a lens for pictures that were rendered sharp, and kernels of bokeh."""
+"""The blur of a lens for pictures that were rendered sharp, and its kernels of bokeh."""

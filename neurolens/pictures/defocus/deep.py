@@ -1,10 +1,10 @@
 """Deep OpenEXR files: the samples of each pixel as layers, read chunk by chunk.
 
-The OpenEXR library gives deep pixels as one array a pixel and channel: a file of full HD takes gigabytes, and nothing
-tells how many samples there are before they are all in memory. Here their numbers are read first, and then no more
-than a chunk of samples at a time. The layout is that of "OpenEXR File Layout" (openexr.com): a chunk has the place of
-its block, the sizes of its parts, the running sums of the samples of each row, and the samples, row by row and channel
-by channel. Compressed bytes are differences to the byte before, the even bytes of the block first.
+The OpenEXR library gives deep pixels as one array for each pixel and channel: a file of full HD takes gigabytes, and
+nothing tells how many samples there are before they are all in memory. Here the numbers of samples are read first, and
+then never more than a chunk of samples at a time. The layout is that of "OpenEXR File Layout" (openexr.com): a chunk
+has the place of its block, the sizes of its parts, the running sums of the samples of each row, and the samples, row by
+row and channel by channel. Compressed bytes are differences to the byte before, with the even bytes of the block first.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from neurolens.pictures.render.pictures import COLOURS, PIXEL_TYPES, check_size,
 
 OPAQUE = 0.5  # opacity from which a sample hides what is behind it
 _MOST_LAYERS = 8
-_LARGEST, _MOST_PIXELS, _MOST_IN_LAYERS = 16384, 1 << 25, 1 << 26  # pixels a side, of a file, and of all its layers
-_MOST_BYTES = 1 << 30  # of a file
-_MOST_SAMPLES, _MOST_IN_CHUNK = 1 << 27, 1 << 26  # of a file; bytes of a chunk's samples
-_SEVERAL_PARTS = 0x10  # of the flags in byte 5
+# the most pixels: a side, of a file, of all its layers
+_LARGEST, _MOST_PIXELS, _MOST_IN_LAYERS = 16384, 1 << 25, 1 << 26
+_MOST_BYTES = 1 << 30  # the most bytes of a file
+_MOST_SAMPLES, _MOST_IN_CHUNK = 1 << 27, 1 << 26  # the most samples of a file; the most bytes of a chunk's samples
+_SEVERAL_PARTS = 0x10  # a flag in byte 5
 _CHANNEL = re.compile(rb"([^\0]+)\0(.).{15}", re.DOTALL)  # name and type of a channel in a list of channels
 Block = tuple[int, int, int, int]  # left, top, width, height
 
 
 def deep_layers(path: Path, header: Mapping[str, Any]) -> list[tuple[FloatArray, FloatArray]]:
-    """Colours and depths of the opaque samples of a file's first part: the first of each pixel, then the second.
+    """Read the opaque samples of a file's first part as layers of colours and depths: each pixel's first, then second.
 
     Raises:
-        InputError: damaged, without colours or depth, of another compression, or with too many samples.
+        InputError: the file is damaged, has no colours or no depth, has another compression, or too many samples.
     """
     first, last = header["dataWindow"]
     width, height = size = [int(b) - int(a) + 1 for a, b in zip(first, last, strict=True)]
@@ -70,7 +71,7 @@ def deep_layers(path: Path, header: Mapping[str, Any]) -> list[tuple[FloatArray,
 
 
 def _channels(data: bytes) -> tuple[dict[str, np.dtype[Any]], int]:
-    """The channels of the first part with their types, and where the places of its chunks begin."""
+    """Read the channels of the first part, with their types, and where the places of its chunks begin."""
     found, at, parts = dict[str, np.dtype[Any]](), 8, 0
     while True:
         while data[at]:  # an attribute: its name, its type, its length, its value
@@ -96,7 +97,7 @@ def _rows(
     start: int,
     size: tuple[int, int],
 ) -> Iterator[tuple[NDArray[np.int64], dict[str, FloatArray]]]:
-    """The pixels and the values of all samples, a row of a chunk at a time."""
+    """Yield the pixels and the values of all samples, one row of a chunk at a time."""
     method, each = header["compression"], sum(kind.itemsize for kind in channels.values())
     if method not in (OpenEXR.NO_COMPRESSION, OpenEXR.RLE_COMPRESSION, OpenEXR.ZIPS_COMPRESSION):
         raise InputError(path, "compression", f"({method})", "none, RLE or ZIPS, which deep files have")
@@ -115,7 +116,7 @@ def _rows(
     if not seen.all():
         raise ValueError(f"{int((~seen).sum())} pixels are in no chunk")
     for (left, top, wide, high), at, table, packed, unpacked in chunks:
-        # The library writes the table of a tile at the border as long as that of any other.
+        # At the border, too, the library writes the table of a tile as long as that of any other.
         full = header["tiles"].xSize * header["tiles"].ySize if "tiles" in header else wide * high
         listed = _unpacked(data[at : at + table], method, 4 * wide * high, 4 * full)
         sums = np.frombuffer(listed, "<i4", wide * high).reshape(high, wide).astype(np.int64)
@@ -134,7 +135,7 @@ def _rows(
 
 
 def _block(data: bytes, at: int, header: Mapping[str, Any], size: tuple[int, int]) -> tuple[Block, int]:
-    """The block of a chunk in the picture, and where the sizes of its parts stand."""
+    """Return the block of the picture that a chunk has, and where the sizes of its parts stand."""
     if header["type"] == OpenEXR.deepscanline:
         block, at = (0, struct.unpack_from("<i", data, at)[0] - int(header["dataWindow"][0][1]), size[0], 1), at + 4
     else:
@@ -149,7 +150,7 @@ def _block(data: bytes, at: int, header: Mapping[str, Any], size: tuple[int, int
 
 
 def _unpacked(data: bytes, method: Any, *sizes: int) -> bytes:
-    """The bytes of a part of a chunk, of one of these sizes; they are stored as they are where that is shorter."""
+    """Unpack a part of a chunk to one of these sizes; it is stored as it is where that is shorter."""
     if method == OpenEXR.NO_COMPRESSION or len(data) == max(sizes):
         found = data
     else:
@@ -167,13 +168,13 @@ def _unpacked(data: bytes, method: Any, *sizes: int) -> bytes:
 def _inflated(data: bytes, most: int) -> bytes:
     reader = zlib.decompressobj()
     found = reader.decompress(data, most + 1)
-    if not reader.eof:  # where the checksum stands
+    if not reader.eof:  # the checksum stands at the end
         raise ValueError("compressed data without an end")
     return found
 
 
 def _repeated(data: bytes, most: int) -> bytes:
-    """Bytes from runs: after n < 0 come -n bytes as they are, after any other n one byte that stands n + 1 times."""
+    """Unpack runs: after n < 0 come -n bytes as they are, after any other n one byte that stands n + 1 times."""
     found, at = bytearray(), 0
     while at < len(data) and len(found) <= most:
         count = data[at] - 256 if data[at] > 127 else data[at]

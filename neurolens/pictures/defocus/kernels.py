@@ -4,11 +4,11 @@ A point is named by its place in a plate and its inverse depth. Each point of th
 point whose ray sees it there, found by Newton's method on the camera's own rays; cells of a grid of the pupil are drawn
 as the areas that they cover. So a kernel has no noise, and cat's eyes, coma and colour fringes are the lens's.
 
-Onion rings: concentric grooves, which grinding leaves on aspheres, move the light within a blur disc. A groove raises
-the surface along the axis by h(r). The path of a ray through it changes by W = h (n d_z - n' d'_z), d and d' the
-directions before and after the surface. By Fermat's principle the light of a point that passes the same place of the
-lens then arrives on the film beside its old place, by the gradient of W over the direction cosines with which rays
-leave that place. This is exact to first order in h; diffraction by the grooves is left out, as by Joo et al. 2016
+Onion rings: grinding leaves concentric grooves on aspheres, which move the light within a blur disc. A groove raises
+the surface along the axis by h(r). The path of a ray through it changes by W = h (n d_z - n' d'_z), with d and d' the
+directions before and after the surface. By Fermat's principle, light of a point that passes the same place of the lens
+arrives beside its old place on the film, displaced by the gradient of W over the direction cosines with which rays
+leave that place. This is exact to first order in h. Diffraction by the grooves is left out, as by Joo et al. 2016
 ("Efficient ray tracing through aspheric lenses and imperfect bokeh synthesis"), who measured such rings.
 """
 
@@ -38,36 +38,36 @@ from neurolens.pictures.defocus.plate import (
 from neurolens.pictures.flare.canvas import LOST, draw_edges, edges_of
 
 Array = NDArray[np.float64]
-_STEP_MM = 0.01  # on the pupil's plane, of differences
+_STEP_MM = 0.01  # of differences on the pupil's plane
 GRID = 48  # cells of the pupil along a side
-COLOURS = 5  # wavelengths of a channel
-_STEPS = 5  # of Newton's method
+COLOURS = 5  # wavelengths in a channel
+_STEPS = 5  # steps of Newton's method
 _CLOSE = 0.01  # pixels by which a ray may miss the point
-_FAR = 0.02  # of the kernel's width: the places of rays that miss by more are not used
-_SURE = 0.5  # share of the light whose rays meet the point, below which the places of all rays count
+_FAR = 0.02  # share of the kernel's width: rays that miss by more have places that are not used
+_SURE = 0.5  # where a smaller share of the light has rays that meet the point, the places of all rays count
 LARGEST = 2048  # pixels a side of a kernel
-_RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
-_MARGIN = 2  # pixels around it
+_RIM = 0.99  # of a pupil's outline, where hardly a ray passes: places from here on are extrapolated
+_MARGIN = 2  # dark pixels around a kernel
 _A_GROOVE, _FINEST = 8, 1536  # cells for each groove of an asphere, and the most along a side
-_FINER = 3  # pixels along a side of one, odd, that show grooves finer than it
+_FINER = 3  # an odd number of boxes along a pixel's side, which show grooves finer than a pixel
 _LARGEST = 16384  # pixels a side of an atlas
 
 
 @dataclass(frozen=True)
 class Grooves:
-    """Grooves of the height H sin(2 pi r / spacing)."""
+    """Grooves whose height is H sin(2 pi r / spacing)."""
 
     height_nm: float
     spacing_mm: float
 
     def heights(self, radius_mm: Array) -> tuple[Array, Array]:
-        """The heights in mm, and their derivatives by the radius."""
+        """Return the heights in mm, and their derivatives by the radius."""
         turn, height = 2 * math.pi / self.spacing_mm, 1e-6 * self.height_nm
         return height * np.sin(turn * radius_mm), height * turn * np.cos(turn * radius_mm)
 
 
 def aspheres(camera: Any) -> list[int]:
-    """The surfaces of a camera's lens that are round aspheres. Raises InputError: there is none."""
+    """Return the surfaces of a camera's lens that are round aspheres. Raises InputError: there is none."""
     lens = getattr(camera, "lens", None)
     surfaces = lens.surfaces if lens is not None else ()
     found = [k for k, s in enumerate(surfaces) if s.figure.aspheric and not s.figure.axis]
@@ -79,10 +79,11 @@ def aspheres(camera: Any) -> list[int]:
 
 
 def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDArray[Any]) -> Array:
-    """How light moves: [aspheres, 5, N] for rays of film points [2, N] by points of the pupil's square [2, N].
+    """Return how grooves move light: [aspheres, 5, N] for rays from film points [2, N] through pupil points [2, N].
 
-    Of each asphere the distance in mm from the axis at which the ray meets it, and by how many mm light moves on the
-    film, x and y, for a slope of 1 there, then for a height of 1 mm.
+    Pupil points are those of the unit square. The five rows of an asphere are the distance (mm) from the axis at which
+    the ray meets it, and by how many mm light moves on the film, in x and y, for a slope of 1 there, then for a height
+    of 1 mm.
     """
     surfaces, outline = aspheres(camera), camera.film.outline
     pupil, _ = outline.sample(*(v.astype(np.float32) for v in (film_mm, square, nm)))
@@ -96,7 +97,7 @@ def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDAr
 
 
 def moves(response: Array, grooves: Grooves) -> Array:
-    """By how many mm [2, N] grooves on all aspheres move light on the film; `response` as of `responses`."""
+    """By how many mm [2, N] grooves on all aspheres move light on the film; `response` is that of `responses`."""
     height, slope = grooves.heights(response[:, 0])
     return np.asarray((response[:, 1:3] * slope[:, None] + response[:, 3:] * height[:, None]).sum(axis=0))
 
@@ -106,11 +107,11 @@ class Kernel:
     """The picture of a point.
 
     Attributes:
-        light: [h, w, 3] the part of the radiance of one square pixel of the plate that arrives at each pixel.
-        corner_px: column and row in the film, of its first pixel; whole numbers.
-        film_by_plate: [2, 2] by how much the point's picture moves on the film as the point moves in the plate, pixels.
-        sweep: [2, 3] how fast the ray from a film pixel to the point moves in the plate as it comes nearer (pixels by
-            1/m): the constant, and the factors of column and row in the kernel.
+        light: [h, w, 3] share of the radiance of one square pixel of the plate that arrives at each pixel.
+        corner_px: column and row, in the film, of its first pixel; whole numbers.
+        film_by_plate: [2, 2] by how many pixels the point's picture moves on the film as the point moves in the plate.
+        sweep: [2, 3] how fast the ray from a film pixel to the point moves in the plate as the point comes nearer
+            (pixels by 1/m): a constant, and factors of column and row in the kernel.
     """
 
     light: FloatArray
@@ -120,16 +121,16 @@ class Kernel:
 
     @property
     def middle_px(self) -> tuple[float, float]:
-        """The centroid of the green light, in the film."""
+        """Return the place in the film of the green light's centroid."""
         green = self.light[..., 1].astype(np.float64)
         total = max(float(green.sum()), 1e-30)
         x, y = (float(green.sum(axis=a) @ (np.arange(green.shape[1 - a]) + 0.5)) / total for a in (0, 1))
         return self.corner_px[0] + x, self.corner_px[1] + y
 
     def centred(self, side: int, middle_px: tuple[float, float]) -> FloatArray:
-        """The kernel of sum 1 in each channel on `side` pixels a side, whose centre is the film place `middle_px`.
+        """Return the kernel on `side` pixels a side about the film place `middle_px`; each channel has the sum 1.
 
-        Light that has no room is lost; the kernel moves by whole pixels.
+        Light for which there is no room is lost. The kernel moves by whole pixels.
         """
         found = np.zeros((side, side, 3), np.float32)
         x, y = (c - math.floor(m) + side // 2 for c, m in zip(self.corner_px, middle_px, strict=True))
@@ -141,7 +142,7 @@ class Kernel:
 
     @property
     def energy(self) -> Array:
-        """The light of red, green and blue."""
+        """Return the light of red, green and blue."""
         return np.asarray(self.light.sum(axis=(0, 1), dtype=np.float64))
 
 
@@ -150,15 +151,16 @@ def kernel_at(
     cells: int = GRID, colours: int = COLOURS, wavelengths_nm: tuple[float, float, float] | None = None,
     grooves: Grooves | None = None,
 ) -> Kernel | None:  # fmt: skip
-    """The kernel of a point at a place of the plate, in pixels of the camera's picture; None where no light arrives.
+    """Return the kernel of a point of the plate, in pixels of the camera's picture; None where no light arrives.
 
     Args:
-        guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths a channel.
+        guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths in a channel.
         wavelengths_nm: one wavelength for red, green and blue each, in place of those that make white light.
-        grooves: marks of grinding on the lens's aspheres, which make onion rings.
+        grooves: traces of grinding on the lens's aspheres, which make onion rings.
 
     Raises:
-        InputError: a kernel of over 2048 pixels a side; grooves on a lens without aspheres, or too many.
+        InputError: the kernel has over 2048 pixels a side; the lens has no aspheres for grooves, or the grooves are too
+            many.
     """
     pupil = _square(_RIM * _disk(np.linspace(-1, 1, cells + 1)))
     table = RayTable(camera, plate, pupil, np.zeros(pupil.shape[1], np.float32))
@@ -183,7 +185,7 @@ def kernel_at(
     width, height = (np.ceil(most).astype(int) + _MARGIN - corner).tolist()
     if max(width, height) > LARGEST:
         raise InputError("kernel", "size", f"({width} x {height} pixels)", f"at most {LARGEST} a side: blur less")
-    # Grooves finer than a pixel, in one box a pixel, would leave a checkerboard.
+    # With one box a pixel, grooves finer than a pixel would leave a checkerboard.
     finer = _FINER if grooves is not None and _FINER * max(width, height) <= LARGEST else 1
     light = np.zeros((finer * height, finer * width, 3), np.float32)
     colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
@@ -194,7 +196,7 @@ def kernel_at(
 
 
 def _averaged(light: FloatArray, finer: int) -> FloatArray:
-    """The light of pixels that are so many times as wide, under a quadratic spline over three; the rim is dark."""
+    """Average light to pixels `finer` times as wide, under a quadratic spline over three of them; the rim is dark."""
     for axis in (0, 1) if finer > 1 else ():
         for _ in range(2):
             light = np.mean([np.roll(light, k - finer // 2, axis) for k in range(finer)], axis=0)
@@ -203,31 +205,33 @@ def _averaged(light: FloatArray, finer: int) -> FloatArray:
 
 
 def _disk(side: NDArray[Any]) -> Array:
-    """A grid [2, N, N] over the square of -1 to 1 on the disk: x sqrt(1 - y^2 / 2), and the same in y. It is smooth, as
-    the one of `Camera.sample`, which has corners along the diagonals, is not."""
+    """Map a grid [2, N, N] over the square of -1 to 1 to the disk: x sqrt(1 - y^2 / 2), and the same in y.
+
+    It is smooth; the map of `Camera.sample` has corners along the diagonals.
+    """
     x, y = np.meshgrid(side, side)
     return np.stack([x * np.sqrt(1 - y**2 / 2), y * np.sqrt(1 - x**2 / 2)])
 
 
 def _square(disk: Array) -> FloatArray:
-    """Points [2, N] of the unit square that `Camera.sample` takes for points of the disk."""
+    """Return the points [2, N] of the unit square that `Camera.sample` takes to these points of the disk."""
     (u, v), radius = disk.reshape(2, -1), np.hypot(*disk.reshape(2, -1))
     return turned(np.stack([0.5 + 0.5 * radius, np.full_like(radius, 0.5)]), np.arctan2(v, u))
 
 
 def _between(values: NDArray[Any], at: NDArray[Any]) -> Array:
-    """Values [..., cells + 1, cells + 1] at other columns and rows `at` of their grids, linear between points."""
+    """Interpolate values [..., cells + 1, cells + 1] at columns and rows `at` of their grids, linearly."""
     share = np.maximum(1 - np.abs(at[:, None] - np.arange(values.shape[-1])), 0)
     return np.asarray(share @ values @ share.T)
 
 
 @dataclass(frozen=True)
 class _Aimed:
-    """Rays of a pupil's grid, of several wavelengths one after the other, that see a point.
+    """Rays of a pupil's grid that see a point, at several wavelengths one after the other.
 
-    Attributes: of N rays, or after `on_grid` of rays [waves, cells + 1, cells + 1].
-        place: [2, ...] on the film in pixels. weight: [...]. slope: [2, ...], b of their lines.
-        film_by_plate: [2, 2] the mean derivatives of places by the point's.
+    Attributes: (for N rays, or after `on_grid` for rays [waves, cells + 1, cells + 1]) place: [2, ...] on the film in
+    pixels. weight: [...]. slope: [2, ...], b of their lines. film_by_plate: [2, 2] the mean derivatives of the places
+    by the point's place.
     """
 
     place: Array
@@ -236,7 +240,7 @@ class _Aimed:
     film_by_plate: Array
 
     def on_grid(self, waves: int, cells: int) -> _Aimed:
-        """The rays as grids, their places taken from `_RIM` to the outline itself, along the radii of the pupil."""
+        """The rays as grids; their places are extrapolated from `_RIM` to the outline, along the pupil's radii."""
         place, weight, slope = (
             v.reshape(*v.shape[:-1], waves, cells + 1, -1) for v in (self.place, self.weight, self.slope)
         )
@@ -248,15 +252,18 @@ class _Aimed:
         return _Aimed(place + np.where(solid, more, 0), weight, slope, self.film_by_plate)
 
     def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], colour: Array, finer: int) -> None:
-        """Add the light of a wavelength to a kernel's picture, each quarter of the pupil with its cells cut along the
-        grid's diagonal; `finer`: the picture's pixels along the side of one of the film's."""
+        """Add the light of a wavelength to a kernel's picture, by quarters of the pupil.
+
+        Cells are cut along the grid's diagonal in each quarter. `finer` is how many of the picture's pixels a film
+        pixel has along its side.
+        """
         height, width = light.shape[:2]
         (x, y), weight = finer * (self.place[:, number] - corner[:, None, None]), self.weight[number]
         lit, cells = weight > 0, len(weight) - 1
         half, square = cells // 2, 1 - np.linspace(-1, 1, cells + 1) ** 2 / 2
-        # The area of the disk that a cell has, over its whole.
+        # A cell's share of the area of the disk.
         share = (square[:, None] + square - 1) / np.sqrt(square[:, None] * square) * (4 / math.pi / cells**2)
-        # `edges_of` turns film points in mm into pixels: one mm a pixel, from the middle.
+        # `edges_of` turns film points in mm into pixels, from the middle on; here a pixel is a mm.
         rows = np.stack(
             [np.where(lit, width / 2 - x, 0), np.where(lit, y - height / 2, 0), weight * share, np.where(lit, 0, LOST)]
         )
@@ -267,7 +274,7 @@ class _Aimed:
             draw_edges(light, range(height), edges, np.array([len(edges)]), colour)
 
     def with_rings(self, table: RayTable, nm: FloatArray, grooves: Grooves) -> _Aimed:
-        """The rays on a grid so fine that it shows grooves, with their places moved by them."""
+        """Return the rays on a grid so fine that it shows the grooves, with places that these have moved."""
         cells, lit = self.weight.shape[1] - 1, self.weight > 0
         pupil, film = (
             np.tile(_square(_disk(np.linspace(-1, 1, cells + 1))), len(nm)),
@@ -287,7 +294,7 @@ class _Aimed:
         return _Aimed(place + moved, np.where(whole > 1 - 1e-9, weight, 0), slope, self.film_by_plate)
 
     def sweep(self, corner: NDArray[np.int_]) -> Array:
-        """See `Kernel.sweep`: a fit by least squares to the rays that pass."""
+        """Fit `Kernel.sweep` by least squares to the rays that pass."""
         lit = self.weight > 0
         basis = np.stack([np.ones(int(lit.sum())), *(self.place[:, lit] - corner[:, None])], axis=1)
         return np.asarray(np.linalg.lstsq(basis, self.slope[:, lit].T, rcond=None)[0].T)
@@ -296,7 +303,7 @@ class _Aimed:
 def _aimed(
     table: RayTable, target: tuple[float, float], w: float, guess: tuple[float, float], nm: FloatArray
 ) -> _Aimed:
-    """The rays of all points of the pupil that see a point of the plate, at each of some wavelengths."""
+    """Find the rays of all points of the pupil that see a point of the plate, at each of some wavelengths."""
     pupil, waves = np.tile(table.pupil, len(nm)), np.repeat(nm, table.pupil.shape[1])
     wanted = np.array(target)[:, None]
 
@@ -314,13 +321,13 @@ def _aimed(
     film_by_plate = np.linalg.inv(np.stack([((m[0] - at) / step)[:, good].mean(axis=1) for m in moved], axis=1))
     for _ in range(_STEPS):
         off = wanted - at
-        # Rays that do not pass say nothing about where the point's light is: they move as the others do.
+        # Rays that do not pass do not tell where the point's light is: they move as the others do.
         off[:, weight <= 0] = off[:, weight > 0].mean(axis=1, keepdims=True) if (weight > 0).any() else 0.0
         place = place + film_by_plate @ off
         at, weight, slope = seen(place)
         if np.hypot(*(wanted - at))[weight > 0].max(initial=0.0) < _CLOSE:
             break
-    # Each ray's own area: near the end of the light the pupil's outline moves fast with the film point.
+    # Each ray has its own area: near the end of the light the pupil's outline moves fast with the film point.
     ahead, behind = ([seen(place + d * np.eye(2)[:, [k]]) for k in (0, 1)] for d in (0.5, -0.5))
     (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(ahead, behind, strict=True))
     stretch = np.abs(xx * yy - xy * yx)
@@ -328,15 +335,19 @@ def _aimed(
     area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(film_by_plate))))
     close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
     light, kept = weight * area, np.where(close, weight, 0) * area
-    # The light of rays that Newton's method leaves beside the point goes where the others' goes.
+    # Where Newton's method leaves rays beside the point, their light goes where that of the others goes.
     share = kept.sum() / max(light.sum(), 1e-30)
     return _Aimed(place, kept / share if share > _SURE else light, slope, film_by_plate)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One kernel: its field (-1 to 1 from left to right and from bottom to top of the film), its distance from the film
-    in m, the film place that is its centre, and the kernel; None where no light arrives."""
+    """One kernel of many.
+
+    Attributes:
+        field: -1 to 1 from left to right and from bottom to top of the film. distance_m: from the film.
+        place_px: the film place that is its centre. kernel: None where no light arrives.
+    """
 
     field: tuple[float, float]
     distance_m: float
@@ -345,7 +356,7 @@ class Cell:
 
     @property
     def width_px(self) -> int:
-        """Pixels a side, odd, that hold the kernel about its place."""
+        """Return how many pixels a side, an odd number, hold the kernel about its place."""
         if self.kernel is None:
             return 1
         first = np.subtract(self.kernel.corner_px, np.floor(self.place_px))
@@ -353,7 +364,7 @@ class Cell:
 
 
 def own_plate(camera: Camera, size: tuple[int, int]) -> Plate:
-    """An empty plate of the camera's own pinhole, that of `neurolens stmap`, with `size` pixels on its film."""
+    """Return an empty plate of the camera's own pinhole, that of `neurolens stmap`, with `size` pixels on its film."""
     frame = frame_of(camera)
     per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
     reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
@@ -365,15 +376,15 @@ def kernels_over(
     wavelengths_nm: tuple[float, float, float] | None = None, grooves: Grooves | None = None,
     report: Callable[[float], None] = lambda _: None,
 ) -> list[list[Cell]]:  # fmt: skip
-    """The kernels of each distance, row by row from the top of the picture.
+    """Make the kernels of each distance, row by row from the top of the picture.
 
     Args:
         size: of the picture in pixels. distances_m: from the film, along the axis; inf is far.
-        fields: columns and rows of places, in the middles of equal parts of the picture.
+        fields: how many columns and rows of places, in the middles of equal parts of the picture.
         wavelengths_nm, grooves: as for `kernel_at`.
 
     Raises:
-        InputError: a distance within the lens; kernels too large for memory.
+        InputError: a distance lies within the lens; the kernels are too large for memory.
     """
     plate, found = own_plate(camera, size), []
     places = [
@@ -400,7 +411,7 @@ def kernels_over(
 
 
 def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
-    """The atlas [rows side, columns side, 3] of the kernels of one distance, each of sum 1 in each channel."""
+    """Put the kernels of one distance into an atlas [rows side, columns side, 3]; each channel has the sum 1."""
     picture = np.zeros((len(cells) // columns * side, columns * side, 3), np.float32)
     for k, cell in enumerate(cells):
         j, i = divmod(k, columns)
@@ -410,7 +421,7 @@ def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
 
 
 def as_preview(picture: FloatArray, side: int) -> FloatArray:
-    """An atlas with each kernel as bright as the others, to be looked at."""
+    """Scale the kernels of an atlas to equal brightness, to be looked at."""
     found = picture.copy()
     for j, i in itertools.product(range(0, len(found), side), range(0, found.shape[1], side)):
         part = found[j : j + side, i : i + side]

@@ -1,14 +1,15 @@
-"""A plate as a lens would have photographed it: its pixels gathered, and its highlights spread as clean discs.
+"""A plate as a lens would have photographed it: its pixels are gathered, its highlights spread as clean discs.
 
 The picture gets the camera's blur, distortion, vignetting and colour fringes. The rays of a pixel lie between those of
-the four nodes around it. What a ray meets is found in the plate's depth (`gather.c`). A pixel takes the number
-of samples that is asked for where the light in its blur is uneven, and fewer where it is even or sharp. It weighs them
-so that even light stays even: the mean of radiance by weight, times the mean weight of the whole pupil.
+the four nodes around it. What a ray meets is found in the plate's depth (`gather.c`). A pixel takes the number of
+samples that is asked for where the light in its blur is uneven, and fewer where it is even or sharp. Samples are
+weighted so that even light stays even: a pixel is the weighted mean of radiance, times the mean weight of the whole
+pupil.
 
-Highlights are pixels that are far brighter than their surroundings. Few of a pixel's samples would find them, which is
-noise. Their light above that of the surroundings is taken out of the plate and spread by the lens's own kernels, one
-for all points of a place and a depth that are alike; from film pixels where something nearer hides a point it is left
-out.
+Highlights are pixels that are far brighter than their surroundings. Few of a pixel's samples would find them, which
+makes noise. Their light above that of the surroundings is taken out of the plate and spread by the lens's own kernels;
+points of a place and depth that are alike share one. It is left out at film pixels where something nearer hides the
+point.
 """
 
 from __future__ import annotations
@@ -34,30 +35,36 @@ from neurolens.pictures.defocus.kernels import LARGEST, kernel_at
 from neurolens.pictures.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable, reduced
 from neurolens.pictures.render.sampler import sobol
 
-_SET = 512  # points of the pupil
-_FEW = 128  # of them, to measure blur
-SAMPLES, _LEAST = 128, 8  # of a pixel: as a rule, and at least
-# The contrast of the light in a pixel's blur, and the radius of that with the pixel itself, from which it takes all
-# samples: the error is in proportion to the contrast, and a small blur has few pixels to take samples of.
+_SET = 512  # points of the pupil in a set
+_FEW = 128  # of these, to measure blur
+SAMPLES, _LEAST = 128, 8  # samples of a pixel: by default, and at least
+# From this contrast of the light in its blur, and this radius of blur with the pixel itself, a pixel takes all samples:
+# the error is in proportion to the contrast, and a small blur has few pixels to sample.
 _FULL, _FULL_PX = 0.25, 2.0
-_CLEAR = 0.01  # of its inverse depth, by which what hides a point is nearer
-_SAID = 0.002  # share of the light that was made up, from which it is said
-_EDGE = 9  # points of each side of the film that are tried
-_WINDOW = 33  # pixels about which surroundings are meant
-_BRIGHTER, _ABOVE = 8.0, 3.0  # than the geometric mean of the surroundings, and than their mean
-_LEAST_PX = 1.5  # radius of the blur: what is sharper has no noise
+_CLEAR = 0.01  # share of its inverse depth by which something must be nearer to hide a point
+_SAID = 0.002  # a share of made-up light from which there is a warning
+_EDGE = 9  # points that are tried along each side of the film
+_WINDOW = 33  # pixels across the surroundings
+# a highlight is so many times as bright as the geometric mean of its surroundings, and as their mean
+_BRIGHTER, _ABOVE = 8.0, 3.0
+_LEAST_PX = 1.5  # radius of blur: what is sharper has no noise
 _PLACES = 32  # kernels along the longer side of the film
-_FINE_PX, _FINE = 0.25, 0.03  # steps of the radius between kernels, absolute and relative
-_MOST_WORK = 4e9  # pixels of kernels
-_SAME = 0.01  # of inverse depth, within which two layers show the same thing
+_FINE_PX, _FINE = 0.25, 0.03  # steps of the radius between two kernels: in pixels, and relative
+_MOST_WORK = 4e9  # pixels of kernels in all
+_SAME = 0.01  # share of inverse depth within which two layers show the same thing
 _CELLS, _COLOURS = 24, 2
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """The picture [H, W, 3] that a camera takes of a plate, and the shares of its light that the plate did not have:
-    `filled`, behind the edges of things, and `beyond`, outside of the plate; `highlights` were spread as discs; `lost`
-    is the share of the light of those that no layer shows, if there are as many behind edges as beside them."""
+    """The picture that a camera takes of a plate.
+
+    Attributes:
+        rgb: [H, W, 3]. filled, beyond: shares of its light that the plate did not have: behind the edges of things, and
+            outside of the plate.
+        highlights: how many were spread as discs. lost: estimated share of the light of highlights that no layer shows,
+            if there are as many behind edges as beside them.
+    """
 
     rgb: FloatArray
     filled: float
@@ -88,13 +95,16 @@ def compiled() -> ctypes.CDLL:
 
 
 def _points(count: int, numbers: int) -> FloatArray:
-    """Points [numbers, count] of the unit cube, evenly."""
+    """Return points [numbers, count] spread evenly over the unit cube."""
     return ((sobol(count, numbers) + 2.0**31 / count) / 2.0**32).astype(np.float32)
 
 
 def spread_over(camera: Camera, plate: Plate) -> NDArray[np.float64]:
-    """The variance of the places at which rays of each node [rows, columns, 3] see a point: of a, 2 covariances, of b;
-    summed over x and y, so that its root is the radius of an even disc over sqrt(2)."""
+    """Return the variance of the places at which rays of each node [rows, columns, 3] see a point.
+
+    The last axis has the variance of a, twice the covariance of a and b, and the variance of b, each summed over x and
+    y. The variance's root is the radius of an even disc over sqrt(2).
+    """
     points, found = _points(_FEW, 3), []
     table = RayTable(camera, plate, points[:2], points[2])
     for j in range(table.cells[1] + 1):
@@ -106,13 +116,13 @@ def spread_over(camera: Camera, plate: Plate) -> NDArray[np.float64]:
 
 
 def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float64]:
-    """Radii in pixels of the discs of things of inverse depth w."""
+    """Return the radii in pixels of the discs of things of inverse depth w."""
     a, ab, b = np.moveaxis(spread, -1, 0)
     return np.sqrt(np.maximum(2 * (a + (ab + b * w) * w), 0))
 
 
 def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[np.uint8]:
-    """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel and what is in it."""
+    """Log2 of each pixel's number of samples [H, W], from the widest disc that reaches it and the light in it."""
     width, height = plate.size
     places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
     nodes = [
@@ -144,8 +154,11 @@ def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[n
 
 
 def _contrast(plate: Plate, places: list[NDArray[np.float64]], reach: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The standard deviation of the light of all layers over its mean, in squares [rows, columns] about places (rows,
-    columns of the film) that a blur of the radii `reach` fills: even light has no noise."""
+    """Return the contrast of light in blurs: the standard deviation over the mean, of all layers.
+
+    It is taken in squares [rows, columns] about `places` (rows, columns of the film) that a blur of the radii `reach`
+    fills. Even light has no noise.
+    """
     sums: Any = 0.0
     for layer in plate.layers:
         solid = layer.texel[..., 3] >= 0
@@ -167,7 +180,7 @@ def _contrast(plate: Plate, places: list[NDArray[np.float64]], reach: NDArray[np
 
 
 def _beside(values: FloatArray, by: np.ufunc) -> FloatArray:
-    """The least or largest value of each cell and its eight neighbours."""
+    """Return the least or largest value of each cell and its eight neighbours."""
     padded = np.pad(values, 1, mode="edge")
     rows = by(by(padded[:-2], padded[1:-1]), padded[2:])
     return by(by(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
@@ -177,7 +190,7 @@ def gather(
     plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = SAMPLES, threads: int = 1,
     report: Callable[[float], None] = lambda _: None,
 ) -> Gathered:  # fmt: skip
-    """The picture that a camera takes of a plate; `spread` is `spread_over` of both, `samples` a power of two."""
+    """Take a camera's picture of a plate; `spread` is `spread_over` of both, `samples` a power of two."""
     width, height = plate.size
     points = _points(_SET, 5)
     jitter = np.ascontiguousarray(points[2:4].T)
@@ -222,8 +235,12 @@ def gather(
 
 @dataclass(frozen=True)
 class Highlights:
-    """Light [N, 3] taken out of a layer at places [N, 2] in its pixels, inverse depths [N], radii of blur [N], and its
-    sign [N], by the side of the plane in focus."""
+    """Highlights that were taken out of a layer.
+
+    Attributes:
+        place_px: [N, 2] in pixels of the layer. inverse_depth: [N]. radius_px: [N] of their blur.
+        side: [N] the sign of their blur, by the side of the plane in focus. light: [N, 3].
+    """
 
     place_px: NDArray[np.float64]
     inverse_depth: FloatArray
@@ -233,14 +250,16 @@ class Highlights:
 
 
 def take_highlights(plate: Plate, number: int, spread: NDArray[np.float64]) -> Highlights:
-    """Take the highlights out of a layer of a plate, which is changed, for a camera of such a spread at its nodes.
+    """Take the highlights out of a layer of a plate, which is changed; `spread` is `spread_over` of camera and plate.
 
-    What the layers before it show, too, at the same place and depth, is taken out and left to them.
+    A highlight that a layer before it also shows, at the same place and depth, is taken out here and left to that
+    layer.
     """
     layer, size = plate.layers[number], plate.size
     rgb, w = layer.texel[..., :3], layer.texel[..., 3]
     bright, there = rgb.max(axis=2), w >= 0
-    part = np.maximum(_around(there.astype(np.float32)), 1e-9)  # of the surroundings, where the layer has something
+    # share of the surroundings where the layer has something
+    part = np.maximum(_around(there.astype(np.float32)), 1e-9)
     log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
     geometric = np.exp(_around(np.where(there, log, 0)) / part)
     mean = _around(np.where(there, np.minimum(bright, _BRIGHTER * geometric), 0)) / part
@@ -252,9 +271,9 @@ def take_highlights(plate: Plate, number: int, spread: NDArray[np.float64]) -> H
     ]
     radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
     _, ab, b = np.moveaxis(spread[nodes[0], nodes[1]], -1, 0)
-    side = np.sign(ab + 2 * b * w[row, column])  # of the growth of the radius's square with the inverse depth
+    side = np.sign(ab + 2 * b * w[row, column])  # the sign of the growth of the squared radius with the inverse depth
     wide = (radius > _LEAST_PX) & (radius < LARGEST / 3)  # still larger discs have little noise
-    order = np.flatnonzero(wide)[np.argsort(-(bright / cap)[row, column][wide])]  # the brightest first
+    order = np.flatnonzero(wide)[np.argsort(-(bright / cap)[row, column][wide])]  # brightest first
     some = np.sort(order[np.cumsum(math.pi * radius[order] ** 2) <= _MOST_WORK])  # as many as there is time for
     row, column, radius, side = row[some], column[some], radius[some], side[some]
     light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
@@ -268,7 +287,7 @@ def take_highlights(plate: Plate, number: int, spread: NDArray[np.float64]) -> H
 
 
 def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The mean of the window about each pixel; the picture's border goes on beyond it."""
+    """Return the mean of the window about each pixel; beyond the border the picture is continued."""
     found = values.astype(np.float64)
     for axis in (0, 1):
         found = np.pad(found, [(_WINDOW // 2 + 1, _WINDOW // 2) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
@@ -285,8 +304,10 @@ def spread_highlights(
     camera: Camera,
     report: Callable[[float], None] = lambda _: None,
 ) -> float:
-    """Add the light of highlights to a picture [H, W, 3]; returns that which nearer things hide, where no layer shows
-    what is behind them, summed likewise."""
+    """Add the light of highlights to a picture [H, W, 3].
+
+    Returns the summed light that nearer things hide where no layer shows what is behind them.
+    """
     (width, height), border = plate.size, np.array(plate.border_px)
     groups = defaultdict(list)
     cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
@@ -316,17 +337,17 @@ def defocus(
     plate: Plate, camera: Camera, samples: int = SAMPLES, threads: int = 1, highlights: bool = True,
     progress: Progress | None = None,
 ) -> Gathered:  # fmt: skip
-    """The picture that a camera takes of a plate.
+    """Take a camera's picture of a plate.
 
     Args:
         samples: of each pixel whose blur is uneven, 8 to 512; rounded up to a power of two.
-        highlights: spread pixels that are far brighter than their surroundings as discs, without noise.
+        highlights: whether to spread pixels far brighter than their surroundings as discs, without noise.
 
     Warns:
-        NeurolensWarning: light that the plate does not have.
+        NeurolensWarning: some light of the picture is none that the plate has.
 
     Raises:
-        InputError: a camera that sees 85 degrees from its axis or more; no C compiler.
+        InputError: the camera sees 85 degrees from its axis or more; there is no C compiler.
     """
     progress = progress or Progress(quiet=True)
     check_field(camera)
@@ -338,8 +359,9 @@ def defocus(
     for some in taken:
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
-                # Edges hide as much of highlights that a plate shows as they let through of those that it does not: of
-                # a point's pupil they cover, on the mean over points, what they leave open of a hidden one's.
+                # Edges hide as much light of highlights that a plate shows as they let through of those that it does
+                # not show: the part of the pupil that they cover of one point is, on average, the part that they leave
+                # open of a hidden one.
                 hidden += spread_highlights(found.rgb, some, plate, camera, report)
     light = float(found.rgb.sum(dtype=np.float64))
     lost, number = max(hidden, 0) / max(light + hidden, 1e-30), sum(len(some.radius_px) for some in taken)

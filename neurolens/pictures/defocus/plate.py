@@ -1,11 +1,12 @@
-"""Plates: pictures of a pinhole camera with depth, in layers, read from OpenEXR and ready for rays to be followed.
+"""Plates: a pinhole camera's pictures with depth, in layers, read from OpenEXR and ready to be met by rays.
 
 Inverse depth is linear along the straight line that a ray draws in such a picture, and over every plane of the scene.
-Steps of inverse depth that go on as the surface does on either side join two pixels; others are edges of things.
+Two neighbouring pixels are joined where their step of inverse depth goes on as the surface does on either side; other
+steps are edges of things.
 
 A layer of a file is what has red, green, blue and depth under one name: R, G, B, Z of the picture itself, "behind.R"
-and "behind.Z", or "ViewLayer.Combined.R" and "ViewLayer.Depth.Z" of Blender. Of a deep file the first sample of each
-pixel is one layer, the second the next. The picture's own layer is the front; a ray takes whatever it meets first.
+and "behind.Z", or "ViewLayer.Combined.R" and "ViewLayer.Depth.Z" of Blender. In a deep file the first sample of each
+pixel makes one layer, the second the next. The picture's own layer is the front; a ray takes whatever it meets first.
 
 A camera that takes a plate traces rays only at nodes, a sixtieth of its film apart, through one set of pupil points.
 Each channel has its own wavelengths, those that make its light from white surfaces, so that colours blur apart but have
@@ -41,20 +42,20 @@ from neurolens.pictures.render.pictures import (
 )
 
 FloatArray = NDArray[np.float32]
-NUMBERS = 5  # of the line of a ray: ax, ay, bx, by, weight
+NUMBERS = 5  # that a ray's line has: ax, ay, bx, by, weight
 LIGHT_NM, MIDDLE_NM = (400.0, 700.0), 550.0
 _NODES, _PITCH = 64, 8  # cells along the longer side of the film, and their least size in pixels
 FINEST = 4  # pixels a side of the smallest cells with bounds
 _STEEPEST = 0.2  # of the inverse depth: a larger step to a neighbour is an edge
-_LEVEL = 1e-4  # of the inverse depth: a smaller one is none
+_LEVEL = 1e-4  # of the inverse depth: a smaller step is no edge
 _SLOPES = 1.5
-_MIXED = 4.0  # steps of the surfaces beside an edge, below which the pixel between them is a mixture of both
+_MIXED = 4.0  # a step larger than so many of the steps beside it is an edge, where a pixel mixes both sides
 Along = Literal["axis", "ray"]
-_DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # after the name of a layer
+_DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # names of depth, after the name of a layer
 _COMBINED = ("Combined.", "combined.")
-_SKY_M = 1e9  # and beyond it
+_SKY_M = 1e9  # depth from which on there is sky
 _LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
-_SAME = 1e-3  # relative: shapes of plate and film
+_SAME = 1e-3  # by which the shapes of plate and film may differ, relatively
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class PlatePinhole:
     """The pinhole that a plate was rendered through.
 
     Attributes:
-        reach_px: pixels for a slope of 1, along x and y; centre_px: where the axis meets the plate.
+        reach_px: pixels for a slope of 1, along x and y. centre_px: where the axis meets the plate.
         before_film_mm: distance of the hole before the film.
     """
 
@@ -84,8 +85,8 @@ class Layer:
     """One layer of a plate.
 
     Args:
-        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the pinhole, 0 for the sky, below 0 where the
-            layer has nothing.
+        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the pinhole; 0 is the sky, and below 0 the layer
+            has nothing.
     """
 
     def __init__(self, rgb: FloatArray, inverse_depth: FloatArray) -> None:
@@ -113,7 +114,7 @@ class _Struct(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate: its layers, the front first, its pinhole, and the size and colour space of a camera's picture of it."""
+    """A plate: its layers, front first, its pinhole, and the size and colour space of the picture to take of it."""
 
     layers: list[Layer]
     pinhole: PlatePinhole
@@ -122,11 +123,11 @@ class Plate:
 
     @property
     def border_px(self) -> tuple[float, float]:
-        """How far the first pixel lies beyond that of the picture, whose pixels are as large: overscan."""
+        """Return how far its first pixel lies beyond the first pixel of the picture: the overscan."""
         return self.pinhole.centre_px[0] - self.size[0] / 2, self.pinhole.centre_px[1] - self.size[1] / 2
 
     def structs(self) -> Any:
-        """The layers as an array of C's structures, which keeps what these point at."""
+        """Return the layers as an array of C's structures; it keeps the memory to which these point."""
         structs: Any = (_Struct * len(self.layers))()
         structs.kept = []
         for layer, struct in zip(self.layers, structs, strict=True):
@@ -141,14 +142,14 @@ class Plate:
 
 
 def _lesser(step: FloatArray, axis: int) -> FloatArray:
-    """The lesser of the steps to the two neighbours along an axis; of a border pixel, the one that it has."""
+    """Return the lesser of the steps to both neighbours along an axis; a border pixel has one."""
     padded = np.pad(step, [(int(a == axis), int(a == axis)) for a in (0, 1)], constant_values=np.inf)
     count = step.shape[axis] + 1
     return np.minimum(padded.take(range(count), axis), padded.take(range(1, count + 1), axis))
 
 
 def _unmixed(w: FloatArray) -> FloatArray:
-    """Inverse depth where pixels on edges, whose depth is a mean of both sides, take that of the nearer side."""
+    """Return inverse depth where pixels on edges take that of the nearer side: theirs is a mean of both sides."""
     found = w.copy()
     for axis in (0, 1):
         if w.shape[axis] < 5:
@@ -159,7 +160,7 @@ def _unmixed(w: FloatArray) -> FloatArray:
         slopes = np.abs(before - far_before) + np.abs(far_after - after)
         edge = np.abs(after - before) > _MIXED * slopes + 0.02 * np.abs(here)
         mixed = edge & ((here - before) * (after - here) > 0) & (np.minimum(before, after) > 0)
-        with np.errstate(divide="ignore", invalid="ignore"):  # depth, not its inverse, is averaged
+        with np.errstate(divide="ignore", invalid="ignore"):  # renderers average depth, not its inverse
             share = (1 / here - 1 / before) / (1 / after - 1 / before)
         target = np.moveaxis(found, axis, 0)[2:-2]
         np.copyto(target, np.where(share > 0.5, after, before), where=mixed)
@@ -179,7 +180,7 @@ def _pyramid(w: FloatArray) -> list[FloatArray]:
 
 
 def reduced(values: FloatArray, step: int, by: np.ufunc) -> FloatArray:
-    """Cells of `step` pixels a side [h, w], each one value of its pixels' by `np.add`, `np.minimum` or `np.maximum`."""
+    """Reduce cells of `step` pixels a side to one value each, [h, w], by `np.add`, `np.minimum` or `np.maximum`."""
     for axis in (0, 1):
         values = by.reduceat(values, np.arange(0, values.shape[axis], step), axis=axis)
     return values
@@ -190,9 +191,9 @@ class DepthSettings:
     """What the depth of a plate means.
 
     Attributes:
-        channel: its name; "" finds it. scale_m: metres of its unit; None is 1, and refuses
-            what looks like no metres. along: the camera's axis, or each pixel's ray.
-        from_film: whether it counts from the film, as pictures of `neurolens render` have it, or from the pinhole; None
+        channel: the channel of depth; "" finds it. scale_m: metres in its unit; None takes 1, and refuses what does not
+            look like metres. along: whether depth is along the camera's axis or along each pixel's ray.
+        from_film: whether depth counts from the film, as in pictures of `neurolens render`, or from the pinhole; None
             asks the file.
     """
 
@@ -205,19 +206,19 @@ class DepthSettings:
 def read_plate(
     path: Path, film_mm: tuple[float, float], frame: Frame, depth: DepthSettings, behind: Sequence[Path] = ()
 ) -> Plate:
-    """A plate for a camera of such a film and frame (`cameras.field.frame_of`).
+    """Read a plate for a camera of such a film and frame (`cameras.field.frame_of`).
 
     The display window is the film; a larger data window is overscan. A picture of `neurolens render --camera pinhole`
-    says itself what its pinhole and its film were: a larger film is overscan, too. Any other is that of the camera's
-    own frame: its hole in the paraxial entrance pupil, its focal length the lens's paraxial size in the plane in focus,
-    which `neurolens stmap` prints.
+    says itself what its pinhole and its film were: a larger film is overscan, too. For any other picture the pinhole is
+    that of the camera's own frame, which `neurolens stmap` prints: its hole is the paraxial entrance pupil, its focal
+    length the lens's paraxial size in the plane in focus.
 
     Args:
         behind: files of the same size that show what is behind the things of the plate.
 
     Raises:
-        InputError: no depth; depth that is negative, or from 0 to 1 only; a shape other than the film's; files of
-            different sizes.
+        InputError: there is no depth, or depth is negative or only from 0 to 1; the shape is not the film's; the files
+            have different sizes.
     """
     header = header_of(path)
     (left, top), (last, bottom) = header["displayWindow"]
@@ -258,7 +259,7 @@ def read_plate(
 
 
 def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The settings of our pinhole, where it took the picture."""
+    """Return the settings of our pinhole, if it took the picture."""
     camera = metadata.get("camera")
     if not isinstance(camera, dict) or camera.get("camera") != "pinhole":
         return None
@@ -268,7 +269,7 @@ def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[FloatArray, FloatArray]]:
-    """Colours and depths of the layers of a file."""
+    """Return the colours and depths of the layers of a file."""
     header = header_of(path)
     if header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
         return deep_layers(path, header)
@@ -293,7 +294,7 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
     layers = []
     for prefix, channel in found if several else found[:1]:
         rgb, metres = np.stack([planes[prefix + c] for c in COLOURS], axis=2), planes[channel]
-        if (alpha := planes.get(prefix + "A")) is not None:  # colours are premultiplied
+        if (alpha := planes.get(prefix + "A")) is not None:  # colours are premultiplied by it
             solid = alpha >= OPAQUE
             rgb = np.where(solid[..., None], rgb / np.where(solid, np.minimum(alpha, 1), 1)[..., None], 0)
             metres = np.where(solid, metres, np.float32(-np.inf))
@@ -302,7 +303,7 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
 
 
 def _planes(path: Path) -> dict[str, FloatArray]:
-    """The channels of all parts; of two with one name the later one has the name of its part before it."""
+    """Read the channels of all parts; of two with one name, the later one gets its part's name in front."""
     planes, _ = decoded_channels(path, path, "file")
     for title, channels in decoded_later_parts(path):
         for name, pixels in channels.items():
@@ -311,7 +312,7 @@ def _planes(path: Path) -> dict[str, FloatArray]:
 
 
 def _finite(path: Path, rgb: FloatArray) -> FloatArray:
-    """Colours without NaN and infinity, which become black, with a warning."""
+    """Return colours in which NaN and infinity have become black, with a warning."""
     bad: NDArray[np.bool_] = np.asarray(~np.isfinite(rgb).all(axis=2))
     if bad.any():
         warn(f"{path}: {int(bad.sum())} of {bad.size} pixels are not finite; they are black")
@@ -322,9 +323,9 @@ def _finite(path: Path, rgb: FloatArray) -> FloatArray:
 def _inverse_depth(
     path: Path, metres: FloatArray, depth: DepthSettings, pinhole: PlatePinhole, pinhole_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Inverse depth from the pinhole, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
+    """Inverse depth from the pinhole (1/m, below 0 where a layer has nothing), and the cosine of each pixel's ray.
 
-    `pinhole_m`: the pinhole's distance before the place from which depth counts.
+    `pinhole_m`: how far before the place from which depth counts the pinhole lies.
     """
     height, width = metres.shape
     x, y = (
@@ -356,7 +357,7 @@ def _inverse_depth(
 
 
 def channel_wavelengths(sample: FloatArray, low_nm: float, high_nm: float) -> FloatArray:
-    """Wavelengths [3, N] of red, green and blue for uniform samples [N], by their share in the film's light."""
+    """Draw wavelengths [3, N] of red, green and blue by uniform samples [N], by their share in the film's light."""
     light = SpectralRange(low_nm, high_nm)
     found = []
     for part in np.maximum(light.response * light.basis, 0):
@@ -366,20 +367,20 @@ def channel_wavelengths(sample: FloatArray, low_nm: float, high_nm: float) -> Fl
 
 
 def turned(square: NDArray[Any], angle_rad: NDArray[Any]) -> FloatArray:
-    """Points [2, N] of the unit square whose places on the disk are turned by angles [N] (`concentric_disk`)."""
+    """Return points [2, N] of the unit square whose places on the disk are turned by angles [N] (`concentric_disk`)."""
     a, b = 2.0 * square[0] - 1.0, 2.0 * square[1] - 1.0
     size = np.maximum(np.abs(a), np.abs(b))
     along = 2.0 - np.divide(a, size, out=np.zeros_like(a), where=size > 0) * (
         2.0 - np.divide(np.abs(b), size, out=np.zeros_like(a), where=size > 0)
     )
-    # Along the sides of the square, from 0 at +x over 2 at +y to 8.
+    # The place along the sides of the square, from 0 at +x over 2 at +y to 8.
     along = (np.where(b < 0, 8.0 - along, along) + angle_rad * (4.0 / math.pi)) % 8.0
     x, y = (np.clip(np.abs((along - by) % 8.0 - 4.0) - 2.0, -1.0, 1.0) for by in (0.0, 2.0))
     return np.stack([0.5 + 0.5 * size * x, 0.5 + 0.5 * size * y]).astype(np.float32)
 
 
 def turns_pupil(camera: Camera) -> bool:
-    """Whether a camera's pupil samples turn about the axis with the film point, as those of round lenses do."""
+    """Return whether a camera's pupil samples turn about the axis with the film point, as those of round lenses do."""
     reach = 0.01 * min(camera.film_mm)
     film = np.repeat(np.array([[reach, 0.0], [0.0, reach]], np.float32), 2, axis=1)
     pupil = np.tile(np.array([[0.9, 0.5], [0.5, 0.9]], np.float32), 2)
@@ -390,9 +391,9 @@ def turns_pupil(camera: Camera) -> bool:
 
 
 class RayTable:
-    """Rays of a camera at nodes of its film, as lines in a plate, for one set of points of the pupil.
+    """Rays of a camera at nodes of its film, as lines in a plate, for one set of pupil points.
 
-    A point of the pupil is the same place in the lens for all film points.
+    A pupil point is the same place in the lens for all film points.
     """
 
     def __init__(self, camera: Camera, plate: Plate, pupil: FloatArray, hue: FloatArray) -> None:
@@ -407,9 +408,9 @@ class RayTable:
             self.nm = np.full((1, pupil.shape[1]), min(max(MIDDLE_NM, low), high), np.float32)
 
     def row(self, j: int) -> FloatArray:
-        """Rays [nodes across, samples, 16 or 8] of the nodes of a row: lines and weights of green, red and blue.
+        """The rays of a row of nodes, [nodes across, samples, 16 or 8]: lines and weights of green, red and blue.
 
-        Where green does not pass, the others have no weight either; where it does, they have lines, too.
+        Where green does not pass, the others have no weight either; where it passes, they have lines, too.
         """
         (across, down), (width, height) = self.cells, self.camera.film_mm
         channels, samples = self.nm.shape
@@ -428,15 +429,15 @@ class RayTable:
         return found
 
     def at(self, place_px: NDArray[Any], pupil: FloatArray, nm: FloatArray) -> FloatArray:
-        """Lines and weights [N, 5] of the rays of film places [2, N] by points of the pupil [2, N]."""
+        """Return lines and weights [N, 5] of the rays from film places [2, N] through pupil points [2, N]."""
         return self._lines(self.film_mm(place_px), pupil, nm)
 
     def film_mm(self, place_px: NDArray[Any]) -> FloatArray:
-        """Film points [2, N] of film places [2, N], which a picture shows upright."""
+        """Return the film points [2, N] of film places [2, N], which a picture shows upright."""
         return ((place_px.T / self.size - 0.5) * self.camera.film_mm * (-1, 1)).T.astype(np.float32)
 
     def unturned(self, film_mm: FloatArray, pupil: FloatArray) -> FloatArray:
-        """The samples that the camera takes for points of the pupil [2, N], seen from film points [2, N]."""
+        """Return the samples that the camera takes to pupil points [2, N], seen from film points [2, N]."""
         return turned(pupil, -np.arctan2(film_mm[1], film_mm[0])) if self.turns else pupil
 
     def _lines(self, film: FloatArray, pupil: FloatArray, nm: FloatArray) -> FloatArray:

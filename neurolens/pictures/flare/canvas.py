@@ -1,16 +1,16 @@
-"""Light drawn on the film: grids of rays as the areas that their cells cover, smears of extended lights, kernels.
+"""Draws light on the film: grids of rays as the areas of their cells, and extended lights as smears by kernels.
 
 A picture of areas has neither holes nor noise, and its sum is the light of the grid, however the map to the film
 stretches, folds or turns (Hullin et al. 2011, section 4.2, spread light over quads in this way). Rims cut cells where
 the largest r / R on the way is 1, by linear interpolation between rays. Pixels are covered exactly (`area.c`): an edge
 adds its height, times the step of density across it, to the pixels that it crosses, and sums along rows make the
 picture. Within whole cells the density is linear between the corners, where it is the mean of the cells that meet
-there. So no borders show where the density changes little from cell to cell, and each cell keeps its light, but for a
+there. So no borders show where the density changes little from cell to cell. Each cell keeps its light, except for one
 part in 10,000 at its border pixels.
 
 Light adds up: the picture of an extended light is the integral over its points (Goodman, Introduction to Fourier
 Optics, section 6.1). Over a small patch a ghost, or a star, keeps its shape and moves with the point, so that the
-integral is a convolution with the patch as large as the picture moves: of each ghost by another factor.
+integral is a convolution with the patch, as large as the picture moves. Each ghost moves by another factor.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 CELLS = 8  # along each side of an extended light
 FADE = 8  # parts of a cell's side where patches of a light fade into each other
-LOST = 1e30  # `worst` of a ray that meets no surface, or is totally reflected where it should go on
-_PER_CELL = 8  # edges of two triangles that rims cut, at most
-_LEAST = 0.5  # pixels that a picture moves, below which a light is a point
-_STEP, _STEPS = 0.125, 256  # movements are rounded to so many pixels, and to such a part of themselves
-_CORNERS = 64  # of an ellipse
+LOST = 1e30  # `worst` of a ray that misses a surface, or is totally reflected where it should go on
+_PER_CELL = 8  # the most edges of two triangles that rims cut
+_LEAST = 0.5  # pixels: a light whose picture moves by less is a point
+_STEP, _STEPS = 0.125, 256  # movements are rounded to this many pixels, or to such a part of themselves
+_CORNERS = 64  # corners that stand for an ellipse
 _THIN = 0.25  # least width of a patch in pixels
-_FINE = 12.0  # pixels that draw the width of a smear, at least
-_FADING = 0.15  # step of light, over the most light, between parts of a patch that fades over 16 or more: 0.1 at most
+_FINE = 12.0  # the fewest pixels that draw the width of a smear
+_FADING = 0.15  # the largest step of light, over the most light, within a patch that fades over 16 parts or more is 0.1
 
 
 def edges_of(rays: Floats, columns: int, size: tuple[int, int], per_mm: float) -> Doubles:
-    """The light of a grid of rays of one wavelength as edges for `draw_edges`; none if it misses the film.
+    """Return the light of a grid of rays of one wavelength as edges for `draw_edges`; none if it misses the film.
 
     Args:
         rays: [4, N] film x, y (mm), power and worst, row after row, with one ray more than `columns` in each.
@@ -63,12 +63,12 @@ def edges_of(rays: Floats, columns: int, size: tuple[int, int], per_mm: float) -
 def draw_edges(picture: Floats, rows: range, edges: Doubles, counts: NDArray[np.int64], light: Doubles) -> None:
     """Add light to some rows of a picture [H, W, 3], centred and upright (the film turned by 180 degrees).
 
-    A row is the same whether it is drawn by itself or with others.
+    A row comes out the same whether it is drawn by itself or with others.
 
     Args:
-        edges: [N, 7], edges of several grids: x and y of both ends in pixels, then the step of density across the edge
-            (at the corner of the picture, and its slopes in x and y). An edge of two equal ends is light at a point.
-        counts: [K] number of edges of each grid. light: [K, 3] colour of a cell whose power is 1.
+        edges: [N, 7] of several grids: x and y of both ends in pixels, then the step of density across the edge (at the
+            corner of the picture, and its slopes in x and y). An edge whose ends are equal is light at a point.
+        counts: [K] how many edges each grid has. light: [K, 3] colour of a cell whose power is 1.
 
     Raises:
         InputError: as `edges_of`.
@@ -105,12 +105,12 @@ class Raster:
 
 
 class Smear(NamedTuple):
-    """The image of a patch in a picture; equal smears are drawn together.
+    """How the image of a patch is smeared in a picture; equal smears are drawn together.
 
     Attributes:
-        sides: x and y in pixels, to the right and down, of both sides of the parallelogram.
-        weights: [N, M] light of its cells, along the first side and the second; empty if all have the same.
-        round: whether it is the ellipse in the parallelogram.
+        sides: right and down, in pixels, of the parallelogram's first side, then of its second.
+        weights: [N, M] light of its cells along both sides; empty if all have the same.
+        round: whether only the ellipse in the parallelogram is lit.
     """
 
     sides: tuple[float, float, float, float]
@@ -119,7 +119,7 @@ class Smear(NamedTuple):
 
     @property
     def coarse(self) -> int:
-        """How many pixels wide those pixels may be that the smeared picture is drawn with."""
+        """How many pixels wide the pixels may be with which the smeared picture is drawn."""
         (a, b, c, d), weights = self.sides, np.array(self.weights or ((1.0,),))
         parts, steps = max(weights.shape), (np.abs(np.diff(weights, axis=axis)).max(initial=0) for axis in (0, 1))
         # The light may jump between cells, not between their parts; a patch of even light only fades.
@@ -128,16 +128,18 @@ class Smear(NamedTuple):
         return 1 << max(0, math.floor(math.log2(wide / cells / _FINE)))
 
     def kernel(self, most: int, coarse: int = 1) -> Floats:
-        """The kernel [2 H + 1, 2 W + 1] about the middle of the light, of sum 1 but for what lies beyond `most` pixels.
+        """The kernel [2 H + 1, 2 W + 1] about the middle of the light; what lies beyond `most` pixels is cut off.
 
-        Args:
-            coarse: width of the kernel's pixels.
+        coarse: the width of the kernel's pixels.
+
+        Its sum is 1, less the light that is cut off.
         """
         sides = np.array(self.sides).reshape(2, 2) / coarse
         area = abs(float(np.linalg.det(sides)))
         if self.round:
             turn = 2 * math.pi * np.arange(_CORNERS) / _CORNERS
-            grown = math.sqrt(2 * math.pi / (_CORNERS * math.sin(2 * math.pi / _CORNERS)))  # to the ellipse's area
+            # gives the polygon the ellipse's area
+            grown = math.sqrt(2 * math.pi / (_CORNERS * math.sin(2 * math.pi / _CORNERS)))
             places = 0.5 * grown * np.stack([np.cos(turn), np.sin(turn)], 1)[None]
             light = np.array([4 / math.pi])
         else:
@@ -157,7 +159,7 @@ class Smear(NamedTuple):
 
 
 def smear_of(patch: Patch, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
-    """The smear of a picture that moves so far [2, 2] (right and down) along the sides of a patch; None if hardly."""
+    """The smear of a picture that moves by [2, 2] (right, down) along a patch's sides; None if it hardly moves."""
     size = float(np.abs(moved_px).sum(0).max())
     if not _LEAST < size < math.inf:
         return None
@@ -172,9 +174,9 @@ def smear_of(patch: Patch, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
 
 
 def smeared(picture: Floats, kernel: Floats) -> Floats:
-    """A picture [H + 2 M, W + 2 N, C] under a kernel [2 M + 1, 2 N + 1]: [H, W, C].
+    """Convolve a picture [H + 2 M, W + 2 N, C] with a kernel [2 M + 1, 2 N + 1]; returns [H, W, C].
 
-    The convolution is in float64: rounding is relative to the brightest pixel, and a millionth of that is seen, too.
+    It is done in float64: rounding is relative to the brightest pixel, and a millionth of that is seen, too.
     """
     from scipy import signal  # type: ignore[import-untyped]
 
@@ -191,7 +193,7 @@ def smeared(picture: Floats, kernel: Floats) -> Floats:
 
 
 def enlarged(picture: Floats, factor: int, height: int, width: int) -> Floats:
-    """A picture with pixels so many times as wide, in pixels [height, width] about the same middle; linear between."""
+    """Enlarge a picture by a factor into pixels [height, width] about the same middle; it is linear between its own."""
     if factor == 1:
         return picture
     for axis, size in enumerate((height, width)):
@@ -201,14 +203,14 @@ def enlarged(picture: Floats, factor: int, height: int, width: int) -> Floats:
 
 
 def resampled(values: Floats, axis: int, at: Doubles) -> Floats:
-    """Values at places along an axis, linear between them."""
+    """Return values at places along an axis, linear between the given ones."""
     first = np.floor(at).astype(int)
     part = np.moveaxis((at - first).astype(np.float32).reshape(-1, *[1] * (values.ndim - 1)), 0, axis)
     return values.take(first, axis, mode="clip") * (1 - part) + values.take(first + 1, axis, mode="clip") * part
 
 
 def spread(picture: Floats, radius: float) -> Floats:
-    """A picture [H, W, C] under Epanechnikov's kernel of this radius, mirrored at the edges."""
+    """Blur a picture [H, W, C] by Epanechnikov's kernel of this radius, mirrored at the edges."""
     reach = min(math.ceil(radius), *picture.shape[:2])
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     kernel = np.maximum(1 - (x * x + y * y) / radius**2, 0)

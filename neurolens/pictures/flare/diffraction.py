@@ -1,8 +1,8 @@
-"""Diffraction at the opening that a light has through the lens: its far field on the film, and the star about it.
+"""Diffraction at the opening that a light has through the lens: its far field on the film, and the star that it makes.
 
 The field on the film is U(x, y) = 1/lambda times the integral of sqrt(e) exp(i k (W + L x + M y)) dL dM over the
-light's exit pupil (Debye; Born and Wolf, section 8.8), with e the light per area of direction cosines (L, M): |U|^2
-sums to the light that arrives.
+light's exit pupil (Debye; Born and Wolf, section 8.8). Here e is the light per area of direction cosines (L, M), and
+|U|^2 sums to the light that arrives.
 
 Near the centre the integral is summed over cells of the pupil. A picture is thousands of fringes wide, and pixels are
 wider than fringes: farther out, at a distance u, the mean over a pixel follows from the pupil's outline. With n dl its
@@ -43,29 +43,29 @@ from neurolens.pictures.render.colour import in_gamut
 if TYPE_CHECKING:
     from neurolens.pictures.flare.layers import FlareJob
 
-_PER_CYCLE = 2.5  # cells a cycle of the field
-_NEAR, _FAR = 2.0, 4.0  # pixels from the centre between which the sum over cells gives way to the outline
+_PER_CYCLE = 2.5  # cells a cycle of the field needs
+_NEAR, _FAR = 2.0, 4.0  # pixels from the centre: between these the sum over cells gives way to the outline
 _SPECTRUM = 4096  # samples a side of the outline's power spectrum
-_PARTS = 8  # of the range, out of focus
-_STARTS = 1 << 15  # elements of the outline that pairs start at
-_PATCH_DEG = 8.0  # of an extended light: see `patches`
-_GROUPS, _SAMPLES = 3, 64  # of elements out of focus; of each, those whose places are kept, for each of up to 8 lines
+_PARTS = 8  # of the range of wavelengths, out of focus
+_STARTS = 1 << 15  # elements of the outline at which pairs start
+_PATCH_DEG = 8.0  # of a patch of an extended light: see `patches`
+_GROUPS, _SAMPLES = 3, 64  # of elements out of focus; how many of a group keep their places, for each of up to 8 lines
 
 
 def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
-    """The least number of cells across the pupil, a power of two, that `far_field` needs for points so far out."""
+    """Return the fewest cells across the pupil, a power of two, that `far_field` needs for points so far out."""
     cycles = 2 * float(pupil.half.max()) * (reach_mm + pupil.blur_mm) / (pupil.wavelength_nm * 1e-6)
     return max(64, 1 << math.ceil(math.log2(_PER_CYCLE * cycles + 1)))
 
 
 def far_field(pupil: ExitPupil, lines: Sequence[Array], x_mm: Array, y_mm: Array) -> Array:
-    """Irradiance [Y, X] on the film, for 1 at the lens, at x and y from the pupil's centre, by the sum over cells.
+    """The irradiance [Y, X] on the film, for 1 at the lens, at x and y from the pupil's centre, summed over cells.
 
     Args:
         lines: `outline` of the pupil at any wavelength.
 
     Raises:
-        InputError: the points are so far out, or the aberrations so large, that cells are too few.
+        InputError: the points are so far out, or the aberrations so large, that the cells do not suffice.
     """
     wave = pupil.wavelength_nm * 1e-6
     farthest = max(float(np.abs(x_mm).max()), float(np.abs(y_mm).max()))
@@ -79,7 +79,7 @@ def far_field(pupil: ExitPupil, lines: Sequence[Array], x_mm: Array, y_mm: Array
     ways = []
     for axis, place in ((0, x_mm), (1, y_mm)):
         cosine = pupil.half[axis] * share
-        # Shares of cells are means over them: their transform is lower by a sinc.
+        # Shares of cells are means over cells, whose transform is lower by a sinc.
         ways.append(
             size[axis] / np.sinc(size[axis] * np.maximum(np.abs(place) - pupil.blur_mm, 0) / wave)[:, None]
             * np.exp(2j * math.pi / wave * np.outer(place, cosine))
@@ -93,10 +93,10 @@ class Spectrum:
     """The power spectrum of an outline, |sum of sqrt(e) n exp(i k W) dl|^2 in mm^2, smoothed.
 
     Attributes:
-        values: [G, N, N], the parts of groups of elements, at multiples of `step` in y and x, 0 at N // 2.
+        values: [G, N, N] the parts of G groups of elements, at multiples of `step` in y and x; 0 is at N // 2.
         step: cycles per unit of cosine.
-        edges: [G] arrays [M, 4], some elements of each group: x, y in mm from the centre where their rays meet the
-            film, and n of length 1. M = 0: all rays meet at the centre.
+        edges: [G] arrays [M, 4] of some elements of each group: x, y in mm from the centre where their rays meet the
+            film, and n with length 1. With M = 0 all rays meet at the centre.
     """
 
     values: Floats
@@ -104,7 +104,7 @@ class Spectrum:
     edges: Sequence[Array]
 
     def irradiance(self, x_mm: Array, y_mm: Array, wavelength_nm: float) -> Array:
-        """Mean irradiance [Y, X] about points away from the image, for 1 at the lens."""
+        """Return the mean irradiance [Y, X] about points away from the image, for 1 at the lens."""
         total = np.zeros((len(y_mm), len(x_mm)), np.float32)
         for found, edges in zip(self.values, self.edges, strict=True):
             for axis, place in ((0, y_mm), (1, x_mm)):
@@ -114,7 +114,7 @@ class Spectrum:
 
 
 def _squares(edges: Array, x_mm: Array, y_mm: Array) -> Floats:
-    """|u|^2 [Y, X] of points, each from the element (`Spectrum.edges`) whose light it has."""
+    """Return |u|^2 [Y, X] of points, each from the element (`Spectrum.edges`) whose light it has."""
     found = np.empty((len(y_mm), len(x_mm)), np.float32)
     between = np.pad((np.diff(edges[:, :2], axis=0) ** 2).sum(1), 1, constant_values=np.inf)
     edges = np.column_stack([edges, np.minimum(between[1:], between[:-1]) if len(edges) else edges[:, :1]])
@@ -133,13 +133,14 @@ def outline_spectrum(
     reach_mm: float,
     part: tuple[int, int] = (0, 1),
 ) -> Spectrum:
-    """The spectrum that holds film points up to `reach_mm` from the centre.
+    """Return the spectrum that serves film points up to `reach_mm` from the centre.
 
-    It is smoothed as by pixels at the shortest wavelength (or more, if samples are too few): by the fourth power of
-    sinc(x / 2), x in pixels, whose samples a pixel apart always have the same sum.
+    It is smoothed as by pixels at the shortest wavelength (or by larger ones, if samples are too few): by the fourth
+    power of sinc(x / 2), x in pixels, whose samples a pixel apart always have the same sum.
 
     Args:
-        part: K and N for the K-th of N spectra whose mean is wanted: each starts pairs at its own share of elements.
+        part: K and N for the K-th of N spectra whose mean is wanted; each starts pairs at its own share of the
+            elements.
     """
     wave = shortest_nm * 1e-6
     pixel = max(pixel_mm, 8 * reach_mm / _SPECTRUM)
@@ -157,13 +158,13 @@ def outline_spectrum(
     rank = np.argsort(order)[some]
     call = load_compiled(c_source("pictures/flare/diffraction.c")).pairs
     call.argtypes, call.restype = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4, None
-    # What was laid down on the nearest nine lags is lower by the third power of a sinc.
+    # A value spread over its nearest nine lags is lowered by the third power of a sinc.
     near = np.arange(-(samples // 4) - 2, samples // 4 + 3)  # samples of film points
     raised = (np.sinc(near / samples) ** -3).astype(np.float32)
     group = np.zeros(len(order), int) if focused else _groups(normal)
     values, edges = np.empty((group.max() + 1, len(near), len(near)), np.float32), []
     for k, own in enumerate(values):
-        total = np.zeros((samples // 2 + 3, samples), np.complex64)  # of lags in x from -1 on
+        total = np.zeros((samples // 2 + 3, samples), np.complex64)  # by lags in x, which begin at -1
         starts = rank[group[some] == k].astype(np.int64)
         call(len(order), len(starts), samples, *(a.ctypes.data for a in (starts, *given, total)))
         opposite = -np.arange(samples)
@@ -181,7 +182,7 @@ def outline_spectrum(
 
 
 def _groups(normal: Array) -> NDArray[np.int_]:
-    """The group of each element [N] by the direction of n; limits lie where elements are fewest, not along an edge."""
+    """Group elements [N] by the direction of n; limits lie where elements are fewest, so not along an edge."""
     turn = np.arctan2(normal[1], normal[0]) * (_GROUPS / (2 * math.pi))
     fewest = np.histogram(turn % 1, 60, (0, 1))[0].argmin()
     found = np.floor(turn - (fewest + 0.5) / 60).astype(int) % _GROUPS
@@ -189,7 +190,7 @@ def _groups(normal: Array) -> NDArray[np.int_]:
 
 
 def _elements(pupil: ExitPupil, lines: Sequence[Array], spacing: float) -> tuple[Array, Array]:
-    """Elements of outlines, at most `spacing` long: cosines from the middle of the box, and n dl."""
+    """Cut outlines into elements, at most `spacing` long: cosines from the middle of the box, and n dl."""
     places, normals = [], []
     for line in lines:
         ends = np.append(line, line[:, :1], 1) * pupil.half[:, None]
@@ -202,13 +203,13 @@ def _elements(pupil: ExitPupil, lines: Sequence[Array], spacing: float) -> tuple
 
 
 def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda share: None) -> Floats:
-    """The stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
+    """Return the stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
 
-    For a point it is 0 where rays make the image itself, and at the pixels next to that: there a render has the light.
-    Energy is kept if the render's light is less by the sum of this layer on a film without edges. An extended light has
-    the sum of its points' stars, also within its image. Diffracted light is taken to pass the rear of the lens
-    unhindered. A light whose rays do not reach the film has no star. Fringes of one wavelength lie beyond the gamut of
-    sRGB: see `in_gamut`. `done` is called with the share of the work.
+    The star of a point is 0 where rays make the image itself and at the pixels next to that, because a render has the
+    light there. Energy is kept if the render's light is reduced by the sum of this layer on a film without edges. An
+    extended light has the sum of its points' stars, also within its image. Diffracted light is assumed to pass the rear
+    of the lens unhindered. A light whose rays do not reach the film has no star. Fringes of one wavelength lie beyond
+    the gamut of sRGB: see `in_gamut`. `done` is called with the share of the work.
     """
     raster, spectral = job.raster, job.spectral()
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
@@ -230,7 +231,7 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
 
 
 def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, threads: int) -> Iterator[Floats]:
-    """Yield the star of a light at each wavelength: irradiance [H, W] for 1 at the lens; nothing where it is dark."""
+    """Yield the star of a light at each wavelength: irradiance [H, W] for 1 at the lens; none if it is dark."""
     middle = exit_pupil(lens, light, float(wavelengths_nm.mean()))
     lines = [] if middle is None else outline(middle)
     if middle is None or not lines:
@@ -248,18 +249,19 @@ def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, thre
 
     parts = np.array_split(wavelengths_nm, 1 if middle.blur_mm < pixel / 8 else min(_PARTS, len(wavelengths_nm)))
     for number, part in enumerate(parts):
-        # Their mean phase, which is as 1 / wavelength.
+        # At the wavelength of their mean phase, which goes as 1 / wavelength.
         like = exit_pupil(lens, light, float(1 / np.mean(1 / part)), middle) or middle
         far = outline_spectrum(like, lines, float(part.min()), pixel, reach + pixel, (number, len(parts)))
         yield from in_order(threads, partial(one, far=far), part)
 
 
 def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: Array, pixel_mm: float) -> Floats:
-    """Mean irradiance [Y, X] of pixels at x and y, mm from the pupil's centre, for 1 at the lens; 0 at the image itself
-    and next to it.
+    """Return the mean irradiance [Y, X] of pixels at x and y, mm from the pupil's centre, for 1 at the lens.
+
+    It is 0 at the image itself and next to it.
 
     Args:
-        lines, far: the outline and its spectrum, at any wavelength.
+        lines, far: the outline and its spectrum, each at any wavelength.
     """
     found = far.irradiance(x, y, pupil.wavelength_nm)
     columns, rows = (np.nonzero(np.abs(p) < (_FAR + 0.5) * pixel_mm)[0] for p in (x, y))
@@ -278,7 +280,7 @@ def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: A
 
 
 def _image(pupil: ExitPupil, x: Array, y: Array, pixel_mm: float) -> NDArray[np.bool_]:
-    """Pixels [Y, X] that rays meet, and those next to them."""
+    """Return which pixels [Y, X] rays meet, with those next to them."""
     reach = 1 + int(pupil.blur_mm / pixel_mm / 20)  # rays are farther apart in large images
     met = np.zeros((len(y) + 2 * reach, len(x) + 2 * reach), bool)
     columns, rows = (

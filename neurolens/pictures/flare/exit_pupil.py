@@ -1,4 +1,4 @@
-"""Where and how a light's rays leave a lens, and the outline of the opening that they leave through.
+"""Where and how a light's rays leave a lens, and the outline of the opening through which they leave.
 
 The exit pupil of a light is a part of the plane of direction cosines (L, M) in which its rays meet the film: the part
 that the stop's blades or mask and every rim leave open, as traced for this light. There it has the light per area and
@@ -30,29 +30,30 @@ from neurolens.pictures.flare.lights import Light, Patch, disc, light_towards, r
 
 Array = NDArray[np.floating[Any]]
 
-CELLS = 1024  # across the pupil
-_SEARCH, _BOX = 1 << 16, 48  # rays that find where light passes; rays a side for the polynomials
+CELLS = 1024  # cells across the pupil
+_SEARCH, _BOX = 1 << 16, 48  # rays that find where light passes; rays along a side, for the polynomials
 _DEGREE = 14  # of the polynomials
-_FEWEST = 240  # rays for their 120 terms
-_BEYOND = 1.15  # radii of a rim up to which rays count for the polynomials
-_FLAT = 1e-6  # half width in cosines of a beam that does not meet on the film
-_BENT = 0.1  # sine of the least angle of a corner
+_FEWEST = 240  # the fewest rays for their 120 terms
+_BEYOND = 1.15  # rays up to so many radii of a rim count for the polynomials
+_FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
+_BENT = 0.1  # sine of the smallest angle that counts as a corner
 
 
 @dataclass(frozen=True)
 class ExitPupil:
-    """Where and how the light of one direction and wavelength leaves a lens, by direction cosines at the film.
+    """Where and how the light of one direction and wavelength leaves a lens, in direction cosines at the film.
 
     Attributes:
         wavelength_nm: of the light.
         centre_mm: film point [2] from which x and y are counted: the mean of the rays.
-        middle, half: [2] of the box of cosines that holds the light.
-        figures: [D, D, K] Chebyshev coefficients on that box, for the wavefront W in mm, the light per area of cosines
-            in mm^2 (for an irradiance of 1 at the lens), and x, y in mm at each surface that may cut the beam.
+        middle, half: [2] middle and half sides of the box of cosines that holds the light.
+        figures: [D, D, K] Chebyshev coefficients on that box: of the wavefront W in mm, of the light per area of
+            cosines in mm^2 (for an irradiance of 1 at the lens), and of x, y in mm at each surface that may cut the
+            beam.
         limits_mm: radii of those surfaces; the stop is the first.
         aperture: the stop's shape.
-        hits_mm: [2, N] where some of the rays meet the film, from the centre.
-        box: the part of the disc across the light's direction that holds the rays, [2 low, high, 2].
+        hits_mm: [2, N] where some of the rays meet the film, counted from the centre.
+        box: the part of the disc across the light's direction that holds the rays, [2 (low, high), 2].
     """
 
     wavelength_nm: float
@@ -71,7 +72,7 @@ class ExitPupil:
         return float(np.hypot(*self.hits_mm).max())
 
     def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
-        """Whether light passes at points [2, N] of the box (-1 to 1), or for a tuple of two axes on their grid."""
+        """Whether light passes at points [2, N] of the box (-1 to 1); a tuple of two axes stands for their grid."""
         at = self._at(places, slice(2, None))
         inside = np.ones(at.shape[1:], bool)
         for x, y, limit in zip(at[::2], at[1::2], self.limits_mm, strict=True):
@@ -81,17 +82,17 @@ class ExitPupil:
         return inside
 
     def field(self, places: Array | tuple[Array, Array]) -> NDArray[np.complex128]:
-        """sqrt(e) exp(i k W) at points, which are as in `passes`."""
+        """Return sqrt(e) exp(i k W) at points, which are as in `passes`."""
         w, e = self._at(places, slice(2))
         return np.sqrt(np.maximum(e, 0)) * np.exp(2e6j * math.pi / self.wavelength_nm * w)
 
     def hits(self, places: Array) -> Array:
-        """Where the rays of points [2, N] meet the film, [2, N] in mm from the centre."""
+        """Return where the rays of points [2, N] meet the film, [2, N] in mm from the centre."""
         (u, v), wave = places, self.figures[..., 0]
         return -np.stack([chebyshev.chebval2d(u, v, chebyshev.chebder(wave, axis=k)) / self.half[k] for k in (0, 1)])
 
     def _at(self, places: Array | tuple[Array, Array], rows: slice) -> Array:
-        """The figures [K, ...] at points, which are as in `passes`."""
+        """Return the figures [K, ...] at points, which are as in `passes`."""
         u, v = (chebyshev.chebvander(p, _DEGREE) for p in places)
         figures = np.moveaxis(self.figures[..., rows], -1, 0)
         if isinstance(places, tuple):
@@ -100,11 +101,11 @@ class ExitPupil:
 
 
 def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil | None = None) -> ExitPupil | None:
-    """The exit pupil of a light; None if none of its light arrives, or its rays meet nowhere (a pinhole, a plate).
+    """Return a light's exit pupil; None if no light arrives, or its rays meet nowhere (a pinhole, a plate).
 
     Args:
         lens: its film must be placed (`set_lens`).
-        like: the pupil of another wavelength, whose boxes are used again.
+        like: the pupil of another wavelength, whose boxes are taken.
 
     Raises:
         InputError: the lens has no film, or the light is inside the lens.
@@ -128,7 +129,7 @@ def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil |
     cosines, hits = _pair(film.dx, film.dy), _pair(film.x, film.y)
     at = np.stack([_pair(found.crossings[k].x, found.crossings[k].y) for k in every])
     limits = np.array([s.semi_diameter_mm for s in lens.surfaces])
-    part = np.hypot(at[:, 0], at[:, 1]) / limits[:, None]  # of the rim, at each surface
+    part = np.hypot(at[:, 0], at[:, 1]) / limits[:, None]  # relative to the rim's radius, at each surface
     near = (found.status.numpy() == 0) & (part.max(0) < _BEYOND)
     inside = near & (part.max(0) <= 1)
     if inside.sum() < 16 or near.sum() < _FEWEST:
@@ -152,7 +153,7 @@ def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil |
 
 
 def image_moves(lens: Lens, patch: Patch, wavelength_nm: float) -> Array:
-    """How far the image of a point moves on the film (mm) along the sides of a light's patch, [2, 2]."""
+    """Return how far the image of a point moves on the film (mm) along the sides of a light's patch, [2, 2]."""
     moves = np.zeros((2, 2))
     for along, side in zip(moves, patch.sides, strict=True):
         ends = [
@@ -169,7 +170,7 @@ def _pair(a: Tensor, b: Tensor) -> Array:
 
 
 def _box(lens: Lens, light: Light, wavelength_nm: float) -> Array | None:
-    """The box [2 low, high, 2] of the rays that pass, on the disc across the light's direction, for a round stop."""
+    """Find the box [2 (low, high), 2] of passing rays on the disc across the light's direction, for a round stop."""
     lens, box = replace(lens, aperture=None), np.zeros((2, 2))
     places: Array = disc(0, _SEARCH)
     for step in (0.02, 0.05, 0.05):
@@ -184,15 +185,17 @@ def _box(lens: Lens, light: Light, wavelength_nm: float) -> Array | None:
 
 
 def _grid(box: Array, widened: float, count: int) -> Array:
-    """Points [2, count^2] of a box [2 low, high, 2]."""
+    """Return points [2, count^2] of a box [2 (low, high), 2], widened by a factor."""
     share = np.linspace(-widened, widened, count)
     place = np.stack(np.meshgrid(share, share)).reshape(2, -1)
     return box.mean(0)[:, None] + (box[1] - box[0])[:, None] / 2 * place
 
 
 def _fitted(places: Array, half: Array, off_mm: Array, disc_places: Array, power: Array, at_mm: Array) -> Array:
-    """`ExitPupil.figures` by least squares from rays at points [2, N] of the box: the wavefront by its slopes, the
-    light per area of cosines by the derivatives of the points on the disc."""
+    """Fit `ExitPupil.figures` by least squares to rays at points [2, N] of the box.
+
+    The wavefront is fitted by its slopes, the light per area of cosines by the derivatives of the points on the disc.
+    """
     orders = np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE
     # Chebyshev polynomials of each coordinate, and their slopes.
     value = [chebyshev.chebvander(p, _DEGREE) for p in places]
@@ -215,20 +218,20 @@ def _fitted(places: Array, half: Array, off_mm: Array, disc_places: Array, power
 
 
 def _least(q: Array, r: Array, given: Array) -> Array:
-    """The least-squares solution by a matrix's QR decomposition."""
+    """Return the least-squares solution by a matrix's QR decomposition."""
     return np.asarray(np.linalg.solve(r, q.T @ given))
 
 
 def outline(pupil: ExitPupil) -> list[Array]:
-    """The edge of the opening: closed lines [2, P] of points of the box, through a grid's cells, light on the left."""
+    """Trace the edge of the opening through a grid's cells: closed lines [2, P] in the box, light on the left."""
     nodes = np.linspace(-1, 1, CELLS + 1)
     lit = pupil.passes((nodes, nodes))
     lit[[0, -1]] = lit[:, [0, -1]] = False
-    # Half steps from the grid's corner: above 0.5 a cell whose lit nodes face each other keeps them apart.
+    # Half steps from the grid's corner. Above 0.5, a cell whose lit nodes are opposite corners keeps these apart.
     found: Any = contour_generator(z=lit.T.astype(float)).lines(0.51)
     closed = [np.rint(2 * line[:-1].T).astype(int) for line in found]
     twice = np.concatenate(closed, 1) if closed else np.zeros((2, 0), int)
-    ends = twice // 2, (twice + 1) // 2  # the nodes of the grid's edge that the line crosses
+    ends = twice // 2, (twice + 1) // 2  # the nodes at both ends of the grid's edge that the line crosses
     first_lit = lit[tuple(ends[0])]
     inner, outer = (nodes[np.where(first_lit == k, *ends)] for k in (True, False))
     for _ in range(24):
@@ -240,7 +243,7 @@ def outline(pupil: ExitPupil) -> list[Array]:
 
 
 def _with_corners(line: Array) -> Array:
-    """A closed line through cells with the corners that it cuts off, where its parts before and after a cell meet."""
+    """Add to a closed line through cells the corners that it cuts off, where its parts before and after a cell meet."""
     before, here, there, after = (np.roll(line, k, 1) for k in (1, 0, -1, -2))
     come, go, gap = here - before, after - there, there - here
 
@@ -258,7 +261,7 @@ def _with_corners(line: Array) -> Array:
 
 
 def coverage(lines: Sequence[Array], cells: int) -> Array:
-    """The share [cells, cells] of each cell of the box inside an outline; exact if `cells` divides `CELLS`."""
+    """Return the share [cells, cells] of each cell of the box inside an outline; exact if `cells` divides `CELLS`."""
     share = np.zeros((cells + 1, cells))
     for line in lines:
         a = (line + 1) / 2 * cells

@@ -4,8 +4,8 @@ Ghosts share their paths. Light that comes to surface j is reflected there once 
 back to surface i is traced once for all ghosts that are reflected there or further to the front; only the path from i
 to the film belongs to a single ghost. So a lens of n surfaces takes n^3 / 3 steps for n^2 / 2 ghosts. The steps are
 graphs (`pictures.flare.steps`), compiled once for a lens's kinds of surfaces, and `ghosts.c` loops over them. Focus,
-zoom, stop and wavelength are numbers of the call, which need no compiling. `optics.trace.rays.follow` is the truth in
-float64 for one path. For programs that draw ghosts on a GPU, `ghost_graphs` has each path as a graph of its own.
+zoom, stop and wavelength are numbers of the call, which need no compiling. `optics.trace.rays.follow` is the reference
+in float64 for one path. For programs that draw ghosts on a GPU, `ghost_graphs` has each path as a graph of its own.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from neurolens.optics.trace.rays import Rays, follow, turning
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.flare.steps import CALL, LOST, STATE, Floats, Stack, entering, film_graph, reflects, step_graph
 
-RANKED = 4096  # rays behind a ghost's energy in a table
-_BLOCK = 512  # rays whose states, 32 bytes each before every surface, fit the second cache
+RANKED = 4096  # rays from which a table has a ghost's energy
+_BLOCK = 512  # rays at a time: their states, 32 bytes before every surface, fit the second cache
 Array = NDArray[np.float64]
-_RAYS = 1 << 16  # that look for the light of each ghost
-_FEWEST = 8  # of them that reach the film, for a ghost to be known
-_WIDE = 1.3  # the disc that they enter, over the front's radius
-_MARGIN = 1.12  # of the disc in which they find the light
-_DEGREE = 13  # of the numbers of a surface by the wavelength
+_RAYS = 1 << 16  # rays that look for the light of each ghost
+_FEWEST = 8  # the fewest of these that must reach the film for a ghost to be known
+_WIDE = 1.3  # radius of the disc through which they enter, over the front's
+_MARGIN = 1.12  # by which the disc in which they find light is enlarged
+_DEGREE = 13  # degree, in the wavelength, of the numbers of a surface
 
 
 class Pair(NamedTuple):
@@ -91,7 +91,7 @@ def coated(lens: Lens, names: str) -> Lens:
 
 
 class GhostRays(NamedTuple):
-    """The rays of one wavelength that follow each ghost to the film.
+    """Rays of one wavelength that follow each ghost to the film.
 
     Attributes:
         rows: [P, 4, N] film x and y (mm, lens frame), power and worst.
@@ -101,12 +101,12 @@ class GhostRays(NamedTuple):
 
     @property
     def film_xy_mm(self) -> Floats:
-        """Film points [P, 2, N]."""
+        """The film points [P, 2, N]."""
         return self.rows[:, :2]
 
     @property
     def power(self) -> Floats:
-        """The share [P, N] of the ray's light that arrives, 0 where any rim stops the ray."""
+        """The share [P, N] of a ray's light that arrives; 0 where any rim stops the ray."""
         return self.rows[:, 2]
 
     @property
@@ -116,7 +116,7 @@ class GhostRays(NamedTuple):
 
 
 class GhostTracer:
-    """Traces ghosts of a set lens, and the direct light, as compiled code in float32.
+    """Traces the ghosts of a set lens, and its direct light, by compiled code in float32.
 
     Args:
         lens: its film must be placed (`set_lens`).
@@ -126,14 +126,14 @@ class GhostTracer:
         pairs: the ghosts, in the order of the results. stack: the lens's compiled steps.
 
     Raises:
-        InputError: there is no C compiler, or it fails; a lens without film position; pairs that are no ghosts.
+        InputError: there is no C compiler, or it fails; the lens has no film position; a pair is no ghost.
     """
 
     def __init__(self, lens: Lens, pairs: Sequence[Pair] | None = None) -> None:
         self.lens = lens
         self.pairs: tuple[Pair, ...] = ghost_pairs(lens) if pairs is None else tuple(pairs)
         count = len(lens.surfaces)
-        needed = {(k, 0) for k in range(count)}  # surfaces and actions; each kind takes a second to compile
+        needed = {(k, 0) for k in range(count)}  # surfaces with actions, of which each kind takes a second to compile
         for pair in self.pairs:
             if not (0 <= pair.first < pair.second < count and all(reflects(lens, k) for k in pair)):
                 raise InputError(lens.path, "ghost", pair.name, "two surfaces that reflect, the first nearer the front")
@@ -147,7 +147,7 @@ class GhostTracer:
         """Follow light [6, N] (point in mm and unit direction towards the film, lens frame) along every ghost.
 
         Args:
-            direct: whether the light that forms the image comes last, as if it were one more ghost.
+            direct: whether the light that forms the image follows last, as if it were one more ghost.
         """
         return self.follow(entering(rays), wavelength_nm, direct=direct)
 
@@ -160,15 +160,15 @@ class GhostTracer:
         direct: bool = False,
         reach: float = 1.0,
     ) -> GhostRays:
-        """Follow rays as `entering` gives them.
+        """Follow rays such as `entering` gives.
 
         Args:
             only: some of the tracer's ghosts; None follows all. direct: see `trace`.
-            reach: a block of rays is followed while the `worst` of some of its rays is at most this; after that, theirs
-                is `LOST`.
+            reach: a block of rays is followed as long as `worst` of any of its rays is at most this; then all of them
+                get `LOST`.
         """
         pairs, surfaces = self.pairs if only is None else tuple(only), len(self.lens.surfaces)
-        # `ghosts.c` meets the second surfaces from the front, and the first ones on the way back.
+        # `ghosts.c` goes through the second surfaces from the front on, and through the first ones on the way back.
         rows = [(second, first, k) for k, (first, second) in enumerate(pairs)] + [(surfaces, 0, len(pairs))] * direct
         rows.sort(key=lambda row: (row[0], -row[1]))
         out = np.zeros((len(rows), 4, start.shape[1]), np.float32)
@@ -180,7 +180,7 @@ class GhostTracer:
         return GhostRays(out)
 
     def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
-        """Rays as `entering` gives them along one ghost at several wavelengths, [W, 4, N]: rows of `GhostRays`."""
+        """Follow rays of `entering` along one ghost at several wavelengths, [W, 4, N]; rows as in `GhostRays`."""
         return np.concatenate([self.follow(start, nm, only=[pair], reach=reach).rows for nm in wavelengths_nm])
 
 
@@ -189,9 +189,10 @@ class Ghost:
     """One ghost of a light.
 
     Attributes:
-        pair: its surfaces. energy: its light on the film's plane over that of the image of the same light.
-        centre_mm: the mean x, y of its light on the film, lens frame. size_mm: the root mean square distance from it.
-        passed: the share of the rays at the front disc that arrive.
+        pair: its surfaces. energy: its light on the film's plane over that of the same light's image.
+        centre_mm: the mean x, y of its light on the film, lens frame. size_mm: the root mean square distance from
+            there.
+        passed: the share of the rays through the front disc that arrive.
     """
 
     pair: Pair
@@ -202,13 +203,13 @@ class Ghost:
 
 
 def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: int = RANKED) -> list[Ghost]:
-    """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first, by `count` rays."""
+    """List a light's ghosts that reach the film's plane, brightest first, at one wavelength, by `count` rays."""
     start, sums = entering(light_rays(tracer.lens, light, 0, count)[0]), np.zeros((len(tracer.pairs) + 1, 5))
     for k in range(0, count, _BLOCK):  # the rows of a block stay in the caches
         block = np.ascontiguousarray(start[:, k : k + _BLOCK])
         found = tracer.follow(block, wavelength_nm, direct=True).rows[:, :3].astype(np.float64)
         x, y, power = np.moveaxis(found, 1, 0)
-        x, y = (np.where(power > 0, v, 0.0) for v in (x, y))  # lost rays are nowhere
+        x, y = (np.where(power > 0, v, 0.0) for v in (x, y))  # lost rays have no place
         sums += np.stack([power, power * x, power * y, power * (x * x + y * y), power > 0], 1).sum(2)
     *of_ghosts, (of_image, *_) = sums.tolist()
     rows = []
@@ -221,9 +222,9 @@ def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: 
 
 
 def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout:
-    """The lens with rays of one ghost in the plane through the axis, of light as far off the axis as `light`.
+    """Draw the lens with rays of one ghost in the plane through the axis; they enter as far off it as `light`.
 
-    At most so many rays are drawn, evenly chosen from those that arrive.
+    At most `lines` rays are drawn, chosen evenly from those that arrive.
 
     Raises:
         InputError: no ray arrives.
@@ -254,8 +255,8 @@ def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout
 class Entrance:
     """A ghost, and the disc through which its light enters the lens.
 
-    The disc has the points chief_mm p + scale_mm u of the plane z = 0 (mm), with |u| < 1, where p is the light's
-    direction (x, y) over the sine of the widest angle. `light` is the ghost's light on the film.
+    The disc has the points chief_mm p + scale_mm u of the plane z = 0 (mm) with |u| < 1. Here p is the light's
+    direction (x, y) over the sine of the widest angle. `light` is how much of the ghost's light is on the film.
     """
 
     pair: Pair
@@ -270,7 +271,7 @@ def entrances(
     """Find the discs through which the ghosts enter whose light reaches the film, brightest first.
 
     Args:
-        tracer: of a lens whose film is placed. sine: of the largest angle between the axis and the light.
+        tracer: of a lens whose film is placed. sine: that of the largest angle between the axis and the light.
     """
     lens, rng = tracer.lens, np.random.default_rng(seed)
     p, u = _drawn(lens, rng)
@@ -290,7 +291,7 @@ def entrances(
 
 
 def _drawn(lens: Lens, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Random p and u [2, N], each in the unit disc; with an axis of symmetry p lies along x, which stands for all."""
+    """Draw random p and u [2, N] from unit discs; with an axis of symmetry all p lie along x, which stands for all."""
     r, turn = np.sqrt(rng.random(_RAYS)), 2 * np.pi * rng.random(_RAYS)
     length = np.sqrt(rng.random(_RAYS))
     about = 2 * np.pi * rng.random(_RAYS) if lens.anamorphic else np.zeros(_RAYS)
@@ -298,7 +299,7 @@ def _drawn(lens: Lens, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _disc(along: Array, place: Array, anamorphic: bool) -> tuple[Array, Array]:
-    """The chief and the scale [2] of a disc that holds points [2, N] of light of directions p [2, N]."""
+    """Return the chief and the scale [2] of a disc that holds points [2, N] of light of directions p [2, N]."""
     chief = (place * along).sum(1) / np.maximum((along**2).sum(1), 1e-300)
     chief[1] = chief[1] if anamorphic else chief[0]
     off = place - chief[:, None] * along
@@ -308,11 +309,11 @@ def _disc(along: Array, place: Array, anamorphic: bool) -> tuple[Array, Array]:
 
 
 def ghost_graphs(lens: Lens, pairs: Sequence[Pair], wavelength_nm: tuple[float, float]) -> list[Graph]:
-    """The exact path of each ghost as a graph, from `program.ENTERING` to `program.ARRIVING`.
+    """Write the exact path of each ghost as a graph, from `program.ENTERING` to `program.ARRIVING`.
 
     `entering` [5] is the light's unit direction towards the film (dx, dy), its point on the plane z = 0 (mm) and the
-    wavelength; `stop_radius_mm` of the call is that of a round stop. `arriving` [4] is the film point (mm), the power,
-    and the largest r^2 / R^2 at any rim.
+    wavelength. `stop_radius_mm`, of the call, is that of a round stop. `arriving` [4] is the film point (mm), the
+    power, and the largest r^2 / R^2 at any rim.
 
     Args:
         lens: its film must be placed. wavelength_nm: the range in which indices and coatings hold.

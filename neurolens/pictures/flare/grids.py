@@ -1,4 +1,4 @@
-"""Grids of rays that draw ghosts: the part of a light's disc that each ghost takes, and how fine its grid is."""
+"""Grids of rays that draw ghosts: which part of a light's disc each ghost takes, and how fine its grid is."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from neurolens.pictures.flare.lights import Light, Patch, light_towards, rays_ac
 from neurolens.pictures.flare.steps import LOST, Floats, entering
 
 Array = NDArray[np.float64]
-FEWEST, MOST = 320, 512  # lit cells, and cells along a side
-REACH = 16.0  # of `GhostTracer.follow`: rims are cut between rays inside and outside
+FEWEST, MOST = 320, 512  # lit cells, at least; cells along a side, at most
+REACH = 16.0  # of `GhostTracer.follow`, so that rims can be cut between rays inside and outside
 _SCOUTS = 48  # cells a side of the grid of scouts, the rays that look for ghosts
-_FEW = 2  # one scout in so many a side is traced at all wavelengths
-_NEAR = 2.0  # r^2 / R^2 up to which rays beyond rims count for the spread of colours
-_EVEN = 0.02  # least unevenness, and least spread of colours over the size, of a ghost
-_STEP = 0.25  # part of a cell by which the shadow of a rim may move on the film between two wavelengths
-_BAND = 0.02  # step of colour that may remain in one ghost, over the irradiance that wide ghosts leave on the film
+_FEW = 2  # every n-th scout along a side is traced at all wavelengths
+_NEAR = 2.0  # rays beyond rims count for the spread of colours up to this r^2 / R^2
+_EVEN = 0.02  # the least unevenness, and spread of colours over its size, that a ghost is taken to have
+_STEP = 0.25  # share of a cell by which a rim's shadow may move on the film between two wavelengths
+_BAND = 0.02  # a step of colour that may remain in one ghost, over the irradiance that wide ghosts leave on the film
 _NODES = 31  # wavelengths of scouts
-_FOLD = 2.0  # change of the logarithm of a ray's power, up and down together, from band to band
-_AT_ONCE = 128  # ghosts
+_FOLD = 2.0  # change in the logarithm of a ray's power, up and down together, from one band to the next
+_AT_ONCE = 128  # ghosts that are scouted at a time
 _MOVED, _LONG, _SOFT, _SHORT = 32, math.radians(0.25), 0.2, 2.5  # for moves: cells a side, step, soft edge in r^2 / R^2
 _ERROR, _WORST = 3.0, 0.25  # share of light beside its place, times the cells across half the film; at most
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A regular grid over a rectangle of the square about a light's disc.
+    """A regular grid over a rectangle in the square about a light's disc.
 
     Attributes:
-        low, high: corners of the rectangle, in disc radii. columns, rows: cells.
-        wavelengths: how many, about, stand for all of the range.
-        spectrum: wavelengths in nm, and the power of a ray at each of them over that at the first; empty if unknown.
+        low, high: corners of the rectangle, in disc radii. columns, rows: how many cells it has.
+        wavelengths: about how many stand for the whole range.
+        spectrum: wavelengths in nm, each with the power of a ray over that at the first wavelength; empty if unknown.
     """
 
     low: tuple[float, float]
@@ -51,20 +51,20 @@ class Grid:
 
     @property
     def places(self) -> Array:
-        """The corners of cells, [2, (rows + 1) (columns + 1)], row after row."""
+        """Return the corners of the cells, [2, (rows + 1) (columns + 1)], row after row."""
         u, v = (
             np.linspace(a, b, n + 1) for a, b, n in zip(self.low, self.high, (self.columns, self.rows), strict=True)
         )
         return np.stack([np.tile(u, len(v)), np.repeat(v, len(u))])
 
     def coarser(self, factor: int, least: int) -> Grid:
-        """The grid with a part of the cells of its sides and of its wavelengths, but with `least` cells a side."""
+        """Return the grid with fewer cells and wavelengths by a factor, but with at least `least` cells a side."""
         columns, rows = (min(n, max(n // factor, least)) for n in (self.columns, self.rows))
         return replace(self, columns=columns, rows=rows, wavelengths=max(self.wavelengths // factor, 1))
 
     @property
     def cell(self) -> float:
-        """Area of a cell over that of the disc."""
+        """The area of a cell over that of the disc."""
         (a, b), (c, d) = self.low, self.high
         return (c - a) * (d - b) / (np.pi * self.columns * self.rows)
 
@@ -78,18 +78,18 @@ def grids_of(
     wavelengths_nm: Sequence[float] = (400.0, 700.0),
     only: Sequence[Pair] | None = None,
 ) -> dict[Pair, Grid]:
-    """The grids of all ghosts, or of `only` some, that reach the film.
+    """Make the grids of all ghosts that reach the film, or of those in `only`.
 
-    A cell has one density, and a wavelength stands for its neighbours: both put light beside its place, a share a / n
-    with n cells a side and b / k with k wavelengths. The work of a ghost is n k times its size on the film. For a given
-    sum of errors all work is least where a / n and b / k of each ghost are the cube root of a b size, times a number
-    that all ghosts share: so most cells go to ghosts that are bright, small and uneven.
+    A cell has one density, and a wavelength stands for its neighbours: both put light beside its place. With n cells a
+    side and k wavelengths, its shares are a / n and b / k. The work of a ghost is n k times its size on the film. For a
+    given sum of errors, the work of all ghosts is least where a / n and b / k of each are the cube root of a b size,
+    times a number that all ghosts share. So most cells go to ghosts that are bright, small and uneven.
 
     Args:
-        wavelength_nm: of the scouts; others differ little.
+        wavelength_nm: that of the scouts; at others ghosts differ little.
         half_mm: half the film's width and height.
-        cell_mm: about the size of cells on the film, which the share of light beside its place follows.
-        wavelengths_nm: of light, increasing.
+        cell_mm: about the size of cells on the film, to which the share of light beside its place is proportional.
+        wavelengths_nm: those of the light, increasing.
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
     start = entering(rays_across(tracer.lens, light, whole.places)[0])
@@ -119,13 +119,15 @@ def grids_of(
 
 
 def ghost_moves(tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float) -> tuple[Array, Array]:
-    """How far the middle of a ghost's light moves on the film (mm) along the sides of a light's patch, [2, 2]; and how
-    much of its light comes or goes along the side where that is most, and its light, [2].
+    """Return how a ghost moves and changes on the film while its light moves over a patch.
 
-    The middle moves as the ghost's edges do, which are most often those of the stop: on the film these move by another
-    amount than the light of one point of the front. Rays near rims have smaller weights, so that none comes or goes.
-    Where rims cut away light, the middle moves by up to that share of the radius as well, and the way is shortened by
-    this, but not below `_SHORT` images of the side: edges of a ghost without a smear would be seen.
+    The first array [2, 2] is how far (mm) the middle of its light moves along the patch's sides. The second [2] is how
+    much of its light comes or goes along the side where that is most, and its light.
+
+    The middle moves as the ghost's edges do, which are mostly those of the stop; light through one point of the front
+    moves by another amount. Rays near rims have smaller weights, so that none comes or goes at once. Where rims cut
+    away light, the middle moves by up to that share of the radius as well, and the way is shortened by as much. It
+    stays at least `_SHORT` images of the side, for a ghost without a smear would show edges.
     """
     coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
 
@@ -160,13 +162,13 @@ def ghost_moves(tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavel
 
 
 class _Look(NamedTuple):
-    """A ghost as scouts see it.
+    """How the scouts see a ghost.
 
     Attributes:
-        along_u, along_v: light that cells of one density put beside its place, times the cells of a side.
-        colours: the same for wavelengths, times their number. size_mm: of the part on the film.
+        along_u, along_v: light that cells of one density put beside its place, times the number of cells along a side.
+        colours: the same for wavelengths, times their number. size_mm: that of the part on the film.
         lit: share of the rectangle that holds its light. light: its light on the film.
-        swept_mm: about how far the shadow of a rim moves on the film from one end of the spectrum to the other.
+        swept_mm: about how far a rim's shadow moves on the film from one end of the spectrum to the other.
         spectrum: as in `Grid`.
     """
 
@@ -183,7 +185,7 @@ class _Look(NamedTuple):
 def _look(
     kept: NDArray[np.bool_], rows: Floats, colours: tuple[Any, ...], nm: Sequence[float], half_mm: tuple[float, float]
 ) -> _Look:
-    """Measure a ghost by the cells that are kept, its scouts `rows` [4, N], and its `_colours` at wavelengths."""
+    """Measure a ghost: cells that are kept, rows [4, N] of its scouts, and `_colours` at its wavelengths."""
     x, y, power, worst = rows.reshape(4, _SCOUTS + 1, _SCOUTS + 1).astype(np.float64)
     lit, half = worst <= 1, np.array(half_mm)[:, None]
     whole = kept & _corners(lit, np.logical_and)
@@ -215,14 +217,14 @@ def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray
 
 
 def _colours(each: Sequence[Floats], half_mm: tuple[float, float]) -> tuple[Array, Array, Array]:
-    """How ghosts differ by the wavelength, by the rows [P, 4, N] of their rays at each wavelength.
+    """Measure how ghosts differ by the wavelength, from the rows [P, 4, N] of their rays at each of W wavelengths.
 
-    The first array [P] is how far each ghost moves from the first to the last wavelength in mm, inf for a ghost without
-    light; the second [P], about how far in mm the shadows of rims move on the film, summed from wavelength to
+    The first array [P] is how far (mm) each ghost moves from the first to the last wavelength; inf for a ghost without
+    light. The second [P] is about how far (mm) the shadows of rims move on the film, summed from wavelength to
     wavelength. A rim may cut a ghost at another place in each colour even where the rays themselves do not move.
     Between two wavelengths a shadow moves by the share of the rays on the film that pass at only one of them, times the
-    ghost's width. The third [P, W] is the power at each wavelength over that at the first, by the rays that pass at
-    both of two neighbours.
+    ghost's width. The third [P, W] is the power at each wavelength over that at the first, from rays that pass at both
+    of two neighbours.
     """
     one, other = each[0], each[-1]
     here = (one[:, 3] <= _NEAR) & (other[:, 3] <= _NEAR) & (np.abs(one[:, :2]).max(1) < 2 * max(half_mm))
@@ -244,9 +246,10 @@ def _colours(each: Sequence[Floats], half_mm: tuple[float, float]) -> tuple[Arra
 
 
 def _kept(rows: Floats, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
-    """Whether light of each cell may reach the film, [P, S, S], by the rows [P, 4, N] of the scouts.
+    """Return whether light of each cell may reach the film, [P, S, S], from the rows [P, 4, N] of the scouts.
 
-    A cell all of whose corners a rim stops is kept where `worst`, extrapolated by its change in the cell, reaches 1.
+    A cell whose corners are all stopped by a rim is kept where `worst`, extrapolated by its change in the cell, reaches
+    1.
     """
     shape = (len(rows), 4, _SCOUTS + 1, _SCOUTS + 1)
     xy, worst = np.split(rows.reshape(shape)[:, [0, 1, 3]], [2], 1)
@@ -266,7 +269,7 @@ def _corners(a: NDArray[Any], of: Callable[[Any, Any], Any]) -> NDArray[Any]:
 def _around(kept: NDArray[np.bool_], look: _Look, error: float, least: int) -> Grid:
     """The grid about the cells that are kept [S, S], so fine that the light beside its place is `error` each way.
 
-    It has at least so many wavelengths.
+    It has at least `least` wavelengths.
     """
     low, high, fewest = [], [], math.sqrt(FEWEST / look.lit)
     for axis in (0, 1):

@@ -1,7 +1,7 @@
-"""Flare in a picture: its layers, which are added to a render of the same lens, film and focus, and what makes them.
+"""The layers of flare, which are added to a render of the same lens, film and focus, and what makes them.
 
 Values are those of a render: film irradiance over the irradiance that a white card of radiance 1 makes on the axis.
-Each maker makes one picture, and by name others that are parts of it. A layer that is switched off is absent.
+Each maker makes one picture, and others, by name, that are parts of it. A layer that is switched off is absent.
 """
 
 from __future__ import annotations
@@ -39,21 +39,23 @@ from neurolens.pictures.render.film import check_memory, digest
 from neurolens.pictures.render.scene import Scene
 from neurolens.pictures.render.settings import LAYERS, FlareSettings
 
-_AXIS = 1 << 15  # rays of the exposure
-_AT_ONCE = 1 << 16  # photons of a call
-_ENOUGH = 200  # photons of a kernel: a noise of 8%
-_COLOURED = 3200  # photons of a kernel of colour: eyes see its noise in wider areas
-_KEEP_S = 30.0  # between two states of long work
+_AXIS = 1 << 15  # rays that measure the exposure
+_AT_ONCE = 1 << 16  # photons in a call
+_ENOUGH = 200  # photons that a kernel gathers: a noise of 8%
+_COLOURED = 3200  # photons that a kernel of colour gathers: eyes see its noise in wider areas
+_KEEP_S = 30.0  # between two saved states of long work
 _GOLDEN = 0.6180339887498949
 _STRIP = 1 << 22  # bytes of a strip of a picture, which one thread draws
 _ROOM = 1 << 26  # bytes of edges that wait to be drawn
 _EDGES = 176  # bytes of a cell's edges
-FEWEST = 4  # wavelengths that stand for all
-_PATCH_DEG = 2.0  # of an extended light: see `patches`
-_PATCHES, _CELLS = (4, 6, 9), 48  # along a side, at most; cells of a ghost along a side, which many patches keep
-_BEGUN, _SMEARED = 14_000, 0.45  # times to begin a group of ghosts, and to smear a pixel, in that of a cell
-_MUCH, _TRIALS = 1e7, 6  # work that takes seconds; groups whose time is measured before it
-_UNEVEN, _FAINT = 0.6, 5e-4  # share of its light that may come or go over a patch; share of all light, of a faint ghost
+FEWEST = 4  # of wavelengths that stand for all
+_PATCH_DEG = 2.0  # side of a patch of an extended light: see `patches`
+# patches along a side, at most; cells of a ghost along a side, which stay where patches are many
+_PATCHES, _CELLS = (4, 6, 9), 48
+_BEGUN, _SMEARED = 14_000, 0.45  # in the time of a cell: to begin a group of ghosts, and to smear a pixel
+_MUCH, _TRIALS = 1e7, 6  # cells that take seconds; groups whose time is measured before such work
+# shares: of a ghost's light that may come or go over a patch; of all light, below which a ghost is faint
+_UNEVEN, _FAINT = 0.6, 5e-4
 Layers = dict[str, Floats]
 REST = "rest"
 
@@ -64,11 +66,11 @@ class FlareJob:
 
     Attributes:
         lens: its film must be placed (`set_lens`), and it must have the coating of the settings (`with_coating`).
-        wavelength_nm: range of light. threads: of the work.
-        ghosts: traces the ghosts of the same lens and stop; left out, all of two reflections.
+        wavelength_nm: range of light. threads: for the work.
+        ghosts: traces the ghosts of the same lens and stop; left out, all ghosts of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".
-        keep: picture beside which the photons of long work are kept until they are whole.
-        finer: how many times as many wavelengths a ghost may take as stars and photons do.
+        keep: picture beside which the photons of long work are kept until they are complete.
+        finer: how many times as many wavelengths ghosts may take as stars and photons do.
     """
 
     lens: Lens
@@ -83,12 +85,12 @@ class FlareJob:
     finer: int = 4
 
     def spectral(self, finer: int = 1) -> SpectralRange:
-        """The range of light in its wavelengths, or in so many times as many."""
+        """Return the range of light in its wavelengths, or in `finer` times as many."""
         return SpectralRange(*self.wavelength_nm, bins=finer * self.settings.bins)
 
     @property
     def exposure(self) -> float:
-        """See `axis_irradiance`."""
+        """The exposure: see `axis_irradiance`."""
         return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm))
 
     @cached_property
@@ -99,9 +101,9 @@ class FlareJob:
 
 @lru_cache(maxsize=32)
 def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
-    """Irradiance at the film's centre from uniform surroundings of radiance 1, in sr: the integral of T cos."""
+    """Return the irradiance (sr) at the film's centre in uniform surroundings of radiance 1: the integral of T cos."""
     film_z = lens.film_z_mm
-    assert film_z is not None  # of a tracer's lens
+    assert film_z is not None  # a tracer's lens has one
 
     def share(sines: Doubles) -> Doubles:
         d = torch.from_numpy(np.stack([*sines, -np.sqrt(1 - (sines**2).sum(0))]))
@@ -111,7 +113,7 @@ def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
         return torch.where(traced.status == 0, traced.transmittance, 0.0).numpy()
 
     coarse, widest = disc(0, _AXIS), 1.0
-    for _ in range(3):  # narrows to the cone that passes, and a little more
+    for _ in range(3):  # narrows to a little more than the cone that passes
         lit = share(widest * coarse) > 0
         widest *= 1.02 * float(np.hypot(*coarse)[lit].max(initial=0.0)) if lit.any() else 0.3
     light = math.pi * widest**2 * float(share(min(widest, 1.0) * coarse).mean())
@@ -131,7 +133,7 @@ class _Task(NamedTuple):
 
     @property
     def work(self) -> int:
-        """Cells that are drawn."""
+        """The cells that are drawn."""
         return len(self.wavelengths_nm) * self.grid.columns * self.grid.rows
 
 
@@ -142,12 +144,12 @@ def _quietly(fraction: float, seconds_left: float | None = None) -> None:
 def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) -> Iterator[tuple[int, Floats]]:
     """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
 
-    Each ghost is drawn as the areas of a grid of rays (`pictures.flare.canvas`). Of the wavelengths, fewer stand for
-    all where a ghost's colours part little.
+    Each ghost is drawn as the areas of a grid of rays (`pictures.flare.canvas`). Where a ghost's colours hardly part,
+    fewer wavelengths stand for all.
 
     Args:
-        layers: for each pair of the tracer, the layer that takes it. done: is called with the share of the work that is
-            done, and of long work with the seconds that are left, first by a trial.
+        layers: for each pair of the tracer, the layer that takes it. done: called with the share of the work that is
+            done, and for long work with the seconds left, which a trial tells first.
     """
     tracer, raster, spectral = job.tracer, job.raster, job.spectral(job.finer)
     layer = dict(zip(tracer.pairs, layers, strict=True))
@@ -178,7 +180,7 @@ def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) 
 
 
 class _Group(NamedTuple):
-    """Ghosts of one layer that are smeared alike and drawn together, with pixels so many times as wide (`coarse`)."""
+    """Ghosts of one layer that are smeared alike and drawn together, in pixels `coarse` times as wide."""
 
     layer: int
     coarse: int
@@ -186,17 +188,17 @@ class _Group(NamedTuple):
     tasks: list[_Task]
 
     def size(self, raster: Raster) -> list[int]:
-        """Rows and columns of its picture; one that is enlarged has a border."""
+        """Return the rows and columns of its picture, with a border where that is to be enlarged."""
         return [n // self.coarse + 3 * (self.coarse > 1) for n in (raster.height, raster.width)]
 
     def work(self, raster: Raster) -> float:
-        """About the time that it takes, in that of a cell at one wavelength."""
+        """Return about how long it takes, in units of a cell at one wavelength."""
         smeared = 0 if self.smear is None else _SMEARED * math.prod(self.size(raster))
         return _BEGUN + smeared + sum(task.work for task in self.tasks)
 
 
 def _add(job: FlareJob, group: _Group, picture: Floats) -> Iterator[float]:
-    """Add ghosts to a picture of the group's size, and yield the work that was done each time."""
+    """Add a group of ghosts to a picture of its size; yields the work done each time."""
     raster, kernel, drawing = job.raster, None, picture
     if group.smear is not None:
         kernel = group.smear.kernel(max(raster.width, raster.height) // 2, group.coarse)
@@ -209,8 +211,10 @@ def _add(job: FlareJob, group: _Group, picture: Floats) -> Iterator[float]:
 
 
 def _expected_s(job: FlareJob, groups: Sequence[_Group]) -> float | None:
-    """Seconds that ghosts will take, by a ghost each of a few groups, drawn for trial, which are at equal
-    steps of the work; None for little work."""
+    """Estimate the seconds that ghosts will take; None for little work.
+
+    One ghost of each of a few groups, at equal steps of the work, is drawn for trial.
+    """
     steps = np.cumsum([group.work(job.raster) for group in groups])
     if not groups or steps[-1] < _MUCH:
         return None
@@ -219,14 +223,16 @@ def _expected_s(job: FlareJob, groups: Sequence[_Group]) -> float | None:
         began, group = time.perf_counter(), groups[at]._replace(tasks=groups[at].tasks[:1])
         work = sum(_add(job, group, np.zeros((*group.size(job.raster), 3), np.float32)))
         pace.append((time.perf_counter() - began) / work)
-    return float(steps[-1] * np.median(pace))  # the first imports and compiles
+    return float(steps[-1] * np.median(pace))  # of the paces the median, for the first trial imports and compiles
 
 
 def _parts(
     job: FlareJob, tracer: GhostTracer, light: Light, nm: Sequence[float]
 ) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
-    """The patches of a light, and the ghosts of each with their grids and moves. Patches are finer for a ghost much of
-    whose light comes or goes over a patch, because rims cut it differently there."""
+    """Yield the patches of a light, and the ghosts of each with their grids and moves.
+
+    Patches are finer for a ghost much of whose light comes or goes over a patch, because rims cut it differently there.
+    """
     raster, middle_nm = job.raster, 0.5 * sum(job.wavelength_nm)
     half_mm, cell = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), job.settings.cell_px / raster.per_mm
     efl, needs = abs(float(first_order(tracer.lens).efl_mm)), dict.fromkeys(tracer.pairs, _PATCHES[0])
@@ -235,7 +241,7 @@ def _parts(
         found, sums = list[tuple[Patch, Pair, Grid, Doubles]](), dict.fromkeys(pairs, np.zeros(2))
         for patch in patches(light, _PATCH_DEG * _PATCHES[0] / most, most) if pairs else ():
             size = 1.5 * float(np.abs(patch.sides).sum()) * efl
-            around = half_mm[0] + size, half_mm[1] + size  # a smear may bring ghosts from beside the film
+            around = half_mm[0] + size, half_mm[1] + size  # a smear may bring ghosts in from beside the film
             for pair, grid in grids_of(tracer, patch.light, middle_nm, around, cell, nm, pairs).items():
                 moves, lit = ghost_moves(tracer, patch, pair, grid, middle_nm)
                 columns, rows = (min(n, max(n * _PATCHES[0] // most, _CELLS)) for n in (grid.columns, grid.rows))
@@ -250,13 +256,13 @@ def _parts(
 
 
 def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: float, threads: int) -> Iterator[float]:
-    """Add ghosts to a picture of so many pixels per mm, and yield the work that was done each time."""
+    """Add ghosts to a picture with `per_mm` pixels per mm; yields the work done each time."""
     height, width, _ = picture.shape
     high = max(1, _STRIP // (32 * width))
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
     def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
-        """The edges of each wavelength's cells, and the light of the cells."""
+        """Return the edges of each wavelength's cells, and the light of the cells."""
         rays, area = rays_across(tracer.lens, task.light, task.grid.places)
         rows = tracer.follow_each(entering(rays), task.wavelengths_nm, task.pair, REACH)
         each = [canvas.edges_of(of_one, task.grid.columns, (width, height), per_mm) for of_one in rows]
@@ -275,7 +281,7 @@ def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: 
 
 
 def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
-    """Tasks in order, of one light and as many at a time as have room for their edges."""
+    """Yield tasks in order: those of one light, as many at a time as have room for their edges."""
     batch, used = list[_Task](), 0
     for task in tasks:
         size = _EDGES * task.work
@@ -289,14 +295,14 @@ def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
 
 
 def _bands(nm: Doubles, response: Doubles, grid: Grid) -> tuple[list[float], Doubles]:
-    """The wavelengths that stand for all of `nm` [W] in a ghost, and their colours [K, 3] for responses [W, 3].
+    """Choose wavelengths that stand for all of `nm` [W] in a ghost, with colours [K, 3] from responses [W, 3].
 
-    One wavelength is traced for each band. The others of the band have its places and their own power: a coating may
-    reflect ten times as much at one end of a band as at the other. Ghosts with equally many bands share the wavelengths
-    that are traced, unless a ghost is too dark at one of them to stand for its band.
+    One wavelength is traced for each band. The other wavelengths of the band take its places on the film and have their
+    own power, because a coating may reflect ten times as much at one end of a band as at the other. Ghosts with equally
+    many bands share the traced wavelengths, unless a ghost is too dark at one of them to stand for its band.
     """
     count = min(max(grid.wavelengths, FEWEST), len(nm))
-    w = inverse_square_um(nm)  # glass moves light about evenly with it
+    w = inverse_square_um(nm)  # glass spreads light about evenly in this
     at = np.arange(count) if count == len(nm) else (count * (w[0] - w) / (1.000001 * (w[0] - w[-1]))).astype(int)
     nodes, level = zip(*(grid.spectrum or ((nm[0], 1.0),)), strict=True)
     power = np.interp(nm, nodes, np.maximum(level, 1e-3 * max(level) + 1e-30))
@@ -311,7 +317,7 @@ def _bands(nm: Doubles, response: Doubles, grid: Grid) -> tuple[list[float], Dou
     return traced, np.array(colours)
 
 
-# Photons by what became of them; those of "ghosts" and "glare" are the flare.
+# Photons by what became of them. Those of "ghosts" and "glare" together are the flare.
 PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
     "image": lambda photons: (photons.reflections == 0) & (photons.scattered == 0),
     "ghosts": lambda photons: (photons.reflections > 0) & ~photons.glare,
@@ -321,12 +327,12 @@ PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
 
 
 def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quietly) -> Floats:
-    """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
+    """Return the photons of lights on the film as a picture, [H, W, 3] linear sRGB, by density estimation.
 
     Args:
         part: one of `PARTS`: photons that were reflected or scattered ("flare"), reflected twice at most ("ghosts"),
             reflected more often or scattered ("glare"), or neither ("image").
-        photons: of each light and wavelength. done: is called with the share of the work.
+        photons: for each light and wavelength. done: called with the share of the work.
     """
     settings, raster, spectral = job.settings, job.raster, job.spectral()
     lens, tracer, count = job.lens, PhotonTracer(job.lens, settings.scatter), spectral.bins
@@ -344,11 +350,11 @@ def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quiet
             begun, (picture, sums) = done_before, arrays
 
     def one(task: tuple[int, Light, int, int]) -> tuple[Floats, float]:
-        """Sums of weights and of their squares, [2, H, W], and the area of the light."""
+        """Return the sums of weights and of their squares, [2, H, W], and the area of the light."""
         number, light, k, first = task
         shift = (k / count + settings.seed * _GOLDEN % 1) % 1
         rays, area = light_rays(lens, light, first, min(_AT_ONCE, photons - first), shift, photons**-0.5)
-        # A seed of its own, the same for any number of threads.
+        # Each task has a seed of its own, the same for any number of threads.
         chances = ((settings.seed << 44) + (number * count + k) * photons + first) % (1 << 64)
         film = np.zeros((2, raster.height, raster.width), np.float32)
         nm = float(spectral.centres_nm[k])
@@ -374,27 +380,27 @@ def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quiet
 
 
 def kept_file(picture: Path, part: str) -> Path:
-    """The file of photons that interrupted work leaves beside a picture."""
+    """Return the file of photons that interrupted work leaves beside a picture."""
     return picture.with_name(f"{picture.name}.{part}.part")
 
 
 def _arrivals(
     tracer: PhotonTracer, part: str, rays: Floats, wavelength_nm: float, most_reflections: int, seed: int
 ) -> Iterator[tuple[Floats, Floats]]:
-    """Places on the film [2, M] (mm) and weights [M] of the photons of a part."""
-    # Glare that surfaces alone reflect turns round by choice; photons that scatter go as they would.
+    """Yield places on the film [2, M] (mm) and weights [M] of the photons of a part."""
+    # For glare by surfaces alone photons are made to turn round; photons that scatter go as they would.
     for scatters in (False, True)[: 1 + tracer.scatter.on] if part == "glare" else (None,):
         boost = tracer.turning(wavelength_nm, LEVELS - 1) if scatters is False else 1.0
         photons = tracer.trace(rays, wavelength_nm, most_reflections=most_reflections, seed=seed, boost=boost)
         which = PARTS[part](photons)
         if scatters is not None:
             which &= (photons.scattered > 0) == scatters
-        # A film that sends light back is exposed by what it keeps.
+        # A film that sends light back is exposed by the light that it keeps.
         yield photons.film_xy_mm[:, which], photons.weight[which] / (1 - tracer.scatter.sensor)
 
 
 def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
-    """Smooth a picture [H, W, 3] of photons: its luminance by kernels from `radius` on, its colour by wider kernels."""
+    """Smooth a picture [H, W, 3] of photons: its luminance by kernels of `radius` or more, its colour by wider ones."""
     wide = min(picture.shape[:2])
     bright = in_gamut(_spread_wide(picture, sums, radius, _ENOUGH, wide / 8))
     coloured = in_gamut(_spread_wide(picture, sums, radius, _COLOURED, wide / 2))
@@ -403,11 +409,12 @@ def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
 
 
 def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int, widest: float) -> Floats:
-    """A picture [H, W, 3] whose pixels' light is spread by kernels that keep its sum, mirrored at the edges.
+    """Spread the light of a picture [H, W, 3] by kernels that keep its sum, mirrored at the edges.
 
-    Each pixel takes the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight, or is as
-    little noisy by their `sums` of weights and of squares, [2, H, W], with a soft step to the next, and none much wider
-    than `widest`, in pixels. The kernel is Epanechnikov's, 2 / pi (1 - r^2) in units of its radius.
+    Each pixel takes the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight. Photons of
+    unequal weight must be as little noisy, by `sums` [2, H, W] of weights and of squares. The step to the next kernel
+    is soft, and none is much wider than `widest` pixels. The kernel is Epanechnikov's, 2 / pi (1 - r^2) in units of its
+    radius.
     """
     total, left, last = np.zeros_like(picture), np.ones(picture.shape[:2], np.float32), False
     while not last:
@@ -422,7 +429,7 @@ def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int, wide
 
 
 def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
-    """The layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
+    """Make the layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
 
     Raises:
         InputError: as the makers.
@@ -440,33 +447,33 @@ def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
 
 
 def with_coating(lens: Lens, settings: FlareSettings) -> Lens:
-    """The lens with the coating of the settings; raises InputError as `coated`."""
+    """Return the lens with the coating of the settings; raises InputError as `coated`."""
     return lens if settings.coating is None else coated(lens, settings.coating)
 
 
 class Choice(NamedTuple):
-    """What the flare of all frames of a scene shares: ghosts that become layers, and whether lights fade (`keep`)."""
+    """What the flare of all a scene's frames shares: ghosts that become layers; whether lights fade (`keep`)."""
 
     single: tuple[str, ...]
     fade: bool
 
 
 def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: int, *, fade: bool = False) -> Choice:
-    """The ghosts that `brightest` names in some frames of a scene that has the table [flare].
+    """Choose the ghosts that `brightest` names in some frames of a scene that has the table [flare].
 
     Args:
-        frames: the scene, its camera in the frame's place, and the lens in its state.
-        fade: whether lights fade before they are left out, as those of an animation do.
+        frames: the scene with its camera in the frame's place, and the lens in its state.
+        fade: whether lights fade before they are left out, as in an animation.
 
     Raises:
-        InputError: as of `coated`.
+        InputError: as `coated`.
     """
     sources = SceneLights(frames[0][0])
     return Choice(brightest([_scene_job(sources, *frame, raster, threads, fade) for frame in frames]), fade)
 
 
 def _scene_job(sources: SceneLights, scene: Scene, lens: Lens, raster: Raster, threads: int, fade: bool) -> FlareJob:
-    """The flare of a scene by its own lights."""
+    """Return the job of a scene's flare by the scene's own lights."""
     settings = scene.settings.flare
     assert settings is not None and lens.film_z_mm is not None
     lights = keep(sources.seen(scene, lens.film_z_mm), settings.most, fade).lights
@@ -478,10 +485,10 @@ def scene_flare(
     scene: Scene, lens: Lens, raster: Raster, white_balance: str | None, threads: int, progress: Progress,
     choice: Choice | None = None,
 ) -> Layers:  # fmt: skip
-    """The layers of a scene that has the table [flare], by its own lights and a lens whose film is placed.
+    """Make the layers of a scene that has the table [flare], by its own lights, for a lens whose film is placed.
 
     Args:
-        choice: of all frames; None chooses by this picture.
+        choice: that of all frames; None chooses by this picture alone.
 
     Raises:
         InputError: as `flare_layers` and `coated`.
@@ -493,15 +500,15 @@ def scene_flare(
 
 
 def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
-    """The whole flare, [H, W, 3]: layers of `MAKERS`, without their parts."""
+    """Return the whole flare, [H, W, 3]: the layers of `MAKERS`, without their parts."""
     none = np.zeros((raster.height, raster.width, 3), np.float32)
     return sum((layers[name] for name in MAKERS if name in layers), none)
 
 
 def brightest(frames: Sequence[FlareJob], done: Report = _quietly) -> tuple[str, ...]:
-    """Names of the ghosts whose own pictures, with their gains, have the greatest values on the film in any frame.
+    """Name the ghosts whose own pictures, with their gains, have the greatest values on the film in any frame.
 
-    These are at most `settings.brightest` names, the brightest first. A ghost without light on the film is never one.
+    There are at most `settings.brightest` names, the brightest first. A ghost without light on the film is never named.
     """
     raster, count, peaks = frames[0].raster, frames[0].settings.brightest, dict[str, float]()
     if not count:
@@ -521,7 +528,7 @@ def _ghosts(job: FlareJob, done: Report) -> Layers:
     if job.settings.photons:
         return {"ghosts": photon_picture(job, "ghosts" if job.settings.glare else "flare", job.settings.photons, done)}
     pairs, raster, factors = job.tracer.pairs, job.raster, _factors(job)
-    # Ghosts of one layer and of equal factors share a picture.
+    # Ghosts of one layer with equal factors share a picture.
     keys = [(p.name if p.name in job.single else REST, factors[p]) for p in pairs]
     kinds = list(dict.fromkeys(keys))
     check_memory(raster.width, raster.height, 12 * (len(kinds) + len(job.single) + 4))
@@ -533,12 +540,12 @@ def _ghosts(job: FlareJob, done: Report) -> Layers:
 
 
 def kept_beside(picture: Path) -> list[Path]:
-    """The files of photons that interrupted work has left beside a picture."""
+    """Return the files of photons that interrupted work has left beside a picture."""
     return [path for part in PARTS if (path := kept_file(picture, part)).is_file()]
 
 
 def _factors(job: FlareJob) -> dict[Pair, tuple[float, float, float]]:
-    """The gain of each pair."""
+    """Return the gain of each pair."""
     names = [pair.name for pair in ghost_pairs(job.lens)]
     for name in job.settings.gains:
         if name not in (*MAKERS, *names):

@@ -1,7 +1,7 @@
-"""The lights of flare: points and extended lights, over frames, in lists, in scenes and pictures, and their rays.
+"""The lights of flare and their rays: points and extended lights, over frames, from lists, scenes and pictures.
 
-Rays go through a disc across the light's direction that holds the whole front surface, at the points of a
-low-discrepancy sequence that is the same every time: an animated light has no noise of its own.
+Rays go through a disc across the light's direction that covers the whole front surface, at the points of a
+low-discrepancy sequence that is the same every time, so that an animated light has no noise of its own.
 
 A scene's lights are its rectangles, discs, spheres, points, spots and the sun, as far as the lens's front vertex sees
 them; a picture's are regions brighter than a threshold. The sky and other surroundings are no lights.
@@ -32,11 +32,11 @@ from neurolens.pictures.render.job import camera_axes
 from neurolens.pictures.render.scene import Scene
 from neurolens.pictures.render.world import World
 
-_PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
+_PLASTIC = 1.32471795724474602596  # ratio of the R2 sequence (Roberts 2018): x^3 = x + 1
 
-SUN = math.pi  # irradiance by which the sun lights a white card across its way to radiance 1
-MOST_LIGHTS = 10_000  # of a list, and of --most
-# Columns of a list of lights: the default (NaN: none), least and most.
+SUN = math.pi  # irradiance by which the sun lights a white card across its way as radiance 1
+MOST_LIGHTS = 10_000  # in a list, and for --most
+# Columns of a list of lights: the default (NaN: none), the least and the largest value.
 _COLUMNS: dict[str, tuple[float, float, float]] = {
     "frame": (0.0, -1e7, 1e7),
     "azimuth_deg": (math.nan, -360.0, 360.0),
@@ -46,18 +46,18 @@ _COLUMNS: dict[str, tuple[float, float, float]] = {
     "distance_m": (math.inf, 1e-6, math.inf),
     "visible": (1.0, 0.0, 1.0),
 }
-_CELL = 1 / 48  # of the picture's width: larger highlights are several lights
-_FADES = 1.25  # lights fade from so many times the energy of the brightest light that is left out
-_MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # above the threshold; at a time, each of some 500 bytes
-_DIMMEST = 0.02  # relative illumination below which a highlight's radiance is not known
+_CELL = 1 / 48  # of the picture's width: a larger highlight is cut into several lights
+_FADES = 1.25  # lights fade below so many times the energy of the brightest light that is left out
+_MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # pixels above the threshold; pixels at a time, each of some 500 bytes
+_DIMMEST = 0.02  # at less relative illumination a highlight's radiance is not known
 
 
 class Shape(NamedTuple):
-    """The extent of a light that is not a point: `CELLS` x `CELLS` cells, and how much of its light each has.
+    """The extent of a light that is not a point: `CELLS` x `CELLS` cells, and how much of its light each cell has.
 
     Attributes:
-        corners: [CELLS + 1, CELLS + 1, 3] directions (lens frame) of the cells' corners.
-        weights: [CELLS, CELLS] at least 0, of any sum. round: whether the light is the whole ellipse in the cells.
+        corners: [CELLS + 1, CELLS + 1, 3] directions (lens frame) of the corners of cells.
+        weights: [CELLS, CELLS] at least 0, of any sum. round: whether the light fills just the ellipse in the cells.
     """
 
     corners: Array
@@ -70,13 +70,13 @@ class Light:
     """A light far away, or at a distance: a point, or one that has a shape.
 
     Attributes:
-        azimuth_deg: to the right of the axis, seen by the camera; elevation_deg: above it.
-        rgb: linear sRGB irradiance that it makes at the front vertex across its way: radiance times solid angle in sr.
-        distance_m: from the front vertex; inf allowed. shape: of an extended light, in whose middle the angles are.
+        azimuth_deg: to the right of the axis, seen by the camera. elevation_deg: above the axis.
+        rgb: irradiance (linear sRGB) that it makes at the front vertex across its way: radiance times solid angle in
+            sr.
+        distance_m: from the front vertex; inf allowed. shape: that of an extended light; the angles are of its middle.
 
     Raises:
-        InputError: angles that do not come from the front (the light lies behind the lens), a distance that is not
-            positive, an irradiance that is negative.
+        InputError: the light lies behind the lens, the distance is not positive, or an irradiance is negative.
     """
 
     azimuth_deg: float
@@ -96,13 +96,13 @@ class Light:
 
     @property
     def towards(self) -> Array:
-        """Unit vector from the lens to the light, lens frame."""
+        """The unit vector from the lens to the light, lens frame."""
         a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
         return np.array([math.sin(a) * math.cos(e), math.sin(e), -math.cos(a) * math.cos(e)])
 
     @property
     def about(self) -> dict[str, Any]:
-        """Its attributes for metadata; the shape is its size in degrees along both sides."""
+        """Return its attributes for metadata; of the shape, the size in degrees along both sides."""
         size = None if self.shape is None else np.degrees(_lengths(self.shape.corners)).round(4).tolist()
         return asdict(replace(self, shape=None)) | {"shape": size}
 
@@ -110,7 +110,7 @@ class Light:
 def light_towards(
     towards: NDArray[np.floating[Any]], rgb: Sequence[float], distance_m: float = math.inf, shape: Shape | None = None
 ) -> Light | None:
-    """The light in a direction [3] of any length; None where that does not lie before the lens."""
+    """Return the light in a direction [3] of any length; None where that does not lie before the lens."""
     x, y, z = towards / np.linalg.norm(towards)
     r, g, b = (max(float(v), 0.0) for v in rgb)
     azimuth, elevation = math.degrees(math.atan2(x, -z)), math.degrees(math.asin(max(-1.0, min(1.0, y))))
@@ -118,7 +118,7 @@ def light_towards(
 
 
 def flat_shape(towards: NDArray[np.floating[Any]], sides: NDArray[np.floating[Any]], round_: bool = False) -> Shape:
-    """The parallelogram of two sides [2, 3] about a direction [3], or the ellipse in it, all of equal radiance."""
+    """The shape of even radiance about a direction [3]: the parallelogram of sides [2, 3], or the ellipse in it."""
     at = np.linspace(-0.5, 0.5, CELLS + 1)
     corners = towards + at[:, None, None] * sides[0] + at[:, None] * sides[1]
     middle = (np.arange(CELLS) + 0.5) / CELLS - 0.5
@@ -127,18 +127,18 @@ def flat_shape(towards: NDArray[np.floating[Any]], sides: NDArray[np.floating[An
 
 
 def with_disc(light: Light, diameter_deg: float) -> Light:
-    """A light as a round disc of this diameter about its direction."""
+    """Return a light as a round disc of this diameter about its direction."""
     ahead, size = light.towards, 2 * math.tan(math.radians(diameter_deg) / 2)
     return replace(light, shape=flat_shape(ahead, size * sides_across(ahead), True)) if diameter_deg > 0 else light
 
 
 class Patch(NamedTuple):
-    """A part of a light, so small that its ghosts and star are those of its middle, smeared.
+    """A part of a light that is so small that its ghosts and star are those of its middle, smeared.
 
     Attributes:
         light: the point in its middle, with all of its light.
-        sides: [2, 3], of the parallelogram of directions about it. weights: [N, M] light of its cells.
-        round: whether it is the ellipse in the parallelogram.
+        sides: [2, 3] of the parallelogram of directions about it. weights: [N, M] light of its cells.
+        round: whether only the ellipse in the parallelogram is lit.
     """
 
     light: Light
@@ -148,12 +148,12 @@ class Patch(NamedTuple):
 
 
 def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch]:
-    """A light in patches of about so many degrees a side.
+    """Cut a light into patches of about `most_deg` degrees a side.
 
     Each patch fades smoothly into its neighbours, so that no seam is seen where their ghosts do not quite meet.
 
     Args:
-        most: patches along a side, at most; `CELLS` makes a patch of each cell.
+        most: the most patches along a side; `CELLS` makes a patch of each cell.
     """
     if light.shape is None:
         return [Patch(light, np.zeros((2, 3)), np.ones((1, 1)), False)]
@@ -180,14 +180,14 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
 
 
 def _shares(count: int, cells: int) -> Array:
-    """The share [count, cells] of each cell along a side that each of so many patches has: their sum is 1."""
+    """Return the share [count, cells] that each of `count` patches along a side has of each cell; a cell's sum is 1."""
     at = (np.arange(cells) + 0.5) * count / cells - 0.5
     far = np.abs(at.clip(0, count - 1) - np.arange(count)[:, None]).clip(0, 1)
     return 0.5 + 0.5 * np.cos(math.pi * far)
 
 
 def _lengths(corners: Array) -> tuple[float, float]:
-    """Lengths in radians of the middles of a shape's two kinds of sides."""
+    """Return the lengths in radians of a shape's two kinds of sides, along their middles."""
     half = CELLS // 2
     along, across = corners[-1, half] - corners[0, half], corners[half, -1] - corners[half, 0]
     return float(np.linalg.norm(along)), float(np.linalg.norm(across))
@@ -195,18 +195,19 @@ def _lengths(corners: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Track:
-    """A light over frames.
+    """A light over several frames.
 
     Attributes:
-        name: of the light. keys: [K, 9] frame, azimuth and elevation in degrees, r, g, b, diameter in degrees,
-            1 / distance in 1/m, share that shows; linear between keys, constant before the first and after the last.
+        name: the light's. keys: [K, 9] frame, azimuth and elevation in degrees, r, g, b, diameter in degrees, 1 /
+            distance in 1/m, and the share that shows; linear between keys, constant before the first and after the
+            last.
     """
 
     name: str
     keys: Array
 
     def at(self, frame: float) -> Light | None:
-        """The light at a frame; None while it stands behind the lens."""
+        """Return the light at a frame; None while it stands behind the lens."""
         values = (float(np.interp(frame, self.keys[:, 0], column)) for column in self.keys.T[1:])
         azimuth, elevation, r, g, b, diameter, near, shown = values
         if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
@@ -216,15 +217,15 @@ class Track:
 
 
 def read_lights(path: Path) -> list[Track]:
-    """The lights of a list: CSV with a header, or JSON, a list of objects.
+    """Read the lights of a list: CSV with a header, or JSON with a list of objects.
 
     Columns or keys are azimuth_deg, elevation_deg and, with their defaults, light (a name; without it each row is a
     light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, `SUN`), distance_m (inf),
     diameter_deg (of a round light, 0; the sun has 0.53) and visible (the share of it that shows, 1).
 
     Raises:
-        InputError: a column is unknown or missing, or a value is out of range, by file, row and column; no light, or
-            more than `MOST_LIGHTS`.
+        InputError: a column is unknown or missing, or a value is out of range (it names file, row and column); there is
+            no light, or there are more than `MOST_LIGHTS`.
     """
     rows, lights = read_rows(path, "a list of lights"), dict[str, list[list[float]]]()
     if not rows:
@@ -258,14 +259,15 @@ def _value(path: Path, place: str, name: str, given: Any) -> float:
 def light_rays(
     lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
 ) -> tuple[Floats, float]:
-    """Rays of a light from number `first` on, [6, count] in the lens frame, and the area in mm^2 that all N rays share.
+    """Return rays [6, count] of a light from number `first` on, lens frame, and the area (mm^2) of all N rays together.
 
     Each of N rays carries the irradiance at the lens times area / N. The rays of a light far away are uniform across
     its direction, those of a near light in solid angle. An extended light divides its rays among points, one in each of
-    its cells, by their light; `shift` moves the points.
+    its cells, in proportion to their light.
 
     Args:
-        shift: of the sequence, another for each wavelength. jitter: see `disc`.
+        shift: shifts the sequence, and the points of an extended light; each wavelength takes another. jitter: see
+            `disc`.
     """
     if light.shape is None:
         return rays_across(lens, light, disc(first, count, shift, jitter))
@@ -282,24 +284,26 @@ def light_rays(
 
 
 def front_sphere(lens: Lens) -> tuple[Array, float]:
-    """Centre [3] (lens frame) and radius in mm of a sphere that holds the front surface."""
+    """Return centre [3] (lens frame) and radius in mm of a sphere that holds the front surface."""
     front = lens.surfaces[0]
     depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
     return np.array([0.0, 0.0, depth / 2]), math.hypot(front.semi_diameter_mm, depth / 2)
 
 
 def sides_across(ahead: Array) -> Array:
-    """Two unit vectors [2, 3] across a direction before the lens, which turn smoothly while the direction moves (Duff
-    et al. 2017, for one hemisphere)."""
+    """Return two unit vectors [2, 3] across a direction before the lens.
+
+    They turn smoothly while the direction moves (Duff et al. 2017, for one hemisphere).
+    """
     x, y, z = ahead
     return np.array([[1 - x * x / (1 - z), -x * y / (1 - z), x], [x * y / (1 - z), y * y / (1 - z) - 1, -y]])
 
 
 def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> tuple[Floats, float]:
-    """Rays [6, N] of a light through points [2, N] of the unit disc, which stands across its direction, and the area of
-    the whole disc in mm^2: equal shares of the disc carry equal light; see `light_rays`.
+    """Return rays [6, N] of a light through points [2, N] of the unit disc, and the area in mm^2 of the whole disc.
 
-    Points may also lie in the corners of the square about the disc.
+    The disc stands across the light's direction. Equal shares of it carry equal light; see `light_rays`. Points may
+    also lie in the corners of the square about the disc.
     """
     centre, radius = front_sphere(lens)
     ahead = light.towards
@@ -312,7 +316,7 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
     if not 1.01 * radius < far < math.inf:
         expected = f"one beyond {radius / 1000:.3g} m, outside the lens, or inf"
         raise InputError("light", "distance_m", light.distance_m, expected)
-    # Uniform in solid angle over the cone that holds the sphere about the front surface.
+    # Rays are uniform in solid angle over the cone that holds the sphere about the front surface.
     solid = 1 - math.sqrt(1 - (radius / far) ** 2)
     off = across * np.sqrt(solid * (2 - solid * (across**2).sum(0)))
     towards = (centre - source) / far
@@ -320,14 +324,15 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
     cos = 1 - solid * (across**2).sum(0)
     sine = np.sqrt(np.maximum(1 - cos**2, 0)) / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
     direction = towards[:, None] * cos + off * sine
-    area = 2 * math.pi * solid * (1000 * light.distance_m) ** 2  # the irradiance is that at the front vertex
+    area = 2 * math.pi * solid * (1000 * light.distance_m) ** 2  # since the irradiance is that at the front vertex
     return np.concatenate([source[:, None] + direction * (far - radius), direction]), area
 
 
 def disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> Array:
-    """Points [2, count] of equal shares of the unit disc: the R2 sequence from a number on, shifted.
+    """Return points [2, count] of equal shares of the unit disc: the R2 sequence from number `first` on, shifted.
 
-    `jitter` moves each point by up to so much of the square's side, because regular points make patterns in a picture.
+    `jitter` moves each point by up to this share of the square's side, because regular points make patterns in a
+    picture.
     """
     n = np.arange(first, first + count) + 1.0
     moved = jitter * np.random.default_rng([first, int(shift * 2**32)]).random((2, count))
@@ -347,17 +352,17 @@ class SceneLights:
         self._rgb = [spectral.film_rgb(palette.look_up(np.full_like(every, row), every)[0]) for row in each]
 
     def balance(self, illuminant: str | None) -> Array:
-        """Matrix [3, 3] on linear sRGB that makes an illuminant neutral, as renders of the scene have it."""
+        """Return the matrix [3, 3] on linear sRGB that makes an illuminant neutral, as renders of the scene do."""
         if illuminant is None or not self._spectral.colours:
             return np.eye(3)
         return balance(self._spectral.film_rgb(self._world.palette.illuminant(illuminant)))
 
     def seen(self, scene: Scene, film_z_mm: float, most: int | None = None) -> list[Light]:
-        """The lights before the lens of the camera of `scene`, which may stand anywhere in this scene.
+        """Return the lights before the lens of the camera of `scene`, which may stand anywhere in this scene.
 
         Args:
-            film_z_mm: of the lens: the front vertex lies so far before the film.
-            most: how many lights to test, those that are strongest there if nothing hides them; None tests all.
+            film_z_mm: the lens's film; the front vertex lies as far before the film.
+            most: how many lights to test, the strongest there if nothing hides them; None tests all.
         """
         pose = scene.settings.camera
         axes = camera_axes(pose).astype(np.float64)
@@ -379,7 +384,7 @@ class SceneLights:
             if not rgb.any():
                 continue
             mean = float(np.average(distance, weights=seen)) if np.isfinite(distance).all() else math.inf
-            extended = np.ptp(shape.corners, axis=(0, 1)).any()  # those of a light without size are one direction
+            extended = np.ptp(shape.corners, axis=(0, 1)).any()  # a light without size is one direction
             towards = axes.T @ (direction @ seen)
             if light := light_towards(towards, rgb.tolist(), mean, shape if extended else None):
                 found.append(light)
@@ -387,7 +392,7 @@ class SceneLights:
 
 
 class KeptLights(NamedTuple):
-    """The lights that are kept, brightest first; of how many; and the share of the energy that is left out."""
+    """The lights that are kept, brightest first; `of` how many; and the share of the energy that is left out."""
 
     lights: list[Light]
     of: int
@@ -395,11 +400,11 @@ class KeptLights(NamedTuple):
 
 
 def keep(lights: Sequence[Light], most: int, fade: bool = False) -> KeptLights:
-    """The lights of the most energy at the lens.
+    """Keep the lights of the most energy at the lens.
 
     Args:
-        fade: whether lights fade as their energy approaches that of the brightest light that is left out, so that none
-            comes or goes at once over frames. Where all would be dark, none fades.
+        fade: whether lights fade as their energy nears that of the brightest light left out, so that over frames none
+            comes or goes at once. Where all lights would be dark, none fades.
     """
     ordered = sorted(lights, key=lambda light: sum(light.rgb), reverse=True)
     kept = ordered[:most]
@@ -416,17 +421,18 @@ def keep(lights: Sequence[Light], most: int, fade: bool = False) -> KeptLights:
 def highlights(
     picture: FloatArray, field: Field, film_mm: tuple[float, float], threshold: float, most: int, fade: bool = False
 ) -> KeptLights:
-    """The regions of a picture [H, W, 3] (linear; 1 is a white card of radiance 1) that reach a threshold in a colour.
+    """Find the regions of a picture [H, W, 3] (linear; 1 is a white card of radiance 1) in which a colour is bright.
 
-    A region of connected pixels is a light far away with the region's radiance times solid angle; a large region is
-    several lights. Radiance is the picture's value over the relative illumination. Pixels count in full from twice the
-    threshold on, and less the nearer they are to it, so that over frames no light switches on at once.
+    A pixel is bright where one of its colours reaches the threshold. A region of connected pixels is a light far away
+    with the region's radiance times solid angle; a large region is several lights. Radiance is the picture's value over
+    the relative illumination. Pixels count in full from twice the threshold on, and less the nearer they are to it, so
+    that over frames no light switches on at once.
 
     Args:
-        field: of the camera that took the picture, laid out as equidistant. most, fade: as for `keep`.
+        field: that of the camera that took the picture. most, fade: as for `keep`.
 
     Raises:
-        InputError: values that are not finite; more than `_MOST_PIXELS` pixels that reach the threshold.
+        InputError: values are not finite; more than `_MOST_PIXELS` pixels reach the threshold.
     """
     if bad := int((~np.isfinite(picture)).any(-1).sum()):
         raise InputError("picture", "pixels", f"({bad} with NaN or infinity)", "finite values")
@@ -450,7 +456,7 @@ def highlights(
             np.add.at(sums, of, some)  # in place: there may be as many regions as pixels
     middle, each = moments[:3], colour.sum(1)
     seen = np.flatnonzero((each > 0) & (middle[2] < -1e-6 * np.linalg.norm(middle, axis=0)))
-    first = seen[np.argsort(-each[seen], kind="stable")][: most + 1]  # one more tells how they fade
+    first = seen[np.argsort(-each[seen], kind="stable")][: most + 1]  # one more than are kept, to tell how lights fade
     shapes = [_spread_of(moments[:, k] / each[k]) for k in first]
     lights = [light_towards(middle[:, k], colour[k], shape=shape) for k, shape in zip(first, shapes, strict=True)]
     kept = keep([light for light in lights if light], most, fade).lights
@@ -459,18 +465,21 @@ def highlights(
 
 
 def _spread_of(means: Array) -> Shape:
-    """The parallelogram with the variances of a region, from means [13] of directions, their products, solid angles."""
+    """Return the parallelogram with a region's variances, from means [13] of directions, products and solid angles."""
     towards = means[:3] / np.linalg.norm(means[:3])
     across = sides_across(towards)
     variance = across @ (means[3:12].reshape(3, 3) - np.outer(means[:3], means[:3])) @ across.T
-    pixel = means[12] / 12 * np.eye(2)  # its own variance, with that of its middles
+    pixel = means[12] / 12 * np.eye(2)  # a pixel's own variance is added to that of pixels' middles
     half = np.linalg.cholesky(variance + pixel)
     return flat_shape(towards, math.sqrt(12) * half.T @ across)
 
 
 def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
-    """The number of the connected region of each bright pixel, [N] row by row; a region larger than two cells has a
-    number for each of its cells. Time and memory grow with the pixels alone, not with the regions."""
+    """Number the connected regions of bright pixels, [N] row by row.
+
+    A region larger than two cells has a number for each of its cells. Time and memory grow with the pixels alone, not
+    with the regions.
+    """
     from scipy import ndimage  # type: ignore[import-untyped]
 
     label, _ = ndimage.label(bright, np.ones((3, 3)))
@@ -491,8 +500,10 @@ def _pixels(
     colour: FloatArray, row: NDArray[np.intp], column: NDArray[np.intp], field: Field, film_mm: tuple[float, float],
     size: tuple[int, int],
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Irradiance at the lens [N, 3], unit direction [3, N] (lens frame) and solid angle [N] of pixels, by the
-    directions of their corners."""
+    """Return irradiance at the lens [N, 3], unit direction [3, N] (lens frame) and solid angle [N] of pixels.
+
+    These follow from the directions of their corners.
+    """
     x = (np.array([[0], [1], [1], [0]]) + column) * (film_mm[0] / size[1]) - film_mm[0] / 2
     y = film_mm[1] / 2 - (np.array([[0], [0], [1], [1]]) + row) * (film_mm[1] / size[0])
     corner = field.directions((x + 1j * y).reshape(-1)).reshape(3, 4, -1)

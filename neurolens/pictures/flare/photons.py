@@ -1,4 +1,4 @@
-"""Flare by photons: light that each surface refracts or reflects by chance, and that may scatter, any number of times.
+"""Flare by photons: each surface refracts or reflects a photon by chance, and photons may scatter any number of times.
 
 Photons leave the lights, and each surface reflects a photon with the probability of its Fresnel or coating reflectance.
 The photons that reach the film after reflections are the flare, smoothed by a kernel (Keshmirian 2008). Here photons
@@ -7,10 +7,10 @@ are aimed at the front surface alone and weighted by the solid angle. They go th
 and photons that turn round wait at their surface for the next sweep. All photons are accounted for: each one arrives,
 leaves at the front, ends at a rim, is absorbed, or is cut off.
 
-A boost b makes reflection more frequent than it is: if T is the transmitted share, a photon turns round with the
+A boost b makes reflection more frequent than it is. If T is the transmitted share, a photon turns round with the
 probability b (1 - T) / (T + b (1 - T)), and its weight makes up for that. Steinert (2009, 5.3.2) transmits photons with
-the probability T^2, which is b = 2 but for terms in (1 - T)^2. `PhotonTracer.turning` is less noisy: it chooses one of
-the surfaces ahead by its reflectance.
+the probability T^2, which is b = 2 except for terms in (1 - T)^2. `PhotonTracer.turning` is less noisy: it chooses one
+of the surfaces ahead by its reflectance.
 
 Light scatters at the lens's tube and rings, on the film, at dust on the front surface and in hazy glass. These are
 simple models that conserve energy, written as graphs of one event. Between two surfaces the lens sits in a tube as wide
@@ -36,18 +36,18 @@ from neurolens.pictures.flare.steps import LOST, STATE, Floats, Place, Stack, en
 from neurolens.pictures.render.settings import Scatter
 
 BLOCK = 4096  # photons at a time: their states, 40 bytes at every surface, stay in the caches
-MOST_REFLECTIONS = 1000  # also the most scattering events
+MOST_REFLECTIONS = 1000  # also of scattering events
 LEVELS = 5  # numbers of reflections that have a boost of their own: 0, 1, 2, 3, at least 4
-_TURNS = 0.95  # share of the photons that turn round in one sweep under the boosts of `turning`
+_TURNS = 0.95  # share of photons that the boosts of `turning` make turn round in one sweep
 _BOOSTS = 1e-6, 1e6
 CHANCES = 5  # rows of random numbers: an exponential variate, two uniform ones, cosine and sine of a uniform angle
 PASSED, VOLUME, WALL, NOWHERE = range(4)  # what happens to a photon: see `scatter_graph`
 NUMBERS = (
     "shift_mm", "tube_mm", "ring_r2_mm2", "ring_z_mm", "per_rim2", "least_mm", "per_mm", "layer", "forward", "gloss",
 )  # fmt: skip
-_LOBE = 0.9  # mean cosine of the glossy lobe about the mirror's direction, 26 degrees
+_LOBE = 0.9  # mean cosine about the mirror's direction, 26 degrees, of light that a glossy wall reflects
 _TINY, _NEAR = 1e-20, 1e-3
-_FLAT = 1e-6  # the smallest cosine with the axis, so that no light stays between two surfaces for ever
+_FLAT = 1e-6  # of the cosine with the axis, so that no light stays between two surfaces for ever
 
 
 class Photons(NamedTuple):
@@ -55,7 +55,7 @@ class Photons(NamedTuple):
 
     Attributes:
         film_xy_mm: [2, M] in the lens frame. weight: [M], 1 each without a boost.
-        reflections, scattered: [M], how often surfaces reflected each photon, and how often it scattered.
+        reflections, scattered: [M] how often surfaces reflected each photon, and how often it scattered.
         cast: all photons. left: photons that left the lens at the front. stopped: photons that ended at rims, at the
             barrel or beside the film. absorbed: photons that glass absorbed, or that total reflection sent where no
             surface is. cut: photons that would have had more reflections than allowed.
@@ -73,7 +73,7 @@ class Photons(NamedTuple):
 
     @property
     def glare(self) -> NDArray[np.bool_]:
-        """[M] whether a photon is neither image nor ghost: it scattered, or was reflected more than twice."""
+        """[M] Whether a photon belongs to neither image nor ghosts: it scattered, or was reflected more than twice."""
         return (self.scattered > 0) | (self.reflections > 2)
 
 
@@ -81,7 +81,7 @@ class PhotonTracer:
     """Traces photons through a set lens.
 
     Args:
-        scatter: what scatters photons; None scatters nothing.
+        scatter: what scatters photons; with None nothing does.
 
     Attributes:
         stack: the lens's compiled steps.
@@ -107,10 +107,10 @@ class PhotonTracer:
         self._call.restype = ctypes.c_size_t
 
     def turning(self, wavelength_nm: float, times: int) -> NDArray[np.float64]:
-        """Boosts [surfaces, 2, LEVELS] that make photons turn round `times` times (at most `LEVELS` - 1).
+        """Return boosts [surfaces, 2, LEVELS] that make photons turn round `times` times (at most `LEVELS` - 1).
 
-        The chance of each surface ahead is proportional to its reflectance at normal incidence, so that all paths with
-        that number of reflections have about the same weight. After that, reflection is as frequent as it is.
+        Each surface ahead is chosen in proportion to its reflectance at normal incidence, so that all paths with that
+        number of reflections have about the same weight. After that, reflection is no more frequent than it is.
         """
         share = self.stack.reflectance(wavelength_nm)
         boosts = np.ones((len(share), 2, LEVELS))
@@ -135,10 +135,10 @@ class PhotonTracer:
         Args:
             most_reflections: a photon that would be reflected once more is cut off. seed: of the random numbers.
             boost: how much more often photons turn round than reflectances say: one number, or [surfaces, 2, LEVELS]
-                for the way to the film and back, after no, one, ... reflections.
+                for the ways to the film and back, after no, one, ... reflections.
 
         Raises:
-            InputError: as `steps.entering`; reflections or boosts out of bounds.
+            InputError: as `steps.entering`; reflections or boosts are out of bounds.
         """
         if not 0 <= most_reflections <= MOST_REFLECTIONS:
             raise InputError("photons", "most_reflections", most_reflections, f"from 0 to {MOST_REFLECTIONS}")
@@ -162,7 +162,7 @@ class PhotonTracer:
 
 
 def scatter_numbers(scatter: Scatter, lens: Lens) -> NDArray[np.float32]:
-    """The `NUMBERS` for the way to every surface, towards the film and back, [surfaces, 2, NUMBERS]."""
+    """Return the `NUMBERS` for the way to every surface, towards the film and back, [surfaces, 2, NUMBERS]."""
     z, rows = [float(v) for v in lens.vertices_mm], lens.surfaces
     numbers = np.zeros((len(rows), 2, len(NUMBERS)), np.float32)
     for k, s in enumerate(rows):
@@ -190,12 +190,12 @@ def scatter_numbers(scatter: Scatter, lens: Lens) -> NDArray[np.float32]:
 
 
 def scatter_graph() -> Graph:
-    """The graph of what happens to a photon on its way to a surface.
+    """Write the graph of what happens to a photon on its way to a surface.
 
-    Its inputs are `row`, the state before [8], the state after refraction there [8] and random numbers [CHANCES]; and
-    `call`, the `NUMBERS`. Its output `event` has x, y, z and the direction in the frame of the next step, then what
-    happens (`PASSED`, ...), and whether the photon then travels the other way. A photon that the surface refracts or
-    totally reflects has met it; others meet the ring, the tube, or nothing.
+    Its inputs are `row` and `call`. `row` is the state before [8], the state after refraction there [8] and random
+    numbers [CHANCES]; `call` has the `NUMBERS`. Its output `event` has x, y, z and the direction in the frame of the
+    next step, then what happens (`PASSED`, ...), and whether the photon then travels the other way. A photon that the
+    surface refracts or totally reflects has met it; others meet the ring, the tube, or nothing.
     """
     g = Graph()
     row, call = g.input("row", 2 * STATE + CHANCES), g.input("call", len(NUMBERS), per_call=True)
@@ -206,7 +206,7 @@ def scatter_graph() -> Graph:
     way = (met[2] - x[2]) / d[2]
     beyond = g.select(row[2 * STATE - 1] <= 1.0, 0.0, g.square(met[0:2]) * per_rim2)
     meets = (beyond <= 1.0) & (least <= way)
-    # The tube, by the form of the root that divides by what is not small; then the plane of the ring.
+    # The tube, by the form of the root that divides by no small number; then the plane of the ring.
     along, out2 = g.dot(x[0:2], d[0:2]), g.square(x[0:2]) - tube * tube
     steep = g.square(d[0:2])
     root = (along * along - steep * out2).sqrt()
@@ -236,11 +236,11 @@ def scatter_graph() -> Graph:
 
 
 def film_scatter_graph() -> Graph:
-    """The graph of photons that the film sends back.
+    """Write the graph of photons that the film sends back.
 
-    Its inputs are `row`, the state behind the last surface [8], the point on the film [2] and random numbers
-    [CHANCES]; and `call`, the film's distance from that surface and the share that the film reflects as a mirror. Its
-    output `event` [6] is the position and direction in the frame of the last surface.
+    Its inputs are `row` and `call`. `row` is the state behind the last surface [8], the point on the film [2] and
+    random numbers [CHANCES]; `call` is the film's distance from that surface, and the share that the film reflects as a
+    mirror. Its output `event` [6] is the position and direction in the frame of the last surface.
     """
     g = Graph()
     row, call = g.input("row", STATE + 2 + CHANCES), g.input("call", 2, per_call=True)
@@ -252,14 +252,14 @@ def film_scatter_graph() -> Graph:
 
 
 def _greenstein(forward: Value, u: Value) -> Value:
-    """A random cosine by a uniform variate u, for a mean cosine above 0 (the inverse of Henyey and Greenstein 1941)."""
+    """Return a random cosine from a uniform u, for a mean cosine above 0 (inverse of Henyey and Greenstein 1941)."""
     square = forward * forward
     q = (1.0 - square) / (1.0 - forward + forward * u * 2.0)
     return ((square + 1.0 - q * q) / (forward * 2.0)).maximum(-1.0).minimum(1.0)
 
 
 def _about(g: Graph, axis: Value, cosine: Value, turn: Value) -> Value:
-    """The unit vector at an angle from an axis and turned about it, in the frame of Duff et al. (JCGT 6, 2017)."""
+    """Return the unit vector at an angle from an axis, turned about it, in the frame of Duff et al. (JCGT 6, 2017)."""
     x, y, z = axis[0], axis[1], axis[2]
     sign = g.select(g.constant(0.0) <= z, 1.0, -1.0)
     a = -1.0 / (sign + z)

@@ -1,11 +1,10 @@
 """The surfaces of a lens as compiled steps, by which ghosts and photons are traced.
 
-Light always travels towards -z here: the frame is mirrored (z reversed) while light goes to the film. So one step
-serves both directions, and it is the tracer's (`optics.trace.surfaces`). The figure of a surface and its media are
-numbers of the call, so that all surfaces of one kind share a function, which is compiled once. Fresnel's reflectance
-is written without the difference of nearly equal roots, which float32 would lose where glasses are cemented. The
-reflectance of a coating is a polynomial in the cosine on the side of the lower index, fitted to its transfer matrices
-at one wavelength.
+Light always travels towards -z here: the frame is mirrored (z reversed) while light goes to the film. So one step, the
+tracer's (`optics.trace.surfaces`), serves both directions. The figure of a surface and its media are numbers of the
+call, so that all surfaces of one kind share a function, which is compiled once. Fresnel's reflectance is written
+without the difference of nearly equal roots, which float32 would lose where glasses are cemented. The reflectance of a
+coating is a polynomial in the cosine on the side of the lower index, fitted to its transfer matrices at one wavelength.
 """
 
 from __future__ import annotations
@@ -43,13 +42,14 @@ CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "a
 DEGREE = 10  # the degree of a coating's reflectance
 CURVE = ("stretch", "start_c", "start_cz", "last_step_mm")  # see `shapes.Curve`; `across` and the terms follow
 ACROSS = 3
-PLAIN = len(CALL) + DEGREE + 1  # how many numbers of the call a sphere has
-# Actions: refract light that travels to the film (0) or back (1), reflect such light (2, 3); sense of the light before.
+PLAIN = len(CALL) + DEGREE + 1  # how many numbers of the call a sphere takes
+# Actions: refract light that travels to the film (0) or back (1), reflect such light (2, 3); with the light's sense
+# before.
 ACTIONS: tuple[tuple[Action, int], ...] = (("T", 1), ("T", -1), ("R", 1), ("R", -1))
 Place = tuple[int, int]  # surface and action
-_UNIT = Medium(1.0, 1.0, 1.0)  # unlike air, it may have total reflection behind it
-_FAINT = 2e-4  # a reflectance below which no ghost is seen
-_MASKS: dict[str, Floats] = {}  # masks of stops, which compiled code points at as long as it is loaded
+_UNIT = Medium(1.0, 1.0, 1.0)  # not air, for behind it there may be total reflection
+_FAINT = 2e-4  # ghosts of a smaller reflectance are not seen
+_MASKS: dict[str, Floats] = {}  # masks of stops, which compiled code points to as long as it is loaded
 
 
 class Shape(NamedTuple):
@@ -57,7 +57,8 @@ class Shape(NamedTuple):
 
     terms: int = 0
     even: bool = True
-    centred: bool | None = None  # and whether by Chebyshev's polynomials
+    # whether the terms are powers about a centre, and whether these are written in Chebyshev's polynomials
+    centred: bool | None = None
     steps: int = 0
     bent: tuple[bool, bool] = (True, True)
     crossed: bool = False
@@ -70,9 +71,9 @@ class Kind(NamedTuple):
     Attributes:
         action: "T" refracts, "R" reflects.
         shape: None for spheres and planes.
-        bends: whether the media differ. coated: whether the reflectance is a polynomial of the call.
+        bends: whether the media differ. coated: whether the reflectance is a polynomial, whose numbers are the call's.
         absorbs: whether the medium before the surface absorbs light.
-        aperture: the shape of the stop's opening, tested at this surface; None is round.
+        aperture: the shape of the stop's opening, which is tested at this surface; None is round.
     """
 
     action: Action
@@ -84,13 +85,13 @@ class Kind(NamedTuple):
 
 
 def step_graph(kind: Kind) -> Graph:
-    """The graph of one step: its input `state` [8] becomes the output `after` [8], in the frame of the next step.
+    """Write the graph of one step: its input `state` [8] becomes the output `after` [8], in the frame of the next step.
 
     The input `call` holds `CALL`, then the coefficients of a coating's reflectance, lowest first, then `CURVE` and the
     terms of the polynomial (`_terms`), as many as the shape has.
     """
     g, shape = Graph(), kind.shape
-    o = Graphs(g, finite=True)  # films average over rays, also over those that are lost and have no power
+    o = Graphs(g, finite=True)  # films average over all rays, also over lost ones, which have no power
     count = PLAIN + (0 if shape is None else len(CURVE) + ACROSS * shape.crossed + shape.terms)
     state, call = g.input("state", STATE), g.input("call", count, per_call=True)
     shift, curvature, per_rim2, n1, n2, n_step, absorbed = (call[k] for k in range(len(CALL)))
@@ -130,9 +131,9 @@ def step_graph(kind: Kind) -> Graph:
 
 
 def film_graph() -> Graph:
-    """The graph from a `state` behind the last surface, the film `shift_mm` away, to `film`: x, y (mm), power, worst.
+    """Write the graph from a `state` behind the last surface to `film`: x, y (mm), power, worst.
 
-    The power is 0 where any rim stopped the ray.
+    The film is `shift_mm` away. The power is 0 where any rim stopped the ray.
     """
     g = Graph()
     state, shift = g.input("state", STATE), g.input("shift_mm", per_call=True)
@@ -144,9 +145,10 @@ def film_graph() -> Graph:
 
 
 def _fresnel(n1: Value, n2: Value, n_step: Value, cos_i: Value, cos_t: Value) -> Value:
-    """(Rs + Rp) / 2 of a bare surface; n_step = n2^2 - n1^2 (Born and Wolf, 1.5.2, by a^2 - b^2 = (a - b)(a + b)).
+    """Return (Rs + Rp) / 2 of a bare surface (Born and Wolf, 1.5.2, by a^2 - b^2 = (a - b)(a + b)).
 
-    With s = n1 c1 + n2 c2 and p = n2 c1 + n1 c2: rs = -n_step / s^2, rp = n_step (c1^2 - (n1 / n2)^2 (1 - c1^2)) / p^2.
+    n_step is n2^2 - n1^2. With s = n1 c1 + n2 c2 and p = n2 c1 + n1 c2: rs = -n_step / s^2, rp = n_step (c1^2 - (n1 /
+    n2)^2 (1 - c1^2)) / p^2.
     """
     s, p = n1 * cos_i + n2 * cos_t, n2 * cos_i + n1 * cos_t
     ratio, c2 = n1 / n2, cos_i * cos_i
@@ -156,20 +158,20 @@ def _fresnel(n1: Value, n2: Value, n_step: Value, cos_i: Value, cos_t: Value) ->
 
 
 def _coated(g: Graph, call: Value, cos_i: Value, cos_t: Value, n_step: Value) -> Value:
-    """The reflectance of a coating: a polynomial in 1 - c with c the cosine on the side of the lower index."""
+    """Return a coating's reflectance: a polynomial in 1 - c with c the cosine on the side of the lower index."""
     u = 1.0 - g.select(g.constant(0.0) <= n_step, cos_i, cos_t)
     highest, *lower = (call[k] for k in range(PLAIN - 1, len(CALL) - 1, -1))
     return reduce(lambda total, coefficient: total * u + coefficient, lower, highest).maximum(0.0).minimum(1.0)
 
 
-@lru_cache(maxsize=4096)  # the same for every frame, stop and tracer, and for surfaces that are coated alike
+@lru_cache(maxsize=4096)  # equal for every frame, stop and tracer, and for surfaces that are coated alike
 def reflectance_fit(
     layers: Layers, n_before: float, n_after: float, wavelength_nm: float, sense: int
 ) -> tuple[float, ...]:
-    """Coefficients, lowest first, of a coating's reflectance in 1 - c, c being the cosine on the lower index's side.
+    """Fit a coating's reflectance by a polynomial in 1 - c, c the cosine on the lower index's side; lowest first.
 
-    They have the least relative squares at Chebyshev nodes, because ghosts live on the little that is left near normal
-    incidence. Light of this sense (1: towards the film) meets `n_before` first.
+    The squares of relative errors are least at Chebyshev nodes, because ghosts live on the little that is left near
+    normal incidence. Light of this sense (1: towards the film) meets `n_before` first.
     """
     c = 0.5 + 0.5 * np.cos((np.arange(64) + 0.5) * math.pi / 64)
     low, high = min(n_before, n_after), max(n_before, n_after)
@@ -196,7 +198,7 @@ def _curve(shape: Shape, call: Value) -> Curve:
 
 
 def curve_numbers(curve: Curve, turn: float) -> list[Any]:
-    """The numbers `CURVE`, across and terms; `turn` is -1.0 for light that travels towards +z in the lens frame."""
+    """Return the numbers `CURVE`, `across` and terms; `turn` is -1.0 for light that travels towards +z (lens frame)."""
     cx, cy, cz = curve.start or (0.0, 0.0, 0.0)
     c, other = (cx, cy) if curve.bent[0] else (cy, cx)
     across = [turn * curve.across[0], turn * other, curve.across[1]] if curve.across else []
@@ -204,7 +206,7 @@ def curve_numbers(curve: Curve, turn: float) -> list[Any]:
 
 
 def _terms(curve: Curve, turn: float) -> list[float]:
-    """The numbers of a polynomial: terms; of a centred one the scale, and in turn those of its sag and its slope."""
+    """Return the numbers of a polynomial: its terms, or of a centred one the scale, then terms of its sag and slope."""
     if curve.centred is None:
         return [turn * v for v in curve.terms]
     scale, sag, slope, _ = curve.centred
@@ -234,7 +236,7 @@ class Stack:
             raise InputError(lens.path, "film_z_mm", None, "a focused lens (set_lens)")
         lens.require_glass("reflections, of which flare is made")
         self.lens = lens
-        # All aspheres of a sort get the degree of the highest one, so that they share a function.
+        # All aspheres with the same sort of terms get the degree of the highest one, so that they share a function.
         self._curves = {k: traced_curve(s, float) for k, s in enumerate(lens.surfaces) if not s.figure.plain}
         curves = self._curves.values()
         most: dict[tuple[bool, bool | None], int] = {}
@@ -252,7 +254,7 @@ class Stack:
         """Compile a C text that calls the steps by `go` of `stack.c`, and return its function `name`.
 
         Args:
-            driver: the text. graphs: further functions run_NAME: rows `row` and numbers `call` become rows `event`.
+            driver: the text. graphs: further functions run_NAME, from rows `row` and numbers `call` to rows `event`.
 
         Raises:
             InputError: there is no C compiler, or it fails.
@@ -276,7 +278,7 @@ class Stack:
         return call
 
     def kind(self, k: int, which: int) -> Kind:
-        """What a step does at surface k by the action of this number."""
+        """Return what a step does at surface k by the action of this number."""
         lens, s, f = self.lens, self.lens.surfaces[k], self._curves.get(k)
         return Kind(
             ACTIONS[which][0],
@@ -287,7 +289,7 @@ class Stack:
             lens.aperture if s.stop else None,
         )
 
-    @lru_cache(maxsize=256)  # noqa: B019  it keeps a few stacks, which are small
+    @lru_cache(maxsize=256)  # noqa: B019  a few stacks are kept, which are small
     def numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
         """The numbers of all steps [surfaces, actions, width], and the distance from last surface to film (mm)."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
@@ -297,7 +299,8 @@ class Stack:
         for k, s in enumerate(lens.surfaces):
             for which, (_, sense) in enumerate(ACTIONS):
                 before, after = (k, k + 1) if sense > 0 else (k + 1, k)
-                # A ray arrives in the frame of the surface before; at the front and the rear in that of the surface.
+                # A ray comes in the frame of the surface before; at the front and the rear in that of the surface
+                # itself.
                 gap = sense * (z[k] - z[k - sense]) if 0 <= k - sense < len(lens.surfaces) else 0.0
                 step = (n[after] - n[before]) * (n[after] + n[before])
                 row = gap, -sense * float(s.curvature), 1 / s.semi_diameter_mm**2, n[before], n[after], step, a[before]
@@ -315,7 +318,7 @@ class Stack:
         return numbers, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
 
     def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Reflectances at normal incidence for light towards the film, [surfaces]."""
+        """Return the reflectances [surfaces] at normal incidence for light towards the film."""
         numbers = self.numbers(wavelength_nm)[0][:, 0].astype(np.float64)
         n1, n2 = numbers[:, CALL.index("n_before")], numbers[:, CALL.index("n_after")]
         coated = [bool(s.coating and s.coating.layers) for s in self.lens.surfaces]
@@ -323,7 +326,7 @@ class Stack:
 
 
 def entering(rays: NDArray[np.floating]) -> Floats:
-    """States [STATE, N] before the first surface of rays [6, N]: moved near the front vertex, and mirrored."""
+    """Return states [STATE, N] before the first surface of rays [6, N]: moved near the front vertex, and mirrored."""
     rays = np.asarray(rays, np.float64)
     if rays.ndim != 2 or rays.shape[0] != 6:
         raise InputError("flare", "rays", f"({rays.shape})", "an array [6, N]")
@@ -335,16 +338,16 @@ def entering(rays: NDArray[np.floating]) -> Floats:
 
 
 def reflects(lens: Lens, k: int) -> bool:
-    """Whether surface k reflects any light, because the medium changes there or it is coated."""
+    """Return whether surface k reflects any light, because the medium changes there or it is coated."""
     coating = lens.surfaces[k].coating
     return bool(coating and coating.layers) or not same_medium(lens.surfaces, k, lens.object_medium)
 
 
 def function_text(graph: Graph, name: str, run: str, inputs: str, outputs: str, numbers: str) -> str:
-    """The C text of a graph as a function `name`, and a function `run` that takes pointers to its rows.
+    """Write a graph as C text: a function `name`, and a function `run` that takes pointers to its rows.
 
     Args:
-        inputs, outputs, numbers: the names of the graph's input rows, output rows and numbers of the call.
+        inputs, outputs, numbers: what the graph's input rows, output rows and numbers of the call are named.
     """
     program = lower(graph).in_order_of_need()
     s = Signature.of(program, name)

@@ -1,11 +1,11 @@
-"""Pictures of whole shots with their flare and their files; `pictures.frames.farm` renders them in tiles.
+"""Pictures of whole shots with their flare and their files. `pictures.frames.farm` renders them in tiles.
 
 A `Frame` holds everything that decides one picture; `render_frame` renders it and writes its files::
 
     frame = Frame.of("experiments/scenes/room.toml", "lenses/cooke_triplet_50.toml", f_number=4.0, samples=16)
     render_frame(frame, Path("room.exr"))
 
-`prepare` only reads and checks the files that it names, for a picture in memory::
+`prepare` only reads and checks the files that a frame names, for a picture in memory::
 
     picture = prepare(frame, Path("room.exr")).render(threads=2).rgb
 """
@@ -60,12 +60,12 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Vector = tuple[float, float, float]
 Layers = dict[str, FloatArray]
-_CHOICE_FRAMES = 16  # of an animation, which decide the brightest ghosts
-_PALER = 1e-3  # share of the light that may lie below zero without a word
+_CHOICE_FRAMES = 16  # frames of an animation that decide the brightest ghosts
+_PALER = 1e-3  # a share of the light that may lie below zero without a warning
 
 
 def with_changes(settings: T, changes: object) -> T:
-    """Settings with the values of `changes`, a mapping or an object with such fields, that are not None."""
+    """Return settings with those values of `changes`, a mapping or an object with such fields, that are not None."""
     values = changes
     if not isinstance(values, Mapping):
         values = {f.name: getattr(changes, f.name, None) for f in fields(settings)}  # type: ignore[arg-type]
@@ -74,7 +74,7 @@ def with_changes(settings: T, changes: object) -> T:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """The settings of a picture that are options of commands; None leaves a setting to the scene."""
+    """The settings of a picture that are options of commands. None leaves a setting to the scene."""
 
     samples: int | None = setting(None, "per pixel (default: the scene's)", within=(1, 2**20))
     width: int | None = setting(
@@ -107,17 +107,17 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(Picture):
-    """Everything that decides one picture. Values of None leave a setting to the scene file, or to the lens.
+    """Everything that decides one picture. A value of None leaves the setting to the scene file, or to the lens.
 
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
         focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, cover_glass_mm,
             vignetting, dispersion, runtime: as in `optics.lens.shot.Shot`.
-        glass_files: catalogues of Zemax, whose glasses come before those that ship.
+        glass_files: Zemax's catalogues, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
-        colour: changes of the scene's [film] table by their keys, as {"white_balance": "A"}.
-        sensor: changes of the scene's [sensor] table; with any the picture has its channels.
-        number: of the frame in an animation. tile: I and N, for the I-th of N bands of rows alone.
+        colour: changes of the scene's [film] table by key, such as {"white_balance": "A"}.
+        sensor: changes of the scene's [sensor] table; with any of them the picture has the sensor's channels.
+        number: the frame's in an animation. tile: I and N, to render only the I-th of N bands of rows.
     """
 
     scene: Path
@@ -148,17 +148,17 @@ class Frame(Picture):
         return cls(scene=Path(scene), camera=resolve(camera), **settings)
 
     def shot(self, settings: CameraSettings, aperture: Aperture | None) -> Shot:
-        """The scene's settings of the camera, and its stop's shape, with the changes of the frame."""
-        # A scene's f-number is clamped to the lens; one of the frame must be possible.
+        """Return the scene's settings of the camera, with this stop's shape and the frame's changes."""
+        # A scene's f-number is clamped to the lens's; that of the frame must be possible.
         return with_changes(replace(settings.shot(aperture), clamp_f_number=self.f_number is None), self)
 
     def reads(self, settings: SensorSettings | None) -> SensorSettings | None:
-        """The scene's [sensor] table with the changes of the frame; None: no sensor."""
+        """Return the scene's [sensor] table with the frame's changes; None: no sensor."""
         asked = self.sensor is not None and set(vars(self.sensor).values()) != {None}
         return with_changes(settings or SensorSettings(), self.sensor) if asked else settings
 
     def size(self, settings: CameraSettings) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Return width and height in pixels."""
         film = self.film_mm or settings.film_mm
         width, height = self.width, self.height
         if width is None and height is None:
@@ -170,7 +170,7 @@ class Frame(Picture):
 
 @dataclass(frozen=True)
 class Files:
-    """Files of a picture: the EXR, the PNG beside it, and the temporary checkpoint."""
+    """The files of a picture: the EXR, the PNG beside it, and the temporary checkpoint."""
 
     out: Path
     preview: Path
@@ -178,11 +178,11 @@ class Files:
 
     @classmethod
     def of(cls, out: Path) -> Files:
-        """The files of an EXR; refuses names that cannot be written, before anything is rendered.
+        """Name the files of an EXR; names that cannot be written are refused before anything is rendered.
 
         Raises:
-            InputError: not .exr, or no such folder.
-            OSError: a folder that cannot be written, a folder of that name.
+            InputError: the suffix is not .exr, or there is no such folder.
+            OSError: the folder cannot be written, or a folder has that name.
         """
         if out.suffix.lower() != ".exr":
             raise InputError(out, "--output", out.suffix or "(no suffix)", ".exr")
@@ -201,7 +201,7 @@ class Files:
                     raise InputError(self.out, "--output", written.name, f"another name: {read} is read")
 
     def kept(self) -> str:
-        """A sentence that says how to resume a render that ended early."""
+        """Say in a sentence how to resume a render that ended early."""
         if self.checkpoint.exists():
             return f"the same command resumes from {self.checkpoint}"
         return "there is no checkpoint to resume from"
@@ -213,7 +213,8 @@ class Prepared:
 
     Attributes:
         scene: with the camera in the frame's place. film: its [film] table with the frame's changes.
-        sensor: what counts the picture, None without. size: width and height of the whole picture in pixels.
+        sensor: what turns the picture into numbers; None without one. size: width and height of the whole picture in
+            pixels.
         rows: the first row of the frame's tile and the one after its last; None without a tile.
     """
 
@@ -228,7 +229,7 @@ class Prepared:
 
     @property
     def name(self) -> str:
-        """Scene and camera, for messages."""
+        """Name scene and camera, for messages."""
         return f"{self.scene.name}, {self.camera.name}"
 
     def render(self, threads: int = 2, progress: Any = None, watch: Watch | None = None) -> RenderResult:
@@ -248,7 +249,7 @@ class Prepared:
             for k in range(1, frame.behind + 1):
                 if result.stats["complete"]:
                     layer = taken(Behind(self.camera, self.scene, k), behind)
-                    if not layer.stats["complete"]:  # the picture itself is kept; its layers begin anew
+                    if not layer.stats["complete"]:  # the picture itself is in its checkpoint; its layers begin anew
                         result.stats["complete"] = False
                         if result.save is not None:
                             result.save()
@@ -258,15 +259,15 @@ class Prepared:
 
 
 def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepared:
-    """Read and check everything that a frame needs, before it is rendered to `out` (of a tile: beside it).
+    """Read and check everything that a frame needs, before it is rendered to `out` (a tile: beside that).
 
     The glasses of `frame.glass_files` must be known already, see `optics.readers.glasses.more_glasses`.
 
     Warns:
-        NeurolensWarning: what the camera's settings note, as a film larger than the image circle.
+        NeurolensWarning: what the camera's settings note, such as a film larger than the image circle.
 
     Raises:
-        InputError: a mistake in the scene or the camera, an output that cannot be written or is an input.
+        InputError: the scene or the camera has a mistake; an output cannot be written or is an input.
         OSError: an output that cannot be written.
     """
     files = Files.of(tile_path(out, frame.tile))
@@ -277,7 +278,7 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
     film, sensor = with_changes(scene.settings.film, frame.colour), frame.reads(scene.settings.sensor)
     if frame.colour is not None and film.white_balance is not None:
         check_name(frame.scene, "--white-balance", film.white_balance, scene.illuminants)
-    PixelGrid(width, height, shot.film_mm)  # checked before the slow make_camera
+    PixelGrid(width, height, shot.film_mm)  # checks sizes before `make_camera`, which is slow
     rows = None if frame.tile is None else rows_of(height, frame.tile)
     camera = make_camera(str(frame.camera), shot, progress)
     if frame.behind and (camera.settings.get("camera") != "pinhole" or frame.channels != "all"):
@@ -306,8 +307,8 @@ def render_frame(
     The bytes of the picture depend on the frame alone, not on the number of threads.
 
     Args:
-        out: the picture; of a tile the name of the whole picture, see `pictures.render.renderer.tile_path`.
-        choice: see `flare_choice`, which all frames of an animation share; None: of this frame.
+        out: the picture; for a tile, the name of the whole picture (see `pictures.render.renderer.tile_path`).
+        choice: that of `flare_choice`, which all frames of an animation share; None chooses by this frame.
         watch: previews, checkpoints and an early end. preview: whether OUT.png is written.
 
     Raises:
@@ -324,10 +325,10 @@ def render_frame(
 
 
 def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: Progress) -> Layers:
-    """The layers of flare that the scene of a frame asks for, by name, [H, W, 3] linear sRGB each.
+    """Make the layers of flare that a frame's scene asks for, by name, [H, W, 3] linear sRGB each.
 
     Warns:
-        NeurolensWarning: a camera that has no flare.
+        NeurolensWarning: the camera has no flare.
     """
     if prepared.scene.settings.flare is None:
         return {}
@@ -344,10 +345,10 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
 
 
 def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) -> Choice | None:
-    """Choose the ghosts that are layers of the flare in all frames of an animation.
+    """Choose the ghosts that become layers of the flare in all frames of an animation.
 
-    At most 16 of the frames, evenly spread, decide which are brightest. `prepared` is one of the frames, or of the same
-    camera and scene. The choice is None where there is no flare.
+    At most 16 of the frames, evenly spread, decide which ghosts are brightest. `prepared` is one of the frames, or
+    another of the same camera and scene. The choice is None where there is no flare.
     """
     if prepared.scene.settings.flare is None or getattr(prepared.camera, "lens", None) is None:
         return None
@@ -366,7 +367,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
 
 
 def _state(frame: Frame) -> tuple[Any, ...]:
-    """What frames with the same lens share."""
+    """Return what frames with the same lens share."""
     return frame.focus_m, frame.f_number, frame.zoom
 
 
@@ -378,7 +379,7 @@ def _raster(prepared: Prepared) -> Raster:
 
 @contextmanager
 def _errors_of_table(scene: Path) -> Iterator[None]:
-    """Errors of flare name the scene's table."""
+    """Make errors of flare name the scene's table."""
     try:
         yield
     except InputError as error:
@@ -388,13 +389,13 @@ def _errors_of_table(scene: Path) -> Iterator[None]:
 def write_pictures(
     prepared: Prepared, result: RenderResult, flare: Mapping[str, FloatArray], preview: bool = True
 ) -> None:
-    """Write EXR and PNG; if they cannot be written, the checkpoint.
+    """Write EXR and PNG; where they cannot be written, write the checkpoint.
 
     Args:
-        flare: layers by name, [H, W, 3] linear sRGB of the whole picture, which are to be added.
+        flare: layers by name, [H, W, 3] linear sRGB of the whole picture, which are added to it.
 
     Raises:
-        NeurolensError: they cannot be written; with the way to resume.
+        NeurolensError: they cannot be written; it says how to resume.
     """
     from neurolens.pictures.render.pictures import write_exr, write_png
 
@@ -412,7 +413,7 @@ def write_pictures(
         metadata["layers"][f"behind{k}"] = f"what follows the first {k} things on each ray; premultiplied"
     rows = prepared.rows or (0, height)
     if (sensor := prepared.sensor) is not None:
-        added = (flare[name][slice(*rows)] for name in LAYERS if name in flare)  # it stands behind the lens, too
+        added = (flare[name][slice(*rows)] for name in LAYERS if name in flare)  # flare also covers what stands behind
         layers |= expose(sum(added, start=result.rgb), sensor, frame.seed, rows[0])
         metadata["sensor"] = about(sensor, frame.seed)
     layers |= flare_channels({name: picture[slice(*rows)] for name, picture in flare.items()}, space)
@@ -433,12 +434,12 @@ def write_pictures(
 
 
 def flare_channels(flare: Mapping[str, FloatArray], space: ColourSpace) -> Layers:
-    """The channels of layers of flare in a colour space, of pictures [H, W, 3] linear sRGB by name.
+    """Return the channels of flare's layers in a colour space; pictures are [H, W, 3] linear sRGB by name.
 
-    None is negative: colours beyond the space are mixed with grey, see `in_gamut`. Single ghosts sum to all.
+    No value is negative: colours beyond the space are mixed with grey, see `in_gamut`. Single ghosts sum to all.
 
     Warns:
-        NeurolensWarning: colours that become noticeably paler.
+        NeurolensWarning: some colours become noticeably paler.
     """
     inside, below, above = dict[str, FloatArray](), 0.0, 0.0
     for name, picture in flare.items():

@@ -1,7 +1,7 @@
-"""Frames cut into tiles that any executor of `base.tasks` renders, and put together when their tiles are there.
+"""Frames cut into tiles, which any executor of `base.tasks` renders, and put together when all tiles are there.
 
-Tiles are kept in a folder until their picture is written, under names that their frame and its files decide, so that
-the next run takes those that are there.
+Tiles are kept in a folder until their picture is written. A frame and its files decide their names, so that the next
+run takes the tiles that are there.
 
     with Dask("local:2") as executor:
         render_frames({Path("room.exr"): Frame.of("experiments/scenes/room.toml", "thin")}, executor)
@@ -33,13 +33,17 @@ from neurolens.pictures.render.renderer import read_tile, tile_path, write_pictu
 if TYPE_CHECKING:
     from neurolens.pictures.flare.layers import Choice
 
-_PATHS_A_TILE, _MOST_TILES = 1 << 24, 1024  # some 20 s of a core
-_FEW, _PATHS_OF_FEW = 4, 1 << 19  # tiles of small pictures, if each has so many paths
+_PATHS_A_TILE, _MOST_TILES = 1 << 24, 1024  # about 20 s of a core; the most tiles of a picture
+_FEW, _PATHS_OF_FEW = 4, 1 << 19  # a small picture has so many tiles, if each has so many paths
 
 
 @dataclass(frozen=True)
 class TileTask:
-    """A tile to render: its name in messages, the frame, the file of its whole picture, and the lights of its flare."""
+    """A tile to render.
+
+    Attributes:
+        name: for messages. out: the file of its whole picture. choice: the layers of its flare.
+    """
 
     name: str
     frame: Frame
@@ -49,7 +53,7 @@ class TileTask:
 
 @dataclass
 class _Picture:
-    """A picture in the making: its frame, where it is written, the files of its tiles, and which are missing yet."""
+    """A picture in the making: its frame, where it is written, its tiles' files, and which tiles are missing."""
 
     frame: Frame
     out: Path
@@ -71,20 +75,20 @@ def render_frames(
     restart: bool = False,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Render frames by tiles, wherever the executor runs them; pictures are those of one machine, bit for bit.
+    """Render frames by tiles, wherever the executor runs them. Pictures are those of one machine, bit for bit.
 
     Args:
-        frames: of one scene and one camera, by the files of their pictures (.exr); without tiles of their own.
+        frames: of one scene and one camera, by the files of their pictures (.exr); a frame must not be a tile itself.
         folder: where tiles are kept (default: OUT.exr.tiles for the first picture OUT.exr).
-        shown: the frames that decide which ghosts the flare has as layers, see `flare_choice`; None: these frames.
-        restart: render tiles that are there again.
+        shown: the frames that decide which ghosts become layers of flare, see `flare_choice`; None takes `frames`.
+        restart: whether to render tiles that are there again.
 
     Returns:
         For each picture its file, preview, number of tiles and statistics.
 
     Raises:
-        InputError: a mistake in a scene or a camera, before anything is sent. NeurolensError: a tile has failed; the
-            others are kept. Lost: the executor has failed.
+        InputError: a scene or a camera has a mistake; this is found before anything is sent. NeurolensError: a tile has
+            failed; the other tiles are kept. Lost: the executor has failed.
     """
     out, frame = next(iter(frames.items()))
     progress = progress or Progress(quiet=True)
@@ -113,7 +117,7 @@ def render_frames(
                 pictures[picture.out] = _finish(todo.pop(task.out), prepared)
             done += 1
             report(done / count)
-        # Pictures whose tiles were all there.
+        # Pictures of which all tiles were there.
         pictures |= {picture.out: _finish(picture, prepared) for picture in todo.values()}
     with suppress(OSError):
         for stale in folder.glob("*.tile-*.exr"):
@@ -123,15 +127,17 @@ def render_frames(
 
 
 def how_to_resume(folder: Path) -> str:
-    """A sentence that says how to resume frames whose tiles are in a folder."""
+    """Say in a sentence how to resume frames whose tiles are in a folder."""
     return f"tiles that are done are kept in {folder}: the same command goes on"
 
 
 def _picture(
     frame: Frame, out: Path, folder: Path, shared: Any, prepared: Prepared, restart: bool
 ) -> tuple[Path, _Picture]:
-    """The name that the tiles of a picture have for it, and the picture; the cut into tiles depends on the picture
-    alone, so that the next command has the same."""
+    """Return the name by which tiles know their picture, and the picture.
+
+    Its cut into tiles depends on the picture alone, so that the next command has the same tiles.
+    """
     width, height = prepared.size
     paths = width * height * (frame.samples or prepared.scene.settings.camera.samples)
     few = min(_FEW, math.ceil(paths / _PATHS_OF_FEW))
@@ -142,7 +148,7 @@ def _picture(
 
 
 def _finish(picture: _Picture, prepared: Prepared) -> dict[str, Any]:
-    """Put a picture together, with the paths as they are here, and remove its tiles."""
+    """Put a picture together, with paths as they are on this machine, and remove its tiles."""
     tiles = [read_tile(tile) for tile in picture.tiles.values()]
     for tile in tiles:
         tile.metadata["scene"] = str(picture.frame.scene)

@@ -1,4 +1,4 @@
-"""What is behind the things that a pinhole sees: a picture for each layer, by depth peeling (Everitt 2001).
+"""Shows what is behind the things that a pinhole sees: a picture for each layer, by depth peeling (Everitt 2001).
 
 A lens sees past the edges of near things, and its blur needs what a pinhole does not show: see
 `pictures/defocus/plate.py`.
@@ -21,8 +21,8 @@ from neurolens.pictures.render.world import world_of
 class Behind:
     """A camera whose rays begin behind the first `things` that those of another camera meet in a scene.
 
-    Rays behind which nothing follows do not pass. The same random numbers give the same rays as the other camera's, so
-    that the layers of a plate fit each other.
+    A ray passes only where something follows behind those things. The same random numbers give the same rays as the
+    other camera's, so that the layers of a plate fit each other.
     """
 
     def __init__(self, camera: Camera, scene: Scene, things: int) -> None:

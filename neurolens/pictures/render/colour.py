@@ -51,7 +51,7 @@ _MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
 # Beyond this condition number the three responses are too similar: separating them would only amplify noise.
 _LARGEST_CONDITION = 30.0
 _DEFENSIVE = 0.1  # share of the wavelengths drawn uniformly, independent of the importance
-_STEPS = 2048  # at which the importance is sampled
+_STEPS = 2048  # steps in which the importance is sampled
 Index = NDArray[np.intp]
 
 
@@ -66,7 +66,7 @@ def _solve(matrix: Matrix, right: Matrix) -> Matrix:
 
 
 def adaptation(xyz_from: ArrayLike, xyz_to: ArrayLike) -> Matrix:
-    """Matrix [3, 3] on XYZ that turns one white into another (XYZ [3] each) and keeps its luminance (Bradford)."""
+    """The matrix [3, 3] on XYZ that turns one white into another (XYZ [3] each) at equal luminance (Bradford)."""
     source, target = (np.asarray(white, np.float64) / np.asarray(white)[1] for white in (xyz_from, xyz_to))
     scale = np.diag(BRADFORD @ target / (BRADFORD @ source))
     return _solve(BRADFORD, scale @ BRADFORD)
@@ -78,7 +78,7 @@ class ColourSpace:
 
     Attributes:
         name: for display and the command line. interop_id: value of the attribute colorInteropID of an EXR.
-        primaries: chromaticities (x, y) of red, green and blue. white: of (1, 1, 1).
+        primaries: chromaticities (x, y) of red, green and blue. white: that of RGB (1, 1, 1).
     """
 
     name: str
@@ -94,12 +94,12 @@ class ColourSpace:
 
     @property
     def chromaticities(self) -> tuple[float, ...]:
-        """Primaries and white as OpenEXR's attribute of that name has them, 8 numbers."""
+        """Return the 8 numbers of OpenEXR's attribute `chromaticities`: the primaries, then the white."""
         return tuple(value for xy in (*self.primaries, self.white) for value in xy)
 
     @property
     def stated(self) -> dict[str, Any]:
-        """The metadata of a picture about its colours."""
+        """Return what a picture's metadata say about its colours."""
         return {"space": self.name, "white_xy": list(self.white), "adaptation": "Bradford"}
 
 
@@ -115,9 +115,9 @@ def conversion(source: ColourSpace, target: ColourSpace) -> Matrix:
 
 
 def converted(colours: NDArray[np.floating], matrix: ArrayLike) -> NDArray[np.floating]:
-    """Colours [..., 3] times rows of a matrix [n, 3]: [..., n], each rounded the same in whatever array it stands.
+    """Multiply colours [..., 3] by the rows of a matrix [n, 3]; the results [..., n] do not depend on the array.
 
-    A product by BLAS rounds the last rows of an array otherwise, and a tile would not be that part of its picture.
+    A product by BLAS rounds the last rows of an array differently, and a tile would not equal that part of its picture.
     """
     columns = np.asarray(matrix).T
     total = colours[..., :1] * columns[0]
@@ -133,8 +133,11 @@ def balance(white_rgb: ArrayLike) -> Matrix:
 
 
 def in_gamut(colours: NDArray[np.floating], space: ColourSpace = SRGB) -> FloatArray:
-    """Linear colours [..., 3] of a space without negative values: colours beyond its gamut, as of one wavelength, are
-    mixed with grey of their luminance until they lie on its border; the others stay as they are."""
+    """Move linear colours [..., 3] of a space into its gamut, so that no value is negative.
+
+    Colours beyond the gamut, such as those of one wavelength, are mixed with grey of their luminance until they lie on
+    its border; the others stay as they are.
+    """
     grey = converted(colours, space.to_xyz[1:2].astype(np.float32)).clip(0)
     least = np.minimum(colours.min(-1, keepdims=True), 0)
     share = grey / np.maximum(grey - least, np.finfo(np.float32).tiny)
@@ -188,9 +191,9 @@ def daylight_weights(x: FloatArray64, y: FloatArray64) -> FloatArray64:
 
 
 def check_spectrum(file: Path, field: str, rows: Sequence[Sequence[float]], most: float | None = None) -> Spectrum:
-    """Rows (nm, value) as two arrays: scaled to the largest value 1, or with `most` as they are and at most that.
+    """Turn rows (nm, value) into two arrays, scaled to a largest value of 1.
 
-    An InputError names the row at fault.
+    With `most` values are not scaled, and at most that. An InputError names the row at fault.
     """
     if not 2 <= len(rows) <= _MOST_ROWS:
         raise InputError(file, field, f"({len(rows)} rows)", f"2 to {_MOST_ROWS} rows of nm, value")
@@ -212,7 +215,7 @@ def check_spectrum(file: Path, field: str, rows: Sequence[Sequence[float]], most
 
 
 def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None) -> Spectrum:
-    """A CSV file of rows "nm, value"; a header may come first, and lines that start with # are skipped.
+    """Read a CSV file of rows "nm, value"; a header may come first, and lines that start with # are skipped.
 
     Raises:
         InputError: missing, too large, not numbers, or refused by `check_spectrum`.
@@ -256,7 +259,7 @@ def illuminant(name: str, measured: Mapping[str, Spectrum] | None = None) -> Spe
     if name in ("D65", "D50"):
         return nm, table(name.lower())
     if name == "A":
-        # CIE 15: Planck's law at 2848 K with the constant of its day, 0.01435 m K: the law at 2855.5 K of today.
+        # CIE 15: Planck's law at 2848 K with the constant of its day, 0.01435 m K, which is the law at 2855.5 K today.
         return nm, planck(nm, 2848 * _SECOND_RADIATION_CONSTANT / 1.435e-2)
     if name == "E":
         return nm, np.ones_like(nm)
@@ -266,7 +269,7 @@ def illuminant(name: str, measured: Mapping[str, Spectrum] | None = None) -> Spe
 
 
 def check_name(file: str | Path, field: str, name: str, measured: Mapping[str, object]) -> None:
-    """Refuse an unknown name of a spectrum; the InputError says what is known."""
+    """Refuse an unknown name of a spectrum; the InputError lists the known names."""
     if name in measured or illuminant(name) is not None:
         return
     known = [*CIE_NAMES, *measured]
@@ -275,15 +278,15 @@ def check_name(file: str | Path, field: str, name: str, measured: Mapping[str, o
 
 
 class SpectralRange:
-    """A wavelength range cut into bins of equal probability, and the tables of basis and film response by bin.
+    """A wavelength range cut into bins of equal probability, with the tables of basis and film response by bin.
 
-    Wavelengths are continuous, drawn by inverting the piecewise linear distribution function that the bins are; spectra
-    are means over bins.
+    Wavelengths are continuous: they are drawn by inverting the piecewise linear distribution function of the bins.
+    Spectra are means over bins.
 
     Args:
         low_nm, high_nm: the range; equal for light of one wavelength.
         bins: table length.
-        lanes: wavelengths that a path carries, a whole number of bins apart.
+        lanes: how many wavelengths a path carries; they lie a whole number of bins apart.
         light: expected spectrum of the light (nm, radiance relative to D65). None draws wavelengths evenly; else a
             wavelength is drawn in proportion to the film's response to it (root of the sum of squares of R, G and B)
             times light, and a tenth of all evenly.
@@ -319,7 +322,7 @@ class SpectralRange:
         nm = table("wavelength_nm")
         basis = np.stack([self.means(nm, table(name)) for name in ("red", "green", "blue")])
         self.basis = basis / basis.sum(axis=0)
-        # Bins stand for as much of the range as they are wide: 1 on average.
+        # The share of the range that a bin stands for, in units of the mean.
         share = np.diff(edges) * self.bins / (self.high_nm - self.low_nm) if self.low_nm < self.high_nm else 1.0
         observer = np.stack([self.means(nm, table(name) * table("d65")) for name in "xyz"]) * share
         mixing = observer @ self.basis.T / self.bins  # [3 XYZ, 3 basis], of each basis colour in white light
@@ -351,7 +354,7 @@ class SpectralRange:
         return np.diff(integral[np.searchsorted(x, self.edges_nm)]) / np.diff(self.edges_nm)
 
     def wavelengths_nm(self, sample: FloatArray, lanes: int = 1) -> FloatArray:
-        """Wavelengths [lanes, N] in nm of the first lanes, for uniform samples [N] in [0, 1)."""
+        """Return wavelengths [lanes, N] in nm of the first lanes, for uniform samples [N] in [0, 1)."""
         place = sample * np.float32(self.bins)
         number = place.astype(np.intp)
         place -= number
@@ -365,41 +368,41 @@ class SpectralRange:
         return (sample * np.float32(self.bins)).astype(np.intp)
 
     def rotated(self, table: NDArray[Any]) -> NDArray[Any]:
-        """A table [..., bins] as [lanes, ..., bins], each lane's turned to its own bin.
+        """Return a table [..., bins] as [lanes, ..., bins], where each lane is turned to its own bin.
 
-        Lane k of a path whose hero is in bin b is in bin b + k bins / lanes, counted round: as probable as the hero's,
+        If the hero is in bin b, lane k is in bin b + k bins / lanes, counted round. It is as probable as the hero's,
         for all bins are equally probable (Wilkie et al. 2014).
         """
         step = self.bins // self.lanes
         return np.stack([np.roll(table, -lane * step, axis=-1) for lane in range(self.lanes)])
 
     def film_rgb(self, spectrum: ArrayLike) -> FloatArray64:
-        """Linear sRGB film value [3] of a radiance [bins] relative to D65."""
+        """Return the linear sRGB film value [3] of a radiance [bins] relative to D65."""
         return np.asarray(self.response @ np.asarray(spectrum, np.float64) / self.bins)
 
     def relative(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
-        """Radiance [bins] relative to D65 of a light of any unit, scaled to the luminance of D65 on the film.
+        """Scale a light of any unit to the luminance of D65 on the film, as radiance [bins] relative to D65.
 
-        Zero everywhere where the light has nothing within the range.
+        It is 0 everywhere where the light has nothing within the range.
         """
         ratio = self.over_d65(nm, values)
         luminance = self.luminance(ratio)
         return ratio / luminance if luminance > 0 else np.zeros(self.bins)
 
     def over_d65(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
-        """A spectrum over that of D65, [bins]."""
+        """Divide a spectrum by that of D65; returns [bins]."""
         return self.means(nm, values) / self.means(table("wavelength_nm"), table("d65"))
 
     def luminance(self, spectrum: ArrayLike) -> float:
-        """Luminance on the film of a radiance [bins] relative to D65."""
+        """Return the luminance on the film of a radiance [bins] relative to D65."""
         return float(SRGB.to_xyz[1] @ self.film_rgb(spectrum))
 
     def spectrum(self, rgb: tuple[float, float, float] | NDArray[np.floating]) -> FloatArray:
-        """Spectrum [..., bins] of linear sRGB colours [..., 3]."""
+        """Return the spectra [..., bins] of linear sRGB colours [..., 3]."""
         return (np.asarray(rgb, np.float64) @ self.basis).astype(np.float32)
 
     def refractive_index(self, n_d: float, v_d: float | None) -> FloatArray:
-        """Index [bins] of a glass (`glass.index_at`)."""
+        """Return the index [bins] of a glass (`glass.index_at`)."""
         return np.full(self.bins, index_at(n_d, v_d, self.centres_nm), np.float32)
 
 
@@ -407,7 +410,7 @@ class ChannelWavelengths:
     """Draws wavelengths over a range and weighs them for R, G and B.
 
     Args:
-        low_nm, high_nm: the range, within 380 to 780 nm. One too narrow to tell colours apart gives weights of 1.
+        low_nm, high_nm: the range, within 380 to 780 nm. In a range too narrow to tell colours apart all weights are 1.
     """
 
     def __init__(self, low_nm: float, high_nm: float) -> None:
@@ -418,13 +421,13 @@ class ChannelWavelengths:
         self._weights = (weights if self._range.colours else np.ones_like(weights)).astype(np.float32)
 
     def draw(self, sample: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Wavelengths [N] in nm and weights [3, N] for uniform samples [N] in [0, 1)."""
+        """Draw wavelengths [N] in nm, with weights [3, N], by uniform samples [N] in [0, 1)."""
         weights = self._weights.take(self._range.bin_of(sample), axis=1)
         return self._range.wavelengths_nm(sample)[0], weights
 
 
 class Palette:
-    """Spectra [rows, bins], looked up by row and wavelength bin; colours that occur twice share a row."""
+    """Spectra [rows, bins], looked up by row and wavelength bin; equal colours share a row."""
 
     def __init__(
         self, spectral: SpectralRange, measured: Mapping[str, Spectrum], reflectances: Mapping[str, Spectrum]
@@ -435,45 +438,45 @@ class Palette:
         self._flat: FloatArray = np.zeros(0, np.float32)
 
     def colour(self, rgb: Vector) -> int:
-        """Row of a colour."""
+        """Return the row of a colour."""
         return self._row(rgb, lambda: self._spectral.spectrum(rgb))
 
     def reflectance(self, value: Vector | str) -> int:
-        """Row of a colour, or of a measured reflectance."""
+        """Return the row of a colour, or of a measured reflectance."""
         if not isinstance(value, str):
             return self.colour(value)
         return self._row(("reflectance", value), lambda: self._spectral.means(*self._reflectances[value]))
 
     def absorption(self, transmittance: Vector, depth_m: float) -> int:
-        """Row of the absorption coefficient in 1/m of which `transmittance` is left after `depth_m`."""
+        """Return the row of the absorption coefficient (1/m) that leaves `transmittance` after `depth_m`."""
         return self._row(
             ("absorption", transmittance, depth_m), lambda: -np.log(self._spectral.spectrum(transmittance)) / depth_m
         )
 
     def light(self, rgb: Vector, name: str) -> int:
-        """Row of the light of an illuminant, tinted by a colour; relative to D65."""
+        """Return the row of an illuminant's light, tinted by a colour; relative to D65."""
         if name == "D65" or not any(rgb):
             return self.colour(rgb)
         return self._row((*rgb, name), lambda: self._spectral.spectrum(rgb) * self.illuminant(name))
 
     def illuminant(self, name: str) -> FloatArray:
-        """Radiance [bins] relative to D65 of an illuminant of luminance 1 on the film."""
+        """Return the radiance [bins] relative to D65 of an illuminant whose luminance on the film is 1."""
         found = illuminant(name, self._measured)
         assert found is not None  # names are checked where scenes are read
         return self._spectral.relative(*found).astype(np.float32)
 
     def measured_light(self, key: object, spectrum: Spectrum, luminance: float) -> int:
-        """Row of a light of a spectrum in any unit, scaled to a luminance (1 is that of D65)."""
+        """Return the row of a spectrum in any unit, scaled to a luminance (1 is that of D65)."""
         return self._row(("light", key), lambda: self._spectral.relative(*spectrum) * luminance)
 
     def daylight(self, component: int) -> tuple[int, float]:
-        """Row of component S0, S1 or S2 of daylight over D65, and its luminance on the film."""
+        """Return the row of daylight's component S0, S1 or S2 over D65, and the component's luminance on the film."""
         nm, components = daylight_table()
         ratio = self._spectral.over_d65(nm, components[component])
         return self._row(("daylight", component), lambda: ratio), self._spectral.luminance(ratio)
 
     def index(self, n_d: float, v_d: float | None) -> int:
-        """Row of a refractive index."""
+        """Return the row of a refractive index."""
         return self._row(("index", n_d, v_d), lambda: self._spectral.refractive_index(n_d, v_d))
 
     def _row(self, key: object, make: Callable[[], NDArray[np.floating]]) -> int:
@@ -483,7 +486,7 @@ class Palette:
         return self._numbers[key]
 
     def means(self, rows: list[int]) -> FloatArray:
-        """Means of rows over the bins."""
+        """Return the means of rows over the bins."""
         return np.array([self._rows[row].mean() for row in rows], np.float32)
 
     def freeze(self) -> None:
@@ -492,7 +495,7 @@ class Palette:
         self._flat = self._spectral.rotated(rows).reshape(self._spectral.lanes, -1)
 
     def look_up(self, row: Index, bins: Index) -> FloatArray:
-        """Values [lanes, N] of rows [N] at wavelength bins [N] of the first lane."""
+        """Return the values [lanes, N] of rows [N]; the first lane is at wavelength bins [N]."""
         where = row * self._spectral.bins
         where += bins
         return self._flat.take(where, axis=-1)

@@ -1,4 +1,4 @@
-"""The film: the film points of pixels, the sums of every pixel, which grow by tiles and passes, and its checkpoint.
+"""The film: the film points of pixels, and the sums of every pixel, which grow by tiles and passes and can be kept.
 
 A checkpoint (see `base.files`) holds the sums and the identity of the render: everything that the picture depends on,
 as JSON that two renders can compare.
@@ -29,23 +29,23 @@ from neurolens.pictures.render.settings import FilmSettings
 if TYPE_CHECKING:
     from neurolens.pictures.render.job import Job
 
-BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
+BATCH = 32768  # paths; with fewer, calling numpy costs more than computing; the state of many more leaves the cache
 SAMPLES_A_PASS = 16
 
 # Columns of the sums: linear sRGB; squared luminance of independent samples; depth in m over the samples that hit
 # something, and how many those are; samples whose camera ray passed; samples that were not finite and add no light.
 RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6, 7, 8
-# Of a render in the main process: the sums, and at the end picture and layers, in the writer's order too.
+# Of a render in the main process: the sums, and at the end picture and layers, once more in the writer's order.
 BYTES_A_PIXEL = 8 * COLUMNS + 100
 # Larger deviations from square pixels are taken as mistakes, unless no whole number comes nearer.
 _ASPECT_TOLERANCE = 0.02
 # Settings of a camera that do not affect its rays: where it was read and notes.
 _NO_MATTER = ("model", "notes")
-_NOTHING = "(nothing)"  # a place that one of two identities lacks
+_NOTHING = "(nothing)"  # stands for a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
 _FORMAT = 4
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
-_BRIGHTEST = 1e37  # sum of a pixel, which float32 shall hold after the white balance, too
+_BRIGHTEST = 1e37  # the largest sum of a pixel, which float32 must hold after the white balance, too
 _LONGEST = 80  # characters of a value in a message
 _AGAIN = "or --restart to begin again"
 
@@ -86,7 +86,7 @@ class PixelGrid:
 
 
 def check_memory(width: int, height: int, bytes_a_pixel: int = BYTES_A_PIXEL) -> None:
-    """Refuse (InputError) a picture that alone would fill the machine, before memory is allocated."""
+    """Refuse (InputError) a picture that alone would fill the machine's memory, before memory is taken."""
     try:
         most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
@@ -100,11 +100,11 @@ def check_memory(width: int, height: int, bytes_a_pixel: int = BYTES_A_PIXEL) ->
 class Tiling:
     """The cut of a render into tiles of consecutive pixels and passes of consecutive samples.
 
-    A function of the picture alone. What a worker holds at a time depends on a tile, not on the picture.
+    The cut depends on the picture alone. What a worker holds at a time depends on a tile, not on the picture.
 
     Attributes:
         pixels, samples: of the picture. tile: pixels per tile. step: samples per pass; the last pass may have fewer.
-        start: the picture's number of the first pixel, where these are the tiles of a part of it.
+        start: where these are the tiles of a part, the number of its first pixel in the whole picture.
     """
 
     pixels: int
@@ -120,7 +120,7 @@ class Tiling:
         return cls(pixels, samples, max(1, BATCH // step), step)
 
     def around(self, first: int, stop: int) -> Tiling:
-        """The tiles that hold the pixels from `first` up to `stop`, whole: other batches might round differently."""
+        """The whole tiles that hold the pixels from `first` up to `stop`: other batches might round differently."""
         start = first - first % self.tile
         return replace(self, pixels=min(-(-stop // self.tile) * self.tile, self.pixels) - start, start=start)
 
@@ -137,11 +137,11 @@ class Tiling:
         return slice(first * self.tile, min((first + 1 if stop is None else stop) * self.tile, self.pixels))
 
     def samples_done(self, done: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The samples of a pixel after some passes."""
+        """Return the samples of a pixel after some passes."""
         return np.minimum(done * self.step, self.samples)
 
     def chunks(self) -> Iterator[tuple[int, int]]:
-        """First tile, and the one after the last, of parts of the picture."""
+        """Yield parts of the picture as their first tile and the one after their last."""
         tiles = max(1, CHUNK_BYTES // (8 * COLUMNS * self.tile))
         for first in range(0, self.tiles, tiles):
             yield first, min(first + tiles, self.tiles)
@@ -151,7 +151,8 @@ class Spill(NamedTuple):
     """The light of companions in one pass of a tile, which may arrive at pixels other than those of its samples.
 
     Attributes:
-        first: number in the picture of the first pixel. sums: [K, 3] float64, of the columns `RGB` of consecutive ones.
+        first: the number of the first pixel in the picture. sums: [K, 3] float64, the columns `RGB` of K pixels from
+            there.
     """
 
     first: int
@@ -162,8 +163,8 @@ class Film:
     """The sums of the pixels, and which passes are in them; several threads may use one film.
 
     Attributes:
-        sums: [pixels, COLUMNS] float64. done: [tiles] passes that are in the sums.
-        seconds: [2] spent by all workers: in the camera, and in all.
+        sums: [pixels, COLUMNS] float64. done: [tiles] how many passes of each are in the sums.
+        seconds: [2] that all workers spent: in the camera, and in all.
 
     Raises:
         MemoryError: there is not enough memory for the sums.
@@ -173,7 +174,7 @@ class Film:
         self.tiling = tiling
         size = tiling.pixels * COLUMNS * 8
         try:
-            # A shared mapping: forked workers, which do not use it, would else keep a second copy of each page.
+            # A shared mapping: forked workers do not use it, but would otherwise keep a second copy of each page.
             self.sums = np.frombuffer(mmap.mmap(-1, size), np.float64).reshape(-1, COLUMNS)
         except (OSError, OverflowError, ValueError):
             raise MemoryError(f"{size} bytes") from None
@@ -184,18 +185,18 @@ class Film:
         self.begin()
 
     def begin(self) -> None:
-        """Prepare to give out the tiles and passes that are not in the sums, and to add them in the same order."""
+        """Prepare to give out the tiles and passes that the sums lack, and to add them in the same order."""
         self._missing, self._order = self._all_missing(), self._all_missing()
         self._next = next(self._order, None)
 
     def _all_missing(self) -> Iterator[tuple[int, int]]:
         for part in range(self.tiling.passes):
             for tile in range(self.tiling.tiles):
-                if self.done[tile] <= part:  # else it was done before a checkpoint
+                if self.done[tile] <= part:  # the others were done before a checkpoint
                     yield tile, part
 
     def take(self) -> tuple[int, int] | None:
-        """The next tile and pass to render, all tiles of one pass before the next pass; None: there is no more."""
+        """The next tile and pass to render, all tiles of one pass before the next pass; None where no more is left."""
         with self._lock:
             return next(self._missing, None)
 
@@ -204,7 +205,7 @@ class Film:
     ) -> None:
         """Add the sums [pixels, COLUMNS] of a pass of a tile, its spill, and the seconds [2] that it took.
 
-        A tile waits here for all before it: sums are always added in the same order, and so round the same.
+        A tile waits here for all tiles before it: sums are always added in the same order, and so round the same.
         """
         with self._lock:
             self.seconds += seconds
@@ -222,7 +223,7 @@ class Film:
             there += spill.sums[max(-here, 0) :][: len(there)]
 
     def copy(self, first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Sums [n, COLUMNS] of the pixels, and passes, of the tiles from `first` up to `stop`, of one moment."""
+        """Return sums [n, COLUMNS] and passes of the tiles from `first` up to `stop`, as they are at one moment."""
         with self._lock:
             return self.sums[self.tiling.pixels_of(first, stop)].copy(), self.done[first:stop].copy()
 
@@ -238,7 +239,7 @@ def identity(job: Job) -> dict[str, Any]:
     The scene is its tables, textures and meshes; the camera its settings and its results for some rays.
     """
     scene, camera = job.scene, job.camera
-    # Given separately, may differ from the scene's.
+    # These are given separately, and may differ from the scene's.
     common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, focus_m=1.0, f_number=None)
     bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings(), sensor=None))
     kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
@@ -262,7 +263,7 @@ def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
 
 
 def difference(there: dict[str, Any], here: dict[str, Any]) -> tuple[str, Any, str] | None:
-    """The first place where two identities differ and what each has there, short for a message; None: nowhere."""
+    """Find the first place where two identities differ, and what each has there, short for a message; None: nowhere."""
     found, wanted = _leaves(there), _leaves(here)
     for place in [*wanted, *found]:
         values = found.get(place, _NOTHING), wanted.get(place, _NOTHING)
@@ -278,7 +279,7 @@ def digest(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The value for JSON, every part with its type, so that different values never give the same text."""
+    """Return the value for JSON, every part with its type, so that different values never give the same text."""
     if isinstance(value, np.ndarray):
         return [value.dtype.str, value.shape, hashlib.sha256(np.ascontiguousarray(value).data).hexdigest()]
     if isinstance(value, Mapping):
@@ -291,7 +292,7 @@ def _plain(value: Any) -> Any:
 
 
 def _rays(camera: Camera) -> str:
-    """Digest of the rays of a fixed set of samples, which tells cameras apart."""
+    """Return a digest of the rays of a fixed set of samples, which tells cameras apart."""
     random = np.random.default_rng(0)
     film = ((random.random((2, _PROBES)) - 0.5) * np.array(camera.film_mm)[:, None]).astype(np.float32)
     low, high = camera.wavelength_nm or (400.0, 700.0)
@@ -302,7 +303,7 @@ def _rays(camera: Camera) -> str:
 
 
 def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: dict[str, float]) -> None:
-    """Write the film's present sums and the seconds spent, by the names of `SPENT`; workers may continue meanwhile.
+    """Write the film's present sums and the seconds spent (by the names of `SPENT`); workers may go on meanwhile.
 
     Raises:
         OSError: it cannot be written; an older checkpoint is still there.
@@ -317,7 +318,8 @@ def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: di
             yield part
 
     about = {"format": _FORMAT, "samples": tiling.samples, "tile": tiling.tile, "step": tiling.step}
-    arrays = {"sums": (film.sums, sums()), "done": (film.done, done)}  # in this order: the passes of the same moment
+    # in this order: writing the sums fills `done` with the passes of the same moments
+    arrays = {"sums": (film.sums, sums()), "done": (film.done, done)}
     write_arrays(path, about | {"render": identity, "spent": spent}, arrays)
 
 
@@ -328,7 +330,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
     multiple of 16 samples can be raised to any number.
 
     Raises:
-        InputError: missing, incomplete, or of another render; it names what differs.
+        InputError: the checkpoint is missing, incomplete, or of another render; the error names what differs.
     """
     try:
         with read_arrays(path, ("sums", "done")) as (about, read):
@@ -341,7 +343,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
             done = read("done", np.empty_like(film.done))
             _check_samples(path, about["samples"], film.tiling, done)
             sums = read("sums", film.sums)
-            # No render has others: samples that are not finite are dropped, and emission is bounded.
+            # No render has larger sums: samples that are not finite are dropped, and emission is bounded.
             for columns, most in (
                 (sums[:, RGB], _BRIGHTEST),
                 (sums, _BRIGHTEST**2),
@@ -365,7 +367,7 @@ def _short(value: Any) -> str:
 
 
 def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
-    """Tiles and passes must be the same; only below 16 samples they depend on the number of samples."""
+    """Check that tiles and passes are the same; they depend on the number of samples only below 16."""
     if not isinstance(about["samples"], int) or not 1 <= about["samples"] < 1 << 31:
         raise ValueError(f"{about['samples']} samples")
     spent = about["spent"]
@@ -377,7 +379,7 @@ def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
 
 
 def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.int64]) -> None:
-    """The passes of every tile must be a part of the requested ones."""
+    """Check that the passes of every tile are among the requested ones."""
     if done.min() < 0 or done.max() > -(-samples // tiling.step):
         raise ValueError("impossible numbers of passes")
     had, counts = np.minimum(done * tiling.step, samples), tiling.samples_done(done)

@@ -1,4 +1,4 @@
-"""The pictures that scenes read: textures, environments, masks of apertures; Radiance's files among them.
+"""The pictures that scenes read: textures, environments, masks of apertures. Radiance's format is read here.
 
 Their sizes are checked before they are decoded. Radiance (.hdr) has three mantissas and a shared exponent a pixel: a
 text header, an empty line, a line with the size, then rows of pixels, each row in one of two forms (Greg Ward, "Real
@@ -36,25 +36,25 @@ from neurolens.pictures.render.scenetables import BRIGHTEST
 
 LARGEST_PICTURE = 8192  # pixels per side
 MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
-_LARGEST_FILE = 1 << 28  # bytes, but of OpenEXR
-_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # of Pillow's, which would ask other programs for some
+_LARGEST_FILE = 1 << 28  # bytes of a picture's file; OpenEXR has its own bound
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # for other formats of Pillow's it would ask other programs
 _MAGIC = (b"#?RADIANCE", b"#?RGBE")
 _RGBE = "32-bit_rle_rgbe"
 _SIZE = re.compile(rb"([-+])Y (\d{1,9}) ([-+])X (\d{1,9})")
-_LONGEST_LINE, _MOST_LINES = 4096, 1000  # of the header
-_NEW = range(8, 1 << 15)  # widths of rows with runs
+_LONGEST_LINE, _MOST_LINES = 4096, 1000  # of Radiance's header
+_NEW = range(8, 1 << 15)  # widths that rows with runs may have
 Bytes = NDArray[np.uint8]
 
-logging.getLogger("PIL").addHandler(logging.NullHandler())  # Pillow logs what our errors say of damaged files
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # Pillow also logs what our errors say of damaged files
 
 
 @contextmanager
 def _opened(file: str | Path, field: str, path: Path, most: int, pixels: int = MOST_PIXELS) -> Iterator[Image.Image]:
-    """A picture of at most `most` pixels per side, and of at most `pixels`; mistakes name file and field."""
-    with _decoded(file, field, path) as data, warnings.catch_warnings(action="ignore"):  # Pillow's, of damaged files
+    """Open a picture of at most `most` pixels per side and `pixels` in all; an InputError names file and field."""
+    with _decoded(file, field, path) as data, warnings.catch_warnings(action="ignore"):  # Pillow warns of damaged files
         with Image.open(io.BytesIO(data), formats=_FORMATS) as picture:
             check_size(file, field, str(path), picture.size, most, pixels)
-            if picture.format == "PNG":  # decoding does not compare the checksums
+            if picture.format == "PNG":  # decoding does not compare the checksums of PNG
                 with Image.open(io.BytesIO(data)) as copy:
                     copy.verify()
             yield picture
@@ -69,14 +69,15 @@ def _decoded(file: str | Path, field: str, path: Path) -> Iterator[bytes]:
         raise
     except Exception as error:  # decoders of damaged files raise errors of many types
         kinds = ", ".join((*_FORMATS, "Radiance (.hdr)", "OpenEXR"))
-        why = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"  # its words name an object
+        # these errors name an object, not a cause
+        why = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"
         raise InputError(file, field, str(path), f"a readable picture, one of {kinds}{why}") from None
 
 
 def read_pictures(scene: Path, files: Mapping[str, Path]) -> dict[str, FloatArray]:
-    """The pictures of a scene by their fields, as `read_picture` reads them; together of at most `MOST_PIXELS`.
+    """Read the pictures of a scene by their fields, as `read_picture` does; all together have at most `MOST_PIXELS`.
 
-    Their values are reflectances: those beyond 0 to 1 are clamped, with a warning.
+    The values are reflectances: those beyond 0 to 1 are clamped, with a warning.
     """
     found: dict[str, FloatArray] = {}
     left = MOST_PIXELS
@@ -89,11 +90,13 @@ def read_pictures(scene: Path, files: Mapping[str, Path]) -> dict[str, FloatArra
 def read_picture(
     scene: Path, field: str, path: Path, most: int = LARGEST_PICTURE, pixels: int = MOST_PIXELS
 ) -> FloatArray:
-    """Linear sRGB [H, W, 3] of a picture: of OpenEXR and Radiance as stored; else of one that is encoded as sRGB is, of
-    8 bits, or grey of 16 bits, which Pillow would clip to 8.
+    """Read a picture as linear sRGB [H, W, 3].
+
+    OpenEXR and Radiance are taken as they are stored. Other pictures are decoded from sRGB: those of 8 bits a channel,
+    and grey of 16 bits, which Pillow would clip to 8.
 
     Raises:
-        InputError: names scene file, field and picture, which is missing, too large or broken.
+        InputError: the picture is missing, too large or broken; the error names scene file, field and picture.
     """
     kind = path.suffix.lower()
     if kind == ".exr":
@@ -118,7 +121,7 @@ def read_picture(
 
 
 def _clamped(scene: Path, field: str, path: Path, picture: FloatArray, most: float | None = None) -> FloatArray:
-    """The picture with values that are no light replaced in place, and a warning that says how many and where.
+    """Replace values that are no light in place, and warn of how many and where.
 
     Values that are negative or not a number become 0. Values above `most` become `most`; where it is None, infinite
     values become the largest finite value, for a map of 16-bit floats holds the sun as infinite.
@@ -142,8 +145,8 @@ def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) ->
     Values that are negative, infinite or not a number are clamped, with a warning.
 
     Raises:
-        InputError: as `read_picture`; also a picture that is not twice as wide as high, values brighter than an
-            emission may be, and black all over.
+        InputError: as `read_picture`; also where the picture is not twice as wide as high, is brighter than an emission
+            may be, or is black all over.
     """
     picture = _clamped(scene, field, path, read_picture(scene, field, path))
     height, width = picture.shape[:2]
@@ -158,10 +161,10 @@ def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) ->
 
 
 def make_aperture(shape: StopShape) -> Aperture | None:
-    """The stop's opening of a command line or a scene; None if no shape is given.
+    """Make the stop's opening that a command line or a scene describes; None if it gives no shape.
 
     Raises:
-        InputError: blades and a mask together, a rotation or curvature of nothing, a picture that cannot be read.
+        InputError: blades and a mask together, a rotation or curvature without blades, a picture that cannot be read.
     """
     blades, rotation_deg, curvature = shape.blades, shape.blade_rotation_deg, shape.blade_curvature
     if blades is None and shape.aperture_mask is None:
@@ -177,7 +180,7 @@ def make_aperture(shape: StopShape) -> Aperture | None:
 
 
 def read_mask(path: str | Path) -> NDArray[np.bool_]:
-    """The opening that a picture shows, [H, W] bool: light passes where it is brighter than half, and opaque.
+    """Read the opening that a picture shows, [H, W] bool: light passes where it is opaque and brighter than half.
 
     There is no partial transmission: a ray passes or it does not. The longer side of the picture spans the stop.
 
@@ -193,13 +196,13 @@ def read_mask(path: str | Path) -> NDArray[np.bool_]:
 
 
 def read_radiance(data: bytes, check: Callable[[int, int], None]) -> tuple[FloatArray, list[str]]:
-    """Linear RGB [H, W, 3] of a Radiance picture, and what its header says that was not applied to it.
+    """Read linear RGB [H, W, 3] of a Radiance picture, and what its header asks for that was not applied.
 
     Args:
         data: the file. check: refuses a width and height, before memory is taken.
 
     Raises:
-        ValueError: no such picture, one in XYZE, one whose columns come first, or a damaged one.
+        ValueError: it is no such picture, it is damaged, it is in XYZE, or its columns come first.
     """
     (up, right), (width, height), place, ignored = _header(data)
     check(width, height)
@@ -212,7 +215,7 @@ def read_radiance(data: bytes, check: Callable[[int, int], None]) -> tuple[Float
 
 
 def _header(data: bytes) -> tuple[tuple[bytes, bytes], tuple[int, int], int, list[str]]:
-    """Signs of the axes y and x, width and height, the place of the first row, and settings that are not applied."""
+    """Read the signs of the axes y and x, width and height, the place of the first row, and settings not applied."""
     if not data.startswith(_MAGIC):
         raise ValueError("it does not begin with #?RADIANCE")
     place = 0
@@ -236,7 +239,7 @@ def _header(data: bytes) -> tuple[tuple[bytes, bytes], tuple[int, int], int, lis
 
 
 def _row(data: bytes, place: int, width: int) -> tuple[Bytes, int]:
-    """A row's bytes [width, 4], and the place of the next row."""
+    """Read a row's bytes [width, 4]; also return the place of the next row."""
     start = data[place : place + 4]
     if width in _NEW and start[:2] == b"\2\2" and start[2:3] < b"\x80":
         if int.from_bytes(start[2:], "big") != width:

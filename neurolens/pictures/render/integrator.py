@@ -1,9 +1,9 @@
 """Path tracing of a batch: all paths advance together, one surface at a time.
 
-At each surface the paths are sorted by kind of material, so that every kind is one contiguous slice (diffuse, glossy,
-mirror, glass) and paths that have ended drop off the end. Light is found in two ways, by aiming at a light and by
+At each surface the paths are sorted by kind of material, so that every kind (diffuse, glossy, mirror, glass) is one
+contiguous slice, and paths that have ended drop off the end. Light is found in two ways, by aiming at a light and by
 scattering into it, weighted by the power heuristic (Veach 1997). What mirrors and glass show is found by scattering
-alone, points and spots by aiming.
+alone, what points and spots light by aiming alone.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from neurolens.pictures.render.world import GLASS, GLOSSY, MIRROR, NOTHING, Worl
 
 _ONE_OVER_PI = np.float32(1 / np.pi)
 _STEP_M = np.float32(1e-4)
-SPECULAR = np.float32(np.inf)  # density of a direction that has no choice
+SPECULAR = np.float32(np.inf)  # the density of a direction that is the only one
 
 
 @dataclass
 class Paths:
-    """The paths still alive.
+    """The paths of a batch that are still alive.
 
     Attributes:
-        origin, direction: [3, N] of their rays. throughput: [lanes, N], of the wavelengths of a path, the hero first.
-        bins: [N] wavelength bin, of the hero.
-        slot: [N] place in the batch.
+        origin, direction: [3, N] of their rays. throughput: [lanes, N] of the wavelengths of a path, the hero first.
+        bins: [N] the hero's wavelength bin.
+        slot: [N] the path's place in the batch.
         density: [N] per solid angle with which the ray's direction was chosen.
-        shared: [N] number of wavelengths that share the path; 1 once glass has bent the hero away from the others.
+        shared: [N] how many wavelengths share the path; 1 once glass has bent the hero away from the others.
     """
 
     origin: FloatArray
@@ -47,14 +47,14 @@ class Paths:
     shared: FloatArray
 
     def take(self, rows: Index) -> Paths:
-        """Some of the paths."""
+        """Return the paths of these rows."""
         vectors = (self.origin.take(rows, axis=1), self.direction.take(rows, axis=1))
         throughput, bins, slot = self.throughput.take(rows, axis=-1), self.bins.take(rows), self.slot.take(rows)
         return Paths(*vectors, throughput, bins, slot, self.density.take(rows), self.shared.take(rows))
 
 
 def lit(value: FloatArray | NDArray[np.bool_]) -> Index:
-    """The paths [n] of numbers [lanes, N] of which any lane is not 0."""
+    """Return the numbers of the paths for which any lane of [lanes, N] is not 0."""
     return np.flatnonzero(value.any(axis=0))
 
 
@@ -73,12 +73,12 @@ class Vertex:
     """Paths at the surfaces they have met.
 
     Args:
-        surface: [N] numbers, sorted by kind. point: [3, N]. distance: [N] travelled since the last surface, m.
-        ends: [kinds] end of the slice of each kind.
+        surface: [N] numbers, sorted by kind. point: [3, N]. distance: [N] m, travelled since the last surface.
+        ends: [kinds] where the slice of each kind ends.
 
     Attributes:
-        facing: [3, N] true normals on the ray's side. shading: [3, N] the interpolated ones, where the scene has such
-        (`smooth`). outside: [N] whether the ray's side is the outside. rough: number of diffuse and glossy paths.
+        facing: [3, N] true normals on the ray's side. shading: [3, N] interpolated normals, where the scene has such
+            (`smooth`). outside: [N] whether the ray's side is the outside. rough: how many paths are diffuse or glossy.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Vertex:
             # An interpolated normal that faces away from the ray is replaced by the true one.
             np.copyto(shading, normal, where=dot(shading, paths.direction) > -1e-3)
         self.facing, self.shading = normal, shading
-        # How far to step off the surface, m: the rounding of a hit grows with the distance travelled.
+        # How far (m) a ray steps off the surface: the rounding of a hit grows with the distance travelled.
         self._reach = distance * np.float32(1e-6)
         self._reach += _STEP_M
 
@@ -122,15 +122,15 @@ class Vertex:
         inside = np.flatnonzero(~self.outside[self.glass])
         rows = inside + self.glass.start
         absorbed = self.world.palette.look_up(self.world.absorption_row.take(surface[inside]), self.paths.bins[rows])
-        absorbed *= -(distance[inside] + _STEP_M)  # the ray set out that far from where it entered
+        absorbed *= -(distance[inside] + _STEP_M)  # the ray set out this far from where it entered
         self.paths.throughput[:, rows] *= np.exp(absorbed)
 
     def start(self, side: FloatArray | None = None) -> FloatArray:
-        """Origins [3, N] of rays that leave on the near side, or where `side` is negative on the far side."""
+        """Return origins [3, N] of rays that leave on the near side, or where `side` is negative on the far side."""
         return self._point + self.facing * (self._reach if side is None else self._reach * side)
 
     def evaluate(self, inward: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Scattering times cosine, and density, [rough] for directions towards light [3, rough]."""
+        """Return scattering times cosine, and density, [rough] each, for directions [3, rough] towards light."""
         d, g = self.diffuse, self.glossy
         cosine = np.maximum(dot(self.shading[:, d], inward[:, d]), np.float32(0))
         cosine *= _ONE_OVER_PI
@@ -141,13 +141,13 @@ class Vertex:
         return np.concatenate([value, shiny], axis=-1), np.concatenate([cosine, density])
 
     def index(self) -> FloatArray:
-        """Refractive index of the glass paths."""
+        """Return the refractive index of the glass paths."""
         rows = self.world.index_row.take(self._surface[self.glass])
         return self.world.palette.look_up(rows, self.paths.bins[self.glass])
 
 
 def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, radiance: FloatArray) -> None:
-    """Add light from one point on one light, unless something is in between, weighted against scattering into it."""
+    """Add the light of one point on one light, unless something is between, weighted against scattering into it."""
     rough, world, paths = vertex.rough, vertex.world, vertex.paths
     keys = keys.cut(0, rough)
     origin = vertex.start()[:, :rough]
@@ -170,7 +170,7 @@ def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, 
 
 
 def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Paths:
-    """The paths on their way to the next surface; a throughput of 0 ends a path."""
+    """Send the paths on to the next surface; a throughput of 0 ends a path."""
     paths = vertex.paths
     direction, density = np.empty_like(paths.direction), np.full(len(paths.slot), SPECULAR)
     if vertex.rough:
@@ -213,8 +213,8 @@ def _scatter_glass(
 ) -> NDArray[np.bool_]:
     """Write the directions of the glass paths, and return which of them refract.
 
-    The hero is refracted as its index says. Lanes of another index would go elsewhere: to them this path has density 0,
-    and the balance heuristic gives the hero the weight of all of them.
+    The hero is refracted by its index. Lanes of another index would go elsewhere: for them this path has density 0, and
+    the balance heuristic gives the hero the weight of all of them.
     """
     g, index = vertex.glass, vertex.index()
     choice = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
@@ -234,7 +234,7 @@ def _scatter_glass(
     return refracts
 
 
-_ROULETTE_FROM = 2  # surfaces that every path may reach before it can end by chance
+_ROULETTE_FROM = 2  # surfaces that a path meets before it can end by chance
 
 
 def trace(
@@ -251,16 +251,16 @@ def trace(
     first_distance: FloatArray | None = None,
     shared: FloatArray | None = None,
 ) -> FloatArray:
-    """Weight times radiance [lanes, N] that arrives along camera rays, of the wavelengths of each path.
+    """Return weight times radiance [lanes, N] that arrives along camera rays, at the wavelengths of each path.
 
     Args:
-        keys: random numbers of the paths. origin, direction: [3, N], m.
-        weight: [lanes, N]; paths of weight 0 cost nothing. bins: [N] wavelength bins, of the first lane.
+        keys: for the random numbers of the paths. origin, direction: [3, N], m.
+        weight: [lanes, N]; paths of weight 0 cost nothing. bins: [N] the first lane's wavelength bin.
         max_depth: number of surfaces along a path at which light is scattered.
-        aim: sample lights directly; without it the mean is the same, found by scattering alone.
-        first_distance: [N], where to write the distance in m to what camera rays hit first, inf for nothing; paths of
+        aim: whether to sample lights directly; without it the mean is the same, found by scattering alone.
+        first_distance: [N], which gets the distance (m) to what camera rays hit first, inf for nothing; paths of
             weight 0 are left out.
-        shared: [N] number of wavelengths that share a path; left out, all lanes do.
+        shared: [N] how many wavelengths share a path; left out, all lanes do.
     """
     radiance = np.zeros(weight.shape[::-1], np.float32)
     count = weight.shape[-1]
@@ -329,7 +329,7 @@ def _add_emission(
 
 
 def _arrive(world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray) -> Vertex:
-    """The paths that meet something that scatters, sorted by kind of material."""
+    """Return the paths that meet something that scatters, sorted by kind of material."""
     kind = world.kind.take(surface)
     ends = np.cumsum(np.bincount(kind, minlength=NOTHING + 1))
     order = np.argsort(kind, kind="stable")[: ends[GLASS]]

@@ -1,4 +1,4 @@
-"""One render: the wavelengths that its paths carry, one pass of one tile, and the developed film."""
+"""One render: the wavelengths that its paths carry, a pass of a tile, and the film developed into a picture."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from neurolens.pictures.render.settings import FilmSettings
 from neurolens.pictures.render.world import world_of
 
 Seconds = NDArray[np.float64]
-# Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
+# The largest luminance of a sample; sums of colours up to a million times as bright stay within float32.
 _BRIGHTEST_SAMPLE = 1e30
 LANES = 4  # wavelengths of a hero path
 _FINE = 1024  # wavelengths at which the light of a scene is summed
@@ -55,7 +55,7 @@ class _Grid(ctypes.Structure):
 
 @cache
 def _light_of_tile(bins: int) -> Any:
-    """The function of `spill.c`, compiled once."""
+    """Return the function of `spill.c`, compiled once."""
     known = {"LANES": LANES, "BINS": bins, "SAMPLES": columns.SAMPLES_A_PASS, "BRIGHTEST": f"{_BRIGHTEST_SAMPLE:g}f"}
     known |= {name: getattr(columns, name) for name in ("LUMINANCE2", "DROPPED", "COLUMNS")}
     call = load_compiled(c_source("pictures/render/spill.c", **known)).light_of_tile
@@ -64,8 +64,12 @@ def _light_of_tile(bins: int) -> Any:
 
 
 class LensRays(NamedTuple):
-    """Camera rays in the scene: origin, direction [3, N], weight [lanes, N], and film points `places` [lanes, 2, N] of
-    wavelengths that have their own."""
+    """Camera rays in the scene.
+
+    Attributes:
+        origin, direction: [3, N]. weight: [lanes, N].
+        places: [lanes, 2, N] film points, where wavelengths have their own.
+    """
 
     origin: FloatArray
     direction: FloatArray
@@ -74,7 +78,7 @@ class LensRays(NamedTuple):
 
 
 def camera_axes(settings: CameraSettings) -> FloatArray:
-    """Rotation [3, 3] from camera to scene axes: columns right, up, backwards."""
+    """Return the rotation [3, 3] from camera to scene axes, with the columns right, up, backwards."""
     backwards = np.subtract(settings.position_m, settings.look_at_m)
     backwards = backwards / np.linalg.norm(backwards)
     right = np.cross(settings.up, backwards)
@@ -83,15 +87,15 @@ def camera_axes(settings: CameraSettings) -> FloatArray:
 
 
 class Job:
-    """One render: the scene made ready for the workers, and the film.
+    """One render: a scene made ready for the workers, and the film.
 
     Attributes:
-        scene, camera, grid, seed, max_depth, settings: as requested; settings are those of the film.
-        mode: "one" wavelength a path, "hero" for several that share film points, or "companions" with their own.
+        scene, camera, grid, seed, max_depth, settings: as requested; `settings` are those of the film.
+        mode: "one" wavelength a path, "hero" for several that share film points, or "companions", which have their own.
         balance: matrix [3, 3] on the film's linear sRGB that makes the light of the white balance neutral; where there
             is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
-        rows: first row and the one after the last, of the part of the picture that is rendered; own: its pixels among
-            those of the tiles, which may begin before it and end after it.
+        rows: of the part of the picture that is rendered, the first row and the one after the last.
+        own: the pixels of these rows among those of the tiles, which may begin before them and end after them.
         film: see `Film`.
     """
 
@@ -122,7 +126,7 @@ class Job:
         table = np.stack(
             [np.concatenate([t, np.einsum("c,lcb->lb", self.luminance_row, t)[:, None]], 1) for t in tables]
         )
-        self._bins = np.ascontiguousarray(table.transpose(3, 0, 1, 2), np.float32)  # as `spill.c` has them
+        self._bins = np.ascontiguousarray(table.transpose(3, 0, 1, 2), np.float32)  # in the order of `spill.c`
         tints = getattr(camera, "tints", None)
         light = None if tints is None else self.spectral.rotated(tints(self.spectral.centres_nm))
         self._tints: FloatArray | None = None
@@ -132,7 +136,7 @@ class Job:
         self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
         self.rows = rows or (0, grid.height)
         first, stop = (row * grid.width for row in self.rows)
-        near = self._near = self._reach()  # samples so far from the job's rows have companions in them
+        near = self._near = self._reach()  # samples at most so far from the job's rows have companions in them
         tiling = Tiling.of(grid.width * grid.height, samples)
         self.tiling = tiling.around(max(first - near, 0), min(stop + near, tiling.pixels))
         self.own = slice(first - self.tiling.start, stop - self.tiling.start)
@@ -148,15 +152,18 @@ class Job:
         return rows * self.grid.width + columns
 
     def picture_settings(self) -> dict[str, Any]:
-        """The settings besides scene and camera that decide the picture, for its metadata and its checkpoint."""
+        """Return the settings besides scene and camera that decide the picture, for its metadata and its checkpoint."""
         settings = asdict(self.settings)
-        del settings["colour_space"]  # of the file alone
+        del settings["colour_space"]  # which concerns the file alone
         size = {"width": self.grid.width, "height": self.grid.height}
         return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
     def render_tile(self, which: tuple[int, int]) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
-        """Sums [pixels, columns] of one pass of one tile, what belongs to other pixels, and the seconds [2] spent in
-        the camera, and in all."""
+        """Render one pass of one tile.
+
+        Returns the sums [pixels, columns], the light that belongs to other pixels, and the seconds [2] spent in the
+        camera and in all.
+        """
         began, (tile, part) = time.perf_counter(), which
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
@@ -187,10 +194,10 @@ class Job:
     def _sum_light(
         self, sums: NDArray[np.float64], value: FloatArray, bins: Index, lens: LensRays, tile: slice
     ) -> Spill | None:
-        """Colour, and the squared luminance of each sample; and the light of companions, of any pixel.
+        """Add the colours and each sample's squared luminance to the sums; return companions' light, of any pixel.
 
-        Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
-        with it the whole file.
+        A path whose light is not finite, or too large for any sum, is counted and adds nothing: one alone would spoil
+        its pixel, and with it the whole file.
         """
         if lens.places is not None:
             return self._spill(sums, value, bins, lens, tile)
@@ -207,7 +214,7 @@ class Job:
         return None
 
     def _spill(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, lens: LensRays, tile: slice) -> Spill:
-        """The light of the companions at the pixels where it arrives, and the sums of the tile (`spill.c`)."""
+        """Add the tile's light to its sums (`spill.c`); return the companions' light at the pixels where it arrives."""
         start = tile.start + self.tiling.start
         first = max(start - self._near, 0)
         stop = min(start + len(sums) + self._near, self.grid.width * self.grid.height)
@@ -222,7 +229,7 @@ class Job:
     def _sum_depth(
         self, sums: NDArray[np.float64], origin: FloatArray, direction: FloatArray, distance: FloatArray
     ) -> None:
-        """Distance along the optical axis from the film's plane to what camera rays hit first."""
+        """Add the distances, along the optical axis from the film's plane, of what camera rays hit first."""
         hit, shape = np.isfinite(distance), (len(sums), -1)
         away = -self._axes[:, 2]
         with np.errstate(over="ignore", invalid="ignore"):  # rays that do not pass have arbitrary values
@@ -233,24 +240,24 @@ class Job:
         sums[:, columns.HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
 
     def _hero_rays(self, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> LensRays:
-        """Rays of the hero wavelengths, with the weights of all lanes."""
+        """Return rays of the hero wavelengths, with the weights of all lanes."""
         lanes = self.spectral.lanes
         nm = self._camera_wavelengths(hue, lanes if self._tints is None or self.mode == "companions" else 1)
         if self.mode == "companions":
             return self._camera_rays(film_mm, pupil, nm)
         hero = self._camera_rays(film_mm, pupil, nm[:1])
         weight = np.repeat(hero.weight, lanes, axis=0)
-        if self._tints is not None:  # nothing else depends on the wavelength
+        if self._tints is not None:  # nothing but the tints depends on the wavelength
             weight *= self._tints.take(self.spectral.bin_of(hue), axis=-1)
         elif self.camera.dispersive or not getattr(self.camera, "achromatic", False):
             for lane in range(1, lanes):
                 weight[lane] = self._camera_rays(film_mm, pupil, nm[lane : lane + 1]).weight
-            weight *= hero.weight > 0  # the hero's ray must exist
+            weight *= hero.weight > 0  # no lane passes where the hero's ray does not
         weight /= lanes
         return hero._replace(weight=weight)
 
     def _camera_rays(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> LensRays:
-        """Rays in the scene for wavelengths [lanes, N]; their weight is 0 where they do not pass."""
+        """Return rays in the scene for wavelengths [lanes, N]; their weight is 0 where they do not pass."""
         at_once, parts = getattr(self.camera, "rays_a_call", RAYS_A_CALL), list[LensRays]()
         for start in range(0, film_mm.shape[1], at_once):
             part = slice(start, start + at_once)
@@ -271,7 +278,7 @@ class Job:
         return LensRays(*joined)
 
     def _camera_wavelengths(self, hue: FloatArray, lanes: int) -> FloatArray:
-        """Wavelengths [lanes, N] for the camera, clipped to its range if it does not disperse."""
+        """Return wavelengths [lanes, N] for the camera; where it does not disperse, they are clipped to its range."""
         wavelengths = self.spectral.wavelengths_nm(hue, lanes)
         accepted = self.camera.wavelength_nm
         if accepted is not None:
@@ -279,7 +286,7 @@ class Job:
         return wavelengths
 
 
-# Of the layers, for the metadata of a picture.
+# What layers mean, for the metadata of a picture.
 MEANING = {
     "samples": "samples in the pixel",
     "variance": "of the pixel's luminance (linear sRGB), from its samples as if they were independent; inf: below two",
@@ -294,9 +301,9 @@ class Layers:
 
     Attributes:
         samples, depth, blocked: see `MEANING`; what is in focus is at depth `focus_m`.
-        variance: of the pixel's luminance (of linear sRGB after the white balance), estimated from its samples as if
-            they were independent: the sample variance over their number. That of low-discrepancy samples is lower.
-            Infinite below two samples.
+        variance: of the pixel's mean luminance (of linear sRGB after the white balance): the variance of its samples
+            over their number, as if they were independent. Low-discrepancy samples have less. Below two samples it is
+            infinite.
     """
 
     samples: FloatArray
@@ -306,7 +313,7 @@ class Layers:
 
 
 def develop(job: Job) -> tuple[FloatArray, Layers]:
-    """The job's rows of the picture, [H, W, 3] float32 linear sRGB, and their layers, also while workers run.
+    """Make the job's rows of the picture, [H, W, 3] float32 linear sRGB, and their layers; workers may still run.
 
     Each tile is divided by the samples that it has so far.
     """
@@ -325,7 +332,7 @@ def develop(job: Job) -> tuple[FloatArray, Layers]:
 
 
 def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> FloatArray:
-    """Samples, variance, depth and blocked share [4, n]; what float32 does not hold is infinite."""
+    """Return samples, variance, depth and blocked share [4, n]; what float32 does not hold is infinite."""
     total = converted(sums[:, columns.RGB], job.luminance_row[None])[:, 0]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         spread = np.maximum(sums[:, columns.LUMINANCE2] - total**2 / samples, 0) / (samples - 1)
@@ -336,7 +343,7 @@ def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> 
 
 
 def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int = 1) -> SpectralRange:
-    """The scene's wavelengths, in bins by their importance; InputError where a camera that disperses lacks some."""
+    """Return the scene's wavelengths, in bins by importance; InputError where a dispersive camera lacks some."""
     settings = scene.settings.camera
     low, high = settings.wavelength_nm
     accepted = camera.wavelength_nm
@@ -348,7 +355,7 @@ def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int 
 
 
 def expected_light(scene: Scene) -> Spectrum:
-    """The spectrum (nm, radiance relative to D65) of a scene's light: lamps by area, the environment as all lamps."""
+    """Estimate the spectrum (nm, radiance relative to D65) of a scene's light; surroundings count as all lamps."""
     fine = SpectralRange(*scene.settings.camera.wavelength_nm, _FINE)
     lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
     for name, emission, area in _lamps(scene):
@@ -377,7 +384,7 @@ def expected_light(scene: Scene) -> Spectrum:
 
 
 def _lamps(scene: Scene) -> Iterator[tuple[str, Vector, float]]:
-    """Illuminant, emission and area of the lamps; for those without size, the area that gives their flux."""
+    """Yield illuminant, emission and area of the lamps; those without size get the area that gives their flux."""
     settings = scene.settings
     for quad in settings.quads:
         yield quad.illuminant, quad.emission, float(np.linalg.norm(np.cross(quad.edge_u_m, quad.edge_v_m)))
@@ -395,7 +402,7 @@ def _lamps(scene: Scene) -> Iterator[tuple[str, Vector, float]]:
 def mode_for(
     camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings
 ) -> Literal["one", "hero", "companions"]:
-    """How paths carry wavelengths: see `Job`.
+    """Choose how paths carry wavelengths: see `Job`.
 
     Raises:
         InputError: the settings ask for "hero", and the camera disperses but cannot place companions in whole pixels,
@@ -417,8 +424,10 @@ def mode_for(
 
 
 def dispersion_px(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float]) -> float:
-    """The shift of the camera's picture with the wavelength, in pixels: RMS over film and pupil, between the middle
-    wavelength and the one of five that moves it most."""
+    """Return by how many pixels the camera's picture shifts with the wavelength.
+
+    It is the RMS, over film and pupil, of the shift between the middle wavelength and the one of five that shifts most.
+    """
     low, high = limits_nm
     random = np.random.default_rng(0)
     film = (random.random((2, _PROBES)) - 0.5) * np.array(grid.film_mm)[:, None]

@@ -1,10 +1,9 @@
 """The lights of a scene: rectangles, discs, spheres, points, spots, and what surrounds it, far away.
 
 A light is chosen partly by how much it lights the point that the camera looks at, partly at random. Its group then
-gives a direction towards it: a rectangle and a disc are sampled uniformly over their area, a sphere over the cone that
-it fills. Light from infinity is in each direction a sum of up to three spectra of the palette. All but a single colour
-are aimed at, by a table of how bright they are in each direction; of a single colour, scattered rays are the best
-samples there are.
+gives a direction towards it: rectangles and discs are sampled uniformly over their area, spheres over the cone that
+they fill. In each direction, light from infinity is a sum of up to three spectra of the palette. It is aimed at by a
+table of its brightness in each direction, unless it is a single colour, for which scattered rays are the best samples.
 
 Luminance and chromaticity of the clear sky are those of Preetham, Shirley and Smits 1999, "A practical analytic model
 for daylight" (appendix A.2). With theta from the zenith, gamma from the sun, turbidity T, sun at theta_s:
@@ -59,16 +58,16 @@ if TYPE_CHECKING:
 
 Numbers = NDArray[np.intp]
 Aimed = tuple[FloatArray, FloatArray, FloatArray]  # direction [3, N], distance [N] m, inverse density [N]
-Coefficients = Callable[[FloatArray], FloatArray]  # of the three spectra, [3, N] in directions [3, N]
-_TABLE = (128, 256)  # rows are even, so that the horizon is the edge of one
-# Least weight of a cell with light, as a share of the mean: it may be brighter away from its middle.
+Coefficients = Callable[[FloatArray], FloatArray]  # factors [3, N] of the three spectra in directions [3, N]
+_TABLE = (128, 256)  # an even number of rows, so that the horizon lies between two
+# Least weight of a cell with light, as a share of the mean, for it may be brighter away from its middle.
 _FAINTEST = 0.02
 
 SUN_RADIUS_RAD = math.radians(0.533 / 2)
 _SUN_K, _SUN_LUX = 5778.0, 133.1e3
 
 _UNITS: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-# Slope and offset in T of A, B, C, D, E.
+# Slope and offset of A, B, C, D, E in the turbidity T.
 _PEREZ = {
     "Y": ((0.1787, -1.4630), (-0.3554, 0.4275), (-0.0227, 5.3251), (0.1206, -2.5771), (-0.0670, 0.3703)),
     "x": ((-0.0193, -0.2592), (-0.0665, 0.0008), (-0.0004, 0.2125), (-0.0641, -0.8989), (-0.0033, 0.0452)),
@@ -90,11 +89,12 @@ class LightSamples:
     """Directions to points on lights.
 
     Attributes:
-        direction: [3, N] unit vectors. distance: [N] m, to the light's surface, inf to the sky. light: [N] its number.
-        inverse_pdf: [N] 1 / density per solid angle, choice of the light included; 0 where the light shows its back,
-            and for lights without size, which no scattered ray finds.
-        scale: [N] factor of the light's emission: the same, and for lights without size the irradiance of
-            intensity 1 over the probability of the choice.
+        direction: [3, N] unit vectors. distance: [N] m, to the light's surface, inf to the sky. light: [N] the light's
+            number.
+        inverse_pdf: [N] 1 / density per solid angle, in which the choice of the light counts. It is 0 where the light
+            shows its back, and for lights without size, which no scattered ray finds.
+        scale: [N] factor on the light's emission: `inverse_pdf`, or for lights without size the irradiance of intensity
+            1 over the probability of the choice.
     """
 
     direction: FloatArray
@@ -108,8 +108,8 @@ class LightGroup:
     """Lights of one kind.
 
     Attributes:
-        count: their number. round_from: samples of lights from this number on are of a disc: their first number is the
-            square of the radius, their second the angle.
+        count: how many lights there are. round_from: from this number on, lights are discs: the first number of a
+            sample is the square of the radius, the second the angle.
         sizeless: whether `sample` gives the irradiance of intensity 1 in place of inverse densities.
     """
 
@@ -118,20 +118,21 @@ class LightGroup:
     sizeless = False
 
     def importance(self, target_m: Vector) -> NDArray[np.float64]:
-        """About the irradiance [count] at a point, its three colours added up."""
+        """Estimate the irradiance [count] at a point, its three colours added up."""
         raise NotImplementedError
 
     def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
-        """Directions from points [3, N] to the lights of some numbers [N], for samples [2, N] in [0, 1)."""
+        """Return directions from points [3, N] to the lights of these numbers [N], for samples [2, N] in [0, 1)."""
         raise NotImplementedError
 
     def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
-        """Density [N] per solid angle with which `sample` takes a direction that hits lights [N]; 0 without surface."""
+        """The density [N] per solid angle of `sample` for a direction that hits lights [N]; 0 for lights without
+        size."""
         return np.zeros_like(distance)
 
 
 class Lights:
-    """Lights of several kinds, numbered group after group (some may be empty); at `target_m` light matters most."""
+    """Lights of several kinds, numbered group by group (some may be empty); the light at `target_m` matters most."""
 
     def __init__(self, groups: Sequence[LightGroup], target_m: Vector = BLACK) -> None:
         self._groups: list[tuple[int, LightGroup]] = []
@@ -143,8 +144,8 @@ class Lights:
         self.black = self.count == 0
         if self.black:
             return
-        # The table by which lights are chosen, half of it in equal parts, half by importance: each light has a whole
-        # number of its entries, at least one, and their share is the light's exact probability.
+        # The table by which lights are chosen: half by equal shares, half by importance. Each light has a whole number
+        # of its entries, at least one, whose share is the light's exact probability.
         importance = np.concatenate([group.importance(target_m) for _, group in self._groups])
         parts = importance / max(importance.sum(), 1e-300) + 1 / self.count
         entries = np.maximum(1, np.rint(parts / parts.sum() * max(1024, 16 * self.count))).astype(np.intp)
@@ -152,7 +153,7 @@ class Lights:
         self.probability = (entries / entries.sum()).astype(np.float32)
 
     def sample(self, point: FloatArray, choice: FloatArray, square: FloatArray) -> LightSamples:
-        """A direction from each point [3, N] to one of the lights, for numbers [N] and [2, N] in [0, 1)."""
+        """Return a direction from each point [3, N] to one of the lights, for numbers [N] and [2, N] in [0, 1)."""
         light = self._table.take((choice * np.float32(len(self._table))).astype(np.intp), mode="clip")
         direction, distance, scale = np.empty_like(point), np.empty_like(choice), np.empty_like(choice)
         inverse_pdf = np.empty_like(choice)
@@ -167,7 +168,7 @@ class Lights:
         """Density [N] per solid angle with which `sample` takes a direction that hits lights [N].
 
         Args:
-            point: [3, N] from where. distance: [N] to the hit. cosine: [N] at the light, above 0.
+            point: [3, N] where rays start. distance: [N] to the hit. cosine: [N] at the light, above 0.
         """
         density = np.zeros_like(distance)
         for group, rows, number in self._by_group(light):
@@ -181,7 +182,7 @@ class Lights:
         """Sample lights one after another from points [3, N]; yields whether each is round, and the group's samples.
 
         Args:
-            place: [2, N] from -1 to 1 in the light's own square, or in the one about it.
+            place: [2, N] from -1 to 1 in the light's own square, or in the square about its disc.
         """
         square = ((place + 1) / 2).astype(np.float32)
         disc = np.stack([(place**2).sum(0), np.arctan2(place[1], place[0]) / TWO_PI % 1]).astype(np.float32)
@@ -192,13 +193,13 @@ class Lights:
             yield is_round, group.sample(some, point, disc if is_round else square)
 
     def strongest(self, target_m: Vector, most: int) -> list[int]:
-        """The numbers of the `most` lights that bring a point the most light if nothing is between, in rising order."""
+        """The numbers of the `most` lights that bring a point most light if nothing is between, in rising order."""
         importance = [group.importance(target_m) for _, group in self._groups]
         order = np.argsort(-np.concatenate([np.zeros(0), *importance]), kind="stable")
         return sorted(order[:most].tolist())
 
     def _by_group(self, light: Numbers) -> Iterator[tuple[LightGroup, Numbers, Numbers]]:
-        """The groups that lights [N] belong to, the places of theirs, and their numbers in the group."""
+        """Yield the groups of lights [N], the places at which each group's lights stand, and their numbers in it."""
         for first, group in self._groups:
             rows = np.flatnonzero((light >= first) & (light < first + group.count))
             if rows.size:
@@ -208,13 +209,13 @@ class Lights:
 def _irradiance(
     area: NDArray[np.floating], middle: NDArray[np.floating], emission: Sequence[Vector], target_m: Vector
 ) -> NDArray[np.float64]:
-    """About the irradiance at a point from lights [n] of a visible area, the three colours added up."""
+    """Estimate the irradiance at a point from lights [n] of a visible area, the three colours added up."""
     away2 = np.sum((middle - np.array(target_m)) ** 2, axis=1)
     return area * np.array([sum(rgb) for rgb in emission]) / np.maximum(away2, 1e-6)
 
 
 class FlatLights(LightGroup):
-    """Rectangles, then discs: each a corner and two edges, of a disc its centre and two radii."""
+    """Rectangles, then discs. A rectangle is a corner and two edges, a disc its centre and two radii."""
 
     def __init__(self, quads: Sequence[tables.Quad], discs: Sequence[tables.Disc]) -> None:
         self.count, self._quads = len(quads) + len(discs), len(quads)
@@ -291,7 +292,7 @@ class SphereLights(LightGroup):
 
 
 class PointLights(LightGroup):
-    """Points, then spots, found only by sampling lights; a point is a spot that emits in all directions."""
+    """Points, then spots, which are found only by sampling lights; a point is a spot that emits in all directions."""
 
     sizeless = True
 
@@ -304,7 +305,8 @@ class PointLights(LightGroup):
         axis[:, len(points) :] = np.array([np.subtract(s.look_at_m, s.position_m) for s in spots]).reshape(-1, 3).T
         length = np.linalg.norm(axis, axis=0)
         self._axis = (axis / np.where(length > 0, length, 1)).astype(np.float32)
-        # Falloff is the smoothstep of (cos - start) / width. A point's axis is 0, and so are its cosines.
+        # Falloff is the smoothstep of (cos - start) / width. A point's axis is the zero vector, and so its cosines are
+        # 0.
         outer, inner = (
             np.array([math.cos(math.radians(getattr(s, name))) for s in spots]) for name in ("outer_deg", "inner_deg")
         )
@@ -317,7 +319,7 @@ class PointLights(LightGroup):
         return self._intensity * self._falloff(np.arange(self.count), to / np.sqrt(distance2)) / distance2
 
     def _falloff(self, number: Numbers, away: NDArray[np.floating]) -> FloatArray:
-        """Share [N] of the intensity that leaves in unit directions [3, N]."""
+        """Return the share [N] of the intensity that leaves in unit directions [3, N]."""
         cosine = dot(self._axis.take(number, axis=1), away)
         t = np.clip((cosine - self._start.take(number)) * self._per_width.take(number), 0, 1)
         return t * t * (3 - 2 * t)
@@ -331,13 +333,13 @@ class PointLights(LightGroup):
 
 
 def sun_direction(sky: Sky) -> FloatArray64:
-    """Unit vector [3] towards the sun's middle."""
+    """Return the unit vector [3] towards the sun's middle."""
     up, around = math.radians(sky.sun_elevation_deg), math.radians(sky.sun_azimuth_deg)
     return np.array([math.cos(up) * math.sin(around), math.sin(up), -math.cos(up) * math.cos(around)])
 
 
 def zenith(sky: Sky) -> dict[str, float]:
-    """Luminance Y in kcd/m^2 and chromaticity x, y of the zenith."""
+    """Return luminance Y (kcd/m^2) and chromaticity x, y of the zenith."""
     sun, t = math.radians(90 - sky.sun_elevation_deg), sky.turbidity
     chi = (4 / 9 - t / 120) * (math.pi - 2 * sun)
     found = {"Y": (4.0453 * t - 4.9710) * math.tan(chi) - 0.2155 * t + 2.4192}
@@ -348,7 +350,7 @@ def zenith(sky: Sky) -> dict[str, float]:
 
 
 def sky_colour(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, FloatArray64, FloatArray64]:
-    """Luminance [N] in kcd/m^2 and chromaticity x, y [N] in unit directions [3, N]; the horizon's colour below it."""
+    """Return luminance [N] (kcd/m^2) and x, y [N] in unit directions [3, N]; below the horizon it is black."""
     height = np.maximum(direction[1].astype(np.float64), 1e-4)
     towards = np.clip(sun_direction(sky) @ direction.astype(np.float64), -1, 1)
     sun_height = math.sin(math.radians(sky.sun_elevation_deg))
@@ -364,7 +366,7 @@ def sky_colour(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, FloatArra
 
 
 def sun_spectrum(sky: Sky) -> tuple[FloatArray64, FloatArray64, float]:
-    """Wavelengths in nm, the sun's relative radiance there, and the luminance of its disc in kcd/m^2."""
+    """Return wavelengths (nm), the sun's relative radiance there, and the luminance of its disc (kcd/m^2)."""
     nm = table("wavelength_nm")
     outside = planck(nm, _SUN_K)
     zenith_deg = 90 - sky.sun_elevation_deg
@@ -377,7 +379,7 @@ def sun_spectrum(sky: Sky) -> tuple[FloatArray64, FloatArray64, float]:
 
 
 def total_spectrum(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, NDArray[np.float64]]:
-    """Wavelengths in nm and the spectrum of the sky's light, the mean over directions [3, N]."""
+    """Return wavelengths (nm) and the spectrum of the sky's light, the mean over directions [3, N]."""
     luminance, x, y = sky_colour(sky, direction)
     nm, components = daylight_table()
     weights = daylight_weights(x, y)
@@ -387,10 +389,10 @@ def total_spectrum(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, NDArr
 
 
 class Surroundings(LightGroup):
-    """Light from infinity: a colour, a gradient, a picture or the clear sky. It is aimed at as one light by a table.
+    """Light from infinity: a colour, a gradient, a picture or the clear sky. A table makes one light of it to aim at.
 
     Args:
-        settings: tables of the scene. picture: [H, W, 3], that of its environment.
+        settings: the tables of the scene. picture: [H, W, 3], the environment's.
     """
 
     def __init__(self, settings: SceneSettings, picture: FloatArray | None, palette: Palette) -> None:
@@ -417,7 +419,7 @@ class Surroundings(LightGroup):
         self.dark = self._table is None and not palette.means(self._rows[:1]).any()
 
     def _aim(self, shape: tuple[int, int]) -> None:
-        """Make the table by the middles of its cells, unless all is black."""
+        """Make the table from the middles of its cells, unless all are black."""
         assert self._coefficients is not None
         bright = self._palette.means(self._rows) @ self._coefficients(centres(*shape))
         bright = np.maximum(bright, 0).reshape(shape)
@@ -433,7 +435,7 @@ class Surroundings(LightGroup):
         return np.maximum(sum(c * s for c, s in zip(share, spectra, strict=True)), np.float32(0))
 
     def importance(self, target_m: Vector) -> NDArray[np.float64]:
-        # Half of the light of all directions, of three colours.
+        # Half the light of all directions, in three colours.
         return np.array([1.5 * self._table.total] if self._table else [])
 
     def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
@@ -443,26 +445,26 @@ class Surroundings(LightGroup):
         return direction, np.full(len(number), np.inf, np.float32), inverse
 
     def far_pdf(self, direction: FloatArray) -> FloatArray:
-        """Density [N] per solid angle with which `sample` takes directions [3, N]."""
+        """Return the density [N] per solid angle with which `sample` takes directions [3, N]."""
         assert self._table is not None
         return self._table.pdf(direction)
 
 
 def _by_height(direction: FloatArray) -> FloatArray:
-    """Shares of the three colours of a gradient."""
+    """Return the shares of a gradient's three colours."""
     below, above = np.maximum(-direction[1], 0), np.maximum(direction[1], 0)
     return np.stack([below, 1 - below - above, above])
 
 
 def _texels(picture: FloatArray, scale: np.float32, turn: float) -> Coefficients:
-    """What a picture shows."""
+    """Return a function that looks a picture up by direction."""
     height, width = picture.shape[:2]
     texels = picture.reshape(-1, 3)
     return lambda d: np.multiply(texels.take(cell_of(d, height, width, turn), axis=0).T, scale, order="C")
 
 
 def _clear_sky(sky: Sky, palette: Palette) -> tuple[list[int], Coefficients]:
-    """Rows of the components of daylight, and how much of each the sky has."""
+    """Return the palette's rows of daylight's components, and a function of how much of each the sky has."""
     daylight = [palette.daylight(k) for k in range(3)]
     luminance = np.array([value for _, value in daylight])
 
@@ -476,7 +478,7 @@ def _clear_sky(sky: Sky, palette: Palette) -> tuple[list[int], Coefficients]:
 
 
 class SunLight(LightGroup):
-    """The sun's disc, as far as it is above the horizon, if the scene has a sky with a sun."""
+    """The sun's disc, as far as it is above the horizon; there is none without a sky that has a sun."""
 
     round_from = 0
 
@@ -487,7 +489,7 @@ class SunLight(LightGroup):
         self._radiance = sun_spectrum(sky)[2] / sky.white_kcd_per_m2 if sky else 0.0
 
     def row(self, sky: Sky, palette: Palette) -> int:
-        """Row of the palette with the disc's radiance."""
+        """Return the palette's row with the disc's radiance."""
         nm, values, _ = sun_spectrum(sky)
         return palette.measured_light(("sun", sky), (nm, values), self._radiance)
 
@@ -502,7 +504,7 @@ class SunLight(LightGroup):
 
     def far_pdf(self, direction: FloatArray) -> FloatArray:
         """Density [N] per solid angle with which `sample` takes directions [3, N]; 0 where no disc is seen."""
-        # The distance from the axis, not the cosine, which float32 cannot tell from 1.
+        # By the distance from the axis: float32 cannot tell the cosine from 1.
         away = direction - self._axis[:, None]
         inside = (dot(away, away) <= 2 * self._one_less_cos) & (direction[1] >= 0)
         return np.where(inside, 1 / (TWO_PI * self._one_less_cos), np.float32(0))

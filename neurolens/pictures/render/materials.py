@@ -1,14 +1,14 @@
 """How surfaces scatter: Lambert, a GGX coat over a Lambert base, mirror, smooth glass.
 
-Reflectances are [lanes, N], of the wavelengths of each path; what is drawn depends on the lanes together, so that all
-give a path the same density. Directions are unit vectors [3, N] that point away from the surface, normals lie on the
+Reflectances are [lanes, N], for the wavelengths of each path. What is drawn depends on all lanes together, so that all
+give a path the same density. Directions are unit vectors [3, N] that point away from the surface; normals lie on the
 side of the incoming ray.
 
 Light that a coat scatters once is not all that it reflects: the rest goes on from facet to facet. Tables hold the
-albedo of one scattering by a GGX coat of Fresnel reflectance F = F0 + (1 - F0)(1 - cos)^5 (Schlick 1994), split as
-F0 (S - T) + T into S, that of F = 1, and T, that of the power (Karis 2013). From them follow the light scattered more
-than once (Kulla and Conty 2017) and what is left for the base underneath. In a white furnace
-about 0.2% is lost or gained at most, at any roughness, seen from up to 87 degrees; some 2% closer to grazing.
+albedo of one scattering by a GGX coat of Fresnel reflectance F = F0 + (1 - F0)(1 - cos)^5 (Schlick 1994), split as F0
+(S - T) + T. S is the albedo for F = 1, T the one for the power alone (Karis 2013). From them follow the light that is
+scattered more than once (Kulla and Conty 2017) and what is left for the base underneath. In a white furnace at most
+some 0.2% is lost or gained, at any roughness, seen from up to 87 degrees; some 2% closer to grazing.
 
 Other sources: Walter et al. 2007 (GGX); Heitz 2014 (Smith shadowing).
 """
@@ -37,14 +37,14 @@ def smith(cosine: Any, alpha2: Any) -> Any:
 
 
 def fifth_power(cosine: FloatArray) -> FloatArray:
-    """(1 - cos)^5 [N]."""
+    """Return (1 - cos)^5 [N]."""
     grazing = np.clip(1 - cosine, 0, 1)
     squared = grazing * grazing
     return squared * squared * grazing
 
 
 def visible_normal(out: FloatArray, alpha: FloatArray, square: FloatArray) -> FloatArray:
-    """Half vectors [3, N] in proportion to how much of their facets is seen from `out` [3, N], both about +z.
+    """Draw half vectors [3, N] in proportion to how much of their facets is seen from `out` [3, N], both about +z.
 
     Dupuy and Benyoub 2023, "Sampling visible GGX normals with spherical caps".
     """
@@ -61,7 +61,7 @@ def visible_normal(out: FloatArray, alpha: FloatArray, square: FloatArray) -> Fl
 
 
 class CoatTable:
-    """S and T by cosine for some GGX widths, one row each."""
+    """S and T of the module, by cosine, for some GGX widths; one row each."""
 
     def __init__(self, alphas: Sequence[float]) -> None:
         cosine = (np.arange(_ENTRIES) + 0.5) / _ENTRIES
@@ -72,22 +72,22 @@ class CoatTable:
         self._mean_whole, self._mean_power = (means[:, k].astype(np.float32) for k in (0, 1))
 
     def at(self, row: NDArray[np.intp], cosine: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """S and T [N] for cosines [N] in 0 to 1."""
+        """Return S and T [N] for cosines [N] in 0 to 1."""
         place = row * _ENTRIES
         place += np.minimum(cosine * np.float32(_ENTRIES), np.float32(_ENTRIES - 1)).astype(np.intp)
         return self._whole.take(place), self._power.take(place)
 
     def means(self, row: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        """S and T [N] under light from everywhere: twice their integrals times the cosine."""
+        """Return S and T [N] under light from everywhere: twice the integrals of each times the cosine."""
         return self._mean_whole.take(row), self._mean_power.take(row)
 
 
 @cache
 def _albedos(alpha: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Cosines and S, cosines and T, by quadrature over visible normals, which the lobe is smooth in."""
+    """Return cosines and S, cosines and T, by quadrature over visible normals, in which the lobe is smooth."""
     cosine = ((np.arange(_NODES) + 1) / _NODES) ** 2
     around, outwards = (np.arange(_AROUND) + 0.5) / _AROUND, (np.arange(_OUTWARDS) + 0.5) / _OUTWARDS
-    # The tail of the lobe, where light is lost, is a narrow strip at 1: nodes are dense there.
+    # The tail of the lobe, where light is lost, is a narrow strip at 1, where nodes are dense.
     u, v = (x.ravel() for x in np.meshgrid(around, 1 - (1 - outwards) ** 3))
     weight = np.repeat(3 * (1 - outwards) ** 2, _AROUND) / u.size
     cos_out = np.repeat(cosine, u.size)
@@ -110,16 +110,16 @@ def sine2(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 class GlossyLobes:
-    """A GGX coat over a Lambert base, seen from one direction: what it scatters, and directions to sample.
+    """A GGX coat over a Lambert base, seen from one direction: how much it scatters, and directions to sample.
 
     Coat and base together reflect all light where nothing absorbs: the coat also scatters light from facet to facet
     (Kulla and Conty 2017), and the base gets what the coat's albedo leaves, on the way in and out (Kelemen and
     Szirmay-Kalos 2001). Both are lobes without direction.
 
     Args:
-        normal, out: [3, N], out towards the camera.
-        base: diffuse reflectance [lanes, N]. coat: Fresnel reflectance head on [lanes, N]. alpha: GGX width [N], the
-            squared roughness. table, row: the coat's albedo, and which of its rows [N].
+        normal, out: [3, N]; `out` points towards the camera.
+        base: diffuse reflectance [lanes, N]. coat: Fresnel reflectance [lanes, N] at normal incidence. alpha: GGX width
+            [N], the squared roughness. table, row: the coat's albedo, and which of its rows [N].
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class GlossyLobes:
         self._through_out = np.maximum(1 - once - self._left_out * self._more, 0)
         rest = self._left_out * self._more + self._through_out * base
         once, rest = once.mean(axis=0), rest.mean(axis=0)
-        # At least 1/5: highlights are narrow and bright.
+        # The coat is sampled with at least 1/5: highlights are narrow and bright.
         self._choice = np.clip(once / np.maximum(once + rest, np.float32(1e-6)), np.float32(0.2), np.float32(1))
 
     def evaluate(self, inward: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -158,7 +158,7 @@ class GlossyLobes:
         half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))
         cos_half = dot(self._normal, half)
         alpha2 = self._alpha * self._alpha
-        # The squared sine by the cross product: 1 - cos^2 is lost in float32 where the lobe is narrow.
+        # The squared sine comes from the cross product: 1 - cos^2 is lost in float32 where the lobe is narrow.
         spread = cos_half * cos_half * alpha2 + sine2(self._normal, half)
         peak = alpha2 / (_PI * spread * spread)
         lambda_out, lambda_in = smith(cos_out, alpha2), smith(np.maximum(cos_in, np.float32(1e-6)), alpha2)
@@ -178,7 +178,7 @@ class GlossyLobes:
         return np.where(above, scattered, np.float32(0)), np.where(above, density, np.float32(1))
 
     def sample(self, square: FloatArray, lobe: FloatArray) -> FloatArray:
-        """Directions towards light [3, N]: off a visible GGX normal, or by cosine for the rest."""
+        """Draw directions towards light [3, N]: reflected by a visible GGX normal, or by cosine for the rest."""
         normal, out = self._normal, self._out
         diffuse, _ = cosine_direction(normal, square)
         tangent, bitangent = orthonormal(normal)
@@ -190,7 +190,7 @@ class GlossyLobes:
 
 
 def fresnel_dielectric(cos_in: FloatArray, relative_index: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unpolarised reflectance [N] and refracted cosine [N] of a smooth surface; 1 and 0 where all is reflected.
+    """Return unpolarised reflectance [N] and refracted cosine [N] of a smooth surface; 1 and 0 at total reflection.
 
     `cos_in` is the cosine of incidence, 0 to 1; `relative_index` the index beyond the surface over that before it.
     """
@@ -210,13 +210,14 @@ def glass_direction(
     choice: FloatArray,
     chance: FloatArray,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Reflected or refracted travel directions [3, N], and which refract [N].
+    """Return reflected or refracted travel directions [3, N], and which refract [N].
 
     Args:
-        direction: of travel. outside: whether the ray comes from outside. index: of the glass.
-        choice: in [0, 1). chance: probability of reflection, 1 where it is total.
+        direction: of travel. outside: whether the ray comes from outside. index: the glass's.
+        choice: numbers in [0, 1). chance: probability of reflection, 1 where it is total.
 
-    The throughput stays: the factor n^2 of radiance inside glass cancels on the way out, and no light stands in glass.
+    The throughput stays as it is: the factor n^2 of radiance inside glass cancels on the way out, and no light is
+    inside.
     """
     relative = np.where(outside, index, 1 / index)
     cos_in = np.clip(-dot(direction, normal), 0, 1)

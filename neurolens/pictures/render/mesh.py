@@ -1,12 +1,12 @@
 """Triangle meshes of OBJ and PLY files, or of tables of the scene, placed in it; nothing is merged or repaired.
 
-Files are checked so that no vertex and no face is lost silently. Texture coordinates and normals of an OBJ file with
-materials count face by face, of one that has a material of the scene where every face has them. Of the MTL files
-that it names, diffuse colours and pictures are read (Kd, map_Kd) and nothing else; a material of the scene with the
-name that `usemtl` says comes before theirs.
+Files are checked so that no vertex and no face is lost silently. Where an OBJ file has materials, texture coordinates
+and normals count for each face that has them; where the scene gives one material, only if all faces have them. Of the
+MTL files that an OBJ file names, diffuse colours and pictures (Kd, map_Kd) are read and nothing else. A material of the
+scene with the name that `usemtl` says comes before theirs.
 
-PLY files are ASCII, or binary of either byte order, and their faces may have any number of corners, each another; what
-else a file holds (colours, edges, flags of faces) is passed over. Source: G. Turk, The PLY Polygon File Format (1994).
+PLY files are ASCII, or binary of either byte order. Each face may have its own number of corners. What else a file
+holds (colours, edges, flags of faces) is passed over. Source: G. Turk, The PLY Polygon File Format (1994).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import read_bytes
 from neurolens.pictures.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshSettings, Texture, Vector
 
-_LARGEST, _LARGEST_UV = 1e60, 1e6  # areas are finite; texture coordinates have pixels left in float32
+_LARGEST, _LARGEST_UV = 1e60, 1e6  # so that areas are finite, and texture coordinates tell pixels apart in float32
 _LARGEST_HEADER, _LONGEST = 100_000, 60  # characters of PLY's header, and of a number or a corner
 _KINDS = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64".split()
 _TYPES = dict(zip(_KINDS, ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8") * 2, strict=True))
-_COUNTS = {name for name, kind in _TYPES.items() if kind[0] != "f"}  # what the length of a list may be
+_COUNTS = {name for name, kind in _TYPES.items() if kind[0] != "f"}  # types that the length of a list may have
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_indices", "vertex_index")
 _COORDINATES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
@@ -43,17 +43,17 @@ _CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
 # Of each kind of line: the fewest and most words after it, how many are used, what is expected.
 _OBJ_LINES = {"v": (3, 7, 3, "v X Y Z"), "vt": (2, 3, 2, "vt U V"), "vn": (3, 3, 3, "vn X Y Z")}
 _LARGEST_MTL, _MOST = 4_000_000, 1000  # bytes of an MTL file, materials
-_GREY: Vector = (0.8, 0.8, 0.8)  # of a material that says nothing
+_GREY: Vector = (0.8, 0.8, 0.8)  # colour of a material that states none
 
 
 @dataclass(frozen=True)
 class TriangleSet:
-    """A mesh as read.
+    """A mesh as it was read.
 
     Attributes:
-        vertices: [V, 3] float64 m. faces: [T, 3] counted from 0. uv: [V, 2] texture coordinates, from the lower left
+        vertices: [V, 3] float64, m. faces: [T, 3], counted from 0. uv: [V, 2] texture coordinates, from the lower left
             corner of a picture, or None. normals: [V, 3] unit vectors to interpolate, or None.
-        libraries: MTL files that an OBJ file names. materials, objects: of each of its triangles, by name.
+        libraries: MTL files that an OBJ file names. materials, objects: for each of its triangles, their names.
     """
 
     vertices: NDArray[np.float64]
@@ -66,15 +66,15 @@ class TriangleSet:
 
 
 def whole_values(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """Values of vertices, None where some have none (NaN)."""
+    """Return values of vertices, or None where some vertex has none (NaN)."""
     return None if values is None or np.isnan(values).any() else values
 
 
 def read_file(scene: Path, field: str, path: Path, whole: bool = True) -> TriangleSet:
-    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units, polygons cut into triangles.
+    """Read the triangles of an OBJ or PLY file (ASCII or binary) in its own units; polygons are cut into triangles.
 
-    Without `whole`, texture coordinates and normals of an OBJ file are NaN at corners that have none; with it they
-    count where all corners have them. Errors as of `read_mesh`.
+    Without `whole`, texture coordinates and normals of an OBJ file are NaN at corners that have none. With it, they are
+    read only where all corners have them. Errors are those of `read_mesh`.
     """
     kind = path.suffix.lower()
     try:
@@ -88,10 +88,10 @@ def read_file(scene: Path, field: str, path: Path, whole: bool = True) -> Triang
 
 
 def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSet:
-    """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans."""
+    """Read the triangles of an OBJ file. Each corner, as its faces write it, is a vertex; polygons become fans."""
     if b"\0" in content:
         raise InputError(scene, field, str(path), "a text file, without zero bytes")
-    # Only comments and names can hold more than ASCII, in any encoding. A line may go on after a backslash.
+    # Only comments and names can hold more than ASCII, in any encoding. After a backslash a line goes on.
     text = content.decode("utf-8-sig", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
     values: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: dict[tuple[int, ...], int] = {}
@@ -130,7 +130,7 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSe
 
 
 def _is_number(word: str) -> bool:
-    """Whether a word is a decimal number; infinity, NaN and what only Python takes for one are not."""
+    """Return whether a word is a decimal number; infinity, NaN and forms that only Python reads are not."""
     try:
         return len(word) <= _LONGEST and not word.strip("0123456789+-.eE") and math.isfinite(float(word))
     except ValueError:
@@ -138,9 +138,9 @@ def _is_number(word: str) -> bool:
 
 
 def _corners(scene: Path, field: str, words: list[str], values: dict[str, list[list[float]]]) -> list[tuple[int, ...]]:
-    """Corners of a face as rows of `values`, -1 for what they leave out; the file may count back from the last one.
+    """Return the corners of a face as rows of `values`, -1 for what they leave out; files may count back from the last.
 
-    Refused are corners that refer to something that does not come before them, and corners of unlike forms.
+    A corner is refused if it refers to something that does not come before it, or differs in form from the others.
     """
     if len({tuple(map(bool, word.split("/"))) for word in words}) > 1:
         raise InputError(scene, field, " ".join(words)[:60], "corners of the same form, as in 1/1 2/2 3/3")
@@ -158,11 +158,11 @@ def _corners(scene: Path, field: str, words: list[str], values: dict[str, list[l
 
 
 def read_library(scene: Path, mesh: Path, libraries: list[str]) -> dict[str, tuple[Vector, Path | None]]:
-    """Colour, and picture beside the scene if there is one, of every material of the MTL files."""
+    """Read the colour, and the picture beside the scene if there is one, of every material of the MTL files."""
     found: dict[str, tuple[Vector, Path | None]] = {}
     for listed in libraries:
         whole = (scene.parent / mesh).parent / PurePosixPath(listed)
-        for name in [listed] if os.path.isfile(whole) else listed.split():  # several names, or one with blanks
+        for name in [listed] if os.path.isfile(whole) else listed.split():  # several names, or one with blanks in it
             file = mesh.parent / PurePosixPath(name.replace("\\", "/"))
             found |= _read_mtl(scene.parent / file, file.parent)
             if len(found) > _MOST:
@@ -171,7 +171,7 @@ def read_library(scene: Path, mesh: Path, libraries: list[str]) -> dict[str, tup
 
 
 def _read_mtl(path: Path, folder: Path) -> dict[str, tuple[Vector, Path | None]]:
-    """Materials of an MTL file; `folder`: where it lies, seen from the scene.
+    """Read the materials of an MTL file; `folder` is where it lies, seen from the scene.
 
     Raises:
         InputError: as of `read_bytes`; a colour or picture that is none.
@@ -202,7 +202,7 @@ def _read_mtl(path: Path, folder: Path) -> dict[str, tuple[Vector, Path | None]]
 
 
 class Property(NamedTuple):
-    """A value of each element of a kind in a PLY file, or a list of values, whose length is of type `length`."""
+    """What each element of a kind in a PLY file has: a value, or a list of values whose length is of type `length`."""
 
     name: str
     kind: str
@@ -211,7 +211,7 @@ class Property(NamedTuple):
 
 @dataclass(frozen=True)
 class Element:
-    """A kind of element in a PLY file, how many the header promises, and what each has."""
+    """A kind of element in a PLY file: how many the header promises, and what each has."""
 
     name: str
     count: int
@@ -250,7 +250,7 @@ def read_polygons(content: bytes) -> TriangleSet:
 
 
 def _header(text: str) -> tuple[str, list[Element]]:
-    """The byte order, "" of ASCII, and the kinds of elements in their order."""
+    """Return the byte order ("" for ASCII) and the kinds of elements in their order."""
     order, elements = None, list[Element]()
     for line in text.splitlines()[1:]:
         match line.split():
@@ -275,7 +275,7 @@ def _header(text: str) -> tuple[str, list[Element]]:
 
 
 def _numbers(text: bytes) -> NDArray[np.float64]:
-    """The numbers of an ASCII file, without a Python object for each."""
+    """Read the numbers of an ASCII file, without a Python object for each."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         try:
@@ -287,7 +287,7 @@ def _numbers(text: bytes) -> NDArray[np.float64]:
 class _Body:
     """The part of a PLY file after its header: bytes in an order ("<", ">"), or the numbers of an ASCII file ("").
 
-    It is read from the place `at` on, which counts bytes, or numbers. IndexError: it ends too early.
+    It is read from the place `at` on, which counts bytes or numbers. Raises IndexError where it ends too early.
     """
 
     def __init__(self, content: bytes, order: str) -> None:
@@ -298,7 +298,7 @@ class _Body:
         return int(kind[1]) if self._order else 1
 
     def columns(self, element: Element) -> dict[str, NDArray[np.float64]]:
-        """The values by name of the next elements, which have no lists."""
+        """Read the next elements, which have no lists; returns their values by name."""
         kinds = [p.kind for p in element.properties]
         start, self._at = self._at, self._at + element.count * sum(map(self._size, kinds))
         if self._at > self._values.size:
@@ -309,14 +309,15 @@ class _Body:
             values = [rows[f"{k}"] for k in range(len(kinds))]
         else:
             values = values.reshape(element.count, len(kinds)).T
-        with np.errstate(invalid="ignore"):  # NaN, which the mesh is refused for
+        with np.errstate(invalid="ignore"):  # a mesh with NaN is refused later
             return {p.name: v.astype(np.float64) for p, v in zip(element.properties, values, strict=True)}
 
     def fans(self, element: Element) -> NDArray[np.int64]:
-        """The next elements; of faces the polygons, in their order, as fans of triangles [T, 3], else none."""
+        """Read the next elements; if they are faces, return their polygons, in order, as fans of triangles [T, 3]."""
         names = [p.name for p in element.properties if p.name in _CORNERS and p.length and element.name == "face"]
         big: Literal["big", "little"] = "big" if self._order == ">" else "little"
-        starts, counts, form = array("q"), array("q"), ""  # where the corners of each begin, and how many there are
+        # where the corners of each polygon begin, and how many it has
+        starts, counts, form = array("q"), array("q"), ""
         at, end = self._at, self._values.size
         for _ in range(element.count):
             for name, kind, length in element.properties:
@@ -350,7 +351,7 @@ class _Body:
 
 
 def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:
-    """Triangles in scene coordinates, none degenerate; `part`: those of a file that has been read.
+    """Return triangles in scene coordinates, none degenerate; `part` are those of a file that has been read.
 
     Warns:
         NeurolensWarning: triangles of a file without area, which are left out.
@@ -388,7 +389,7 @@ def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet
 
 
 def _mapped(mesh: TriangleSet, matrix: NDArray[np.float64]) -> TriangleSet:
-    """A mesh mapped by [3, 4]; a mirroring one turns its triangles, so that their fronts stay outside."""
+    """Map a mesh by a matrix [3, 4]; where that mirrors, triangles are turned, so that their fronts stay outside."""
     linear = matrix[:, :3]
     normals = None if mesh.normals is None else mesh.normals @ np.linalg.inv(linear)
     faces = mesh.faces if np.linalg.det(linear) > 0 else mesh.faces[:, ::-1]
@@ -396,7 +397,7 @@ def _mapped(mesh: TriangleSet, matrix: NDArray[np.float64]) -> TriangleSet:
 
 
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Unit normals [V, 3]: the area-weighted mean of the triangles around each vertex."""
+    """Return unit normals [V, 3]: the area-weighted mean of the triangles around each vertex."""
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(vertices)
@@ -406,7 +407,7 @@ def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
 
 
 def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> TriangleSet:
-    """The mesh, of a file without the triangles that have no area; a scene's own must have one."""
+    """Return the mesh. A file's triangles without area are left out; those of the scene's own must have one."""
     vertices, faces = mesh.vertices, mesh.faces
     if not len(faces):
         raise InputError(scene, f"{field}.faces", "(none)", "at least one triangle")
@@ -419,7 +420,7 @@ def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> T
     corners = vertices[faces]
     edges = corners[:, [1, 2, 0]] - corners
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    # Height over the longest side: a needle this thin has no normal in float32.
+    # By the height over the longest side: a needle this thin has no normal in float32.
     flat = ~(area > 1e-6 * np.max(np.sum(edges**2, axis=2), axis=1))
     if not flat.any():
         return mesh
@@ -432,12 +433,12 @@ def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> T
 
 
 class Parts:
-    """The meshes of a scene in parts of one material each, and the materials and textures that come with them.
+    """The meshes of a scene in parts of one material each, with the materials and textures that come with them.
 
-    A mesh that has a material is one part, another is cut by the materials of its file. `known`: those of the scene.
+    A mesh that has a material is one part; any other is cut by the materials of its file. `known` are the scene's.
 
     Raises:
-        InputError: as of `read_mesh`; a file without materials, or with some that are defined nowhere.
+        InputError: as `read_mesh`; also for a file without materials, or with some that are defined nowhere.
     """
 
     def __init__(self, scene: Path, meshes: Sequence[MeshSettings], known: Mapping[str, Material]) -> None:
@@ -457,7 +458,7 @@ class Parts:
         whole = read_file(scene, f"{place}.file", scene.parent / mesh.file, whole=False)
         libraries = list(dict.fromkeys(whole.libraries))
         found = read_library(scene, mesh.file, libraries)
-        # Faces of a material that have texture coordinates or normals are apart from those that have none.
+        # Faces of a material are apart where only some have texture coordinates, or normals.
         has_uv, has_normals = (
             np.zeros(len(whole.faces), np.bool_) if v is None else np.isfinite(v[whole.faces[:, 0]]).all(1)
             for v in (whole.uv, whole.normals)
@@ -480,7 +481,7 @@ class Parts:
             self.triangles.append(read_mesh(scene, place, part, _part(whole, chosen)))
 
     def _defined(self, name: str, look: tuple[Vector, Path | None], coordinates: bool, which: str) -> str:
-        """The name of a material of an MTL file, for faces with texture coordinates or without, once it is defined."""
+        """Define a material of an MTL file, for faces with texture coordinates or without, and return its name."""
         colour, picture = look
         if picture is not None and coordinates:
             self.textures[name] = Texture("image", file=picture)
@@ -494,7 +495,7 @@ class Parts:
 
 
 def _part(mesh: TriangleSet, chosen: NDArray[np.bool_]) -> TriangleSet:
-    """Some triangles of a mesh, with the vertices that they need."""
+    """Return some triangles of a mesh, with the vertices that they need."""
     rows, faces = np.unique(mesh.faces[chosen], return_inverse=True)
     uv, normals = (None if values is None else whole_values(values[rows]) for values in (mesh.uv, mesh.normals))
     return TriangleSet(mesh.vertices[rows], faces.reshape(-1, 3).astype(np.int64), uv, normals)

@@ -47,8 +47,8 @@ COLOURS = "RGB"
 LARGEST_FILM = 1 << 16  # pixels per side
 _MOST_VALUES = 1 << 27  # of an OpenEXR file, at 8 bytes each while it is read
 _MOST_PARTS = 1 << 28  # values of all parts of a file, at 4 bytes each
-_ROUNDED = 2e-4  # how far the chromaticities of one space may lie apart in files
-PIXEL_TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files
+_ROUNDED = 2e-4  # how far apart files may write the chromaticities of one space
+PIXEL_TYPES = (np.uint32, np.float16, np.float32)  # in the order of the numbers of pixel types in OpenEXR files
 _DEPTH = "Z"  # the name of depth in other programs
 
 
@@ -64,7 +64,7 @@ def write_exr(
 ) -> None:
     """Write a picture as OpenEXR: channels R, G and B, then layers, ZIP compression, atomically.
 
-    The attributes chromaticities, adoptedNeutral and colorInteropID say which colour space it is.
+    The attributes chromaticities, adoptedNeutral and colorInteropID say which colour space the picture is in.
 
     Args:
         path: where to; the folder exists.
@@ -76,8 +76,9 @@ def write_exr(
         attributes: more of the header, see `standard_attributes`.
 
     Raises:
-        InputError: another shape, no pixels, complex or text, not finite, a layer with NaN or of a colour's name,
-            metadata that is not JSON, no such folder, a file that the library cannot write.
+        InputError: the picture has another shape, no pixels, complex numbers or text, or values that are not finite; a
+            layer has NaN or a colour's name; the metadata are not JSON; the folder does not exist; the library cannot
+            write the file.
         OSError: a place that cannot be written; it names `path`.
     """
     path = Path(path)
@@ -105,10 +106,10 @@ def write_channels(
 ) -> None:
     """Write channels [H, W] of any of OpenEXR's types as they are; arguments and errors are those of `write_exr`.
 
-    The colour space of data that are no colours is None.
+    `space` is None for data that are no colours.
     """
     try:
-        json.dumps(metadata or {}, allow_nan=False)  # refuses what `plain` would make a text of
+        json.dumps(metadata or {}, allow_nan=False)  # refuses numbers of which `plain` would make texts
         text = json.dumps(plain(metadata or {}))
     except (TypeError, ValueError) as error:
         raise InputError(path, "metadata", f"({error})", "values that JSON can hold") from None
@@ -122,7 +123,8 @@ def write_channels(
     with atomic_path(path) as temporary:
         try:
             OpenEXR.File([OpenEXR.Part(header | dict(attributes or {}), planes)]).write(os.fsencode(temporary))
-        except (RuntimeError, UnicodeError) as error:  # the library's only kinds; it names the temporary file
+        # the library raises nothing else; its message names the temporary file
+        except (RuntimeError, UnicodeError) as error:
             said = str(error).replace(str(temporary), path.name)
             raise InputError(path, "file", f"({said})", "a writable path") from None
 
@@ -146,7 +148,7 @@ def _layer_channels(path: Path, layers: Mapping[str, ArrayLike], shape: tuple[in
 
 
 def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
-    """A picture [H, W, 3] float32, in the colour space that it was written in, and its metadata, {} without ours.
+    """Read a picture [H, W, 3] float32, in the colour space that it was written in, and its metadata ({} if not ours).
 
     Raises:
         InputError: missing, no OpenEXR file, truncated, or without channels R, G and B.
@@ -156,7 +158,9 @@ def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
 
 
 def read_channels(path: str | Path, wanted: Sequence[str] = ()) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-    """The channels [H, W] float32 of a picture by name, or those wanted where it has them all, and its metadata.
+    """Read the channels [H, W] float32 of a picture by name, and its metadata.
+
+    Only the `wanted` channels are read where the picture has them all.
 
     Raises:
         InputError: missing, no OpenEXR file, truncated, metadata that are no JSON object.
@@ -166,18 +170,18 @@ def read_channels(path: str | Path, wanted: Sequence[str] = ()) -> tuple[dict[st
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """The metadata of a picture alone, {} without ours; raises InputError as `read_channels`."""
+    """Read the metadata of a picture alone, {} if not ours; raises InputError as `read_channels`."""
     return metadata_of(path, header_of(path))
 
 
 def read_layers(path: str | Path) -> dict[str, FloatArray]:
-    """The channels [H, W] float32 besides R, G and B by name, Z as depth; raises InputError as `read_exr`."""
+    """Read the channels [H, W] float32 besides R, G and B by name, Z as depth; raises InputError as `read_exr`."""
     planes, _ = decoded_channels(Path(path), path, "file")
     return {"depth" if name == _DEPTH else name: plane for name, plane in planes.items() if name not in COLOURS}
 
 
 def read_colour_space(path: str | Path) -> ColourSpace | None:
-    """The colour space whose chromaticities a picture states; None where it states none.
+    """Return the colour space whose chromaticities a picture states; None where it states none.
 
     Warns:
         NeurolensWarning: chromaticities of another space, in whose place sRGB is assumed.
@@ -197,7 +201,7 @@ def read_colour_space(path: str | Path) -> ColourSpace | None:
 
 
 def metadata_of(path: str | Path, header: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings in our attribute, which in a stranger's file may have any type of OpenEXR."""
+    """Read the settings in our attribute, which in a stranger's file may have any type of OpenEXR."""
     text = header.get(METADATA_KEY, "{}")
     with suppress(ValueError, RecursionError, InputError):
         if isinstance(text, str) and isinstance(metadata := parse_json(text, path), dict):
@@ -206,7 +210,7 @@ def metadata_of(path: str | Path, header: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def colours_of(planes: Mapping[str, FloatArray], file: str | Path, field: str) -> FloatArray:
-    """Channels R, G and B as [H, W, 3]; InputError where one is missing."""
+    """Return channels R, G and B as [H, W, 3]; InputError where one is missing."""
     if not planes.keys() >= set(COLOURS):
         raise InputError(file, field, f"(channels {', '.join(sorted(planes))})", "channels R, G and B")
     return np.stack([planes[name] for name in COLOURS], axis=-1)
@@ -220,11 +224,11 @@ def decoded_channels(
     most: int = LARGEST_FILM,
     pixels: int = _MOST_VALUES,
 ) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-    """The channels [H, W] of the first part as float32, those wanted where it has them all, and its header.
+    """Read the channels [H, W] of the first part as float32, the wanted ones where it has them all, and its header.
 
     Args:
-        file, field: what names the picture, for messages: itself, or a scene and its key.
-        most: pixels a side. pixels: the most in all.
+        file, field: what names the picture in messages: the file itself, or a scene and its key.
+        most: the most pixels a side. pixels: the most in all.
     """
     header = _headers(file, field, path)[0][1]
     with whole_file(file, field, path):
@@ -255,12 +259,12 @@ def check_size(file: str | Path, field: str, name: str, size: Sequence[int], mos
 
 
 def decoded_later_parts(path: Path) -> list[tuple[str, dict[str, NDArray[Any]]]]:
-    """Names and channels, as stored, of the parts after the first, whose pixels stand where those of the first do.
+    """Read names and channels, as stored, of the parts after the first that cover the same pixels as the first.
 
-    The library reads all parts at once, and leaves out those that it cannot read.
+    The library reads all parts at once, and leaves out parts that it cannot read.
 
     Warns:
-        NeurolensWarning: parts that are left out, for their data windows differ.
+        NeurolensWarning: parts are left out, because their data windows differ.
     """
     if len(parts := _headers(path, "file", path)) < 2:
         return []
@@ -290,12 +294,12 @@ def decoded_later_parts(path: Path) -> list[tuple[str, dict[str, NDArray[Any]]]]
 
 
 def header_of(path: str | Path) -> dict[str, Any]:
-    """The header of a file's first part; raises InputError as `read_channels`."""
+    """Read the header of a file's first part; raises InputError as `read_channels`."""
     return _headers(path, "file", Path(path))[0][1]
 
 
 def _headers(file: str | Path, field: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Names and headers of all parts; `file` and `field` name the picture."""
+    """Read names and headers of all parts; `file` and `field` name the picture in messages."""
     with whole_file(file, field, path), _silent():
         open_regular(path).close()
         with OpenEXR.File(os.fsencode(path), header_only=True) as opened:
@@ -335,21 +339,24 @@ def _silent() -> Iterator[None]:
 def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
     """Write an 8-bit sRGB preview of a linear picture [H, W, 3], brighter by `exposure` stops, atomically.
 
-    InputError: another shape.
+    Raises:
+        InputError: the picture has another shape.
     """
     picture = _shaped(path, np.asarray(rgb, np.float32))
     encoded = np.empty(picture.shape, np.uint8)
     rows = max(1, _BAND // picture.shape[1])
-    for first in range(0, len(picture), rows):  # of a whole large picture every step takes pages of memory anew
+    # in bands: on a whole large picture every step would get its pages of memory anew
+    for first in range(0, len(picture), rows):
         band = picture[first : first + rows] * np.float32(2.0**exposure)
         encoded[first : first + rows] = np.rint(255 * linear_to_srgb(band))
     with atomic_path(path) as temporary:
         Image.fromarray(encoded).save(temporary)
 
 
-_LEAST_ASPECT = 1e-5  # of a pixel: the library refuses some less
-_SQUARE = 1e-6  # relative, of pixels
-_TEXTS = ("camera", "lensMake", "lensModel", "lensSerial", "lensFirmware")  # what the names of texts begin with
+_LEAST_ASPECT = 1e-5  # of a pixel: the library refuses some smaller ones
+_SQUARE = 1e-6  # pixels whose sides differ by less, relatively, are square
+# how the names of attributes that are texts begin
+_TEXTS = ("camera", "lensMake", "lensModel", "lensSerial", "lensFirmware")
 _STATE = {
     "nominalFocalLength": "nominal_focal_length_mm",
     "effectiveFocalLength": "effective_focal_length_mm",
@@ -363,15 +370,15 @@ _STATE = {
 def standard_attributes(
     settings: Mapping[str, Any], width: int | None = None, height: int | None = None, frame: int | None = None
 ) -> dict[str, Any]:
-    """Header values of a picture, of the types that the OpenEXR library wants.
+    """Return the header values of a picture, in the types that the OpenEXR library wants.
 
     Args:
-        settings: of the camera, as `Camera.settings` has them.
+        settings: the camera's, as in `Camera.settings`.
         width, height: of the picture, in pixels; None where pixels are no part of the film, as in maps.
-        frame: number of the picture in a sequence.
+        frame: the picture's number in a sequence.
 
     Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError: settings of no camera.
+        KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError: these are no camera's settings.
     """
     found: dict[str, Any] = {
         "cameraMake": "neurolens",
@@ -398,7 +405,7 @@ def _lens(settings: Mapping[str, Any]) -> dict[str, Any]:
     lens = settings.get("lens") or card.get("lens") or {}
     state = settings.get("lens_state") or {}
     found: dict[str, Any] = {name: state.get(key) for name, key in _STATE.items()}
-    # The makers of a published prescription are those who designed it, or who published it.
+    # The designer of a published prescription counts as its maker, else who published it.
     found |= {"lensMake": lens.get("designer") or lens.get("source"), "lensModel": lens.get("name")}
     found |= {"lensSerialNumber": lens.get("sha256"), "lensFirmwareVersion": card.get("fit", {}).get("method")}
     point = str(settings.get("camera")).startswith(("pinhole", "fisheye-"))  # everything is in focus

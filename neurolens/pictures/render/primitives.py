@@ -20,12 +20,12 @@ from neurolens.cameras.contract import FloatArray
 IntArray = NDArray[np.int32]
 FloatArray64 = NDArray[np.float64]
 _TINY = np.float32(1e-20)
-NEAREST = np.float32(1e-6)  # hits closer than this, in metres, are the surface that a ray leaves
+NEAREST = np.float32(1e-6)  # a nearer hit, in metres, is on the surface that a ray leaves
 
 
 @dataclass(frozen=True)
 class Rays:
-    """A batch of rays: origin and direction [3, N] float32 in metres, and 1 / direction, finite also where it is 0."""
+    """A batch of rays: origin and direction [3, N] float32 in metres, and 1 / direction, which is always finite."""
 
     origin: FloatArray
     direction: FloatArray
@@ -33,7 +33,7 @@ class Rays:
 
     @classmethod
     def of(cls, origin: FloatArray, direction: FloatArray) -> Rays:
-        """Rays with their inverse directions."""
+        """Make rays with their inverse directions."""
         inverse = direction + _TINY
         np.divide(np.float32(1), inverse, out=inverse)
         return cls(origin, direction, inverse)
@@ -58,12 +58,12 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _parts(vector: FloatArray64) -> list[tuple[int, np.float32]]:
-    """Components that are not 0, with their axes: most walls have one."""
+    """Return the components that are not 0, with their axes: most walls have one."""
     return [(k, np.float32(v)) for k, v in enumerate(vector) if v]
 
 
 def _sum(parts: list[tuple[int, np.float32]], rows: FloatArray) -> FloatArray:
-    """Dot products [N] of a vector, as its parts, with vectors [3, N]."""
+    """Return dot products [N] of a vector, given by its parts, with vectors [3, N]."""
     axis, value = parts[0]
     out: FloatArray = rows[axis] * value
     for axis, value in parts[1:]:
@@ -185,7 +185,7 @@ class Box:
         _keep(ok, distance, self.first, best, found)
 
     def face(self, point: FloatArray) -> IntArray:
-        """Surface number [N] of points [3, N] on the box: the face to which they are nearest."""
+        """Return the surface numbers [N] of points [3, N] on the box: the faces to which they are nearest."""
         relative = point - self._centre[:, None]
         relative *= self._scale[:, None]
         axis = np.argmax(np.abs(relative), axis=0)
@@ -194,7 +194,7 @@ class Box:
 
 
 def slabs(rays: Rays, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances [N] at which rays enter and leave an axis-aligned box; entry < exit where they meet it."""
+    """Return distances [N] at which rays enter and leave an axis-aligned box; entry < exit where they meet it."""
     entry: FloatArray | None = None
     exit_: FloatArray | None = None
     for k in range(3):
@@ -211,9 +211,9 @@ def slabs(rays: Rays, low: FloatArray, high: FloatArray) -> tuple[FloatArray, Fl
     return entry, exit_
 
 
-MANY_SPHERES = 1024  # beyond, clusters are faster than testing all
-_STEP = np.float32(1e-5)  # m by which a ray that met its own start triangle is moved on
-_LARGE_M = 1000.0  # in float32 the surface of larger spheres would lie behind the rays that leave it
+MANY_SPHERES = 1024  # above this number, clusters are faster than testing all
+_STEP = np.float32(1e-5)  # m by which a ray is moved on that met the triangle on which it starts
+_LARGE_M = 1000.0  # in float32 the surface of a larger sphere would lie behind the rays that leave it
 
 
 class Spheres:
@@ -226,7 +226,7 @@ class Spheres:
     Args:
         first: surface number of the first sphere.
         centres: [S, 3] m. radii: [S] m.
-        rows: numbers of these spheres [S] among all, where they are some of more.
+        rows: [S] numbers of these spheres among all, where they are only some.
     """
 
     def __init__(
@@ -242,7 +242,7 @@ class Spheres:
         constant = radii**2 - (1 - slack) * np.sum(centres**2, axis=1)
         self._along = np.column_stack([centres, -ones]).astype(np.float32)
         self._rest = np.column_stack([2 * centres, constant, (slack - 1) * ones]).astype(np.float32)
-        # Few enough rays that BLAS does not start its own threads for the product.
+        # So few rays that BLAS does not start threads of its own for the product.
         self._rays_at_once = int(np.clip(200_000 // (5 * len(radii)), 64, 4096))
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
@@ -289,15 +289,15 @@ class Spheres:
 
 
 class SphereClusters:
-    """Very many spheres, in clusters of neighbours: a ray is tested against those whose box it enters.
+    """Very many spheres, in clusters of neighbours: a ray is tested against the spheres whose box it enters.
 
-    Arguments as of `Spheres`.
+    Arguments are those of `Spheres`.
     """
 
     def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
         self.first = first
         low, high = centres - radii[:, None], centres + radii[:, None]
-        # Boxes are slightly wider, so that rounding to float32 cuts no sphere off that rays near the scene meet.
+        # Boxes are slightly wider, so that rounding to float32 cuts off no sphere that rays near the scene meet.
         margin = 1e-6 * max(1.0, float(np.abs(low).max()), float(np.abs(high).max()))
         self._clusters = [
             (
@@ -320,7 +320,7 @@ class SphereClusters:
 
 
 def _clusters(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.intp]]:
-    """Rows in groups of neighbours: halved at the median of their longest side until they are few enough."""
+    """Group rows of neighbours: they are halved at the median of their longest side until they are few enough."""
     if len(rows) <= MANY_SPHERES:
         return [rows]
     axis = int(np.argmax(np.ptp(centres[rows], axis=0)))
@@ -329,12 +329,12 @@ def _clusters(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.
 
 
 def has_embree() -> bool:
-    """Whether Embree is installed, which has no wheel for some machines."""
+    """Return whether Embree is installed; some machines have no wheel of it."""
     return find_spec("embreex") is not None
 
 
 class Mesh:
-    """Triangles [T, 3 corners, 3] in m, for Embree; `each` of them in a row are one surface, from `first` on.
+    """Triangles [T, 3 corners, 3] in m, for Embree; each `each` of them in a row are a surface, numbered from `first`.
 
     Raises:
         NeurolensError: Embree is not installed.
@@ -348,14 +348,14 @@ class Mesh:
             raise NeurolensError("meshes need Embree, which is not installed: pip install embreex") from None
         self.first, self._each = first, each
         corners = np.ascontiguousarray(triangles, np.float32)
-        # Robust: watertight at the edges that triangles share.
+        # Robust means watertight at the edges that triangles share.
         self._scene = EmbreeScene(robust=True)
         self._triangles = TriangleMesh(self._scene, corners)
         self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
 
     @classmethod
     def of_rectangles(cls, first: int, corners: FloatArray64) -> Mesh:
-        """Rectangles [T, 3 corners, 3], whose corner 0 lies between the other two: two triangles each."""
+        """Make a mesh of rectangles [T, 3 corners, 3], two triangles each; corner 0 lies between the other two."""
         far = corners[:, 1] + corners[:, 2] - corners[:, 0]
         others = np.stack([far, corners[:, 2], corners[:, 1]], axis=1)
         return cls(first, np.stack([corners, others], axis=1).reshape(-1, 3, 3), each=2)
@@ -384,13 +384,13 @@ class Mesh:
 
 
 def triangle_planes(corners: FloatArray64) -> FloatArray64:
-    """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
+    """Return plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
 
     Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
     """
     a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(edge_b, edge_c)
-    area2 = np.maximum(np.sum(normal**2, axis=1, keepdims=True), 1e-300)  # a triangle of less is never hit
+    area2 = np.maximum(np.sum(normal**2, axis=1, keepdims=True), 1e-300)  # a smaller triangle is never hit
     unit = normal / np.sqrt(area2)
     across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
     rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]

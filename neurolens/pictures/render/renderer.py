@@ -1,8 +1,8 @@
 """The render of a scene through a camera, whole or in tiles, with workers, progress, previews and checkpoints.
 
-A tile is a band of whole rows, an OpenEXR file whose data window is the band and whose display window is the picture:
-other programs show it in its place. Its metadata say what it was rendered from and with; tiles of other settings do
-not go together. Tiles that are put together are the picture that one run gives, bit for bit.
+A tile is a band of whole rows. It is an OpenEXR file whose data window is the band and whose display window is the
+picture, so that other programs show it in its place. Its metadata say what it was rendered from and how; tiles of
+different settings do not go together. Put together, tiles are the picture that one run gives, bit for bit.
 """
 
 from __future__ import annotations
@@ -49,12 +49,13 @@ from neurolens.pictures.render.settings import FilmSettings
 
 Progress = Callable[[float, float], None]
 _FORKS = sys.platform.startswith("linux")
-# Previews and checkpoints wait so many times as long as the last one took: they cost a twentieth of one core at most.
+# Previews and checkpoints wait this many times as long as the last one took, and so cost a twentieth of one core at
+# most.
 _REST = 20.0
 _MOST_SAMPLES = 1 << 20
 _EXPECTED = 'a tile of "neurolens render --tile"'
-_BYTES_A_PIXEL = 50  # of a merge: seven channels, those of the tile that is read, and what the writer packs
-# What a merged picture's statistics add up, each at most `_MOST`; the rest follows, or is the same in all tiles.
+_BYTES_A_PIXEL = 50  # of a merge: seven channels, those of the tile being read, and what the writer packs
+# What a merged picture's statistics add up, each at most `_MOST`. The rest follows, or is the same in all tiles.
 _MOST = 1e15
 _SUMMED = ("seconds", "paths", "dropped_samples", "thread_seconds", "camera_thread_seconds")
 
@@ -65,12 +66,12 @@ class Watch:
 
     Attributes:
         preview: called with the picture so far, [H, W, 3] linear sRGB, at most every `preview_s` seconds.
-        checkpoint: file that the render is kept in every `checkpoint_s` seconds, when it is stopped and when it fails,
-            and that it goes on from where it exists. Once written it stays until the caller, who then has the picture,
-            removes it.
-        restart: ignore an existing checkpoint.
-        keep: write the checkpoint of a render that is complete, too, to add samples later.
-        stop: polled; True ends the render with the present samples.
+        checkpoint: file in which the render is kept every `checkpoint_s` seconds, when it is stopped and when it fails.
+            Where the file exists, the render goes on from it. It stays until the caller removes it, who then has the
+            picture.
+        restart: whether to ignore an existing checkpoint.
+        keep: whether to write the checkpoint of a complete render, too, to add samples later.
+        stop: asked often; once it is true, the render ends with the samples so far.
         note: called with a line on failures that do not end the render, such as a preview that could not be written.
     """
 
@@ -104,11 +105,11 @@ class Keeper:
 
     @property
     def seconds(self) -> float:
-        """Spent on the render, earlier runs included."""
+        """Return the seconds spent on the render, earlier runs included."""
         return self._earlier_s + time.perf_counter() - self._began
 
     def __call__(self) -> bool:
-        """Do what is due; True if the render is to stop."""
+        """Do what is due, and return whether the render is to stop."""
         watch, fraction, now = self._watch, self._job.film.fraction, time.perf_counter()
         if self._progress is not None and fraction > self.resumed:
             pace = (now - self._began) / (fraction - self.resumed)
@@ -132,7 +133,7 @@ class Keeper:
         self._written, self._kept = True, fraction
 
     def finish(self) -> None:
-        """Keep a render that stopped; a complete one only to update an older checkpoint."""
+        """Keep a render that stopped; a complete one only where `keep` asks for it, or to update a checkpoint."""
         if self._watch.keep or self._written or self._job.film.fraction < 1:
             self._try("checkpoint", self.save)
 
@@ -144,7 +145,7 @@ class Keeper:
         return NeurolensError(f"{error}; what was done is kept in {self._watch.checkpoint}: the same command resumes")
 
     def _try(self, what: str, act: Callable[[], None], pause_s: float = 0.0) -> float:
-        """Do an optional action and return the time of the next; the first failure of each kind is reported."""
+        """Do an optional action and return the time of the next one; the first failure of each kind is reported."""
         began = time.perf_counter()
         try:
             act()
@@ -167,12 +168,13 @@ class RenderResult:
         stats: JSON-able; settings, complete, samples_done (mean a pixel), seconds, paths, mpaths_per_s,
             passed_fraction, thread_seconds (summed over the workers), camera_thread_seconds (of these, in the camera),
             camera_fraction (their ratio), dropped_samples (not finite; they count as black). Seconds and dropped
-            samples count those before a checkpoint, too.
+            samples include those before a checkpoint.
         layers: additional channels.
-        identity: what pictures of the same settings have in common, to tell whether rows belong together; of a part.
+        identity: what pictures of the same settings have in common, to tell whether rows belong together; only of a
+            part of a picture.
         behind: pictures of what is behind the first thing on each ray, behind the first two, and so on.
-        save: writes the watch's checkpoint, for use if the picture cannot be written; raises OSError or
-            NeurolensError. None without a watch that names one.
+        save: writes the checkpoint of the watch, for use if the picture cannot be written; raises OSError or
+            NeurolensError. None where the watch names no checkpoint.
     """
 
     rgb: FloatArray
@@ -200,18 +202,18 @@ def render(
 ) -> RenderResult:
     """Path-trace `scene` through `camera`.
 
-    The result depends on the seed, not on the number of threads, nor on whether it was interrupted and went on from a
-    checkpoint: bit for bit, on one machine with one set of packages. Cameras share all random numbers. Samples are
-    taken in the order of the Sobol' sequence, so that more can be added to those that a checkpoint has. Memory: the
-    film's sums, picture and layers, 164 bytes per pixel at most, and for each worker what one tile takes, whatever the
-    size of the picture.
+    The result depends on the seed, but not on the number of threads, nor on interruptions from which a checkpoint goes
+    on: bit for bit, on one machine with one set of packages. All cameras get the same random numbers. Samples are taken
+    in the order of the Sobol' sequence, so that more can be added to those of a checkpoint. Memory holds the film's
+    sums, picture and layers, at most 164 bytes per pixel, and for each worker what one tile takes, whatever the size of
+    the picture.
 
     Args:
-        width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.
-        film: spectral sampling and white balance; left out, those of the scene.
-        rows: the first row and the one after the last, of a part of the picture: its pixels are those of the whole
-            one, bit for bit, and the result holds no others. Statistics are of these pixels, too.
-        threads: workers.
+        width, height, samples, max_depth: as in `CameraSettings`; left out, the scene's.
+        film: spectral sampling and white balance; left out, the scene's.
+        rows: the first row and the one after the last, to render only these. Their pixels are those of the whole
+            picture, bit for bit, and statistics are theirs, too.
+        threads: how many workers there are.
         progress: called with the fraction done and the estimated seconds left.
         watch: previews, checkpoints and an early end.
 
@@ -247,7 +249,7 @@ def render(
     keeper.finish()
     rgb, layers = develop(job)
     stats = {"scene": scene.name, "threads": threads, **_stats(job, seconds)}
-    # Otherwise the result would keep the film's sums in memory.
+    # `keeper` itself would keep the film's sums in memory.
     save = keeper.save if watch is not None and watch.checkpoint is not None else None
     return RenderResult(rgb, stats, layers, None if rows is None else identity(job), save)
 
@@ -296,7 +298,7 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
     Raises:
         NeurolensError: a worker failed or was killed; whole tiles are on the film.
     """
-    forks = _FORKS and not multiprocessing.current_process().daemon  # such as a worker of Dask: it may have no children
+    forks = _FORKS and not multiprocessing.current_process().daemon  # a worker of Dask, for one, may have no children
     alone = workers == 1 and watch is None
     with Here() if alone else Forked(job.render_tile, workers) if forks else ThreadPoolExecutor(workers) as executor:
         for tile, answer in run_each(executor, job.render_tile, iter(job.film.take, None), stop=watch):
@@ -307,7 +309,7 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
 
 
 def rows_of(height: int, tile: tuple[int, int]) -> tuple[int, int]:
-    """First row of tile I of N, and the one after its last; InputError: more tiles than rows."""
+    """Return the first row of tile I of N, and the one after its last. Raises InputError: more tiles than rows."""
     number, count = tile
     if count > height:
         raise InputError("neurolens render", "--tile", f"{number}/{count}", f"at most {height} tiles, one a row")
@@ -315,7 +317,7 @@ def rows_of(height: int, tile: tuple[int, int]) -> tuple[int, int]:
 
 
 def tile_path(out: Path, tile: tuple[int, int] | None) -> Path:
-    """The file of a tile of the picture `out`, OUT.tile-03-of-16.exr; without a tile `out` itself."""
+    """Return the file of a tile of the picture `out`, OUT.tile-03-of-16.exr; without a tile `out` itself."""
     if tile is None:
         return out
     number, count = tile
@@ -323,7 +325,7 @@ def tile_path(out: Path, tile: tuple[int, int] | None) -> Path:
 
 
 def windows(width: int, height: int, rows: Sequence[int]) -> dict[str, Any]:
-    """Header values that place a band of rows in a picture of width x height."""
+    """Return header values that place a band of rows in a picture of width x height."""
 
     def box(first: int, last: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         return np.array([0, first], np.int32), np.array([width - 1, last], np.int32)
@@ -333,7 +335,7 @@ def windows(width: int, height: int, rows: Sequence[int]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile in a file: tile `number` of `count`, its rows, first and the one after the last, and its metadata."""
+    """A tile in a file: tile `number` of `count`; its first row and the one after its last; its metadata."""
 
     path: Path
     number: int
@@ -343,7 +345,7 @@ class Tile:
 
     @property
     def frame(self) -> int | None:
-        """Number of its picture in a sequence."""
+        """The number of its picture in a sequence."""
         frame: int | None = self.metadata["tile"]["frame"]
         return frame
 
@@ -360,7 +362,7 @@ class Tile:
         return {**metadata["tile"]["identity"], **chosen, **stored, "tiles": self.count}
 
     def channels(self) -> dict[str, FloatArray]:
-        """Its channels [rows, width] by name, R, G and B among them; InputError: a file of other rows than it says."""
+        """Read its channels [rows, width] by name, R, G and B among them. Raises InputError: it has other rows."""
         found, _ = read_channels(self.path)
         shape = self.rows[1] - self.rows[0], self.metadata["render"]["width"]
         if not found.keys() >= set("RGB") or any(plane.shape != shape for plane in found.values()):
@@ -369,10 +371,10 @@ class Tile:
 
 
 def read_tile(path: Path) -> Tile:
-    """A tile from its file, of which the pixels are read later.
+    """Read a tile from its file; the pixels are read later.
 
     Raises:
-        InputError: no OpenEXR file, none of ours, or one that an interrupted run left.
+        InputError: it is no OpenEXR file, none of ours, or what an interrupted run left.
     """
     metadata = read_metadata(path)
     try:
@@ -386,7 +388,7 @@ def read_tile(path: Path) -> Tile:
         if not all(0 <= render[name] <= _MOST for name in (*_SUMMED, "passed_fraction")):
             raise ValueError("other statistics")
         complete, done = bool(render["complete"]), float(render["samples_done"])
-        _attributes(metadata, tile.frame)  # can be written
+        _attributes(metadata, tile.frame)  # tests that they can be written
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(path, "metadata", f"({why})", _EXPECTED) from None
@@ -396,7 +398,7 @@ def read_tile(path: Path) -> Tile:
 
 
 def check_together(tiles: Sequence[Tile]) -> None:
-    """Raise InputError unless these are all the tiles of one picture, each once; it names what differs or lacks."""
+    """Raise InputError unless these are all the tiles of one picture, each once; it names what is wrong."""
     first = tiles[0]
     for other in tiles[1:]:
         if differs := difference(other.settings(), first.settings()):
@@ -415,7 +417,7 @@ def check_together(tiles: Sequence[Tile]) -> None:
 
 
 def merged(tiles: Sequence[Tile]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Channels [H, W] as one run stores them, and its metadata, of all tiles of a picture.
+    """Return the channels [H, W] of all tiles of a picture, and its metadata, as one run stores them.
 
     Times are summed over the tiles; the remaining metadata are those of one run.
 
@@ -443,7 +445,7 @@ def merged(tiles: Sequence[Tile]) -> tuple[dict[str, NDArray[Any]], dict[str, An
 
 
 def _statistics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Statistics of a picture from those of its tiles."""
+    """Return a picture's statistics from those of its tiles."""
     sums = {name: sum(part[name] for part in parts) for name in _SUMMED}
     passed = sum(round(part["passed_fraction"] * part["paths"]) for part in parts)
     return {
@@ -462,7 +464,7 @@ def merge_tiles(paths: Iterable[Path], out: Path, exposure: float = 0.0) -> list
         For each picture its file, preview, number of tiles and statistics.
 
     Raises:
-        InputError: as `check_together`; an output that is one of the tiles. OSError: an output that cannot be written.
+        InputError: as `check_together`; an output is one of the tiles. OSError: an output cannot be written.
     """
     frames: dict[int | None, list[Tile]] = {}
     for path in paths:
@@ -482,7 +484,7 @@ def merge_tiles(paths: Iterable[Path], out: Path, exposure: float = 0.0) -> list
 
 
 def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str, Any]:
-    """Write the picture of all its tiles as one run writes it, and its preview; returns its file and statistics.
+    """Write the picture of all its tiles as one run writes it, and a preview; returns its file and statistics.
 
     Raises:
         InputError: as `merged`. OSError: it cannot be written.

@@ -58,7 +58,7 @@ def _direction_numbers(dimension: int) -> list[int]:
 
 
 def sobol(count: int, dimensions: int = _SOBOL_DIMENSIONS) -> UInt32Array:
-    """The first `count` points of the Sobol' sequence, [dimensions, count], as 32-bit fractions."""
+    """Return the first `count` points of the Sobol' sequence, [dimensions, count], as 32-bit fractions."""
     index = np.arange(count, dtype=np.uint32)
     points = np.zeros((dimensions, count), np.uint32)
     for dimension in range(dimensions):
@@ -68,7 +68,7 @@ def sobol(count: int, dimensions: int = _SOBOL_DIMENSIONS) -> UInt32Array:
 
 
 def hash32(x: UInt32Array) -> UInt32Array:
-    """A bijection of 32-bit integers that mixes all bits (two rounds of xor-shift and multiply); x is unchanged."""
+    """Mix all bits of 32-bit integers one to one (two rounds of xor-shift and multiply); x is unchanged."""
     x = x ^ (x >> np.uint32(16))
     x *= np.uint32(0x7FEB352D)
     x ^= x >> np.uint32(15)
@@ -89,7 +89,7 @@ def _reverse_bits(x: UInt32Array) -> UInt32Array:
 
 
 def _to_unit(bits: UInt32Array) -> FloatArray:
-    """Floats in [0, 1) from the upper 24 bits, so that rounding never gives 1."""
+    """Return floats in [0, 1) from the upper 24 bits, so that rounding never gives 1."""
     unit = (bits >> np.uint32(8)).astype(np.float32)
     unit *= np.float32(2.0**-24)
     return unit
@@ -97,7 +97,7 @@ def _to_unit(bits: UInt32Array) -> FloatArray:
 
 @dataclass(frozen=True)
 class PathKeys:
-    """Keys of paths [N] for the sampler: the hashed pixel number and seed, the sample's index in its pixel.
+    """Keys of paths [N] for the sampler: a hash of pixel number and seed, and the sample's index in its pixel.
 
     `path` is a hash of both, for the dimensions beyond the Sobol' sequence.
     """
@@ -107,29 +107,29 @@ class PathKeys:
     path: UInt32Array
 
     def take(self, rows: NDArray[np.intp]) -> PathKeys:
-        """The keys of some paths."""
+        """Return the keys of some paths."""
         return PathKeys(self.pixel.take(rows), self.sample.take(rows), self.path.take(rows))
 
     def cut(self, start: int, stop: int) -> PathKeys:
-        """The keys of consecutive paths, without a copy."""
+        """Return the keys of consecutive paths, without a copy."""
         return PathKeys(self.pixel[start:stop], self.sample[start:stop], self.path[start:stop])
 
 
 class Sampler:
-    """Samples for a picture of so many samples per pixel (a power of two stratifies best), of one seed."""
+    """The random numbers of a picture with one seed and so many samples a pixel (a power of two stratifies best)."""
 
     def __init__(self, samples: int, seed: int) -> None:
         self._sobol_reversed = np.stack([_reverse_bits(points) for points in sobol(samples)])
         self._seed = hash32(np.array([seed & 0xFFFFFFFF], np.uint32))[0] ^ np.uint32(seed >> 32 & 0xFFFFFFFF)
 
     def keys(self, pixel: NDArray[np.intp], sample: NDArray[np.intp]) -> PathKeys:
-        """Keys of the paths of pixel numbers [N] and sample indices [N]."""
+        """Make the keys of the paths of pixel numbers [N] and sample indices [N]."""
         pixel_key = hash32(hash32(pixel.astype(np.uint32)) ^ self._seed)
         path = hash32(pixel_key + sample.astype(np.uint32) * np.uint32(0x9E3779B9))
         return PathKeys(pixel_key, sample, path)
 
     def draw(self, keys: PathKeys, dimension: int) -> FloatArray:
-        """Numbers [N] in [0, 1) of one dimension of each path."""
+        """Return numbers [N] in [0, 1), one dimension of each path."""
         salt = np.uint32((dimension + 1) * 0x85EBCA6B & 0xFFFFFFFF)
         if dimension >= _SOBOL_DIMENSIONS:
             return _to_unit(hash32(keys.path + salt))
@@ -140,12 +140,12 @@ class Sampler:
         return _to_unit(_reverse_bits(x))
 
     def draw2(self, keys: PathKeys, dimension: int) -> FloatArray:
-        """Numbers [2, N] of two dimensions in a row."""
+        """Return numbers [2, N] of two successive dimensions."""
         return np.stack([self.draw(keys, dimension), self.draw(keys, dimension + 1)])
 
 
 def orthonormal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors [3, N] that make a right-handed frame with each unit normal [3, N] (Duff et al. 2017)."""
+    """Return two unit vectors [3, N] that make a right-handed frame with each unit normal [3, N] (Duff et al. 2017)."""
     x, y, z = normal
     sign = np.copysign(np.float32(1), z)
     a = np.float32(-1) / (sign + z)
@@ -156,7 +156,7 @@ def orthonormal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def cosine_direction(normal: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Directions [3, N] with density cos / pi about the normals, and their cosines [N].
+    """Draw directions [3, N] with density cos / pi about the normals; also return their cosines [N].
 
     A normal plus a uniform point on the unit sphere has that distribution; no tangent frame is needed.
     """
@@ -176,15 +176,15 @@ def cosine_direction(normal: FloatArray, square: FloatArray) -> tuple[FloatArray
 
 
 def one_less_cosine(sin2: FloatArray) -> FloatArray:
-    """1 - cos of the half angle of a cone, from its squared sine, without loss for narrow cones."""
+    """Return 1 - cos of a cone's half angle from its squared sine, without loss for narrow cones."""
     sin2 = np.minimum(sin2, np.float32(1))
     return sin2 / (1 + np.sqrt(1 - sin2))
 
 
 def in_cone(axis: FloatArray, one_less_cos: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Directions [3, N] uniform within cones about unit axes [3, N], and their cosines' distance from 1, [N].
+    """Draw directions [3, N], uniform within cones about unit axes [3, N]; also return 1 - cos to the axes, [N].
 
-    1 - cos directly, not cos: a distant sphere's cone is narrower than float32 resolves near 1.
+    It is 1 - cos, not cos, because a distant sphere's cone is narrower than float32 resolves near 1.
     """
     lost = square[0] * one_less_cos
     sin = np.sqrt(lost * (2 - lost))
@@ -194,7 +194,7 @@ def in_cone(axis: FloatArray, one_less_cos: FloatArray, square: FloatArray) -> t
 
 
 def cell_of(direction: FloatArray, height: int, width: int, turn: float = 0.0) -> NDArray[np.intp]:
-    """Flat numbers [N] of the cells of a table [height, width], turned by `turn` radians about y, in directions."""
+    """Return the flat numbers [N] of a table's cells in directions; [height, width], turned by `turn` rad about y."""
     across = np.arctan2(direction[0], -direction[2])
     across += np.float32(turn)
     across *= np.float32(0.5) / _PI
@@ -207,7 +207,7 @@ def cell_of(direction: FloatArray, height: int, width: int, turn: float = 0.0) -
 
 
 def centres(height: int, width: int) -> FloatArray:
-    """Unit directions [3, height * width] of the middles of the cells."""
+    """Return unit directions [3, height * width] to the middles of the cells."""
     down = (np.arange(height) + 0.5) * math.pi / height
     across = (np.arange(width) + 0.5) * 2 * math.pi / width - math.pi
     sin, cos = np.sin(down)[:, None], np.cos(down)[:, None]
@@ -216,7 +216,7 @@ def centres(height: int, width: int) -> FloatArray:
 
 
 class DirectionTable:
-    """Directions with a density per solid angle that is constant in each cell, in proportion to its weight.
+    """Draws directions with a density per solid angle that is constant in each cell, in proportion to its weight.
 
     The table is a picture in the equirectangular form: its middle looks along -z, its right half along +x, its top row
     is at the zenith (+y).
@@ -229,18 +229,18 @@ class DirectionTable:
     def __init__(self, weights: NDArray[np.floating], turn: float = 0.0) -> None:
         self._height, self._width = weights.shape
         self._turn = turn
-        # Uniform in the cosine from the zenith within a row, so that a density is constant per solid angle.
+        # Rows are uniform in the cosine from the zenith, so that a density is constant per solid angle.
         cosine = np.cos(np.linspace(0, math.pi, self._height + 1))
         self._cosine = cosine.astype(np.float32)
         solid = (cosine[:-1] - cosine[1:]) * 2 * math.pi / self._width
-        # Each step in place: of a picture of 8192 by 4096 cells an array takes 0.27 GB.
+        # Each step works in place: at 8192 by 4096 cells an array takes 0.27 GB.
         share = np.multiply(weights, solid[:, None], dtype=np.float64)
         rows = share.sum(axis=1)
         self.total = float(rows.sum())
         self._density = (weights / self.total).astype(np.float32, copy=False).ravel()
         self._rows = np.concatenate([[0.0], np.cumsum(rows) / self.total])
         self._rows[-1] = 1.0
-        # One sorted list for all rows: that of row r runs from r to r + 1.
+        # One sorted list serves all rows: that of row r runs from r to r + 1.
         np.cumsum(share, axis=1, out=share)
         share /= np.maximum(rows, 1e-300)[:, None]
         share[:, -1] = 1.0
@@ -249,7 +249,7 @@ class DirectionTable:
         self._columns = share.ravel()
 
     def sample(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Directions [3, N] and densities [N] per solid angle for numbers [2, N] in [0, 1)."""
+        """Return directions [3, N] and densities [N] per solid angle for numbers [2, N] in [0, 1)."""
         up = square[1].astype(np.float64)
         row = np.clip(np.searchsorted(self._rows, up, side="right") - 1, 0, self._height - 1)
         low = self._rows[row]
@@ -266,5 +266,5 @@ class DirectionTable:
         return np.stack([sine * np.sin(angle), cosine, -sine * np.cos(angle)]), self._density.take(cell)
 
     def pdf(self, direction: FloatArray) -> FloatArray:
-        """Density [N] per solid angle with which `sample` takes directions [3, N]."""
+        """Return the density [N] per solid angle with which `sample` takes directions [3, N]."""
         return self._density.take(cell_of(direction, self._height, self._width, self._turn))

@@ -1,4 +1,4 @@
-"""A scene: the TOML file, then the pictures, meshes and spectra it names, with every reference checked.
+"""A scene: a TOML file, then the pictures, meshes and spectra that it names, with every reference checked.
 
 The tables of shapes, materials and lights are defined in `neurolens.pictures.render.scenetables`.
 """
@@ -44,16 +44,17 @@ _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings(StopShape, Checked):
-    """Place, film and picture of the camera; the camera itself is chosen by the caller of `render`.
+    """Place, film and picture of the camera; which camera it is, the caller of `render` chooses.
 
     Attributes:
-        position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
-        focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
+        position_m: the film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
+        focus_m: distance from the film to the object in focus. f_number: None leaves it to the lens.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
-            `optics.lens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
+            `optics.lens.apertures`; the mask is a picture beside the scene. Without them it is the lens's own, else
+            round.
         film_mm: width and height of the part of the film that is used.
-        wavelength_nm: range of light. width, height: picture in pixels. samples: a pixel.
-        max_depth: number of surfaces along a path at which light is scattered.
+        wavelength_nm: range of light. width, height: of the picture, in pixels. samples: per pixel.
+        max_depth: at how many surfaces along a path light is scattered.
     """
 
     position_m: tables.Place
@@ -79,7 +80,7 @@ class CameraSettings(StopShape, Checked):
         require(across > 1e-6 * far * high, "up", self.up, "a direction not along the optical axis")
 
     def shot(self, aperture: Aperture | None = None) -> Shot:
-        """The shot of the scene, whose f-number is clamped to that of the lens."""
+        """Return the scene's shot; its f-number is clamped to that of the lens."""
         light_nm = self.wavelength_nm
         return Shot(
             self.film_mm, self.focus_m, self.f_number, aperture=aperture, wavelength_nm=light_nm, clamp_f_number=True
@@ -88,7 +89,7 @@ class CameraSettings(StopShape, Checked):
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """A whole scene file."""
+    """The tables of a whole scene file."""
 
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
@@ -120,8 +121,8 @@ class Scene:
     """A scene with all it needs.
 
     Attributes:
-        name: the file's name without ending. settings: the tables of the file.
-        images: linear RGB [H, W, 3] of each image texture. triangles: one a mesh.
+        name: the file's name without its ending. settings: the tables of the file.
+        images: linear RGB [H, W, 3] of each image texture. triangles: a set for each mesh.
         aperture: shape of the stop's opening, None if not given.
         illuminants, reflectances: measured spectra by name.
         environment: linear RGB [H, W, 3] of the environment's picture, if it has one.
@@ -141,9 +142,9 @@ def load_scene(path: str | Path) -> Scene:
     """Read a scene file; pictures and meshes lie beside it.
 
     Raises:
-        InputError: names file, field, value and what was expected, for an unknown or missing key, a wrong type or
-            value, a material or texture that is not defined, a picture or mesh that is missing or broken, a
-            degenerate triangle.
+        InputError: a key is unknown or missing, a type or value is wrong, a material or texture is not defined, a
+            picture or mesh is missing or broken, a triangle is degenerate. It names file, field, value and what was
+            expected.
     """
     return scene_from_tables(read_toml(path), path)
 
@@ -175,7 +176,7 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
 
 
 def _with_film(tables: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
-    """The tables of a scene with `film_mm` in place of its earlier keys, film_width_mm and film_height_mm."""
+    """Return a scene's tables with `film_mm` in place of its earlier keys, film_width_mm and film_height_mm."""
     camera, sides = tables.get("camera"), ("film_width_mm", "film_height_mm")
     if not (isinstance(camera, Mapping) and set(sides) & camera.keys()):
         return tables
@@ -187,7 +188,7 @@ def _with_film(tables: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
 
 
 def seen_from(scene: Scene, path: str | Path, position_m: Vector | None, look_at_m: Vector | None) -> Scene:
-    """The scene from another place, towards another point; None keeps its own. Errors as of `load_scene`."""
+    """Return the scene from another place, towards another point; None keeps the scene's. Errors as in `load_scene`."""
     moved: dict[str, Any] = {"position_m": position_m, "look_at_m": look_at_m}
     changes = {name: value for name, value in moved.items() if value is not None}
     if not changes:
@@ -232,7 +233,7 @@ def _spectra(
     camera: CameraSettings,
     most: float | None = None,
 ) -> dict[str, Spectrum]:
-    """Measured spectra over all of the camera's wavelengths: scaled to a maximum of 1, or with `most` as they are."""
+    """Measured spectra over all of the camera's wavelengths, scaled to a maximum of 1 (with `most`: unscaled)."""
     low, high = camera.wavelength_nm
     found = {}
     for name, table in tables.items():
@@ -292,10 +293,10 @@ def _check_texture(
 
 
 def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
-    """Whether a point [3] lies inside a closed mesh whose triangles face outwards.
+    """Return whether a point [3] lies inside a closed mesh whose triangles face outwards.
 
-    By the winding number, the sum of the solid angles of the triangles over 4 pi (van Oosterom and Strackee 1983): 1
-    inside, 0 outside. A room, whose triangles face inwards, has -1; for an open mesh it means nothing.
+    The winding number decides, the sum of the triangles' solid angles over 4 pi (van Oosterom and Strackee 1983): 1
+    inside, 0 outside. It is -1 in a room, whose triangles face inwards, and means nothing for an open mesh.
     """
     corners = mesh.vertices[mesh.faces]
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
@@ -310,7 +311,7 @@ def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
 
 
 def _is_closed(corners: NDArray[np.float64]) -> bool:
-    """Whether each edge of triangles [T, 3, 3], by position, runs as often forwards as backwards."""
+    """Return whether each edge of triangles [T, 3, 3], told by its position, runs as often forwards as backwards."""
     _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     faces = number.reshape(-1, 3)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -332,7 +333,7 @@ def _check_camera(path: Path, settings: SceneSettings, triangles: Sequence[Trian
 
 
 def files_named(tables: Any) -> Iterator[Path]:
-    """Every file named in a scene's tables, as written."""
+    """Yield every file named in a scene's tables, as written there."""
     if isinstance(tables, Path):
         yield tables
     elif is_dataclass(tables):

@@ -1,6 +1,6 @@
 """The tables of a scene file: shapes, materials, textures, lights, the sky.
 
-Frozen dataclasses, checked one by one; the reader (`neurolens.pictures.render.scene`) adds the file to their errors.
+They are frozen dataclasses, checked one by one; the reader (`pictures.render.scene`) adds the file to their errors.
 Metres, y up, colours linear sRGB.
 
 An emission is a radiance: 1 is what a picture shows as white. The `intensity` of a light without size is a radiant
@@ -24,10 +24,10 @@ from neurolens.base.settings import said, within
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 BLACK: Vector = (0.0, 0.0, 0.0)
-# Squares and products stay far from the limits of float32.
+# Within these, squares and products stay far from the limits of float32.
 SMALLEST_M, FARTHEST_M = 1e-9, 1e9
 BRIGHTEST = 1e18
-_NARROWEST_DEG = 0.01  # of the falloff of a spot: nearer, two cosines would differ by the rounding of float32
+_NARROWEST_DEG = 0.01  # falloff of a spot: in a narrower one, two cosines would differ by float32's rounding alone
 
 
 def require(ok: bool, field: str, value: object, expected: str) -> None:
@@ -37,8 +37,12 @@ def require(ok: bool, field: str, value: object, expected: str) -> None:
 
 @dataclass(frozen=True)
 class Rule:
-    """What the values of a field have in common: a test, what is expected, for messages, and whether they are colours,
-    of which one number is a grey."""
+    """What the values of a field have in common.
+
+    Attributes:
+        good: the test that a value must pass. expected: what a message says of good values.
+        colour: whether values are colours, for which one number stands for a grey.
+    """
 
     good: Callable[[Any], bool]
     expected: str
@@ -46,17 +50,17 @@ class Rule:
 
 
 def between(low: float, high: float, unit: str = "a number") -> Rule:
-    """The rule that a value lies from `low` to `high`."""
+    """Return the rule that a value lies from `low` to `high`."""
     return Rule(lambda v: within((low, high), v), f"{unit} {said((low, high))}")
 
 
 def each_between(low: float, high: float) -> Rule:
-    """The rule that each of three numbers lies from `low` to `high`."""
+    """Return the rule that each of three numbers lies from `low` to `high`."""
     return Rule(lambda v: all(low <= x <= high for x in v), f"three numbers from {low:g} to {high:g}", colour=True)
 
 
 def _is_regular(rows: tuple[Row, ...]) -> bool:
-    """Whether a matrix is finite and keeps the volume of a cube above 1e-9 of that of its longest edges."""
+    """Return whether a matrix is finite and maps a cube to more than 1e-9 of the volume of its longest edges' cube."""
     if not all(abs(x) <= FARTHEST_M for row in rows for x in row):
         return False
     (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rows)
@@ -92,10 +96,10 @@ _ABBE = Rule(lambda v: 10 <= v < math.inf, "a number from 10")
 
 @cache
 def _rules(table: type) -> dict[str, Rule]:
-    """The rules of the fields of a table, which their types carry: `Annotated[kind, rule]`, also beside None."""
+    """Return the rules that the types of a table's fields carry: `Annotated[kind, rule]`, also beside None."""
     rules: dict[str, Rule] = {}
     for base in reversed(table.__mro__):
-        for name, hint in get_annotations(base, eval_str=True).items():  # in the base's own module
+        for name, hint in get_annotations(base, eval_str=True).items():  # as the module of the base knows them
             for kind in (hint, *get_args(hint)):
                 if notes := getattr(kind, "__metadata__", ()):
                     rules[name] = notes[0]
@@ -103,11 +107,11 @@ def _rules(table: type) -> dict[str, Rule]:
 
 
 class Checked:
-    """A table whose values obey the rules of their types; None is a missing field."""
+    """A table whose values obey the rules of their types; None stands for a missing field."""
 
     @classmethod
     def keys_read(cls, data: Mapping[str, Any]) -> dict[str, Any]:
-        """The keys of a file's table; a colour that is one number becomes three."""
+        """Read the keys of a file's table; a colour that is one number becomes three."""
         greys = {name for name, rule in _rules(cls).items() if rule.colour}  # type: ignore[arg-type]
         return {k: [v] * 3 if k in greys and type(v) in (int, float) else v for k, v in data.items()}
 
@@ -131,7 +135,7 @@ class Emitter(Checked):
     """A shape that reflects, emits or both.
 
     The emission's colour tints the light of `illuminant`: "A", "D50", "D65", "E", a black body such as "3200 K", or one
-    of the scene's own; emission [1, 1, 1] of each has the luminance that it has of D65.
+    of the scene's own. Emission [1, 1, 1] has the same luminance with each of them.
     """
 
     material: str | None = None
@@ -172,7 +176,7 @@ class Disc(Emitter):
 
 @dataclass(frozen=True)
 class Sphere(Emitter):
-    """A sphere; `emission` is the radiance of its outside, small ones are point-like."""
+    """A sphere; `emission` is the radiance of its outside. A small one acts as a point light."""
 
     centre_m: Place
     radius_m: Size
@@ -196,7 +200,8 @@ class Box(Checked):
 class Room(Box):
     """The inside of an axis-aligned box; its walls do not exist for rays that come from outside.
 
-    Walls not named have `material`. left and right are x- and x+, floor and ceiling y- and y+, far and near z- and z+.
+    Walls that are not named have `material`. left and right are x- and x+, floor and ceiling y- and y+, far and near z-
+    and z+.
     """
 
     left: str | None = None
@@ -207,7 +212,7 @@ class Room(Box):
     near: str | None = None
 
     def walls(self) -> tuple[str, ...]:
-        """Materials in the order x-, x+, y-, y+, z-, z+."""
+        """Return the materials in the order x-, x+, y-, y+, z-, z+."""
         order = (self.left, self.right, self.floor, self.ceiling, self.far, self.near)
         return tuple(wall or self.material for wall in order)
 
@@ -216,12 +221,13 @@ class Room(Box):
 class MeshSettings(Checked):
     """Triangles: `vertices_m` and `faces` (counted from 0), or an OBJ or PLY `file` beside the scene file.
 
-    Without `material` an OBJ file has its own: diffuse, with the colours (linear) and pictures of its MTL files.
+    Without `material` an OBJ file has its own materials: diffuse, with the colours (linear) and pictures of its MTL
+    files.
 
-    Mapped by `matrix` (three rows of four: x, y, z and what is added in m), scaled (by one number, or along x, y, z),
-    turned about y, then moved; triangles without area in a file are left out with a warning. `smooth` interpolates
-    vertex normals, those of the file or else the mean of the triangles around; left out, those of the file where it has
-    them; false leaves the triangles flat.
+    The mesh is mapped by `matrix` (three rows of four: x, y, z and what is added in m), scaled (by one number, or along
+    x, y, z), turned about y, then moved. A file's triangles without area are left out, with a warning. `smooth` true
+    interpolates vertex normals: those of the file, else the mean of the triangles around. Left out, it interpolates
+    where the file has normals; false leaves the triangles flat.
     """
 
     material: str | None = None
@@ -242,7 +248,7 @@ class MeshSettings(Checked):
 
 
 def _check_kind(item: Texture | Material, needed: tuple[str, ...], optional: tuple[str, ...]) -> None:
-    """Check that required fields are present and no unknown ones."""
+    """Check that the required fields are present, and no fields that are not known."""
     what = f"a {item.kind} {type(item).__name__.lower()}"
     for field, value in vars(item).items():
         if field == "kind":
@@ -256,8 +262,8 @@ def _check_kind(item: Texture | Material, needed: tuple[str, ...], optional: tup
 class MeasuredSpectrum:
     """A measured spectrum: `spectrum` = [[nm, value], ...], or a CSV `file` beside the scene file with such rows.
 
-    Of a light: radiance per nm in any unit, 0 or more, one value above 0. Of a surface: reflectance from 0 to 1.
-    Increasing wavelengths, which cover those of the camera; linear in between.
+    For a light, values are radiance per nm in any unit, 0 or more, one of them above 0. For a surface they are
+    reflectance from 0 to 1. Wavelengths increase and cover those of the camera; values are linear in between.
     """
 
     spectrum: tuple[tuple[float, float], ...] | None = None
@@ -272,10 +278,10 @@ class MeasuredSpectrum:
 class Texture(Checked):
     """A pattern on flat surfaces, in metres along them, or on meshes with texture coordinates.
 
-    kind "checker": squares of `cell_m` in two `colours`. kind "grid": lines `line_m` wide every `cell_m`, the first
-    colour for the lines. kind "image": the picture `file` (beside the scene file), repeated every `size_m` (width,
-    height); without `size_m` it fills the rectangle, or lies on a mesh as the mesh's texture coordinates say. OpenEXR
-    and Radiance (.hdr) are read as linear sRGB, other pictures as sRGB.
+    kind "checker": squares of `cell_m` in two `colours`. kind "grid": lines `line_m` wide every `cell_m`, drawn in the
+    first colour. kind "image": the picture `file` (beside the scene file), repeated every `size_m` (width, height);
+    without `size_m` it fills the rectangle, or lies on a mesh as the mesh's texture coordinates say. OpenEXR and
+    Radiance (.hdr) are read as linear sRGB, other pictures as sRGB.
     """
 
     kind: Literal["checker", "grid", "image"]
@@ -302,11 +308,11 @@ class Texture(Checked):
 class Material(Checked):
     """How a surface scatters light. A `reflectance` is a colour, or the name of one of the scene's `reflectances`.
 
-    kind "diffuse": Lambert of `reflectance` or `texture`. kind "glossy": a rough coat (GGX of `roughness`, Fresnel
-    reflectance `specular` head on) over a diffuse base of `reflectance` or `texture` (black: bare metal).
-    kind "mirror": `reflectance`. kind "glass": smooth, index `n_d`, Abbe number `V_d` (left out: no dispersion); it
-    absorbs so much that `transmittance` of the light is left after `transmittance_depth_m` (Beer and Lambert). Only
-    glass dims: what stands inside it is seen undimmed. Paths step 0.1 mm off a surface: thinner glass is passed over.
+    kind "diffuse": Lambert's law, with `reflectance` or `texture`. kind "glossy": a rough coat (GGX of `roughness`,
+    Fresnel reflectance `specular` at normal incidence) over a diffuse base of `reflectance` or `texture` (black makes
+    bare metal). kind "mirror": of `reflectance`. kind "glass": smooth, index `n_d`, Abbe number `V_d` (left out: no
+    dispersion). Glass absorbs: `transmittance` of the light is left after `transmittance_depth_m` (Beer and Lambert),
+    but what stands inside it is seen undimmed. Paths step 0.1 mm off a surface, so that thinner glass is passed over.
     """
 
     kind: Literal["diffuse", "glossy", "mirror", "glass"]
@@ -340,7 +346,7 @@ class Material(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class PointLight(Checked):
-    """A point light, equal in all directions; `illuminant` as for an `Emitter`."""
+    """A point light, equal in all directions; `illuminant` as in an `Emitter`."""
 
     position_m: Place
     intensity: Light
@@ -376,7 +382,7 @@ class Environment(Checked):
 
     A picture `file` (beside the scene file) is equirectangular: its middle lies towards -z, its right half towards +x,
     its top row at the zenith. OpenEXR and Radiance (.hdr) are read as linear sRGB, other pictures as sRGB. It is
-    multiplied by `scale` and turned by `rotate_y_deg` about y as meshes are. `illuminant`: the light that the colours
+    multiplied by `scale` and turned by `rotate_y_deg` about y as meshes are. `illuminant` is the light that the colours
     tint.
     """
 
@@ -407,7 +413,7 @@ class Sky(Checked):
     """A clear sky with its sun (Preetham, Shirley and Smits 1999); black below the horizon.
 
     Attributes:
-        sun_elevation_deg: of the sun above the horizon. sun_azimuth_deg: from -z over +x.
+        sun_elevation_deg: the sun's height above the horizon. sun_azimuth_deg: its angle from -z over +x.
         turbidity: haze; 2 is very clear, 3 clear, 6 hazy, 10 very hazy.
         sun: whether the sun's disc shines as well.
         white_kcd_per_m2: luminance that counts as emission 1. A white surface in the sun has some 30.

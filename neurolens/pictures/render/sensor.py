@@ -1,7 +1,7 @@
-"""What a sensor counts of a linear picture: electrons of a pixel's colour, their noise, and the numbers that are read.
+"""Turns a linear picture into what a sensor reads: electrons of a pixel's colour, their noise, and numbers.
 
-A pixel whose value is v takes `electrons` times v on average, as if its colour filters were those of linear sRGB;
-values below 0, beyond the gamut, give none. Photons arrive by chance (Poisson), the well holds no more than
+A pixel whose value is v takes `electrons` times v on average, as if its colour filters were those of linear sRGB.
+Values below 0, which lie beyond the gamut, give none. Photons arrive by chance (Poisson), the well holds at most
 `full_well`, reading adds normal noise, and the converter rounds: number = black level + electrons * (2^bits - 1 - black
 level) / full well. The area of the pixel is in the picture already, whose filter is a box (`FilmSettings.fill_factor`).
 
@@ -19,16 +19,16 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.pictures.render.settings import SensorSettings
 
-RAW = "raw"  # the channel of a mosaic; without one raw.R, raw.G and raw.B
+RAW = "raw"  # the channel of a mosaic; other pictures have raw.R, raw.G and raw.B
 _SURE = 20.0  # standard deviations above a full well at which a pixel is surely full
 
 
 def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: int = 0) -> dict[str, FloatArray]:
-    """The numbers that are read, [H, W] float32 by the names of channels, of a picture [H, W, 3] of linear sRGB.
+    """Return the numbers that a sensor reads of a picture [H, W, 3] of linear sRGB: [H, W] float32 by channel.
 
     Args:
-        seed: of the noise. first_row: of the whole picture, where this is a part of it: places of colours and noise
-            are those of the whole.
+        seed: of the noise. first_row: where this is a part, the number of its first row in the whole picture, so that
+            colours of the mosaic and noise are those of the whole.
 
     Raises:
         InputError: no such picture, or values that are not finite.
@@ -59,7 +59,7 @@ def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: 
 
 
 def about(settings: SensorSettings, seed: int) -> dict[str, Any]:
-    """The metadata of the channels: the settings, the largest number that is read, and the electrons of one."""
+    """Return the metadata of the channels: the settings, the largest number that is read, and the electrons of one."""
     most = 2**settings.bits - 1
     electrons = settings.full_well / (most - settings.black)
     known = {"black_level": settings.black, "seed": seed, "white_level": most, "electrons_per_number": electrons}

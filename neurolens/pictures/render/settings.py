@@ -1,4 +1,4 @@
-"""The tables [film], [sensor] and [flare] of a scene: also options of commands, which load them before numpy."""
+"""The tables [film], [sensor] and [flare] of a scene. They are options of commands, too, and load without numpy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neurolens.base.settings import check_bounds, setting
 ColourSpaceName = Literal["sRGB", "ACEScg"]
 WavelengthMode = Literal["auto", "one", "hero"]
 WavelengthSampling = Literal["importance", "uniform"]
-_BLACK = 512  # number that is read without light, of 14 bits
+_BLACK = 512  # of 14 bits: the number that is read without light
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 
@@ -21,12 +21,13 @@ class FilmSettings:
     """The [film] table of a scene: spectral sampling and colour.
 
     Attributes:
-        colour_space: of the EXR, linear: "sRGB" (Rec. 709 primaries, D65) or "ACEScg" (AP1, the white of ACES).
-        white_balance: illuminant that becomes neutral, named as those of lights are; None leaves D65 neutral.
-        wavelengths: of a path: "one"; "hero", four that share the path (Wilkie et al. 2014), each with its own film
-            point where the camera disperses, which takes a C compiler; "auto", hero where the camera can, else one.
+        colour_space: linear, of the EXR: "sRGB" (Rec. 709 primaries, D65) or "ACEScg" (AP1, the white of ACES).
+        white_balance: the illuminant that becomes neutral, named as those of lights are; with None D65 is neutral.
+        wavelengths: what a path carries: "one"; "hero", four that share the path (Wilkie et al. 2014), each with its
+            own film point where the camera disperses, which takes a C compiler; "auto", hero where the camera can, else
+            one.
         wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
-        fill_factor: share of a pixel that takes light, a square in its middle: the filter of a pixel is a box.
+        fill_factor: share of a pixel that takes light, a square in its middle, since the filter of a pixel is a box.
     """
 
     colour_space: ColourSpaceName = setting("sRGB", "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)")
@@ -53,10 +54,10 @@ class SensorSettings:
     """The [sensor] table of a scene: what a sensor counts of a linear picture, see `pictures.render.sensor`.
 
     Attributes:
-        mosaic: colours of the pixels of two rows from the top left, or "none": every pixel counts all three.
-        electrons: mean number in a pixel whose value is 1, a white card of radiance 1 on the axis.
+        mosaic: the colours of the pixels of two rows from the top left; with "none" every pixel counts all three.
+        electrons: mean number in a pixel whose value is 1, as of a white card of radiance 1 on the axis.
         full_well: electrons that a pixel holds. read_noise: standard deviation in electrons.
-        noise: "none" leaves out both the noise of photons and of reading.
+        noise: "none" leaves out the noise of photons and that of reading.
         bits: of the converter, whose largest number is a full well. black_level: its number without any electron.
 
     Raises:
@@ -87,13 +88,13 @@ class SensorSettings:
 
 
 def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:
-    """Width and height in pixels for a film of this width over height; one of them may be missing."""
+    """Return width and height in pixels for a film of this width over height; one of them may be missing."""
     across = max(1, round((height or 0) * shape)) if width is None else width
     return across, max(1, round(across / shape)) if height is None else height
 
 
 LAYERS = ("ghosts", "glare", "starburst")
-GLARE = 1 << 18  # photons where anything scatters
+GLARE = 1 << 18  # photons of the glare where anything scatters
 _MOST_PHOTONS = 1 << 30
 _QUICK_BINS, _QUICK_CELL_PX, _QUICK_PHOTONS = 5, 24.0, 1 << 16
 
@@ -108,11 +109,12 @@ class Scatter:
     """The parts of a lens that scatter light, and how much; none by default.
 
     Attributes:
-        barrel: share of light that the tube, its rings and the stop's plate reflect; gloss: share of it that goes about
-            the mirror's direction, the rest by Lambert's law.
-        sensor: share of light that the film reflects; mirror: share of it as a mirror, the rest by Lambert's law.
-        dust: share of the light that enters at the front that dust there scatters; dust_forward: mean cosine.
-        haze_per_mm: scattering of glass, the inverse of the mean free path; haze_forward: mean cosine.
+        barrel: share of the light that the tube, its rings and the stop's plate reflect. gloss: share of that which
+            goes about the mirror's direction; the rest follows Lambert's law.
+        sensor: share of the light that the film reflects. mirror: share of that which is reflected as by a mirror; the
+            rest follows Lambert's law.
+        dust: share of the light entering at the front that dust scatters there. dust_forward: its mean cosine.
+        haze_per_mm: scattering of the glass, the inverse of the mean free path. haze_forward: its mean cosine.
 
     Raises:
         InputError: a value out of bounds.
@@ -155,8 +157,8 @@ class FlareSettings:
     """The layers of flare, and how finely they are computed.
 
     Attributes:
-        gains: factors of red, green and blue by the name of a layer or of a ghost (g07-03).
-        scatter: what scatters light. Ghosts keep the light that scatters out of them, which is little.
+        gains: factors of red, green and blue, by the name of a layer or of a ghost (g07-03).
+        scatter: what scatters light. Ghosts do not lose the light that is scattered out of them, which is little.
 
     Raises:
         InputError: a value out of bounds, an unknown layer, or photons together with single ghosts.
@@ -232,15 +234,15 @@ class FlareSettings:
             object.__setattr__(self, "glare", GLARE)
 
     def quick(self) -> FlareSettings:
-        """The same settings, but coarse enough for a quick look."""
+        """Return the same settings, coarse enough for a quick look."""
         photons, glare = (min(n, _QUICK_PHOTONS) for n in (self.photons, self.glare))
         cell = max(self.cell_px, _QUICK_CELL_PX)
         return replace(self, bins=min(self.bins, _QUICK_BINS), cell_px=cell, photons=photons, glare=glare)
 
     def makes(self, name: str) -> bool:
-        """Whether the layer of this name is switched on."""
+        """Return whether the layer of this name is switched on."""
         return name not in self.without and bool({"glare": self.glare, "starburst": self.starburst}.get(name, True))
 
     def gain(self, name: str) -> tuple[float, float, float]:
-        """Factors of red, green and blue of a layer or ghost."""
+        """Return the factors of red, green and blue of a layer or ghost."""
         return self.gains.get(name, (1.0, 1.0, 1.0))

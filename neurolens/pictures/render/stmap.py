@@ -1,10 +1,10 @@
 """ST maps: for every pixel of a picture, where another picture holds what belongs there.
 
-Conventions, those of Nuke's STMap and Blender's Map UV: s from 0 at the left edge to 1 at the right edge of the picture
-that is read, t from 0 at its bottom edge to 1 at its top edge, so that the centre of its pixel x, y (from 0, y upwards)
-is s = (x + 0.5) / width, t = (y + 0.5) / height. Channels, float32: R is s, G is t, B is 1 where the place lies within
-the picture that is read and the lens's has light, 0 elsewhere: a mask, and the third coordinate that Map UV takes for
-alpha. A map has the size of the picture that it makes; data and display window are the same.
+Conventions are those of Nuke's STMap and Blender's Map UV. s runs from 0 at the left edge to 1 at the right edge of the
+picture that is read, t from 0 at its bottom edge to 1 at its top edge. The centre of its pixel x, y (from 0, y upwards)
+is s = (x + 0.5) / width, t = (y + 0.5) / height. Channels are float32: R is s, G is t. B is a mask, and the third
+coordinate that Map UV takes for alpha: 1 where the place lies within the picture that is read and the lens's picture
+has light, else 0. A map has the size of the picture that it makes; data and display window are the same.
 
 `undistort` reads the picture of a lens (the plate) and makes its undistorted picture, `redistort` the other way. Both
 pictures have pixels of one size and share their centre; the undistorted one is larger by the overscan, so that it holds
@@ -24,9 +24,9 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.field import Complex, Field
 
-_ROWS = 1 << 18  # pixels at once
+_ROWS = 1 << 18  # pixels that are done at once
 _EDGE = 513  # points on a side of the film
-_TRIED = 97, 55  # points that are sent there and back
+_TRIED = 97, 55  # points, across and down, that are mapped there and back
 LARGEST_MAP = 1 << 26  # pixels
 
 Report = Callable[[float], None]
@@ -34,9 +34,9 @@ Report = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Plates:
-    """The two pictures: width and height in pixels of the lens's own and of the undistorted one; size of a pixel, mm.
+    """The two pictures: pixels (width, height) of the lens's own and of the undistorted one; size of a pixel in mm.
 
-    The film's shape and the picture's may differ by a rounded pixel: so may the sides of a pixel.
+    The shapes of film and picture may differ by a rounded pixel, and so may the two sides of a pixel.
     """
 
     picture: tuple[int, int]
@@ -49,12 +49,12 @@ class Plates:
         return self.undistorted[0] / self.picture[0], self.undistorted[1] / self.picture[1]
 
     def pixels(self, way: Complex) -> NDArray[np.float64]:
-        """The lengths, in pixels, of displacements in mm."""
+        """Return the lengths, in pixels, of displacements in mm."""
         return np.hypot(way.real / self.pixel_mm[0], way.imag / self.pixel_mm[1])
 
 
 def plates_of(fields: Sequence[Field], picture: tuple[int, int], film_mm: tuple[float, float]) -> Plates:
-    """The least undistorted picture that holds, for all of the fields, everything that the lens's picture shows.
+    """Return the smallest undistorted picture that holds, for all fields, everything that the lens's picture shows.
 
     Raises:
         InputError: it would have more than `LARGEST_MAP` pixels.
@@ -67,7 +67,7 @@ def plates_of(fields: Sequence[Field], picture: tuple[int, int], film_mm: tuple[
     places = np.stack([field.ideal(x + 1j * y) for field in fields])
     size = []
     for side, step, reach in zip(picture, pixel, (np.abs(places.real).max(), np.abs(places.imag).max()), strict=True):
-        # By whole pixels on both sides, so that pixels of both pictures lie on one grid; rounding is no pixel.
+        # By whole pixels on both sides, so that pixels of both pictures lie on one grid; rounding adds no pixel.
         size.append(side + 2 * max(0, math.ceil(reach / step - side / 2 - 1e-4)))
     if size[0] * size[1] > LARGEST_MAP:
         expected = f"at most {LARGEST_MAP} pixels undistorted: a smaller --width or --film, or another --projection"
@@ -76,7 +76,7 @@ def plates_of(fields: Sequence[Field], picture: tuple[int, int], film_mm: tuple[
 
 
 def undistort_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """The channels of the map that makes the undistorted picture."""
+    """Return the channels of the map that makes the undistorted picture."""
 
     def read(place: Complex) -> tuple[Complex, NDArray[np.bool_]]:
         point = field.picture(place)
@@ -86,12 +86,12 @@ def undistort_map(field: Field, plates: Plates, report: Report = lambda share: N
 
 
 def redistort_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """The channels of the map that makes the lens's picture."""
+    """Return the channels of the map that makes the lens's picture."""
     return _channels(lambda p: (field.ideal(p), field.lit(p)), plates, plates.picture, plates.undistorted, report)
 
 
 def illumination_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """Relative illumination of the lens's picture, 1 on the axis, as channel Y."""
+    """Return the relative illumination of the lens's picture, 1 on the axis, as channel Y."""
     light = np.empty(plates.picture[::-1], np.float32)
     for rows, point in blocks(plates.picture, plates.pixel_mm, report):
         light[rows] = field.relative_light(point)
@@ -117,7 +117,7 @@ def _channels(
 
 
 def blocks(size: tuple[int, int], pixel_mm: tuple[float, float], report: Report) -> Iterator[tuple[slice, Complex]]:
-    """Rows from the top with the places of their pixels' centres, x + i y in mm."""
+    """Yield rows from the top with the places of their pixels' centres, x + i y in mm."""
     width, height = size
     x = (np.arange(width) + 0.5 - width / 2) * pixel_mm[0]
     y = (height / 2 - 0.5 - np.arange(height)) * pixel_mm[1]
@@ -129,13 +129,13 @@ def blocks(size: tuple[int, int], pixel_mm: tuple[float, float], report: Report)
 
 
 def in_pixels(moved_mm: Complex, pixel_mm: tuple[float, float]) -> dict[str, float]:
-    """Root mean square and worst of displacements in mm, those that are NaN left out."""
+    """Return the root mean square and the worst of displacements in mm, as pixels; NaN is left out."""
     px = np.hypot(moved_mm.real / pixel_mm[0], moved_mm.imag / pixel_mm[1])
     return {"rms_px": float(np.sqrt(np.nanmean(px**2))), "worst_px": float(np.nanmax(px))}
 
 
 def worst_px(field: Field, plates: Plates) -> tuple[float, float]:
-    """The farthest that distortion moves a point, and the largest error of going to the undistorted picture and back.
+    """Return the farthest that distortion moves a point, and the largest error of undistorting it and coming back.
 
     Both are in pixels, and over a grid of points of the picture.
     """

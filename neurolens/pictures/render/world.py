@@ -48,12 +48,13 @@ from neurolens.pictures.render.scene import Scene
 from neurolens.pictures.render.scenetables import BLACK, Emitter, Material, Texture
 
 Frame = NDArray[np.float64]
-_STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still finite in float32
+_STEEPEST = 1e25  # the most pictures or cells a metre: times the farthest point it is still finite in float32
 DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
 _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
-_MANY_QUADS = 128  # beyond, a mesh is faster than testing one after the other
-_THROUGH, _PER_M = np.float32(1e-4), np.float32(1e-5)  # m, and of the way: how far behind a surface a ray goes on
-_SURFACES = 64  # that one ray passes on its way to a layer behind; most are backs of what it has entered
+_MANY_QUADS = 128  # above this number, a mesh is faster than testing one by one
+_THROUGH, _PER_M = np.float32(1e-4), np.float32(1e-5)  # how far behind a surface a ray goes on: m, and share of its way
+# the most surfaces that a ray passes on its way to a layer behind; most are backs of what it has entered
+_SURFACES = 64
 
 
 def _frame(origin: Frame, u: Frame, v: Frame, size: Sequence[float] = (1.0, 1.0)) -> Frame:
@@ -62,7 +63,7 @@ def _frame(origin: Frame, u: Frame, v: Frame, size: Sequence[float] = (1.0, 1.0)
 
 
 def _plane_frame(point: Frame, normal: Frame) -> Frame:
-    """The frame of a plane: it begins at a point and follows the scene's x axis, or z where that is steeper."""
+    """Return the frame of a plane: it begins at a point and follows the scene's x axis, or z where that is steeper."""
     axis = np.eye(3)[2 if abs(normal[0]) > 0.9 else 0]
     u = axis - normal * (axis @ normal)
     u /= np.linalg.norm(u)
@@ -70,9 +71,10 @@ def _plane_frame(point: Frame, normal: Frame) -> Frame:
 
 
 def _triangle_frames(planes: Frame, uv: Frame) -> Frame:
-    """Texture coordinates [T, 3 corners, 2] of triangles as affine functions of a point, [T, 2, 5], in pictures.
+    """Return texture coordinates [T, 3 corners, 2] of triangles as affine functions of a point, [T, 2, 5].
 
-    `planes`: [T, 3, 4] from `mesh.triangle_planes`; rows 1 and 2 are the weights of corners 1 and 2.
+    Their unit is a picture. `planes` [T, 3, 4] come from `triangle_planes`; rows 1 and 2 are the weights of corners 1
+    and 2.
     """
     step = uv[:, 1:] - uv[:, :1]  # [T, 2, 2]
     rows = np.einsum("tkc,tkj->tcj", step, planes[:, 1:])
@@ -85,8 +87,9 @@ class TextureTable:
 
     Args:
         textures: by name. images: linear RGB [H, W, 3] of those of kind "image".
-        surfaces: for surfaces in a row how many, the name of their texture and their frames [count, 2, 5], or None.
-        palette: with the rows of their colours.
+        surfaces: for each run of surfaces their number, the name of their texture or None, and their frames [count, 2,
+            5] or None.
+        palette: takes the rows of their colours.
     """
 
     def __init__(
@@ -111,7 +114,7 @@ class TextureTable:
                 cell = texture.cell_m
                 size = texture.size_m or ((cell, cell) if cell else frames[0, :, 4])
                 self._number[rows] = numbers[name]
-                # In cells, or in pictures.
+                # In units of cells, or of pictures.
                 scaled = np.clip(frames[:, :, :4] / np.array(size)[:, None], -_STEEPEST, _STEEPEST)
                 self._frames[:, :, rows] = np.moveaxis(scaled, 0, -1)
             first += count
@@ -132,7 +135,7 @@ class TextureTable:
                 value[:, rows] = self._picture(self._images[name], u, v, bins[rows])
                 continue
             if texture.kind == "checker":
-                # 2e-4 of a cell of slack: a shape that begins on a cell's edge shows no speckle of rounding there.
+                # 2e-4 of a cell is slack: a shape that begins on a cell's edge shows no speckle of rounding there.
                 which = (np.floor(u + 2e-4).astype(np.intp) + np.floor(v + 2e-4).astype(np.intp)) & 1
             else:
                 reach = np.float32(0.5 * (texture.line_m or 0) / (texture.cell_m or 1))
@@ -141,7 +144,7 @@ class TextureTable:
             value[:, rows] = self._palette.look_up(self._rows[k].take(which), bins[rows])
 
     def _picture(self, image: FloatArray, u: FloatArray, v: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [lanes, N] of the texel at (u, v), in pictures from the lower left corner."""
+        """Look up the reflectance [lanes, N] of the texel at (u, v), in pictures from the lower left corner."""
         height, width = image.shape[:2]
         column = ((u - np.floor(u)) * width).astype(np.intp)
         row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
@@ -151,7 +154,7 @@ class TextureTable:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Surfaces in a row that differ only in where they are: normals [count, 3], `frames` [count, 2, 5] of textures."""
+    """A run of surfaces that differ only in place: normals [count, 3], and `frames` [count, 2, 5] for textures."""
 
     normals: NDArray[np.float64]
     material: Material | None = None
@@ -164,11 +167,13 @@ def _unit(vector: ArrayLike) -> NDArray[np.float64]:
 
 
 class Assembly:
-    """All shapes of a scene, from its tables: quads, discs, planes, rooms, boxes, spheres, meshes.
+    """All shapes of a scene, made from its tables: quads, discs, planes, rooms, boxes, spheres, meshes.
 
     Attributes:
-        primitives: to hit. surfaces: in order of their numbers. boxes: whose faces are identified after a hit.
-        smooth: of meshes with interpolated normals the first surface, planes [T, 3, 4] and corners' normals [T, 3, 3].
+        primitives: what rays can hit. surfaces: in order of their numbers. boxes: those whose faces are found after a
+            hit.
+        smooth: for each mesh with interpolated normals its first surface, its planes [T, 3, 4] and its corners' normals
+            [T, 3, 3].
         first_sphere: number of the first sphere's surface.
     """
 
@@ -264,7 +269,7 @@ _shared: ContextVar[list[World] | None] = ContextVar("worlds", default=None)
 
 @contextmanager
 def shared_worlds() -> Iterator[None]:
-    """Let `world_of` keep its worlds inside the block: that of a million lights takes half a minute to make."""
+    """Let `world_of` keep its worlds inside the block: one with a million lights takes half a minute to make."""
     token = _shared.set([])
     try:
         yield
@@ -273,7 +278,7 @@ def shared_worlds() -> Iterator[None]:
 
 
 def world_of(scene: Scene, spectral: SpectralRange, geometry: bool = False) -> World:
-    """The world of a scene over a range, or over any range for its `geometry`; `shared_worlds` keeps it."""
+    """Return the world of a scene over a range; only for its `geometry`, over any range. `shared_worlds` keeps it."""
     worlds = _shared.get()
     for world in worlds or ():
         if world.scene is scene and (geometry or world.spectral.same(spectral)):
@@ -285,13 +290,15 @@ def world_of(scene: Scene, spectral: SpectralRange, geometry: bool = False) -> W
 
 
 class World:
-    """A scene as the integrator uses it, over a range of wavelengths.
+    """A scene as the integrator uses it, with spectra over a range of wavelengths.
 
     Attributes:
         kind: [S] uint8, DIFFUSE to NOTHING. normal: [3, S]. light: [S] number of the light or -1.
         reflectance_row, specular_row, index_row, absorption_row, emission_row: [S] rows of `palette`, 0 for black.
-        absorbs: whether any glass does. alpha: [S] GGX width. coat: albedos of coats, of which `coat_row` [S] is one.
-        lights: for direct sampling. light_emission_row: [lights] their rows of `palette`. dark: no light from afar.
+        absorbs: whether any glass absorbs. alpha: [S] GGX width. coat: albedos of coats, in which `coat_row` [S] is a
+            row.
+        lights: for direct sampling. light_emission_row: [lights] their rows of `palette`. dark: whether no light comes
+            from afar.
     """
 
     def __init__(self, scene: Scene, spectral: SpectralRange) -> None:
@@ -318,7 +325,7 @@ class World:
         self.kind = spread([_KINDS[m.kind] if m else NOTHING for m in materials], np.uint8)
         shining = np.array([part.emitter is not None for part in parts])
         self.light = np.repeat(np.where(shining, np.cumsum(shining) - 1, -1), counts)
-        self._thing = np.repeat(np.arange(len(parts)), counts)  # which one surfaces are parts of, such as a mesh
+        self._thing = np.repeat(np.arange(len(parts)), counts)  # the thing, such as a mesh, of which a surface is part
         self.emission_row = spread([self._emission(part.emitter) for part in parts], np.intp)
         reflectances = [palette.reflectance((m and m.reflectance) or BLACK) for m in materials]
         self.reflectance_row = spread(reflectances, np.intp)
@@ -341,7 +348,7 @@ class World:
         return 0 if emitter is None else self.palette.light(emitter.emission, emitter.illuminant)
 
     def _fill_spheres(self, first: int) -> None:
-        """Centre and 1 / radius of each sphere, 0 for other surfaces."""
+        """Set centre and 1 / radius of each sphere, 0 for other surfaces."""
         self._spheres = np.zeros((4, len(self.kind)), np.float32)
         for number, sphere in enumerate(self.scene.settings.spheres, first):
             self._spheres[:, number] = (*sphere.centre_m, 1 / sphere.radius_m)
@@ -352,7 +359,7 @@ class World:
         self._endless[list(endless)] = True
 
     def _make_lights(self, surfaces: list[Surfaces]) -> None:
-        """All lights, in the order of `Assembly` those with a surface: quads, discs, spheres."""
+        """Make all lights; those with a surface come in the order of `Assembly`: quads, discs, spheres."""
         settings = self.scene.settings
         quads = [quad for quad in settings.quads if any(quad.emission)]
         discs = [disc for disc in settings.discs if any(disc.emission)]
@@ -363,7 +370,7 @@ class World:
         sizeless = PointLights(settings.points, settings.spots)
         groups = (FlatLights(quads, discs), SphereLights(spheres), sizeless, self._sun, self._sky)
         self.lights = Lights(groups, settings.camera.look_at_m)
-        # Rooms that hold all of these cast no shadows: see `_never_shades`.
+        # A room that holds all of these casts no shadow: see `_never_shades`.
         self._shining_m = [np.array(point.position_m) for point in points]
         around = [(sphere.centre_m, sphere.radius_m) for sphere in spheres]
         around += [(disc.centre_m, disc.radius_m) for disc in discs]
@@ -382,13 +389,13 @@ class World:
         self.dark = self._sky.dark and not self._sun.count
 
     def _never_shades(self, shape: Primitive) -> bool:
-        """Whether the shape blocks no shadow ray: a room that holds every light, as its walls let rays in."""
+        """Return whether the shape blocks no shadow ray: a room that holds every light, since its walls let rays in."""
         if not isinstance(shape, Box) or not shape.room or self._sky.count or self._sun.count:
             return False
         return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in self._shining_m)
 
     def nearest(self, rays: Rays) -> tuple[FloatArray, IntArray]:
-        """Distance [N] in m (inf: none) and surface [N] that rays hit first; -1 for none, of a box its first face."""
+        """Distance [N] in m (inf: none) and surface [N] that rays hit first: -1 for none, of a box its first face."""
         count = rays.origin.shape[1]
         best, found = np.full(count, np.inf, np.float32), np.full(count, -1, np.int32)
         for shape in self._primitives:
@@ -396,11 +403,11 @@ class World:
         return best, found
 
     def behind(self, origin: FloatArray, direction: FloatArray, things: int) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Ways [N] in m along rays [3, N] to just behind the first things that they meet, and whether anything follows.
+        """How far rays [3, N] go to just behind the first things that they meet, [N] m, and whether anything follows.
 
-        What is met inside of balls and boxes is no thing of its own, nor is the back of a mesh whose front was met
-        last. The sky follows, too. Nothing follows an infinite plane or the wall of a room: these have no edges past
-        which a lens could see.
+        What is met inside of balls and boxes does not count as another thing, nor does the back of a mesh whose front
+        was met last. The sky follows, too. Nothing follows an infinite plane or the wall of a room: these have no edges
+        past which a lens could see.
         """
         count = origin.shape[1]
         way, follows = np.zeros(count, np.float32), np.zeros(count, bool)
@@ -409,7 +416,7 @@ class World:
         for _ in range(_SURFACES):
             along, before = direction.take(rows, axis=1), way[rows]
             step, found = self.nearest(Rays.of(origin.take(rows, axis=1) + before * along, along))
-            with np.errstate(invalid="ignore"):  # infinitely far
+            with np.errstate(invalid="ignore"):  # distances may be infinite
                 at = origin.take(rows, axis=1) + (before + step) * along
                 front = dot(self.normals(self.surfaces(found, at), at)[0], along) < 0
             own = ~front & (self._thing[found] == entered[rows])
@@ -427,7 +434,7 @@ class World:
         return way, follows
 
     def visible(self, origin: FloatArray, direction: FloatArray, distance: FloatArray) -> NDArray[np.bool_]:
-        """Visibility [N] of lights at `distance` [N] from origins [3, N]."""
+        """Return the visibility [N] of lights at `distance` [N] from origins [3, N]."""
         rays = Rays.of(origin, direction)
         best, found = distance * np.float32(1 - 1e-4), np.full(len(distance), -1, np.int32)
         for shape in self._shadow_casters:
@@ -435,7 +442,7 @@ class World:
         return found < 0
 
     def surfaces(self, found: IntArray, point: FloatArray) -> Index:
-        """Surface numbers [N] with the faces of boxes identified."""
+        """Return surface numbers [N], with the faces of boxes told apart."""
         surface = found.astype(np.intp)
         for box in self._boxes:
             rows = np.flatnonzero(found == box.first)
@@ -444,7 +451,7 @@ class World:
         return surface
 
     def normals(self, surface: Index, point: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Outward geometric and shading normals [3, N] at points [3, N] of surfaces [N]."""
+        """Return outward geometric and shading normals [3, N] at points [3, N] of surfaces [N]."""
         normal = self.normal.take(surface, axis=1)
         if self._has_spheres:
             rows = np.flatnonzero(self._spheres[3].take(surface))
@@ -466,13 +473,13 @@ class World:
         return normal, shading
 
     def reflectance(self, surface: Index, point: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [lanes, N] at wavelength bins [N], textures included."""
+        """Return the reflectance [lanes, N] at wavelength bins [N], textures included."""
         value = self.palette.look_up(self.reflectance_row.take(surface), bins)
         self.textures.apply(value, surface, point, bins)
         return value
 
     def aimed_emission(self, aimed: LightSamples, rows: Index, bins: Index) -> FloatArray:
-        """Emission [lanes, n] of the lights that some rows [n] aim at, at wavelength bins [n]."""
+        """Return the emission [lanes, n] of the lights that some rows [n] aim at, at wavelength bins [n]."""
         light = aimed.light[rows]
         emitted = self.palette.look_up(self.light_emission_row.take(light), bins)
         if self._sky_number >= 0:
@@ -481,9 +488,10 @@ class World:
         return emitted
 
     def environment(self, direction: FloatArray, bins: Index, density: FloatArray | None = None) -> FloatArray:
-        """Radiance [lanes, N] from infinitely far along directions [3, N].
+        """Return the radiance [lanes, N] from infinitely far along directions [3, N].
 
-        With `density` [N], with which scattering chose them, each part is weighted against aiming at it.
+        `density` [N] is that with which scattering chose the directions; with it each part is weighted against aiming
+        at it.
         """
         light = self._sky.radiance(direction, bins)
         if self._sky_number >= 0 and density is not None:
@@ -498,6 +506,6 @@ class World:
         return light
 
     def _rivals(self, light: int, pdf: FloatArray, density: FloatArray) -> FloatArray:
-        """1 over the weight [N] of scattering by the power heuristic."""
+        """Return 1 over the weight [N] of scattering, by the power heuristic."""
         ratio = pdf * self.lights.probability[light] / density
         return 1 + ratio * ratio

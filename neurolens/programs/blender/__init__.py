@@ -1,8 +1,8 @@
-"""The extension as a zip that Blender installs, and lenses added to one or to its user folder.
+"""The extension as a zip that Blender installs, and lenses that are added to the zip or to its user folder.
 
 blender_manifest.toml, *.py     the extension, neurolens/programs/blender/extension
 lenses.json                     facts of every lens, see `extension.library`
-shaders/NAME.osl                one a form of a lens
+shaders/NAME.osl                one for each form of a lens
 thumbnails/NAME.png             its section; NAME.bokeh.png three discs of light
 """
 
@@ -33,14 +33,14 @@ EXTENSION = Path(__file__).parent / "extension"
 FACTS, SCHEMA = "lenses.json", 1
 _ID = "neurolens"
 _CODE = (*sorted(path.name for path in EXTENSION.glob("*.py")), "blender_manifest.toml")
-_THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
-_LARGEST = 1 << 28  # of a library: 200 lenses unpacked are some 80 MB
-LONGEST_S = 60.0  # that a lens waits for another to be added
+_THEN = (1980, 1, 1, 0, 0, 0)  # a date for all entries, so that a zip of the same lenses is the same, byte for byte
+_LARGEST = 1 << 28  # the most bytes of a library: 200 lenses unpacked are some 80 MB
+LONGEST_S = 60.0  # how long a lens waits while another is added
 
 
 @dataclass(frozen=True)
 class Form:
-    """A shader of a lens; `extension.library.Variant` describes the numbers."""
+    """A shader of a lens; `extension.library.Variant` says what the fields mean."""
 
     kind: str
     model: str
@@ -55,8 +55,12 @@ class Form:
 
 @dataclass(frozen=True)
 class PackedLens:
-    """A lens of the menu, whose files are named by `lens_id`. `picture` and `bokeh` are PNGs, `lens_field` is an
-    `extension.library.Field` as a table, `character` has the keys of `extension.library.CHARACTER`."""
+    """A lens of the menu; its files are named by `lens_id`.
+
+    Attributes:
+        picture, bokeh: PNGs. lens_field: an `extension.library.Field` as a table.
+        character: by the keys of `extension.library.CHARACTER`.
+    """
 
     lens_id: str
     name: str
@@ -71,14 +75,14 @@ class PackedLens:
     bokeh: bytes | None = None
 
     def files(self) -> dict[str, bytes]:
-        """The contents of its files, by their places in the extension."""
+        """Return the contents of its files, by their places in the extension."""
         found = {f"shaders/{self._stem(f)}.osl": f.osl.encode() for f in self.forms}
         pictures = {self._picture(): self.picture, self._picture(".bokeh"): self.bokeh}
         found |= {name: data for name, data in pictures.items() if data is not None}
         return found
 
     def facts(self) -> dict[str, Any]:
-        """The entry of `lenses.json`."""
+        """Return its entry in `lenses.json`."""
         same = ("name", "efl_mm", "f_number", "source", "maker", "character")
         variants = [{**asdict(f), "file": f"shaders/{self._stem(f)}.osl"} for f in self.forms]
         return {
@@ -95,17 +99,17 @@ class PackedLens:
         return f"thumbnails/{safe_name(self.lens_id)}{what}.png"
 
     def _stem(self, form: Form) -> str:
-        """A safe name of files: the model's name is a text of its card, which anybody may have written."""
+        """Return a safe name of files: the model's name comes from its card, which anybody may have written."""
         return safe_name(f"{self.lens_id}.{form.model or form.kind}")
 
 
 @cache
 def extension_library(name: str = "library") -> ModuleType:
-    """A module of the extension that needs no Blender, without its package, which does: the reader of facts, lights."""
+    """Load a module of the extension that needs no Blender (facts, lights) without its package, which needs it."""
     spec = spec_from_file_location(f"neurolens_{name}", EXTENSION / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look their module up
+    sys.modules[spec.name] = module  # dataclasses look their module up there
     spec.loader.exec_module(module)
     return module
 
@@ -114,7 +118,7 @@ def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
     """Write the extension with these lenses, atomically.
 
     Raises:
-        InputError: two lenses of one id. OSError: a place that cannot be written.
+        InputError: two lenses have one id. OSError: the place cannot be written.
     """
     packed = list(lenses)
     if len({p.lens_id for p in packed}) < len(packed):
@@ -127,8 +131,9 @@ def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """A block that one process or thread at a time runs for a folder; others wait. Systems without such locks let all
-    of them through.
+    """Let one process or thread at a time run the block for a folder; others wait.
+
+    Systems without such locks let all of them through.
 
     Raises:
         InputError: another held it for `LONGEST_S`.
@@ -154,7 +159,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _holder(folder: Path) -> str:
-    """Who locks a folder, where the system tells (Linux does)."""
+    """Say who locks a folder, where the system tells (Linux does)."""
     with suppress(OSError):
         for words in map(str.split, Path("/proc/locks").read_text().splitlines()):
             if words[1] == "FLOCK" and words[5].endswith(f":{folder.stat().st_ino}"):
@@ -163,23 +168,24 @@ def _holder(folder: Path) -> str:
 
 
 def check_takes(to: Path) -> None:
-    """Refuse a zip or a user folder that takes no lens, before a lens is made; raises InputError as `add_lens`."""
+    """Refuse a zip or a user folder that takes no lens, before the lens is made; raises InputError as `add_lens`."""
     _contents(to)
 
 
 def add_lens(to: Path, lens: PackedLens) -> None:
-    """Put a lens into a packed extension (.zip) or into its user folder, which is made if needed, in place of one with
-    its id.
+    """Add a lens to a packed extension (.zip) or to its user folder, which is made if needed.
+
+    It replaces a lens of the same id.
 
     Raises:
-        InputError: no packed extension, facts that are not those of neurolens, no folder. OSError: it cannot be
+        InputError: it is no packed extension and no folder, or its facts are not neurolens's. OSError: it cannot be
             written.
     """
     if to.suffix != ".zip" and not to.exists():
         to.mkdir(parents=True, exist_ok=True)
     with locked(to if to.is_dir() else to.parent):  # another process may add a lens meanwhile
         files, known = _contents(to)
-        new = lens.files() | {FACTS: _facts(_merged(known, lens))}  # the facts last: they name files
+        new = lens.files() | {FACTS: _facts(_merged(known, lens))}  # facts come last, for they name files
         if to.suffix == ".zip":
             _write_zip(to, files | new)
             return
@@ -190,7 +196,7 @@ def add_lens(to: Path, lens: PackedLens) -> None:
 
 
 def _contents(to: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
-    """The files of a packed extension (of a folder none), and the entries of its facts, none of a new folder."""
+    """Read a packed extension's files (a folder gives none) and the entries of its facts (a new folder has none)."""
     if to.suffix == ".zip":
         return _of_zip(to)
     file = to / FACTS
@@ -206,12 +212,12 @@ def _contents(to: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
 
 
 def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
-    """The files of a packed extension, and the entries of its facts."""
+    """Read the files of a packed extension, and the entries of its facts."""
     expected = "a zip of `neurolens blender build`"
     data = io.BytesIO(read_bytes(path, _LARGEST, expected))
     try:
         with zipfile.ZipFile(data) as packed:
-            # An entry gives no more bytes than it says here, so that these bound the memory that is taken.
+            # An entry never gives more bytes than it says here, so that these bound the memory taken.
             if sum(i.file_size for i in packed.infolist()) > _LARGEST:
                 raise ValueError(f"more than {_LARGEST} bytes unpacked")
             for info in packed.infolist():
@@ -221,13 +227,13 @@ def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
     except MemoryError:
         raise
     except Exception as error:  # zipfile raises many types: for passwords, methods of compression, damaged data
-        clear = isinstance(error, (zipfile.BadZipFile, ValueError))  # other messages are about the code
+        clear = isinstance(error, (zipfile.BadZipFile, ValueError))  # the messages of others are about the code
         why = f"no {error}" if isinstance(error, KeyError) else str(error) if clear else "damaged or encrypted"
         raise InputError(path, "file", f"({why or type(error).__name__})", expected) from None
 
 
 def user_folders() -> list[Path]:
-    """The user folders of the extension in the Blenders of this machine that have it, the newest Blender first."""
+    """Return the extension's user folders in the Blenders of this machine that have it, newest Blender first."""
     home = Path.home()
     if given := os.environ.get("BLENDER_USER_RESOURCES"):
         places = [Path(given)]
@@ -243,10 +249,10 @@ def user_folders() -> list[Path]:
 
 
 def _entries(text: bytes) -> list[dict[str, Any]]:
-    """The entries of facts that the extension can read, so that it reads those to which a lens is added.
+    """Read entries of facts by the extension's own reader, so that it can read those to which a lens is added.
 
     Raises:
-        InputError, those of `DAMAGED` in the extension's library, RecursionError: other facts.
+        InputError, RecursionError, those of `DAMAGED` in the extension's library: the facts are none.
     """
     data = parse_json(text, FACTS)
     if data["schema"] != SCHEMA:
@@ -257,7 +263,7 @@ def _entries(text: bytes) -> list[dict[str, Any]]:
 
 
 def _merged(known: Iterable[dict[str, Any]], lens: PackedLens) -> list[dict[str, Any]]:
-    """The entries with the lens added; an entry of its id keeps the forms that the lens does not bring."""
+    """Add a lens to entries; an entry of the same id keeps the forms that the lens does not bring."""
     mine = lens.facts()
     kinds = {v["kind"] for v in mine["variants"]}
     others = []

@@ -1,4 +1,4 @@
-"""neurolens cameras in Mitsuba 3: its scenes, unmodified, through an exported lens (extra "mitsuba").
+"""neurolens cameras in Mitsuba 3: its scenes, unmodified, through a lens or model (extra "mitsuba").
 
     import mitsuba as mi
     import neurolens.programs.mitsuba as nm
@@ -30,22 +30,22 @@ from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.programs.mitsuba.sensor import PLUGIN, matrix, register, require_mitsuba
 
 __all__ = ["load_scene", "register", "render", "require_mitsuba"]
-PASS_RAYS = 1 << 20  # of one wavefront: numpy holds some 200 bytes per ray
+PASS_RAYS = 1 << 20  # in one wavefront: numpy holds some 200 bytes per ray
 CORNELL_BOX = "cornell-box"
 
 
 def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None, **parameters: Any) -> Any:
-    """A scene of Mitsuba (mi.Scene): an XML file, its own "cornell-box", or a dictionary for mi.load_dict.
+    """Load a scene of Mitsuba (mi.Scene): an XML file, its own "cornell-box", or a dictionary for mi.load_dict.
 
     Mitsuba reads no glTF; its Blender add-on turns such a scene into XML.
 
     Args:
-        variant: of Mitsuba; None is the current one, else llvm_ad_spectral.
+        variant: Mitsuba's; None takes the current one, else llvm_ad_spectral.
         parameters: values for the $names of an XML file.
 
     Raises:
-        NeurolensError: no Mitsuba, no LLVM; a scene that Mitsuba rejects, with its message.
-        InputError: no such file, or one of another format; a scene without a sensor or an integrator.
+        NeurolensError: Mitsuba or LLVM is missing, or Mitsuba rejects the scene, with its message.
+        InputError: there is no such file, or it has another format; the scene has no sensor or no integrator.
     """
     mi = require_mitsuba(variant)
     register()
@@ -61,7 +61,7 @@ def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None
         load = lambda: mi.load_file(str(scene), **parameters)  # noqa: E731
     try:
         loaded = load()
-    except Exception as error:  # the library raises bare RuntimeError, ours inside it with a traceback
+    except Exception as error:  # the library raises bare RuntimeError, with ours inside it and a traceback
         ours = re.findall(r"^(?:InputError|ModelError): (.*)", str(error), re.MULTILINE)
         reason = ours[-1] if ours else " ".join(str(error).split())
         raise NeurolensError(f"mitsuba scene {name}: {reason}") from error
@@ -90,16 +90,16 @@ def render(
         scene: mi.Scene, or what `load_scene` takes.
         camera: any of our contract; the film has the shape of the scene's picture. Its plane stands at the origin of
             the scene's sensor.
-        spp: samples per pixel; None is the sampler's own number.
+        spp: samples per pixel; None takes the sampler's own number.
         units_per_m: scene units in a metre.
-        to_world: mi.ScalarTransform4f that places the film instead.
+        to_world: mi.ScalarTransform4f that places the film, in place of the sensor's.
         sensor: index of the scene's sensor that supplies film, sampler and transform.
         progress: called with the fraction done.
 
     Returns: [H, W, 3] float32, linear sRGB; white light of radiance 1 everywhere gives 1 on the axis.
 
     Raises:
-        InputError: a film of another shape or without colours, no such sensor, a place with a scale.
+        InputError: the film has another shape or no colours, there is no such sensor, or its place has a scale.
     """
     mi = require_mitsuba()
     made = register()

@@ -1,24 +1,24 @@
 """The Mitsuba sensor "neurolens": any camera of our contract, one numpy call per wavefront.
 
-Mitsuba's camera looks along +z with y up and x to the left of the picture, ours along -z with x to the right: half a
-turn about y. The origin is the centre of the film plane, as in our scenes.
+Mitsuba's camera looks along +z with y up and x to the left of the picture, ours along -z with x to the right: it is
+half a turn about y. The origin is the centre of the film plane, as in our scenes.
 
-In spectral variants a ray carries four wavelengths. Where the camera's rays hardly depend on the wavelength they are
-Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014), as with its dispersion "off"; a lens
-that disperses, even "lateral", gives all four lanes the same wavelength.
+In spectral variants a ray carries four wavelengths. Where the camera's rays hardly depend on the wavelength, as with
+dispersion "off", they are Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014). A lens that
+disperses, even "lateral", gives all four lanes the same wavelength.
 
 A path of an RGB renderer carries three numbers, not a wavelength; a lens that disperses needs one. Each ray takes a
 wavelength, drawn by the film's response, and its channel c is weighted by
 
     w_c(lambda) = response_c(lambda) B_c(lambda) / pdf(lambda),
 
-the diagonal of what our film makes of light of the basis spectra B (Mallett and Yuksel 2019; `SpectralRange`), without
-its few negative values (Mitsuba's scalar variants drop samples below 0) and scaled to a mean of 1: white stays white,
-and any colour stays itself where the rays do not depend on the wavelength. The terms off the diagonal have mean 0; an
-RGB renderer cannot represent them, and colour fringes of saturated objects differ by them from a spectral render.
+It is the diagonal of what our film makes of light of the basis spectra B (Mallett and Yuksel 2019; `SpectralRange`),
+without its few negative values (Mitsuba's scalar variants drop samples below 0) and scaled to a mean of 1. White stays
+white, and any colour stays itself where the rays do not depend on the wavelength. The terms off the diagonal have mean
+0; an RGB renderer cannot represent them, and colour fringes of saturated objects differ by them from a spectral render.
 
 Weights are ours: a uniform environment of radiance 1 gives 1 on the axis, and falls off towards the edge as the lens
-vignettes. Scalar variants ask for one ray at a time, which takes a model about a millisecond: for tests.
+vignettes. Scalar variants ask for one ray at a time, which takes a model about a millisecond: they serve tests.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from neurolens.pictures.render.sampler import hash32
 from neurolens.pictures.render.settings import FilmSettings
 
 PLUGIN = "neurolens"
-LIGHT_NM = (400.0, 700.0)  # which sets the exposure, and the wavelengths of RGB variants; as our scenes have it
+LIGHT_NM = (400.0, 700.0)  # sets the exposure and the wavelengths of RGB variants; the same as in our scenes
 FILM_WIDTH_MM = 36.0
 _MIDDLE_NM = 550.0
 _CLASSES: dict[str, type] = {}
@@ -57,9 +57,10 @@ _TURNED = np.array([[-1], [1], [-1]], np.float32)  # half a turn about y
 
 
 def libraries() -> tuple[Any, Any]:
-    """The modules mitsuba and drjit, untyped: what Mitsuba has depends on its variant.
+    """Import the modules mitsuba and drjit, untyped: what Mitsuba has depends on its variant.
 
-    NeurolensError: they are not installed.
+    Raises:
+        NeurolensError: they are not installed.
     """
     try:
         return importlib.import_module("mitsuba"), importlib.import_module("drjit")
@@ -68,15 +69,15 @@ def libraries() -> tuple[Any, Any]:
 
 
 def require_mitsuba(variant: str | None = None) -> Any:
-    """The module mitsuba with a variant set: `variant`, else the current one, else llvm_ad_spectral.
+    """Import the module mitsuba with a variant set: `variant`, else the current one, else llvm_ad_spectral.
 
     Warns:
-        NeurolensWarning: no LLVM, or one so old that compiled variants may end the process; where no variant was asked
-            for, scalar_spectral is taken in its place.
+        NeurolensWarning: there is no LLVM, or one so old that compiled variants may end the process. If no variant was
+            asked for, scalar_spectral is taken.
 
     Raises:
         NeurolensError: Mitsuba is not installed, or the variant's compiler (LLVM, CUDA) is missing.
-        InputError: a variant that this Mitsuba does not have, or one that carries neither RGB nor plain spectra.
+        InputError: this Mitsuba does not have the variant, or the variant carries neither RGB nor plain spectra.
     """
     mi, dr = libraries()
     wanted = variant or mi.variant() or DEFAULT_VARIANT
@@ -101,7 +102,7 @@ def require_mitsuba(variant: str | None = None) -> Any:
 
 
 def _llvm_doubt(dr: Any) -> str:
-    """The fault of the LLVM that Dr.Jit loads; empty if it has none."""
+    """Say what is wrong with the LLVM that Dr.Jit loads; empty if nothing is."""
     version = dr.detail.llvm_version()
     if version[0] >= _OLDEST_LLVM:
         return ""
@@ -115,31 +116,31 @@ def _llvm_doubt(dr: Any) -> str:
 
 @cache
 def _compile(variant: str) -> None:
-    """Compile one small kernel: a missing LLVM is detected only then."""
+    """Compile one small kernel, since only then a missing LLVM is detected."""
     mi, dr = libraries()
     dr.eval(mi.Float(dr.arange(mi.UInt32, 2)) + 1)
 
 
 def rows(*values: Any) -> FloatArray:
-    """Numbers of the current variant, one wide or N, as [len(values), N] float32; evaluates them."""
+    """Evaluate numbers of the current variant, one wide or N, as [len(values), N] float32."""
     arrays = [np.atleast_1d(np.asarray(value, np.float32)) for value in values]
     return np.stack(np.broadcast_arrays(*arrays))
 
 
 def number(values: FloatArray) -> Any:
-    """Numbers [N] as the variant's Float; in scalar variants N is 1."""
+    """Return numbers [N] as the variant's Float; in scalar variants N is 1."""
     mi, dr = libraries()
 
     return mi.Float(np.ascontiguousarray(values)) if dr.is_jit_v(mi.Float) else float(values[0])
 
 
 def vector(kind: Any, values: FloatArray) -> Any:
-    """Numbers [D, N] as a vector, point, colour or spectrum `kind` of D parts."""
+    """Return numbers [D, N] as a vector, point, colour or spectrum `kind` of D parts."""
     return kind(*(number(row) for row in values))
 
 
 def matrix(transform: Any) -> NDArray[np.float64]:
-    """A transform of any variant as float64 [4, 4]."""
+    """Return a transform of any variant as float64 [4, 4]."""
     return np.array(transform.matrix, np.float64).reshape(4, 4, -1)[..., 0]
 
 
@@ -168,10 +169,10 @@ class FilmRays:
     units_per_m: float = 1.0
 
     def sample(self, position: FloatArray, aperture: FloatArray, wavelength_nm: FloatArray) -> LocalRays:
-        """Rays for film positions [2, N] and aperture samples [2, N] in [0, 1), and wavelengths [N] in nm.
+        """Return rays for film positions [2, N] and aperture samples [2, N] in [0, 1), at wavelengths [N] in nm.
 
-        Wavelengths outside the camera's range are clipped to it: Mitsuba draws from 360 to 830 nm, and the
-        luminance outside 400 to 700 nm is a few thousandths of that of white light.
+        Wavelengths outside the camera's range are clipped to it: Mitsuba draws from 360 to 830 nm, where the luminance
+        outside 400 to 700 nm is a few thousandths of that of white light.
         """
         count = position.shape[1]
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
@@ -200,11 +201,11 @@ class FilmRays:
 
 
 def wavelength_samples(position: FloatArray, aperture: FloatArray) -> FloatArray:
-    """Uniform numbers [N] in [0, 1) for the wavelengths of a wavefront, from its points [2, N] on film and aperture.
+    """Return uniform numbers [N] in [0, 1) for a wavefront's wavelengths, from its points [2, N] on film and aperture.
 
-    Steps of the golden ratio from a start that the first points decide: a pixel's samples follow each other in a
-    wavefront, and so many in a row are spread almost evenly, which saves most of the colour noise. RGB variants of
-    Mitsuba draw no such number at all.
+    RGB variants of Mitsuba draw no such number. These go in steps of the golden ratio from a start that the first
+    points decide. A pixel's samples follow each other in a wavefront, and numbers in a row are spread almost evenly,
+    which saves most of the colour noise.
     """
     first = np.ascontiguousarray(np.concatenate([position[:, :1], aperture[:, :1]]), np.float32)
     start = np.zeros(1, np.uint32)
@@ -218,7 +219,7 @@ def register() -> type:
     """Make the plugin known to the current variant of Mitsuba, once; returns the sensor's class.
 
     Raises:
-        NeurolensError: no Mitsuba. InputError: a variant that carries neither RGB nor spectra.
+        NeurolensError: Mitsuba is missing. InputError: the variant carries neither RGB nor spectra.
     """
     mi = require_mitsuba()
     variant = str(mi.variant())
@@ -231,7 +232,7 @@ def register() -> type:
 
 
 def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
-    """The plugin's constructor.
+    """Construct the plugin.
 
     Parameters in a scene: camera (a model, a lens file, "thin" or "pinhole"), focus_m (default inf), f_number,
     focal_length_mm, zoom, film_width_mm (default 36), film_height_mm (default: by the picture's shape), blades,
@@ -264,7 +265,7 @@ def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
 
 
 def _camera_of(props: Any, shape: float) -> Camera:
-    """The camera that a scene's parameters describe, for a picture of `shape`, its height over its width."""
+    """Make the camera that a scene's parameters describe, for a picture of `shape`, its height over its width."""
     width_mm = _number_of(props, "film_width_mm", FILM_WIDTH_MM)
     height_mm = _number_of(props, "film_height_mm", width_mm * shape)
     name = props.get("camera", None)
@@ -291,7 +292,7 @@ def _number_of(props: Any, name: str, default: float) -> float:
 
 
 def _found(name: str) -> str:
-    """The file of that name, relative to the working folder or to the XML scene."""
+    """Find the file of that name, relative to the working folder or to the XML scene."""
     return str(libraries()[0].file_resolver().resolve(name))
 
 
@@ -315,7 +316,7 @@ def _sample_ray(self: Any, time: Any, sample1: Any, sample2: Any, sample3: Any, 
 def _sample_ray_differential(
     self: Any, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
 ) -> tuple[Any, Any]:
-    """Rays of one wavefront. They carry no differentials: nothing in Mitsuba 3 filters textures by them."""
+    """Return the rays of one wavefront, without differentials: nothing in Mitsuba 3 filters textures by them."""
     mi, dr = libraries()
     samples = rows(sample2.x, sample2.y, sample3.x, sample3.y)
     position, aperture = samples[:2], samples[2:]
@@ -341,19 +342,19 @@ def _sample_ray_differential(
 def _lanes(
     self: Any, position: FloatArray, aperture: FloatArray, wavelength_nm: FloatArray
 ) -> tuple[LocalRays, FloatArray]:
-    """Rays of the first lane, and weights [4, N] of all lanes along them, at wavelengths [4, N]."""
+    """Return rays of the first lane, and weights [4, N] of all lanes along them, at wavelengths [4, N]."""
     wavelength_nm = np.broadcast_to(wavelength_nm, (len(wavelength_nm), position.shape[1]))
     local = self.rays.sample(position, aperture, wavelength_nm[0])
     weights = np.tile(local.weight, (len(wavelength_nm), 1))
     if self.hero and not self.achromatic:
         for lane in range(1, len(weights)):
             weights[lane] = self.rays.sample(position, aperture, wavelength_nm[lane]).weight
-        weights *= local.weight > 0  # the ray must exist
+        weights *= local.weight > 0  # no lane passes where the ray does not
     return local, weights
 
 
 def _channels(self: Any, position: FloatArray, aperture: FloatArray) -> tuple[LocalRays, FloatArray]:
-    """Rays of one wavelength each, and weights [3, N] of R, G and B."""
+    """Return rays of one wavelength each, and weights [3, N] of R, G and B."""
     if self.channels is None:
         middle = np.full(position.shape[1], _MIDDLE_NM, np.float32)
         local = self.rays.sample(position, aperture, middle)

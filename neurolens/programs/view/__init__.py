@@ -1,12 +1,12 @@
-"""A static page in which lenses and their models run: GLSL of the graph in a path tracer of WebGPU or WebGL2.
+"""A static page that runs lenses and their models: GLSL of their graphs in a path tracer for WebGPU or WebGL2.
 
 It is one file: its template, style, scripts and shaders, and the lenses as packed data. Texts and files of lenses are
-one stream of printable characters, which `page/packed.js` unpacks: a fifth of gzip's. C, GLSL and OSL of lenses say
-much the same with temporaries of other numbers. Counted from the line's own number most lines of one are lines of the
-others; LZMA, unlike gzip, looks back far enough to find them.
+one stream of printable characters, which `page/packed.js` unpacks: a fifth of the size that gzip gives. C, GLSL and OSL
+of lenses say much the same, but number their temporaries differently. When temporaries are counted from the line's own
+number, most lines of one text are lines of the others, and LZMA, unlike gzip, looks back far enough to find them.
 
-Functions of the page's shaders come from graphs, too: the weights of rays, the blades, a thin lens, the crossings of
-rays with the surfaces of a lens, and ghosts.
+Functions of the page's shaders are written from graphs, too: the weights of rays, the blades, a thin lens, the
+crossings of rays with the surfaces of a lens, and ghosts.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from neurolens.pictures.flare.ghosts import GhostTracer, entrances, ghost_graphs
 
 SCRIPTS = ("packed.js", "gl.js", "wgsl.js", "webgpu.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
-# A form's download that would carry the page beyond this, or beyond so much for each lens, is left out.
+# A download that would make the page larger than this, or larger than so much for each lens, is left out.
 MOST_BYTES, MOST_A_LENS = 3_000_000, 40_000
-_TOGETHER = 6  # lenses of a stream: each says less for those before, and takes longer to unpack
+_TOGETHER = 6  # lenses in a stream: with more of them each lens packs better, and takes longer to unpack
 _AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
 _CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
 _FUNCTION = re.compile(r"^float ([a-z]\w*)\(([^)]*)\)$", re.MULTILINE)
-# Of 91 characters two hold 13 bits; none ends an element of HTML, begins an entity or an escape.
+# Two of 91 characters hold 13 bits; none of them ends an element of HTML or begins an entity or an escape.
 CHARACTERS = "".join(chr(code) for code in range(33, 127) if chr(code) not in "&<\\")
 FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "dict_size": 1 << 22, "lc": 3, "lp": 0, "pb": 0}
@@ -55,7 +55,7 @@ FILTERS = [
 _STEPS = re.compile(r"(?:^    float t\d+ = .*\n)+", re.M)
 _UNTOLD = re.compile(r"\x01|\bt\d+-")  # what `_counted` could not give back
 _GIVEN = {"zoom_mm": "zoom", "focus_m": "focus", "stop_radius_mm": "stop_radius"}
-# The names that inputs and outputs of functions have in the page's shaders.
+# What inputs and outputs of functions are called in the page's shaders.
 _PLACES = {
     "film_x_mm": "film.x", "film_y_mm": "film.y", "pupil_x_mm": "pupil.x", "pupil_y_mm": "pupil.y",
     WAVELENGTH: "nm", FILM_Z: "film_z", STOP_RADIUS: "stop_radius", "x_mm": "p.x", "y_mm": "p.y", "z_mm": "p.z",
@@ -66,18 +66,18 @@ _PLACES = {
     **{f"seen_{k}": f"{'origin' if k < 3 else 'to'}.{'xyz'[k % 3]}" for k in range(6)},
 }  # fmt: skip
 _ENTERING = {"dx": "d.x", "dy": "d.y", "x_mm": "at.x", "y_mm": "at.y", WAVELENGTH: "nm", STOP_RADIUS: "stop_radius"}
-_ARRIVING = ("arriving.x", "arriving.y", "arriving.z", "arriving.w")  # as `program.ARRIVING`
-_SINE = math.sin(math.radians(35.0))  # of the largest angle between the axis and a lamp that makes ghosts
+_ARRIVING = ("arriving.x", "arriving.y", "arriving.z", "arriving.w")  # in the order of `program.ARRIVING`
+_SINE = math.sin(math.radians(35.0))  # of the largest angle between the axis and a lamp whose ghosts are shown
 _COMMENT = re.compile(r"/\*.*?\*/\s*", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class Form:
-    """A lens as one of its models, or traced.
+    """A lens as one of its models, or as traced exactly.
 
     Attributes:
-        kind: "exact", "polynomial" or "network". method: of the model, as "ols-64".
-        glsl: the text of `neurolens export --to glsl`. signature: of its function.
+        kind: "exact", "polynomial" or "network". method: the model's, such as "ols-64".
+        glsl: the text that `neurolens export --to glsl` writes. signature: of its function.
         card: the facts that the page shows: numbers of the domain and errors.
         files: other downloads, contents by kind ("c", "onnx", "osl").
     """
@@ -90,7 +90,7 @@ class Form:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
     def program(self) -> dict[str, Any]:
-        """The call of the function for a shader, and an expression for each number of the lens."""
+        """Return the call of the function in a shader, and an expression for each number of the lens."""
         own = self.signature.name
         values = {name.removeprefix(f"{own.upper()}_").lower(): name for name in _CONSTANT.findall(self.glsl)}
         for name, arguments in _FUNCTION.findall(self.glsl):
@@ -104,7 +104,8 @@ class ViewLens:
     """A lens of the menu, named by `key`.
 
     Attributes:
-        squeeze: of an anamorphic picture across. f_numbers: (focal length in mm, f-number of the widest stop) by zoom.
+        squeeze: by which an anamorphic lens compresses the picture across. f_numbers: (focal length in mm, f-number of
+            the widest stop) by zoom.
         nearest_m: the nearest focus. section, path, ghosts (of a lamp): from `section_svg`, `path_glsl`, `ghosts_glsl`.
     """
 
@@ -127,7 +128,7 @@ def write_page(
 ) -> dict[str, Any]:
     """Write the page with these `kinds` of downloads, "glsl" first.
 
-    Where they do not fit, the last kinds are left out, in each kind first the files of exact lenses.
+    Where they do not fit, the last kinds are left out; in each kind files of exact lenses go first.
 
     Returns the size of the page, and which downloads it has and which are left out.
 
@@ -150,7 +151,7 @@ def write_page(
 
 
 def _without_exact(lenses: Sequence[ViewLens], kind: str) -> list[ViewLens]:
-    """The lenses without such a file of their exact forms."""
+    """Return the lenses without the files of this kind that their exact forms have."""
 
     def forms(lens: ViewLens) -> list[Form]:
         files = [{k: v for k, v in f.files.items() if f.kind != "exact" or k != kind} for f in lens.forms]
@@ -177,14 +178,14 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
         "lenses": entries,
     }
     data = json.dumps(shared, allow_nan=False, separators=(",", ":")).encode()
-    # Packed texts are of `CHARACTERS`, which end no element.
+    # Packed texts consist of `CHARACTERS`, which end no element.
     elements.insert(0, {"key": "data", "text": packed(data), "bytes": len(data)})
     title = lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"
     return html("view.html", title=title, streams=elements, scripts=SCRIPTS)
 
 
 def _facts(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
-    """What the controls and the first picture of a lens need, which the page unpacks when the lens is chosen."""
+    """Return what the controls and the first picture of a lens need; the page unpacks it when the lens is chosen."""
     found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section", "ghosts")}
     forms = []
     for f in lens.forms:
@@ -194,7 +195,7 @@ def _facts(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
 
 
 def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
-    """Yield texts and files of lenses, first those that a picture needs: the page unpacks no further than it must."""
+    """Yield texts and files of lenses, those that a picture needs first: the page unpacks no further than it must."""
     for lens in lenses:
         yield f"{lens.key}/facts", json.dumps(_facts(lens, kinds), allow_nan=False).encode()
     for lens in lenses:
@@ -213,7 +214,7 @@ def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[s
 
 
 def section_svg(layout: Layout) -> dict[str, Any]:
-    """The section of a lens (glass, rims, stop, film) as paths of SVG in mm, z to the right and heights upwards."""
+    """Return the section of a lens (glass, rims, stop, film) as SVG paths in mm, z to the right and heights upwards."""
     glass = [
         {"path": _path(element_outline(front, back)), "n": round(front.n_after, 3)}
         for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False)
@@ -237,21 +238,24 @@ def section_svg(layout: Layout) -> dict[str, Any]:
 
 
 def _path(points: np.ndarray[Any, Any]) -> str:
-    """A closed path, with every fourth point of an outline's arcs."""
+    """Write a closed path, with every fourth point of an outline's arcs."""
     kept = np.concatenate([points[:65:_ARC], points[65:-65], points[-65::_ARC]])
     return "M" + "L".join(f"{z:.2f} {h:.2f}" for z, h in kept) + "Z"
 
 
 def packed(data: bytes) -> str:
-    """Bytes as LZMA (raw, lc 3, lp 0, pb 0) in `CHARACTERS`, 13 bits a pair, high bits and characters first."""
+    """Write bytes as LZMA (raw, lc 3, lp 0, pb 0) in `CHARACTERS`, 13 bits a pair, high bits and characters first."""
     bits = np.unpackbits(np.frombuffer(lzma.compress(data, lzma.FORMAT_RAW, filters=FILTERS), np.uint8))
     values = np.pad(bits, (0, -bits.size % 13)).reshape(-1, 13) @ (1 << np.arange(12, -1, -1))
     return np.array(list(CHARACTERS))[np.stack(np.divmod(values, len(CHARACTERS)), 1)].tobytes().decode("utf-32-le")
 
 
 def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tuple[str, int, int, int]]]:
-    """The stream of named parts, and for each its name, place, bytes, and form: 0 as it is, 1 with temporaries counted,
-    2 with steps in the order of their numbers, too, which `urgent` had moved."""
+    """Pack named parts into a stream; also return the name, place, bytes and form of each.
+
+    The form is 0 for a part as it is, 1 with temporaries counted, 2 with steps in the order of their numbers, too,
+    which `urgent` had moved.
+    """
     data, index = b"", []
     for name, part in parts:
         how = int(isinstance(part, str) and not _UNTOLD.search(part))
@@ -270,8 +274,10 @@ def _own(line: str) -> int:
 
 
 def _counted(text: str) -> str:
-    """A text with each line's first temporary counted from that of the line before (1 is left out), others back from
-    the first."""
+    """Write a text so that the first temporary of each line counts from that of the line before (1 is left out).
+
+    Other temporaries count back from the first.
+    """
     before, lines = 0, []
     for line in text.split("\n"):
         numbers = [int(n) for n in TEMPORARY.findall(line)]
@@ -286,16 +292,16 @@ def _counted(text: str) -> str:
 
 
 def call_of(signature: Signature) -> str:
-    """The call of a lens's function, its arguments as the page's shaders name them; a state is a uniform."""
+    """Return the call of a lens's function with arguments as the page's shaders name them; a state is a uniform."""
     given = [_PLACES[name] for name in signature.inputs]
     found = [*(_PLACES[o] for o in signature.outputs), *["status"] * signature.status]
     return f"{signature.name}({', '.join([*given, *found])})"
 
 
 def shared_glsl() -> dict[str, tuple[str, str]]:
-    """Functions for all lenses, and their calls, by name.
+    """Return functions that all lenses share, and their calls, by name.
 
-    `weigh` gives the ray in the camera's frame and its weight, `opened` whether it goes through the blades, and `thin`
+    `weigh` gives the ray in the camera's frame and its weight, `opened` tells whether it passes the blades, and `thin`
     is a thin lens.
     """
     graphs = {"weigh": _weight_in_frame(), "opened": _blades_opened(), "thin": _thin_lens()}
@@ -304,29 +310,29 @@ def shared_glsl() -> dict[str, tuple[str, str]]:
 
 
 def _blades_opened() -> Graph:
-    """A graph that is 1 where a crossing with the stop lies between the blades, else 0."""
+    """Write a graph that is 1 where a crossing with the stop lies between the blades, else 0."""
     g = Graph()
     g.outputs["inside"] = Blades(g).opened(g.input("stop_xy_mm", 2) * (1.0 / g.input(STOP_RADIUS, per_call=True)))
     return g
 
 
 def _weight_in_frame() -> Graph:
-    """`cameragraph.weight_graph` with outputs of names of their own."""
+    """Write `cameragraph.weight_graph` with names of its own for outputs."""
     g = Graph()
     inputs = {"film_mm": 2, "pupil_mm": 2, "area_mm2": 1, "scene_ray": 6, "transmittance": 1, "lens_status": 1}
     given = {name: g.input(name, rows) for name, rows in inputs.items()}
     given |= {name: g.input(name, per_call=True) for name in ("per_distance", "scale", FILM_Z)}
     found = g.inline(weight_graph(), given)
-    g.outputs["seen"] = found["ray"]  # under a name of its own: the ray of the lens is an input
+    g.outputs["seen"] = found["ray"]  # another name than that of the lens's ray, which is an input
     g.outputs["weight"] = found["weight"]
     return g
 
 
 def _thin_lens() -> Graph:
-    """A thin lens with the contract of models.
+    """Write a thin lens with the contract of models.
 
-    Pupil points are on the lens, `distance_mm` before the film; besides it takes `per_depth`, 1 / f - 1 / distance
-    (per mm): the ray goes on towards the point conjugate to the film point.
+    Pupil points are on the lens, `distance_mm` before the film. It also takes `per_depth`, 1 / f - 1 / distance (per
+    mm): the ray goes on towards the point conjugate to the film point.
     """
     g = Graph()
     film, pupil = g.input("film_mm", 2), g.input("pupil_mm", 2)
@@ -342,7 +348,7 @@ def _thin_lens() -> Graph:
 
 
 def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> tuple[str, list[str]]:
-    """The text of `lens_path` for meridional rays (film and pupil points on the y axis), and the names of its outputs.
+    """Write `lens_path` for meridional rays (film and pupil points on the y axis); also return its outputs' names.
 
     These are z and y (mm) at each surface from the film on, the direction in front of the lens, and the status.
     """
@@ -357,11 +363,11 @@ def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> t
 
 
 def ghosts_glsl(lens: Lens, film_radius_mm: float, most: int) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The brightest ghosts on the film of a lens, which must be placed; at most so many.
+    """Write the brightest ghosts on the film of a lens, which must be placed; at most `most`.
 
-    Returns the facts of all, for p = direction / sine and stops up to `stop_radius_mm`, where `light` is their share of
-    the light of all ghosts; and of each, brightest first, its function, whose rays cross the plane z = 0 at
-    (x, y) = chief_mm p + scale_mm u.
+    Returns facts of all of them, for p = direction / sine and stops up to `stop_radius_mm`; `light` is their share of
+    the light of all ghosts. Then for each, brightest first, it returns its function, whose rays cross the plane z = 0
+    at (x, y) = chief_mm p + scale_mm u.
 
     Raises:
         InputError: as `GhostTracer` and `ghost_graphs`.

@@ -9,7 +9,7 @@ from .panel import CLASSES, HANDLERS, LIBRARY, CameraSettings
 
 
 def register() -> None:
-    """Add menu, operators and panel."""
+    """Add menu, operators and panel to Blender."""
     for each in (*CLASSES, *OF_FLARE):
         bpy.utils.register_class(each)
     bpy.types.Camera.neurolens = bpy.props.PointerProperty(type=CameraSettings)
@@ -20,7 +20,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take them away; cameras keep their lenses, and render."""
+    """Take menu, operators and panel away. Cameras keep their lenses, and render."""
     for when, act in HANDLERS:
         getattr(bpy.app.handlers, when).remove(act)
     LIBRARY.close()

@@ -1,7 +1,7 @@
-"""A lens put on a camera and taken off it: all that is changed is first written down on the camera and the scene.
+"""Puts a lens on a camera and takes it off; what is changed is first written down on the camera and the scene.
 
 The shader's text and its compiled form are kept in the .blend file, and its settings are the custom camera's own
-properties: the file renders where the extension is missing, and keyframes and drivers act on them directly.
+properties. So the file renders where the extension is missing, and keyframes and drivers act on the settings directly.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import bpy
 
 from .library import FEW, PASSES, LensError, LensFacts, Setting, Variant, fitting_width_mm, refusals, refused
 
-# Of the camera and of the scene, what `apply` changes; the scene's first camera of this extension writes the scene's.
+# What `apply` changes in the camera and in the scene; the scene's first camera of this extension keeps the scene's.
 _CAMERA = (
     "type", "custom_mode", "custom_filepath", "custom_bytecode", "custom_bytecode_hash",
     "sensor_fit", "sensor_width", "sensor_height", "lens",
 )  # fmt: skip
-_RAYS = (24, 14)  # across and down, that tell the depths in view
-_TEXT = "neurolens "  # the names of our shaders in a file start so
+_RAYS = (24, 14)  # across and down, to find the depths in view
+_TEXT = "neurolens "  # how the names of our shaders in a file begin
 _ZOOM = 'cycles_custom["zoom_mm"]'
 
 
@@ -43,22 +43,23 @@ def camera_of(context: Any) -> Any:
 
 
 def applied(camera: Any) -> bool:
-    """Whether camera data carry a lens of the extension."""
+    """Return whether camera data carry a lens of the extension."""
     return bool(camera.neurolens.before) and camera.type == "CUSTOM"
 
 
 def setting_of(scene: Any, found: Any) -> Setting:
-    """The scene's settings for a lens on this camera object."""
+    """Return the scene's settings for a lens on this camera object."""
     camera, render = found.data, scene.render
     custom = camera.cycles_custom if applied(camera) else {}
     f_number = float(custom["f_number"]) if "f_number" in custom else None
-    own = float(custom["focus_m"]) if "focus_m" in custom else 0.0  # of the shader; above 0 it rules
+    # the shader's own focus, which rules if it is above 0
+    own = float(custom["focus_m"]) if "focus_m" in custom else 0.0
     off = applied(camera) and not camera.dof.use_dof  # putting a lens on switches it on
     focus = own if own > 0 else None if off else focus_m(found)
     sensor = sensor_mm(camera, render)
     side = {"HORIZONTAL": sensor[0], "VERTICAL": sensor[1]}.get(camera.sensor_fit, max(sensor))
     unit = scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0
-    # Until the lens is on, the scene's scale counts, which it will take; shaders of earlier versions take metres.
+    # Until the lens is on, its scale is the scene's, which it will take; shaders of earlier versions take metres.
     lens_unit = float(custom.get("unit_m", 1.0)) if applied(camera) else unit
     return Setting(
         sensor_mm=sensor,
@@ -79,7 +80,7 @@ def setting_of(scene: Any, found: Any) -> Setting:
 
 
 def _stereo(camera: Any, render: Any) -> tuple[float, ...]:
-    """The amounts that stereo adds to shift X of the left and the right eye, as Blender computes them."""
+    """Return what stereo adds to shift X for the left and for the right eye, as Blender computes it."""
     stereo = camera.stereo
     off_axis = stereo.convergence_mode == "OFFAXIS" and render.use_multiview and render.views_format == "STEREO_3D"
     if not off_axis:
@@ -90,7 +91,7 @@ def _stereo(camera: Any, render: Any) -> tuple[float, ...]:
 
 
 def _passes(scene: Any) -> tuple[str, ...]:
-    """The passes of `PASSES` that the scene renders."""
+    """Return which of `PASSES` the scene renders."""
     layers = [layer for layer in scene.view_layers if layer.use]
     mattes = ("object", "material", "asset")
     asked = {
@@ -102,7 +103,7 @@ def _passes(scene: Any) -> tuple[str, ...]:
 
 
 def focus_m(found: Any) -> float:
-    """The focus distance along the view, in units of the scene, as Cycles computes it."""
+    """Return the focus distance along the view, in units of the scene, as Cycles computes it."""
     dof = found.data.dof
     if dof.focus_object is None:
         return float(dof.focus_distance)
@@ -112,7 +113,7 @@ def focus_m(found: Any) -> float:
 
 
 def depths_in_view(context: Any, found: Any, setting: Setting, efl_mm: float) -> list[float]:
-    """Depths along the view, in m, at which rays of a pinhole of this focal length end; inf if they meet nothing."""
+    """Depths along the view (m) at which rays of a pinhole of this focal length end; inf if they meet nothing."""
     graph = context.evaluated_depsgraph_get()
     frame = found.evaluated_get(graph).matrix_world.normalized()
     right, up, back = (frame.col[k].xyz for k in range(3))
@@ -126,7 +127,7 @@ def depths_in_view(context: Any, found: Any, setting: Setting, efl_mm: float) ->
 
 
 def sensor_mm(camera: Any, render: Any) -> tuple[float, float]:
-    """Width and height that the picture shows, as Cycles gives them to shaders."""
+    """Return width and height (mm) that the picture shows, as Cycles gives them to shaders."""
     across = render.resolution_x * render.pixel_aspect_x
     down = render.resolution_y * render.pixel_aspect_y
     fit = camera.sensor_fit
@@ -149,7 +150,7 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
     """Put a lens on a camera object.
 
     Raises:
-        LensError: it cannot be; nothing has changed.
+        LensError: the lens cannot be put on; nothing has changed.
     """
     camera = found.data
     if (why := refused(bpy.app.version, bpy.app.build_options.cycles_osl)) is not None:
@@ -199,18 +200,19 @@ def _set(
         render = scene.render
         across, down = (width_mm, width_mm * sensor_mm(camera, render)[1] / sensor_mm(camera, render)[0])
         camera.sensor_fit, camera.sensor_width = "AUTO", max(across, down)
-    if camera.cycles_custom.get("dispersion") is False:  # a switch in earlier versions; a number keeps the choice
+    # in earlier versions it was a switch; a number keeps its choice
+    if camera.cycles_custom.get("dispersion") is False:
         camera.cycles_custom["dispersion"] = 0
     camera.type, camera.custom_mode = "CUSTOM", "INTERNAL"
     old = camera.custom_shader
     camera.custom_shader = _text(f"{_TEXT}{variant.path.name}", source)
     _drop(old)
     if first and not _is_animated(camera, "lens"):
-        camera.lens = max(1.0, lens.efl_mm)  # what the viewport shows is framed by it
-    camera.dof.use_dof = True  # or Cycles does not tell shaders the focus
+        camera.lens = max(1.0, lens.efl_mm)  # frames what the viewport shows
+    camera.dof.use_dof = True  # without it Cycles does not tell shaders the focus
     _compile(camera)
     custom = camera.cycles_custom
-    if "unit_m" in custom and not in_units:  # one that the user has turned stays
+    if "unit_m" in custom and not in_units:  # one that the user has changed stays
         custom["unit_m"] = unit_m
     if first and opened is not None and "f_number" in custom:
         custom["f_number"] = max(float(opened), variant.f_number)
@@ -218,9 +220,11 @@ def _set(
 
 
 def tell_samples(render: bool, only: Any = None) -> None:
-    """Tell the shaders of all cameras whether they get few samples: in the viewport always, in renders by their number.
-    Files keep what is told for renders, so that they render alike without the extension. `only`: the scene that is
-    rendered, since another one with the same camera may have another number."""
+    """Tell the shaders of all cameras whether they get few samples: always in the viewport, in renders by the number.
+
+    Files keep what is told for renders, so that they render alike without the extension. `only` is the scene that is
+    rendered, since another scene with the same camera may have another number.
+    """
     for scene in bpy.data.scenes if only is None else [only]:
         few = not render or scene.cycles.samples < FEW
         for camera in (o.data for o in scene.objects if o.type == "CAMERA" and applied(o.data)):
@@ -230,7 +234,7 @@ def tell_samples(render: bool, only: Any = None) -> None:
 
 
 def _text(name: str, source: str) -> Any:
-    """A text of the file with this content; one that another camera uses is shared."""
+    """Return a text of the file with this content; cameras with the same content share one."""
     for text in bpy.data.texts:
         if text.name.startswith(name) and text.as_string().rstrip("\n") == source.rstrip("\n"):
             return text
@@ -260,7 +264,7 @@ def _is_animated(camera: Any, path: str) -> bool:
 
 
 def _zoom_driver(camera: Any) -> Any:
-    """Our driver of the focal length, or None."""
+    """Return our driver of the focal length, or None."""
     for driver in camera.animation_data.drivers if camera.animation_data is not None else ():
         if driver.data_path == "lens" and any(t.data_path == _ZOOM for v in driver.driver.variables for t in v.targets):
             return driver
@@ -268,7 +272,7 @@ def _zoom_driver(camera: Any) -> Any:
 
 
 def _follow_zoom(camera: Any) -> None:
-    """Let the focal length, which frames the viewport, be that of a lens's zoom; one that is animated stays its own."""
+    """Let the focal length, which frames the viewport, follow the lens's zoom, unless it is animated itself."""
     ours, zooms = _zoom_driver(camera), "zoom_mm" in camera.cycles_custom
     if ours is not None and not zooms:
         camera.driver_remove("lens")
@@ -280,7 +284,7 @@ def _follow_zoom(camera: Any) -> None:
 
 
 def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
-    """The state of all that `apply` changes, JSON-able."""
+    """Return the state of everything that `apply` changes, JSON-able."""
     kept = {name: getattr(camera, name) for name in _CAMERA}
     kept["custom_shader"] = None if camera.custom_shader is None else camera.custom_shader.name
     kept["use_dof"] = camera.dof.use_dof
@@ -289,7 +293,7 @@ def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
 
 
 def take_back(scene: Any, found: Any) -> None:
-    """Take the lens off a camera object: all that `apply` changed is as it was.
+    """Take the lens off a camera object, so that everything that `apply` changed is as it was.
 
     The scene's render settings stay while another camera of the scene carries a lens.
 
@@ -327,7 +331,7 @@ def _put_back(scene: Any, camera: Any, memory: dict[str, Any]) -> None:
 
 
 def _drop(text: Any) -> None:
-    """Remove a shader of ours that nothing uses."""
+    """Remove a shader of ours that nothing uses any more."""
     ours = text is not None and text.name.startswith(_TEXT)
     if ours and not bpy.data.user_map(subset={text})[text]:
         bpy.data.texts.remove(text)

@@ -1,7 +1,7 @@
-"""The scene's lamps, and its meshes that shine, in a list for `neurolens flare`, frame by frame.
+"""Lists the scene's lamps, and its meshes that shine, frame by frame for `neurolens flare`.
 
 Irradiance is on the scale of the picture: in Cycles, too, a white card across the way of a light has the radiance
-irradiance / pi. How much of a light shows comes from rays, so that it dims smoothly as an edge passes before it.
+irradiance / pi. How much of a light shows is found by rays, so that it dims smoothly as an edge passes before it.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from . import lights
 from .library import LensError
 from .panel import _Operator
 
-_MOST_PASSED = 64  # surfaces that no camera sees, on the way of a ray
-_WIDEST = math.pi / 4  # half the angle beyond which a mesh that shines counts as the surroundings
+_MOST_PASSED = 64  # surfaces that no camera sees, which a ray passes on its way
+_WIDEST = math.pi / 4  # half angle: a mesh that shines and is wider counts as surroundings
 _SHINE = {"EMISSION": ("Color", "Strength"), "BSDF_PRINCIPLED": ("Emission Color", "Emission Strength")}
 _KINDS: dict[str, lights.Kind] = {"SUN": "distant", "AREA": "rectangle", "POINT": "sphere", "SPOT": "sphere"}
 
 
 def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
-    """A light of Blender in its frame [4, 4] from a place, and its irradiance there [3]."""
+    """Return a light of Blender with the frame [4, 4] as seen from a place, and its irradiance there [3]."""
     kind = _KINDS[data.type]
     size: tuple[float, ...] = (data.angle if kind == "distant" else data.shadow_soft_size,)
     if data.type == "AREA":
@@ -48,7 +48,7 @@ def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
 
 
 def _radiance(material: Any) -> Any:
-    """How a material shines [3]; None where a texture, or more than one node, decides it."""
+    """Return the radiance [3] of a material; None where a texture, or more than one node, decides it."""
     nodes = material.node_tree.nodes if material and material.node_tree else ()
     pairs = [[node.inputs[name] for name in _SHINE[node.type]] for node in nodes if node.type in _SHINE]
     shining = [pair for pair in pairs if all(s.is_linked or np.atleast_1d(s.default_value)[:3].any() for s in pair)]
@@ -62,7 +62,7 @@ def _radiance(material: Any) -> Any:
 
 
 def _shining_faces(thing: Any, frame: Any, radiance_of: Callable[[Any], Any]) -> tuple[Any, Any, set[int]] | None:
-    """The triangles [N, 3, 3] of a mesh that shine, their radiances [N, 3], and the numbers of their faces."""
+    """Return the triangles [N, 3, 3] of a mesh that shine, their radiances [N, 3], and the numbers of their faces."""
     found, mesh = [radiance_of(slot.material) for slot in thing.material_slots], thing.data
     radiance = np.array([np.zeros(3) if one is None else one for one in found])
     if not radiance.any():
@@ -76,8 +76,10 @@ def _shining_faces(thing: Any, frame: Any, radiance_of: Callable[[Any], Any]) ->
 
 
 def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float, light: Any, own: set[int]) -> bool:
-    """Whether nothing that cameras see, but the light's own faces, lies between two points, beyond `near` from the
-    first."""
+    """Return whether the way between two points is free, beyond `near` from the first.
+
+    What counts is what cameras see, but not the light's own faces.
+    """
     left = float(np.linalg.norm(end - start))
     way, done = (end - start) / left, near
     for _ in range(_MOST_PASSED):
@@ -92,7 +94,7 @@ def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float, light: A
 
 
 def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[str, Any]]:
-    """The rows of all lights that renders have, at the scene's present frame."""
+    """Yield the rows of all lights that renders show, at the scene's present frame."""
     scene, graph = context.scene, context.evaluated_depsgraph_get()
     view = np.array(found.evaluated_get(graph).matrix_world)
     eye, setting = view[:3, 3], on_camera.setting_of(scene, found)
@@ -118,8 +120,9 @@ def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[s
 
 
 def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, str]:
-    """Write the lights of all frames of the scene, and of a camera that carries a lens its keys, to PATH.keys.json;
-    returns how many lights there are, and the arguments of `neurolens flare` for them.
+    """Write the lights of all frames of the scene, and the keys of a camera that carries a lens (to PATH.keys.json).
+
+    Returns how many lights there are, and the arguments of `neurolens flare` for them.
 
     Raises:
         LensError: there is no light, or no such folder.
@@ -158,7 +161,7 @@ def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, 
 
 
 def left_out(scene: Any) -> list[str]:
-    """Names of the materials that shine by a texture or a mixture of nodes: they are no lights of the list."""
+    """Return the names of materials that shine by a texture or a mixture of nodes, and so are not in the list."""
     slots = (slot.material for item in scene.objects if not item.hide_render for slot in item.material_slots)
     return sorted({material.name for material in slots if _radiance(material) is None})
 

@@ -1,6 +1,6 @@
-"""The facts of the extension's lenses, the checks of a camera's settings, and the camera that a shot needs.
+"""The facts of the extension's lenses, checks of a camera's settings, and advice on which camera a shot needs.
 
-Plain Python, without Blender.
+It is plain Python, without Blender.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ KINDS = {"polynomial": "Polynomial", "network": "Network", "exact": "Exact"}
 CHARACTER = {  # figures of `neurolens lens list`
     "cats_eye": "Cat's Eye", "swirl": "Swirl", "bubble": "Soap Bubbles", "softness_um": "Softness", "flare": "Flare",
 }  # fmt: skip
-ORDERS = {"focal_length": "Focal Length", "speed": "Speed", "year": "Year", "maker": "Maker", **CHARACTER}  # of menus
+# orders of menus, with their labels
+ORDERS = {"focal_length": "Focal Length", "speed": "Speed", "year": "Year", "maker": "Maker", **CHARACTER}
 OLDEST = (4, 5, 0)  # the first Blender whose Cycles runs cameras written in OSL
-BEYOND = 1.02  # a film of 36 x 24 mm over an image circle of 43.2 mm is as lenses are engraved
-NOMINAL = 1.02  # and so is f/1.8 for f/1.83
-FEW = 16  # samples of a pixel below which its colours are far off where wavelengths part
+BEYOND = 1.02  # as lenses are engraved, a film of 36 x 24 mm fits an image circle of 43.2 mm
+NOMINAL = 1.02  # as lenses are engraved, f/1.8 may stand for f/1.83
+FEW = 16  # with fewer samples a pixel, colours are far off where wavelengths part
 DAMAGED = (ValueError, KeyError, TypeError, AttributeError, OverflowError)  # errors of reading damaged facts
-_HEADROOM = 1.001  # of a near limit, for rounding
+_HEADROOM = 1.001  # factor on a near limit, for rounding
 
 
 class LensError(Exception):
-    """One sentence for the user; the scene is as it was before."""
+    """One sentence for the user about why nothing was done; the scene is as it was before."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,10 @@ class Variant:
     """One shader of a lens.
 
     Attributes:
-        kind: of `KINDS`. model: its name ("ols-64"), "" of an exact lens. path: of the OSL source.
-        rms_um: error of rays on the film, None of an exact lens. poor: properties that its card calls poor.
-        film_radius_mm: of the picture. f_number: the widest. nearest_m: the nearest focus, None if there is none.
+        kind: one of `KINDS`. model: the model's name ("ols-64"), "" for an exact lens. path: the OSL source.
+        rms_um: error of rays on the film; None for an exact lens. poor: properties that the card calls poor.
+        film_radius_mm: of the lens's picture. f_number: the widest. nearest_m: the nearest focus; None if there is
+            none.
         notes: sentences on what the shader leaves out.
     """
 
@@ -58,11 +60,11 @@ class Variant:
 
 @dataclass(frozen=True)
 class Field:
-    """Distortion, blur and light of a lens, wide open, at film radii, focused far away (first row) and near (second).
+    """Distortion, blur and light of a lens wide open, by film radius: focused far away (first row) and near (second).
 
     Attributes:
-        radius_mm: rising. near_m: the second row's focus. distortion_um: from the place that a thin lens has. blur_um:
-            diameter of a point in focus. light: over that of the middle.
+        radius_mm: rising. near_m: the focus of the second row. distortion_um: distance from where a thin lens images.
+            blur_um: diameter of the picture of a point in focus. light: relative to the middle.
     """
 
     radius_mm: tuple[float, ...]
@@ -72,7 +74,7 @@ class Field:
     light: tuple[tuple[float, ...], ...]
 
     def at(self, rows: Sequence[Sequence[float]], radius_mm: float, focus_m: float) -> float:
-        """The largest value (for light the least) up to a radius; rows are interpolated in the inverse focus."""
+        """Return the largest value (for light the least) up to a radius; between rows it is linear in 1 / focus."""
         share = min(self.near_m / max(focus_m, 1e-6), 1.0)
         values = [a + share * (b - a) for a, b in zip(*rows, strict=True)]
         inside = [v for r, v in zip(self.radius_mm, values, strict=True) if r <= radius_mm]
@@ -85,9 +87,9 @@ class Field:
 
 @dataclass(frozen=True)
 class LensFacts:
-    """One lens of the menu; `variants` by kind, `character` by the keys of `CHARACTER`.
+    """One lens of the menu; `variants` go by kind, `character` by the keys of `CHARACTER`.
 
-    `picture`, `bokeh` (three discs of light, from the axis outwards) and `field` are None if there is none.
+    `picture`, `bokeh` (three discs of light, from the axis outwards) and `field` may be None.
     """
 
     lens_id: str
@@ -105,19 +107,19 @@ class LensFacts:
 
     @property
     def line(self) -> str:
-        """Focal length, f-number and year."""
+        """Its focal length, f-number and year, in words."""
         year = "" if self.year is None else f", {self.year}"
         return f"{self.efl_mm:.3g} mm f/{self.f_number:.2g}{year}"
 
     def value(self, order: str) -> float | str | None:
-        """What an order of `ORDERS` looks at; None where it is not known."""
+        """Return what an order of `ORDERS` looks at; None where it is not known."""
         if order in CHARACTER:
             return self.character.get(order)
         known = {"speed": self.f_number, "year": self.year, "maker": self.maker.casefold() or None}
         return known.get(order, self.efl_mm)
 
     def entry(self, order: str) -> str:
-        """The text of menus in an order."""
+        """Return its text in menus of an order."""
         text, value = f"{self.name} ({self.line})", self.value(order)
         if order == "maker" and value is not None:
             return f"{self.maker}: {text}"
@@ -125,12 +127,12 @@ class LensFacts:
 
     @property
     def number(self) -> int:
-        """The number in menus, which depends on this lens alone, since files keep numbers, not names."""
+        """Its number in menus; it depends on this lens alone, since files keep numbers, not names."""
         return zlib.crc32(self.lens_id.encode()) & 0x7FFFFFFF
 
 
 def read_library(folders: Sequence[Path]) -> tuple[dict[str, LensFacts], list[str]]:
-    """The lenses of folders by id, those of later folders in place of earlier ones, and why others cannot be read."""
+    """Read the lenses of folders by id, later folders first in rank, and say why others cannot be read."""
     found: dict[str, LensFacts] = {}
     wrong: list[str] = []
     for folder in folders:
@@ -152,16 +154,16 @@ def read_library(folders: Sequence[Path]) -> tuple[dict[str, LensFacts], list[st
 
 
 def ordered(lenses: Iterable[LensFacts], order: str) -> list[LensFacts]:
-    """Lenses in an order of `ORDERS`, of a character the strongest first; those where it is not known last."""
+    """Sort lenses by an order of `ORDERS`: a character strongest first, lenses where it is not known last."""
     values = {lens.lens_id: lens.value(order) for lens in lenses}
-    falling = order in CHARACTER and order != "cats_eye"  # of which less is left the more is cut
+    falling = order in CHARACTER and order != "cats_eye"  # of which less is left where more is cut
     known = [lens for lens in lenses if values[lens.lens_id] is not None]
     known.sort(key=lambda lens: values[lens.lens_id], reverse=falling)  # type: ignore[arg-type, return-value]
     return known + [lens for lens in lenses if values[lens.lens_id] is None]
 
 
 def lens_of(folder: Path, entry: dict[str, Any]) -> LensFacts:
-    """A lens from its entry in the facts of a folder; raises `DAMAGED` if it is none."""
+    """Make a lens from its entry in the facts of a folder; raises `DAMAGED` if it is none."""
     variants = {}
     for v in entry["variants"]:
         if v["kind"] not in KINDS:
@@ -206,7 +208,7 @@ def _field(entry: dict[str, Any]) -> Field:
 
 
 def _inside(folder: Path, name: str) -> Path:
-    """A file of the folder; the facts may come from elsewhere."""
+    """Return a file of the folder and none outside, for the facts may come from elsewhere."""
     path = folder / name
     if not path.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{name!r} leads out of the folder")
@@ -218,16 +220,16 @@ class Setting:
     """The settings of a scene for a lens.
 
     Attributes:
-        sensor_mm: width and height that are exposed. pixels: the width of the picture as rendered.
+        sensor_mm: width and height that are exposed. pixels: width of the picture as rendered.
         focus_m: distance in focus; None where depth of field is off. focus_object: its name, "" for a distance.
-        f_number: None for that of the shader.
-        shift, shift_side_mm: Blender's, and the side that Blender's own camera counts it in.
-        stereo: for each eye, the amount that its view adds to shift X; () without stereo.
-        unit_m, lens_unit_m: metres of a unit of the scene, by its unit scale and as the lens takes it.
-        on_gpu: whether a GPU that cannot run OSL cameras is chosen.
-        darkens: whether vignetting or exposure let the lens weaken light.
+        f_number: None takes the shader's.
+        shift, shift_side_mm: Blender's shift, and the side in which Blender's own camera counts it.
+        stereo: what each eye's view adds to shift X; () without stereo.
+        unit_m, lens_unit_m: metres in a unit of the scene, by its unit scale, and as the lens takes it.
+        on_gpu: whether a GPU is chosen that cannot run OSL cameras.
+        darkens: whether the lens may weaken light, by vignetting or exposure.
         passes: those of `PASSES` that are rendered.
-        samples: of a pixel of the render, where they decide whether colours part; else None.
+        samples: of a pixel of the render, where they decide how far colours are off; else None.
     """
 
     sensor_mm: tuple[float, float]
@@ -247,7 +249,7 @@ class Setting:
 
 
 def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
-    """The reason why this Blender cannot run the lenses, or None."""
+    """Return why this Blender cannot run the lenses, or None."""
     if tuple(version[:3]) < OLDEST:
         said = ".".join(map(str, version[:3]))
         return f"This is Blender {said}: cameras written in OSL need {'.'.join(map(str, OLDEST[:2]))} or later"
@@ -255,7 +257,7 @@ def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
 
 
 def refusals(variant: Variant, setting: Setting) -> list[str]:
-    """The reasons why a lens is not put on a camera."""
+    """Return the reasons why a lens is not put on a camera."""
     found = []
     if too_large(variant, setting):
         (width, height), circle = setting.sensor_mm, 2 * variant.film_radius_mm
@@ -271,25 +273,25 @@ def refusals(variant: Variant, setting: Setting) -> list[str]:
 
 
 def too_large(variant: Variant, setting: Setting) -> bool:
-    """Whether the sensor is larger than the lens's picture."""
+    """Return whether the sensor is larger than the lens's picture."""
     return math.hypot(*setting.sensor_mm) > BEYOND * 2 * variant.film_radius_mm
 
 
 def too_near(variant: Variant, setting: Setting) -> bool:
-    """Whether the focus is nearer than the near limit."""
+    """Return whether the focus is nearer than the near limit."""
     if setting.focus_m is None or variant.nearest_m is None:
         return False
     return setting.focus_m * _HEADROOM < variant.nearest_m
 
 
 def fitting_width_mm(variant: Variant, setting: Setting) -> float:
-    """The widest sensor of the setting's shape that the lens's picture fills, rounded down to 0.01 mm."""
+    """Return the widest sensor of the setting's shape that the lens's picture fills, rounded down to 0.01 mm."""
     width, height = setting.sensor_mm
     return math.floor(100 * 2 * variant.film_radius_mm * width / math.hypot(width, height)) / 100
 
 
 def notes(variant: Variant, setting: Setting) -> list[str]:
-    """Sentences for the user on a setting that works."""
+    """Return sentences for the user about a setting that works."""
     found = []
     if setting.f_number is not None and setting.f_number * NOMINAL < variant.f_number:
         found.append(f"The lens opens to f/{variant.f_number:.3g}: f/{setting.f_number:.3g} renders as that")
@@ -301,7 +303,7 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
             f"{setting.lens_unit_m:g} m (Metres per Unit)"
         )
     for axis, shift, side, name in zip("XY", setting.shift, setting.sensor_mm, ("widths", "heights"), strict=True):
-        if shift and not math.isclose(side, setting.shift_side_mm, rel_tol=1e-3):  # so Cycles has it
+        if shift and not math.isclose(side, setting.shift_side_mm, rel_tol=1e-3):  # in which Cycles counts it
             same = f"set {shift * setting.shift_side_mm / side:.4g}"
             found.append(f"Shift {axis} counts {name} here: for what {shift:.4g} does in Blender's own camera, {same}")
     if setting.samples is not None:
@@ -318,7 +320,7 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
 
 
 def _pass_notes(setting: Setting) -> list[str]:
-    """Sentences on passes: Cycles counts the throughput of a lens's rays into alpha and coverage."""
+    """Return sentences about passes: Cycles counts the throughput of a lens's rays into alpha and coverage."""
     light, remedy = "the share of the rays that pass there, nearly 1", ""
     if setting.darkens:
         light = "the lens's light there"
@@ -336,7 +338,7 @@ def _pass_notes(setting: Setting) -> list[str]:
 
 
 def outside(variant: Variant, setting: Setting) -> list[str]:
-    """Warnings about corners that shift and stereo take out of the lens's picture."""
+    """Warn of corners that shift or stereo puts outside the lens's picture."""
     (width, height), (shift_x, shift_y) = setting.sensor_mm, setting.shift
     eyes = [abs(shift_x + more) for more in setting.stereo or (0.0,)]
     corner = math.hypot(width * (0.5 + max(eyes)), height * (0.5 + abs(shift_y)))
@@ -349,28 +351,28 @@ def outside(variant: Variant, setting: Setting) -> list[str]:
 
 
 def error_px(variant: Variant, setting: Setting) -> float | None:
-    """RMS error of the model in pixels of this picture; None of an exact lens."""
+    """Return the model's RMS error in pixels of this picture; None for an exact lens."""
     return None if variant.rms_um is None else variant.rms_um / (1e3 * setting.sensor_mm[0] / setting.pixels)
 
 
 PINHOLE, THIN = "pinhole", "depth of field"
-_ORDER = ("polynomial", "network", "exact")  # by cost in Cycles
+_ORDER = ("polynomial", "network", "exact")  # by what they cost in Cycles
 
 
 @dataclass(frozen=True)
 class Advice:
-    """The camera to use (`PINHOLE`, `THIN`, a variant's kind, or "" if none keeps the tolerance), and two reasons."""
+    """The camera to use (`PINHOLE`, `THIN`, a variant's kind, or "" if none is good enough), and two sentences why."""
 
     use: str
     why: tuple[str, str]
 
 
 def needs(lens: LensFacts, setting: Setting, depths_m: Sequence[float], f_number: float, tolerance_px: float) -> Advice:
-    """The cheapest camera whose picture stays within a tolerance of the lens's.
+    """Advise the cheapest camera whose picture stays within a tolerance of the lens's.
 
     Args:
-        depths_m: along the view of what the picture shows, inf where it shows nothing; none: all distant.
-        f_number: of the shot; a lens that does not open so wide stays as wide as it opens.
+        depths_m: along the view, of what the picture shows, inf where it shows nothing; if empty, everything is far.
+        f_number: the shot's; a lens that does not open so wide is taken as wide as it opens.
     """
     pixel_um = 1e3 * setting.sensor_mm[0] / setting.pixels
     f_number = max(f_number, lens.f_number)
@@ -383,7 +385,7 @@ def needs(lens: LensFacts, setting: Setting, depths_m: Sequence[float], f_number
         worth = "what the lens itself adds is not known: pack it with its lens file"
     else:
         moved = lens.field.at(lens.field.distortion_um, corner, focus) / pixel_um
-        # No aberration shrinks less than the aperture does.
+        # Aberrations shrink at least as fast as the aperture.
         blurred = lens.field.at(lens.field.blur_um, corner, focus) / pixel_um * lens.f_number / f_number
         dark = 1 - lens.field.at(lens.field.light, corner, focus)
         worth = f"distortion up to {_px(moved)} px, aberrations {_px(blurred)} px, corners {100 * dark:.0f}% darker"
@@ -413,14 +415,14 @@ def _px(value: float) -> str:
 
 
 def confusion_mm(efl_mm: float, f_number: float, focus_m: float, depth_m: float) -> float:
-    """Diameter of a thin lens's circle of confusion on the film; focus and depth from the film, inf allowed."""
+    """The diameter (mm) of a thin lens's circle of confusion; focus and depth count from the film, inf allowed."""
 
     def image(distance_m: float) -> float:
         total = 1e3 * distance_m
         if math.isinf(total):
             return efl_mm
         if total <= 4 * efl_mm:
-            return 2 * efl_mm  # nearer than any film can be: as at life size
+            return 2 * efl_mm  # focus nearer than any film can be counts as at life size
         return (total - math.sqrt(total * (total - 4 * efl_mm))) / 2
 
     film, there = image(focus_m), image(depth_m)

@@ -1,4 +1,4 @@
-"""Lights as a camera sees them, for lists of `neurolens flare --lights`; of any program, without Blender."""
+"""Lights of any program as a camera sees them, for lists of `neurolens flare --lights`; without Blender."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 Kind = Literal["sphere", "rectangle", "disc", "distant"]
-FAR = 1e6  # units of the scene, to a distant light
-_TURN = math.pi * (3 - math.sqrt(5))  # of the sunflower's spiral
-_PLASTIC = 1.3247179572447460  # x^3 = x + 1, of the R2 sequence (Roberts 2018)
+FAR = 1e6  # how many units of the scene away a distant light is put
+_TURN = math.pi * (3 - math.sqrt(5))  # angle of the sunflower's spiral
+_PLASTIC = 1.3247179572447460  # ratio of the R2 sequence (Roberts 2018): x^3 = x + 1
 
 
 class Seen(NamedTuple):
-    """A light from a place.
+    """A light as seen from a place.
 
     Attributes:
-        middle, sides: [3] and [2, 3], the ellipse that is seen: its middle and half axes. half_rad: of its cone.
-        irradiance: of a light of radiance 1, sr. cos: of the angle between its axis and the way from it.
+        middle, sides: [3] and [2, 3], middle and half axes of the ellipse that is seen. half_rad: half angle of its
+            cone.
+        irradiance: that of a light of radiance 1, in sr. cos: of the angle between its axis and the way from it.
     """
 
     middle: Any
@@ -29,11 +30,11 @@ class Seen(NamedTuple):
 
 
 def see(kind: Kind, frame: Any, size: tuple[float, ...], normalized: bool, eye: Any) -> Seen:
-    """A light that shines along -z of its frame [4, 4].
+    """See a light that shines along -z of its frame [4, 4] from `eye`.
 
     Args:
-        size: the radius of a sphere, both lengths of a rectangle or disc, the angle in rad of a distant light.
-        normalized: whether its radiance is divided by its area, or by the solid angle of a distant one (projected).
+        size: the radius of a sphere, both lengths of a rectangle or disc, or the angle (rad) of a distant light.
+        normalized: whether its radiance is divided by its area, or for a distant light by its projected solid angle.
     """
     axes, middle = frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0), frame[:3, 3]
     if kind == "distant":
@@ -49,25 +50,28 @@ def see(kind: Kind, frame: Any, size: tuple[float, ...], normalized: bool, eye: 
         sides = size[0] * np.stack([first, np.cross(way, first)])
         solid = (0.25 if normalized else math.pi * size[0] ** 2) / far**2
         return Seen(middle, sides, math.asin(min(size[0] / far, 1.0)), solid, cos)
-    sides = frame[:3, :2].T * np.array(size)[:, None] / (2 if kind == "disc" else math.sqrt(math.pi))  # of equal area
+    # an ellipse of the same area
+    sides = frame[:3, :2].T * np.array(size)[:, None] / (2 if kind == "disc" else math.sqrt(math.pi))
     area = math.pi * float(np.linalg.norm(np.cross(*sides)))
     half = math.atan(math.sqrt(area * max(cos, 0.0) / math.pi) / far)
     return Seen(middle, sides, half, (1.0 if normalized else area) * max(cos, 0.0) / far**2, cos)
 
 
 def see_faces(corners: Any, radiance: Any, eye: Any) -> tuple[Seen, Any]:
-    """Triangles [N, 3, 3] of radiances [N, 3] as an ellipse of their middle and moments, and their irradiance [3].
+    """See triangles [N, 3, 3] of radiances [N, 3] as an ellipse of their middle and moments; also their irradiance [3].
 
-    They shine on both sides; those that turn one side are seen, the outer side where both look equally large.
+    They shine on both sides. The triangles that turn one side to the eye are seen: the outer side where both look
+    equally large.
     """
     middles, areas = corners.mean(1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     far = np.linalg.norm(middles - eye, axis=1).clip(1e-9)
-    facing = ((eye - middles) * areas).sum(1) / far**3  # solid angles, with a sign
+    facing = ((eye - middles) * areas).sum(1) / far**3  # signed solid angles
     outer, inner = facing.clip(0), -facing.clip(None, 0)
     solid = outer if outer.sum() > 0.99 * inner.sum() else inner
     share = (solid * radiance.sum(1)) / max(float((solid * radiance.sum(1)).sum()), 1e-30)
     middle = share @ middles
-    off = np.concatenate([corners, 3 * middles[:, None] - 2 * middle], 1) - middle  # whose squares have the moments
+    # the squares of these points have a triangle's moments
+    off = np.concatenate([corners, 3 * middles[:, None] - 2 * middle], 1) - middle
     way = (middle - eye) / max(float(np.linalg.norm(middle - eye)), 1e-9)
     off -= (off @ way)[..., None] * way
     spread, axes = np.linalg.eigh(np.einsum("n,nki,nkj->ij", share, off, off) / 12)
@@ -76,9 +80,10 @@ def see_faces(corners: Any, radiance: Any, eye: Any) -> tuple[Seen, Any]:
 
 
 def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
-    """Starts and ends [count, 3] of rays from the pupil, half axes [2, 3] about `eye`, to the light.
+    """Return starts and ends [count, 3] of rays from the pupil, with half axes [2, 3] about `eye`, to the light.
 
-    An edge before the light uncovers both a little at a time, so that even a light without size dims smoothly.
+    An edge that passes before the light uncovers both little by little, so that even a light without size dims
+    smoothly.
     """
     k = np.arange(count)
     of_light = np.sqrt((k + 0.5) / count) * np.exp(1j * _TURN * k)
@@ -88,7 +93,7 @@ def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
 
 
 def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, visible: float) -> dict[str, Any]:
-    """A row of a list; `view` [4, 4] is the camera's frame, which looks along -z, and `rgb` the irradiance."""
+    """Return a row of a list; `view` [4, 4] is the camera's frame, which looks along -z, and `rgb` the irradiance."""
     way = (seen.middle - view[:3, 3]) @ (view[:3, :3] / np.linalg.norm(view[:3, :3], axis=0))
     far = max(float(np.linalg.norm(way)), 1e-9)
     return {
@@ -102,7 +107,7 @@ def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, v
 
 
 def in_every_frame(rows: list[dict[str, Any]], frames: range) -> list[dict[str, Any]]:
-    """The rows of a light, with dark ones where it is missing: between keys and beyond them it would shine."""
+    """Add dark rows where a light is missing: otherwise it would shine between its keys and beyond them."""
     known, found = {row["frame"]: row for row in rows}, rows[:1]
     for frame in frames:
         found.append(known.get(frame) or {**found[-1], "frame": frame, "visible": 0.0})

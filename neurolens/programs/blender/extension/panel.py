@@ -14,8 +14,8 @@ from . import camera as on_camera
 from . import library as facts
 from .library import LensError, LensFacts
 
-_FIRST = ("f_number", "focus_m", "zoom_mm")  # of the settings, before the others
-_LABELS = {  # where Blender would show the name alone
+_FIRST = ("f_number", "focus_m", "zoom_mm")  # settings that come before the others
+_LABELS = {  # where Blender would show the bare name
     "f_number": "F-Number",
     "focus_m": "Focus (m)",
     "zoom_mm": "Zoom (mm)",
@@ -26,12 +26,13 @@ _LABELS = {  # where Blender would show the name alone
 
 
 class Library:
-    """The lenses, and their thumbnails; read once, and again by `load`."""
+    """The lenses and their thumbnails, which are read once, and again by `load`."""
 
     def __init__(self) -> None:
         self.lenses: dict[str, LensFacts] = {}
         self.wrong: list[str] = []
-        self.items: dict[str, list[tuple[str, str, str, int, int]]] = {}  # kept: Blender does not hold menus' texts
+        # kept, because Blender does not hold the texts of menus
+        self.items: dict[str, list[tuple[str, str, str, int, int]]] = {}
         self.bokeh: dict[str, int] = {}
         self.pictures: Any = None
 
@@ -42,7 +43,7 @@ class Library:
         try:
             folders.append(Path(bpy.utils.extension_path_user(__package__, create=False)))
         except ValueError:
-            pass  # not run as an extension
+            pass  # this does not run as an extension
         self.lenses, self.wrong = facts.read_library(folders)
         self.pictures = bpy.utils.previews.new()
         icons = {name: self._icon(name, lens.picture) for name, lens in self.lenses.items()}
@@ -50,7 +51,7 @@ class Library:
 
         self.items = {}
         for order in facts.ORDERS:
-            # The section of a lens in the menu; its bokeh where lenses are sorted by their character.
+            # A menu shows the section of a lens, or its bokeh where lenses are sorted by their character.
             shown = icons | {k: v for k, v in self.bokeh.items() if v and order in facts.CHARACTER}
             self.items[order] = [
                 (lens.lens_id, lens.entry(order), lens.source, shown[lens.lens_id], lens.number)
@@ -58,12 +59,12 @@ class Library:
             ]
 
     def _icon(self, name: str, picture: Path | None) -> int:
-        """The number of a picture, which Blender reads when it is first shown; 0 without one."""
+        """Return the number of a picture, which Blender reads when it is first shown; 0 without one."""
         shown = picture is not None and picture.is_file()
         return self.pictures.load(name, str(picture), "IMAGE").icon_id if shown else 0
 
     def close(self) -> None:
-        """Let go of the thumbnails."""
+        """Release the thumbnails."""
         if self.pictures is not None:
             bpy.utils.previews.remove(self.pictures)
             self.pictures = None
@@ -77,7 +78,7 @@ def _lens_items(props: Any, _context: Any) -> list[tuple[str, str, str, int, int
 
 
 def _changed(props: Any, context: Any) -> None:
-    """A lens chosen in the menu of a camera that carries one is put on at once."""
+    """Put a lens on at once when it is chosen in the menu of a camera that carries one."""
     props.message = props.advice = ""
     camera = props.id_data
     if not on_camera.applied(camera) or props.busy:
@@ -93,7 +94,7 @@ def _changed(props: Any, context: Any) -> None:
 
 
 class CameraSettings(bpy.types.PropertyGroup):
-    """On every camera: what is chosen, and what there was before."""
+    """What is chosen on a camera, and what there was before."""
 
     __annotations__ = {
         "lens": bpy.props.EnumProperty(name="Lens", items=_lens_items, update=_changed),
@@ -127,10 +128,10 @@ class CameraSettings(bpy.types.PropertyGroup):
 
 
 def lens_of(props: Any) -> LensFacts:
-    """The lens that is chosen.
+    """Return the lens that is chosen.
 
     Raises:
-        LensError: the library does not have it.
+        LensError: the library does not have the lens.
     """
     if props.lens not in LIBRARY.lenses:
         raise LensError("The chosen lens is not in the library: choose another")
@@ -138,12 +139,12 @@ def lens_of(props: Any) -> LensFacts:
 
 
 def kind_of(props: Any, lens: LensFacts) -> str:
-    """The form that is chosen, or the first that the lens has."""
+    """Return the form that is chosen, or the first that the lens has."""
     return props.kind if props.kind in lens.variants else next(iter(lens.variants), "")
 
 
 class _Operator(bpy.types.Operator):
-    """One line on an error, in the panel and as the operator's report."""
+    """Base of operators: an error is one line, in the panel and as the operator's report."""
 
     bl_options = {"REGISTER", "UNDO"}
 
@@ -263,7 +264,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             told = (f"{facts.CHARACTER[key].lower()} {value:.2g}" for key, value in lens.character.items())
             _wrapped(layout, ", ".join(told).capitalize(), "LIGHT")
         row = layout.row(align=True)
-        row.use_property_split = False  # else the first form's name stands beside its button
+        row.use_property_split = False  # otherwise the first form's name stands beside its button
         for name in lens.variants:
             row.prop_enum(props, "kind", name)
         found = context.object if context.object is not None and context.object.type == "CAMERA" else None
@@ -301,7 +302,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             _wrapped(layout, line, "INFO")
 
     def _draw_settings(self, camera: Any) -> None:
-        """The shader's own parameters: what is keyframed is what Cycles reads."""
+        """Draw the shader's own parameters, which Cycles reads and keyframes change."""
         layout, custom = self.layout, camera.cycles_custom
         names = [n for n in _FIRST if n in custom] + [n for n in custom.keys() if n not in (*_FIRST, "few")]
         column = layout.column()
@@ -316,7 +317,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
 
 @bpy.app.handlers.persistent
 def warn_of_black(scene: Any, _graph: Any = None) -> None:
-    """Before a frame is rendered: a line to the console where the lens cannot take the picture or a corner of it."""
+    """Print a line, before a frame is rendered, if the lens cannot take the picture or a corner of it."""
     found = scene.camera
     if found is None or found.type != "CAMERA" or not on_camera.applied(found.data):
         return
@@ -332,14 +333,14 @@ _saved, _viewport = (
     bpy.app.handlers.persistent(lambda *_, render=render: on_camera.tell_samples(render)) for render in (True, False)
 )
 _rendered = bpy.app.handlers.persistent(lambda scene, *_: on_camera.tell_samples(True, scene))
-HANDLERS = (  # by the list of `bpy.app.handlers` that calls them
+HANDLERS = (  # by the list in `bpy.app.handlers` whose functions are called
     ("render_pre", warn_of_black), ("render_init", _rendered), ("render_complete", _viewport),
     ("render_cancel", _viewport), ("save_pre", _saved), ("save_post", _viewport), ("load_post", _viewport),
 )  # fmt: skip
 
 
 def _wrapped(layout: Any, text: str, icon: str) -> None:
-    """A sentence in lines that the panel can show."""
+    """Write a sentence in lines that the panel can show."""
     for number, line in enumerate(textwrap.wrap(text, 60, break_long_words=False)):
         layout.label(text=line, icon="BLANK1" if number else icon)
 
