@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import lab
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
@@ -134,7 +135,7 @@ def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> lab
     spread over the ball's own picture. Returns FLIP, and relative differences of area ((sum)^2 / sum of squares) and
     of light.
     """
-    shot = Shot(_STRIP_MM, _STRIP_FOCUS_M, f_number=F_NUMBER, wavelength_nm=(400.0, 700.0))
+    shot = Shot(_STRIP_MM, _STRIP_FOCUS_M, f_number=F_NUMBER, wavelength_nm=LIGHT_NM)
     camera = make_camera(f"{lab.LENSES / LENS}.toml", shot)
     size = round(_STRIP_MM[0] * _PER_MM), round(_STRIP_MM[1] * _PER_MM)
     fine = size[0] * _FINER, size[1] * _FINER  # the kernel's pixels, so that the ball's outline is sharp

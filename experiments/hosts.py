@@ -21,12 +21,12 @@ from PIL import Image
 
 import neurolens
 from experiments import lab
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.build import make_camera
 from neurolens.optics.lens.shot import Shot
 from neurolens.pictures.render.colour import linear_to_srgb
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import Scene, scene_from_tables
-from neurolens.programs.hosts import LIGHT_NM
 from neurolens.programs.mitsuba import require_mitsuba
 
 MODEL = "laikin_double_gauss_50.ols-60"

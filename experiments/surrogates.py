@@ -27,7 +27,7 @@ from neurolens.base.errors import InputError, printable
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, versions
-from neurolens.base.settings import add_options, whole
+from neurolens.base.settings import LIGHT_NM, add_options, whole
 from neurolens.cli.arguments import Reporting, check_ids, check_written, named_lens
 from neurolens.graph.scalars import MOST_WEIGHTS
 from neurolens.models.pairs import PairSettings
@@ -102,7 +102,7 @@ def _settings(args: argparse.Namespace) -> BenchSettings:
     rays = args.rays or (6000 if args.quick else 30000)
     rounds = args.rounds if args.rounds is not None else (3 if args.quick else 10)
     # The goals are stated for 400-700 nm.
-    domain = DomainChoice(focus_m=None if args.near else (math.inf, math.inf), wavelength_nm=(400.0, 700.0))
+    domain = DomainChoice(focus_m=None if args.near else (math.inf, math.inf), wavelength_nm=LIGHT_NM)
     evaluation = EvaluationChoice(50_000 if args.quick else 200_000, rounds)
     return BenchSettings(domain, PairSettings(rays, rays, rays, args.seed), evaluation, not args.quick)
 

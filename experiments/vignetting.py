@@ -28,6 +28,7 @@ from experiments.lab import Row
 from experiments.promises import read_index
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import ModelSettings, fit_model, prepare
 from neurolens.models.model import Domain, LensModel
@@ -49,7 +50,7 @@ OPENINGS: dict[str, tuple[int, Aperture | None]] = {
 }
 # Focused at infinity; and the default of `neurolens train --lens`: to the near limit, all of the visible light.
 DOMAINS: dict[str, DomainChoice] = {
-    "infinity": DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=(400.0, 700.0)),
+    "infinity": DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=LIGHT_NM),
     "default": DomainChoice(),
 }
 MODEL = ModelSettings("ols", terms=64)

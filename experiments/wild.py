@@ -30,6 +30,7 @@ import torch
 from experiments import lab
 from experiments.languages import RUN, Given, Missing, Rows
 from neurolens.base import status as st
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.model import load_model
 from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
@@ -37,7 +38,7 @@ from neurolens.cameras.shaders.source import camera_program
 from neurolens.graph import program as arithmetic
 from neurolens.graph.program import RAY, SCENE_RAY, STOP, Program
 from neurolens.models.source import fused_program
-from neurolens.optics.lens.prescription import VISIBLE_NM, Lens
+from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.trace.rays import trace
@@ -160,7 +161,7 @@ def tracer(lens: Lens, pupil_z_mm: float) -> Runner:
             "status": np.where(inside, np.asarray(done.status), st.OUTSIDE_DOMAIN),
         }
 
-    light = [VISIBLE_NM[0] / st.DOMAIN_SLACK, VISIBLE_NM[1] * st.DOMAIN_SLACK]
+    light = [LIGHT_NM[0] / st.DOMAIN_SLACK, LIGHT_NM[1] * st.DOMAIN_SLACK]
     return run
 
 

@@ -184,3 +184,7 @@ def test_exact_cameras_start_without_torchs_compiler() -> None:
     code = "import sys, neurolens.cameras.exact; assert 'torch._dynamo' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_range_of_light_stands_once() -> None:
+    assert [f.name for f in MODULES if re.search(r"\(?400(\.0)?, 700(\.0)?\b", f.read_text())] == ["settings.py"]

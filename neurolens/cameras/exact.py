@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.files import fingerprint_of, kept_in_cache, sha256_of
 from neurolens.base.progress import Progress
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensFilm, LensScene
@@ -211,7 +212,7 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
         "lens": lens.identity,
         "focus_m": None if math.isinf(focus_m) else focus_m,
         "film_mm": list(film_mm),
-        "lens_state": state_of(lens, (400.0, 700.0), nominal),
+        "lens_state": state_of(lens, LIGHT_NM, nominal),
     }
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.ideal import PROJECTIONS
 from neurolens.optics.lens import paraxial
 
@@ -31,7 +32,6 @@ Complex = NDArray[np.complex128]
 
 RECTILINEAR = "rectilinear"
 WIDEST_DEG = 85.0  # field that is laid on a plane: there a picture is 11 focal lengths from the axis
-LIGHT_NM = (400.0, 700.0)
 
 _PUPIL = 6, 24  # rings of pupil samples, and samples of a ring
 _RAYS = 1 << 17  # at once

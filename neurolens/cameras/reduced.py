@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FilmPoints, FloatArray, SpectralRays
 from neurolens.cameras.field import (
     BEYOND,
@@ -126,9 +127,7 @@ class ReducedDispersion:
         InputError: "lateral" of a camera that shows nothing.
     """
 
-    def __init__(
-        self, camera: Any, dispersion: Dispersion, wavelength_nm: tuple[float, float] = (400.0, 700.0)
-    ) -> None:
+    def __init__(self, camera: Any, dispersion: Dispersion, wavelength_nm: tuple[float, float] = LIGHT_NM) -> None:
         self.camera, self.name, self.film_mm = camera, camera.name, camera.film_mm
         self.wavelength_nm, self.rays_a_call = camera.wavelength_nm, getattr(camera, "rays_a_call", RAYS_A_CALL)
         light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)
@@ -275,9 +274,7 @@ class Vignetted:
         InputError: an unknown kind of vignetting.
     """
 
-    def __init__(
-        self, camera: Any, vignetting: str = "none", wavelength_nm: tuple[float, float] = (400.0, 700.0)
-    ) -> None:
+    def __init__(self, camera: Any, vignetting: str = "none", wavelength_nm: tuple[float, float] = LIGHT_NM) -> None:
         if vignetting not in VIGNETTINGS:
             raise InputError("camera", "vignetting", vignetting, f"one of: {', '.join(VIGNETTINGS)}")
         self.camera, self.vignetting = camera, vignetting

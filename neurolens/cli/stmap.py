@@ -18,7 +18,7 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.base.settings import positive, setting, wavelengths_nm
+from neurolens.base.settings import LIGHT_NM, positive, setting, wavelengths_nm
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Field, Frame, diagonal_points, field_of, frame_of, lit_points, shown_at, spectrum_of
 from neurolens.cli import arguments as cli
@@ -39,7 +39,6 @@ from neurolens.pictures.render.stmap import (
 
 Maker = Callable[[Field, Plates, Callable[[float], None]], dict[str, FloatArray]]
 _LARGEST = 16384  # pixels a side
-LIGHT_NM = (400.0, 700.0)
 _SEEN = 17, 11  # points of the film, whose parallax is told
 _NEAR_M = 0.3  # and how far from the film, or 1.5 times as far as the entrance pupil
 # Dominant wavelengths of the primaries of Rec. 709 (and sRGB), for light of D65.

@@ -14,7 +14,7 @@ from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.base.settings import RANGE, setting, setting_of
+from neurolens.base.settings import LIGHT_NM, RANGE, setting, setting_of
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.shaders.lens_source import write_lens
 from neurolens.cameras.shaders.source import model_extras
@@ -25,7 +25,7 @@ from neurolens.models.source import Written, export_source
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.layout import layout_profile
 from neurolens.optics.lens.paraxial import first_order
-from neurolens.optics.lens.prescription import VISIBLE_NM, Lens
+from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers import lensfile
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_plane_z_mm
@@ -174,7 +174,7 @@ def _view_lens(
         lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
         try:
             forms.append(_exact_form(entry.zoom, entry.file, lens, kinds, shaders.get(entry.file)))
-            path = path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM) if entry.zoom != RANGE else None
+            path = path_glsl(lens, pupil_plane_z_mm(lens), LIGHT_NM) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
                 raise  # a model of the lens stands in for it

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from neurolens.base.errors import InputError
+from neurolens.base.settings import LIGHT_NM
 from neurolens.models.axes import Array, Axis, product, weights
 from neurolens.models.boundaries import invariant_core
 from neurolens.models.cores import STOP, Core, Refracted, Residual
@@ -182,7 +183,7 @@ class StateSpace:
     f_number: float | None = None
     film_radius_mm: float | None = None
     focus_m: tuple[float, float] | Callable[[Lens], tuple[float, float]] = (math.inf, math.inf)
-    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    wavelength_nm: tuple[float, float] = LIGHT_NM
 
     @property
     def _knots(self) -> tuple[Axis, ...]:

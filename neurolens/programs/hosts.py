@@ -26,7 +26,17 @@ from numpy.typing import NDArray
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.records import plain
-from neurolens.base.settings import FILM_MM, WAVELENGTH_NM, check_bounds, said, setting, wavelengths_nm, whole, within
+from neurolens.base.settings import (
+    FILM_MM,
+    LIGHT_NM,
+    WAVELENGTH_NM,
+    check_bounds,
+    said,
+    setting,
+    wavelengths_nm,
+    whole,
+    within,
+)
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.field import frame_of
@@ -40,7 +50,6 @@ from neurolens.pictures.render.settings import size_by_shape
 
 Arrays = dict[str, NDArray[Any]]
 Vector = tuple[float, float, float]
-LIGHT_NM = (400.0, 700.0)
 BYTES_A_RAY = 44  # the most, with three weights
 MOST_COMPACT_PX = 0.01  # how far rays in 16 bytes may be off
 _LARGEST = (1 << 63) - 1  # the largest seed that generators of random numbers take

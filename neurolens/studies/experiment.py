@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.base.lensname import lens_id_of
-from neurolens.base.settings import RANGE, apply_overrides, from_dict, read_config, to_dict, to_toml
+from neurolens.base.settings import EYE_NM, RANGE, apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.models.fit import ModelSettings, StateSpace, axes_of
 from neurolens.models.model import Domain
 from neurolens.models.pairs import PairSettings, domain_of
@@ -30,7 +30,6 @@ from neurolens.studies.rays import PIXELS_ACROSS, frame_width_mm
 # front vertex, where a long lens of short focus has less room than that.
 NEAR_LIMIT_FOCAL_LENGTHS, NEAREST_OBJECT_FOCAL_LENGTHS = 14, 8
 # Wavelengths where none are stated, as far as the formulas of the lens's glasses reach.
-VISIBLE_NM = (380.0, 780.0)
 # A film that is dark beyond this share of its radius was stated too large.
 DARK_FROM = 0.9
 
@@ -133,8 +132,8 @@ def near_limit_m(lens: Lens) -> float:
 
 
 def wavelengths_nm(lens: Lens) -> tuple[float, float]:
-    """`VISIBLE_NM`, or the part of it for which every catalogue glass of the lens is stated (400-700 nm at least)."""
-    low, high = VISIBLE_NM
+    """`EYE_NM`, or the part of it for which every catalogue glass of the lens is stated (400-700 nm at least)."""
+    low, high = EYE_NM
     for surface in lens.surfaces:
         if surface.glass is not None:
             shortest, longest = (1000 * v for v in glass_of(surface.glass).range_um)

@@ -44,6 +44,7 @@ from neurolens.base.files import (
 from neurolens.base.html import html_parts
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, versions
+from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import Failed, run_each
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import ModelSettings, prepare
@@ -70,7 +71,6 @@ VERDICTS = ("ok", "doubtful", "refused", "fault")
 # Goals of the fit, on rays that it has not seen.
 GOALS = {"direction_rms_deg": 0.004, "false_pass": 0.001, "false_block": 0.001}
 _REASON = 600  # characters
-_WAVELENGTHS_NM = (400.0, 700.0)
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:
         except InputError as error:
             record["notes"].append(f"no photographs: {error.field}: got {error.value}, expected {error.expected}")
     lens = set_lens(lens.with_aperture(None))
-    domain = DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=_WAVELENGTHS_NM).of(lens)
+    domain = DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=LIGHT_NM).of(lens)
     if lens.half_field_deg is None and lens.image_radius_mm is None:
         film = f"a film radius of {domain.film_radius_mm:.4g} mm, where its light falls to 10%"
         record["notes"].append(f"neither field nor film is stated: taken to {film}")

@@ -6,10 +6,10 @@ import numpy as np
 from experiments import lab
 from experiments.wild import TRACER, Form, Row, by_numpy, judge, tracer, wild
 from neurolens.base import status as st
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.graph.program import RAY
 from neurolens.models.source import fused_program
-from neurolens.optics.lens.prescription import VISIBLE_NM
 
 COUNT = 3000
 
@@ -56,7 +56,7 @@ def test_the_graph_of_the_exact_lens_is_the_tracer_for_wild_numbers() -> None:
     lens = lab.lens_of("canon_aspheric_50")
     planes = pupil_planes_mm([lens], ())
     film, rear, stop = float(lens.film_z_mm), lens.surfaces[-1].semi_diameter_mm, float(lens.stop_radius_mm)
-    ends = dict(zip(RAY, [(-20.0, 20.0)] * 2 + [(-rear, rear)] * 2, strict=True)) | {"wavelength_nm": VISIBLE_NM}
+    ends = dict(zip(RAY, [(-20.0, 20.0)] * 2 + [(-rear, rear)] * 2, strict=True)) | {"wavelength_nm": LIGHT_NM}
     ends |= {"film_z_mm": (film, film + 1), "stop_radius_mm": (0.0, stop)}
     tried = Form(lens_program([lens], (), planes), ends, ("film_z_mm", "stop_radius_mm"))
     traced, row, rng = tracer(lens, planes[0]), Row("exact lens", TRACER), np.random.default_rng(5)

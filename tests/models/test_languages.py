@@ -22,6 +22,7 @@ from writers import rays_of
 from experiments.languages import RUN, Given, Missing, Rows
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.model import load_model
 from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.cameras.shaders.source import camera_program
@@ -31,7 +32,6 @@ from neurolens.graph.shading import LANGUAGES
 from neurolens.models.axes import mixture_of
 from neurolens.models.source import WRITERS, Fix, fixed_models, fused_program
 from neurolens.optics.lens.paraxial import film_z_mm
-from neurolens.optics.lens.prescription import VISIBLE_NM
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds
 from neurolens.optics.setting.states import set_lens
@@ -61,11 +61,11 @@ def exact(name: str, sent: int = COUNT) -> Case:
     lens = set_lens(read_any(ROOT / "lenses" / f"{name}.toml"))
     (plane,), rng = pupil_planes_mm([lens], ()), np.random.default_rng(0)
     radius, film_z = image_radius_mm(lens)[0], film_z_mm(lens, np.inf)
-    disc = pupil_bounds(lens, radius, (film_z, film_z), VISIBLE_NM, pupil_z_mm=plane, rows=9).disc_mm
+    disc = pupil_bounds(lens, radius, (film_z, film_z), LIGHT_NM, pupil_z_mm=plane, rows=9).disc_mm
     (film_x, film_y), (pupil_x, pupil_y) = _disc(rng, radius, sent), _disc(rng, disc, sent)
     rays = rows(
         film_x_mm=film_x, film_y_mm=film_y, pupil_x_mm=pupil_x, pupil_y_mm=pupil_y,
-        wavelength_nm=rng.uniform(*VISIBLE_NM, sent), film_z_mm=film_z, stop_radius_mm=lens.stop_radius_mm,
+        wavelength_nm=rng.uniform(*LIGHT_NM, sent), film_z_mm=film_z, stop_radius_mm=lens.stop_radius_mm,
     )  # fmt: skip
     program = lens_program([lens], (), [plane])
     passed = program.evaluate(rays)["status"] == st.PASSED

@@ -11,7 +11,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
-from neurolens.base.settings import RANGE
+from neurolens.base.settings import LIGHT_NM, RANGE
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.cameras.shaders.osl import (
@@ -34,7 +34,7 @@ from neurolens.optics.readers.any_format import read_any
 
 # Of an exact lens: its wavelengths; its nearest focus in focal lengths; best focus lies beside the paraxial one by less
 # than this share of the film's travel.
-LIGHT_NM, _NEAR_EFL, _SPARE = (400.0, 700.0), 10.0, 0.1
+_NEAR_EFL, _SPARE = 10.0, 0.1
 MAX_STEPS = 12_000  # of a ray: compilers take minutes for more
 
 

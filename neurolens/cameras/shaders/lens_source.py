@@ -13,7 +13,7 @@ import numpy as np
 from neurolens import __version__
 from neurolens.base import status as st
 from neurolens.base.progress import Progress
-from neurolens.base.settings import RANGE
+from neurolens.base.settings import LIGHT_NM, RANGE
 from neurolens.cameras.shaders.source import Array, Focusing, film_extras, followed, state_ranges
 from neurolens.graph.c import Extras
 from neurolens.graph.program import Program
@@ -22,7 +22,7 @@ from neurolens.models.axes import Axis, mixture_of, weights
 from neurolens.models.fit import gap_axis, zoom_axis
 from neurolens.models.source import DOUBLE, Written, checked_name, lines_of, write_program
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
-from neurolens.optics.lens.prescription import VISIBLE_NM, Lens
+from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.focusing import best_focus_of_stops_mm, focus_states
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
@@ -69,7 +69,7 @@ def write_lens(
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes, double=to == DOUBLE)
     constants, functions = followed(axes, numbers(nodes, planes))
-    constants |= {**state_ranges(axes), "wavelength_min_nm": VISIBLE_NM[0], "wavelength_max_nm": VISIBLE_NM[1]}
+    constants |= {**state_ranges(axes), "wavelength_min_nm": LIGHT_NM[0], "wavelength_max_nm": LIGHT_NM[1]}
     placed, said = _film(lens, nodes, axes, progress or Progress(quiet=True))
     plane = f"z = {planes[0]:.6g} mm" if "pupil_z_mm" in constants else "z = NAME_pupil_z_mm(zoom_mm)"
     extras = Extras(constants, {**functions, **placed})
@@ -87,7 +87,7 @@ def _head(lens: Lens, plane: str) -> list[str]:
         f"Lens data: {lens.source} (sha256 {str(lens.sha256)[:16]}).",
         "Lens frame: mm, front vertex at z = 0, film at z > 0. Rays go from the film point through the pupil point on "
         f"the plane {plane}; the ray that comes out is a point on the front surface and a unit direction.",
-        f"Wavelengths from {VISIBLE_NM[0]:g} to {VISIBLE_NM[1]:g} nm. Status: 0 passed; at surface k, counted from 0 "
+        f"Wavelengths from {LIGHT_NM[0]:g} to {LIGHT_NM[1]:g} nm. Status: 0 passed; at surface k, counted from 0 "
         f"at the front, {st.blocked(0, st.MISSED)} + 4 k missed, {st.blocked(0, st.RIM)} + 4 k beyond its rim, "
         f"{st.blocked(0, st.TOTAL_REFLECTION)} + 4 k totally reflected.",
     ]
@@ -111,7 +111,7 @@ def _film(
 
             def best(focus_m: float, stops_mm: Array) -> Array:
                 report(min(1.0, next(done) / (_DISTANCES * len(lenses))))
-                return best_focus_of_stops_mm(at, focus_m, stops_mm.tolist(), VISIBLE_NM)
+                return best_focus_of_stops_mm(at, focus_m, stops_mm.tolist(), LIGHT_NM)
 
             return Focusing(near_m, float(at.stop_radius_mm), lambda focus_m: film_z_mm(at, focus_m), best)
 
@@ -124,7 +124,7 @@ def lens_program(
     nodes: Sequence[Lens], axes: Sequence[Axis], planes_mm: Sequence[float], *, double: bool = False
 ) -> Program:
     """The lens at the nodes of a state, a table each: gaps, and planes of pupil points, follow the state."""
-    program = lower([exact_graph(n, z, VISIBLE_NM, double=double) for n, z in zip(nodes, planes_mm, strict=True)])
+    program = lower([exact_graph(n, z, LIGHT_NM, double=double) for n, z in zip(nodes, planes_mm, strict=True)])
     program.mixture = mixture_of(axes) if axes else None
     return program
 
@@ -144,7 +144,7 @@ def numbers(nodes: Sequence[Lens], planes_mm: Sequence[float]) -> list[tuple[str
     data, infinity = [first_order(n) for n in nodes], [film_z_mm(n, math.inf) for n in nodes]
     radii = [image_radius_mm(n)[0] for n in nodes]
     discs = [
-        pupil_bounds(n, r, (z, z), VISIBLE_NM, pupil_z_mm=plane, rows=9).disc_mm
+        pupil_bounds(n, r, (z, z), LIGHT_NM, pupil_z_mm=plane, rows=9).disc_mm
         for n, r, z, plane in zip(nodes, radii, infinity, planes_mm, strict=True)
     ]
     return [

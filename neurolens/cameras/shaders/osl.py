@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.progress import Report
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
@@ -42,7 +43,7 @@ from neurolens.graph.program import Mixture, Program
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import Parameter, write_osl
 from neurolens.models.axes import STATE, Axis, product, state_graph, state_names, weights
-from neurolens.optics.lens.prescription import LINE_D_NM, VISIBLE_NM
+from neurolens.optics.lens.prescription import LINE_D_NM
 
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")
@@ -383,7 +384,7 @@ def shader_lens(model: OnnxLens) -> ShaderLens:
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
     all_nm = short, long = tuple(map(float, d["wavelength_nm"]))
-    visible = max(short, VISIBLE_NM[0]), min(long, VISIBLE_NM[1])
+    visible = max(short, LIGHT_NM[0]), min(long, LIGHT_NM[1])
     short, long = visible if visible[0] < visible[1] else all_nm
     stop = float(d["stop_radius_mm"])
     height = _BESIDE * float(d["film_radius_mm"])

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
+from neurolens.base.settings import EYE_NM
 from neurolens.optics.analysis.bundles import bundle, hexapolar, points
 from neurolens.optics.analysis.fields import Array, OverField, Result, Scene, on_plane
 from neurolens.optics.analysis.plots import FIELD_COLOURS, drawing, plain_log_ticks
@@ -28,7 +29,6 @@ from neurolens.optics.trace.surfaces import Rays
 # Share of the stop's radius that stands for the paraxial ray: its error grows with the square.
 PARAXIAL = 1e-3
 _ZONES = (PARAXIAL, 0.5**0.5, 1 - 1e-7)
-_VISIBLE_NM = (380.0, 780.0)
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def colour(
     scene.require_power()
     lens = scene.lens
     if spectrum_nm is None:
-        spectrum_nm = np.linspace(*(_VISIBLE_NM if lens.visible else lens.light_nm), 41).tolist()
+        spectrum_nm = np.linspace(*(EYE_NM if lens.visible else lens.light_nm), 41).tolist()
     spectrum = np.asarray(spectrum_nm, dtype=np.float64)
     line_nm = line_nm or (*scene.waves_nm, *((LINE_G_NM,) if lens.visible else ()))
     axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))

@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.settings import LIGHT_NM
 from neurolens.base.status import DOMAIN_SLACK
-from neurolens.optics.lens.prescription import LINE_D_NM, VISIBLE_NM, Lens, Medium, Surface
+from neurolens.optics.lens.prescription import LINE_D_NM, Lens, Medium, Surface
 
 # Fraunhofer lines, nm (helium d; hydrogen F and C; mercury g).
 LINE_F_NM = 486.1327
@@ -364,7 +365,7 @@ def check_light(lens: Lens, wavelength_nm: float) -> None:
 
     Visible light passes: reading a lens says which of its glasses are not stated there.
     """
-    if VISIBLE_NM[0] <= wavelength_nm <= VISIBLE_NM[1]:
+    if LIGHT_NM[0] <= wavelength_nm <= LIGHT_NM[1]:
         return
     low, high = stated_nm(lens)
     if not low / DOMAIN_SLACK <= wavelength_nm <= high * DOMAIN_SLACK:
@@ -423,7 +424,7 @@ def table_notes(surface: Surface) -> list[str]:
         notes.append(
             f"{stated} is stated, but {glass} has n_d = {glass.n_d:.6g}, V_d = {glass.V_d:.4g}, which rules{hint}"
         )
-    if not all(glass.covers(nm) for nm in VISIBLE_NM):
+    if not all(glass.covers(nm) for nm in LIGHT_NM):
         low, high = (round(1000 * v) for v in glass.range_um)
         notes.append(f"the index of {glass} is stated for {low}-{high} nm and extrapolated outside")
     if len(glass.coefficients) == 2:

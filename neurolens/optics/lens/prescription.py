@@ -12,10 +12,10 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import lens_id_of
+from neurolens.base.settings import LIGHT_NM
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.figures import SPHERE, Figure
 
-VISIBLE_NM = (400.0, 700.0)
 LINE_D_NM = 587.5618  # helium, yellow: where first-order data stand
 
 
@@ -176,7 +176,7 @@ class Lens:
     @property
     def light_nm(self) -> tuple[float, float]:
         """Range of wavelengths that the lens is made for: visible light, or the source's range for other light."""
-        return VISIBLE_NM if self.visible else (min(self.wavelengths_nm), max(self.wavelengths_nm))
+        return LIGHT_NM if self.visible else (min(self.wavelengths_nm), max(self.wavelengths_nm))
 
     @property
     def vertices_mm(self) -> list[Any]:

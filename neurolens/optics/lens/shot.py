@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neurolens.base.errors import InputError
-from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, between, check_bounds, said, setting, within
+from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, LIGHT_NM, between, check_bounds, said, setting, within
 from neurolens.base.units import in_unit
 
 FocusMode = Literal["best", "paraxial", "internal"]
@@ -79,7 +79,7 @@ class Shot:
         "groups moved as the focus states of the lens file do (default: best)", old=("focusing",),
     )  # fmt: skip
     aperture: Any = None  # an `Aperture`, whose module loads numpy, which help of the command line does not
-    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    wavelength_nm: tuple[float, float] = LIGHT_NM
     film_offset_mm: float = setting(
         0.0, "move the film away from the lens after focusing (default: 0)", within=(-1e3, 1e3), unit="mm"
     )

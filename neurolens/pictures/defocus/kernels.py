@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.pictures.defocus.plate import (
-    LIGHT_NM,
     FloatArray,
     Plate,
     PlatePinhole,

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
+from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import in_order
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
@@ -385,7 +386,7 @@ def check_field(camera: Camera) -> None:
     width, height = camera.film_mm
     side = np.linspace(-0.5, 0.5, _EDGE)
     film = np.stack(np.meshgrid(side * width, side * height), 0).reshape(2, -1).astype(np.float32)
-    low, high = camera.wavelength_nm or (400.0, 700.0)
+    low, high = camera.wavelength_nm or LIGHT_NM
     nm = np.full(film.shape[1], min(max(550.0, low), high), np.float32)
     rays = camera.sample(film, np.full(film.shape, 0.5, np.float32), nm)
     passed = rays.status == 0

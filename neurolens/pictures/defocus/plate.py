@@ -27,6 +27,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.field import Frame
 from neurolens.pictures.defocus.deep import OPAQUE, deep_layers
@@ -43,7 +44,7 @@ from neurolens.pictures.render.pictures import (
 
 FloatArray = NDArray[np.float32]
 NUMBERS = 5  # that a ray's line has: ax, ay, bx, by, weight
-LIGHT_NM, MIDDLE_NM = (400.0, 700.0), 550.0
+MIDDLE_NM = 550.0
 _NODES, _PITCH = 64, 8  # cells along the longer side of the film, and their least size in pixels
 FINEST = 4  # pixels a side of the smallest cells with bounds
 _STEEPEST = 0.2  # of the inverse depth: a larger step to a neighbour is an edge

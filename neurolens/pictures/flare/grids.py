@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.settings import LIGHT_NM
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.pictures.flare.ghosts import GhostTracer, Pair
 from neurolens.pictures.flare.lights import Light, Patch, light_towards, rays_across
@@ -75,7 +76,7 @@ def grids_of(
     wavelength_nm: float,
     half_mm: tuple[float, float],
     cell_mm: float,
-    wavelengths_nm: Sequence[float] = (400.0, 700.0),
+    wavelengths_nm: Sequence[float] = LIGHT_NM,
     only: Sequence[Pair] | None = None,
 ) -> dict[Pair, Grid]:
     """Make the grids of all ghosts that reach the film, or of those in `only`.

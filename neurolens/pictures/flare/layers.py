@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.base.files import Kept
 from neurolens.base.progress import Progress, Report
+from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import in_order
 from neurolens.optics.lens.glass import inverse_square_um
 from neurolens.optics.lens.paraxial import first_order
@@ -77,7 +78,7 @@ class FlareJob:
     lights: Sequence[Light]
     raster: Raster
     settings: FlareSettings = FlareSettings()
-    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    wavelength_nm: tuple[float, float] = LIGHT_NM
     threads: int = 2
     ghosts: GhostTracer | None = None
     single: tuple[str, ...] = ()

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import CHUNK_BYTES, fingerprint_of, read_arrays, write_arrays
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.pictures.render.settings import FilmSettings
 
@@ -295,7 +296,7 @@ def _rays(camera: Camera) -> str:
     """Return a digest of the rays of a fixed set of samples, which tells cameras apart."""
     random = np.random.default_rng(0)
     film = ((random.random((2, _PROBES)) - 0.5) * np.array(camera.film_mm)[:, None]).astype(np.float32)
-    low, high = camera.wavelength_nm or (400.0, 700.0)
+    low, high = camera.wavelength_nm or LIGHT_NM
     nm = np.linspace(low, high, _PROBES).astype(np.float32)
     rays = camera.sample(film, random.random((2, _PROBES), np.float32), nm)
     passed = rays.status == 0

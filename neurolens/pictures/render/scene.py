@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, printable
-from neurolens.base.settings import F_NUMBER, FILM_MM, from_dict, said, within
+from neurolens.base.settings import F_NUMBER, FILM_MM, LIGHT_NM, from_dict, said, within
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.lens.apertures import Aperture
@@ -65,7 +65,7 @@ class CameraSettings(StopShape, Checked):
     film_mm: Annotated[tuple[float, float], _SIDES] = _FILM_MM
     wavelength_nm: Annotated[
         tuple[float, float], Rule(lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780")
-    ] = field(default=(400.0, 700.0), metadata={"was": ("wavelengths_nm",)})
+    ] = field(default=LIGHT_NM, metadata={"was": ("wavelengths_nm",)})
     width: Annotated[int, between(1, 16384, "an integer")] = 320
     height: Annotated[int, between(1, 16384, "an integer")] = 180
     samples: Annotated[int, Rule(lambda v: 1 <= v <= 1 << 20, f"an integer from 1 to {1 << 20}")] = 64

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, pip_install
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.optics.lens.shot import Shot, StopShape
@@ -46,7 +47,6 @@ from neurolens.pictures.render.sampler import hash32
 from neurolens.pictures.render.settings import FilmSettings
 
 PLUGIN = "neurolens"
-LIGHT_NM = (400.0, 700.0)  # sets the exposure and the wavelengths of RGB variants; the same as in our scenes
 FILM_WIDTH_MM = 36.0
 _MIDDLE_NM = 550.0
 _CLASSES: dict[str, type] = {}

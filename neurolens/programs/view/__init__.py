@@ -27,6 +27,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html, text_of
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import weight_graph
 from neurolens.cameras.shaders.pupil import Blades
 from neurolens.graph.c import Signature
@@ -35,7 +36,7 @@ from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import TEMPORARY, urgent, write_glsl
 from neurolens.optics.analysis.layout import Layout, element_outline
-from neurolens.optics.lens.prescription import VISIBLE_NM, Lens
+from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.tracegraph import exact_graph
 from neurolens.pictures.flare.ghosts import GhostTracer, entrances, ghost_graphs
 
@@ -372,16 +373,16 @@ def ghosts_glsl(lens: Lens, film_radius_mm: float, most: int) -> tuple[dict[str,
     Raises:
         InputError: as `GhostTracer` and `ghost_graphs`.
     """
-    every = entrances(GhostTracer(lens), _SINE, film_radius_mm, 0.5 * sum(VISIBLE_NM))
+    every = entrances(GhostTracer(lens), _SINE, film_radius_mm, 0.5 * sum(LIGHT_NM))
     some, functions = every[:most], []
-    for ghost, graph in zip(some, ghost_graphs(lens, [g.pair for g in some], VISIBLE_NM), strict=True):
+    for ghost, graph in zip(some, ghost_graphs(lens, [g.pair for g in some], LIGHT_NM), strict=True):
         name, program = f"ghost_{ghost.pair.name.replace('-', '_')}", lower(graph)
         given = [_ENTERING[i] for i in Signature.of(program, name).inputs]
         call = f"{name}({', '.join([*given, *_ARRIVING])})"
         places = {"chief_mm": ghost.chief_mm.tolist(), "scale_mm": ghost.scale_mm.tolist()}
         functions.append({"name": ghost.pair.name, "text": _text(program, name), "call": call, **places})
     light = sum(g.light for g in some) / max(sum(g.light for g in every), 1e-300)
-    facts = {"sine": _SINE, "wavelength_nm": VISIBLE_NM, "stop_radius_mm": float(lens.stop_radius_mm), "light": light}
+    facts = {"sine": _SINE, "wavelength_nm": LIGHT_NM, "stop_radius_mm": float(lens.stop_radius_mm), "light": light}
     return facts, functions
 
 

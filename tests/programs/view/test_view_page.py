@@ -18,12 +18,13 @@ import torch
 import neurolens.programs.view as pages
 from neurolens.base.errors import InputError
 from neurolens.base.html import text_of
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.shading import urgent
 from neurolens.optics.lens.figures import Figure
-from neurolens.optics.lens.prescription import VISIBLE_NM, Lens, Surface
+from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.pupils import pupil_plane_z_mm
 from neurolens.optics.setting.states import set_lens
@@ -275,5 +276,5 @@ def test_a_paraboloid_has_a_path() -> None:
     figure = Figure(conic=-1.0, asphere=((4, 1e-7),))
     rows = (Surface(30.0, 5.0, 16.0, 1.5, 60.0, figure=figure, stop=True), Surface(-200.0, 55.0, 16.0))
     lens = set_lens(Lens("paraboloid", "", rows, 4.0, half_field_deg=5.0))
-    text, outputs = pages.path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM)
+    text, outputs = pages.path_glsl(lens, pupil_plane_z_mm(lens), LIGHT_NM)
     assert "lens_path" in text and len(outputs) > 4
