@@ -1,9 +1,9 @@
 """Pictures of flare: what `neurolens render` and `neurolens flare` make of suns, headlights, coatings, stops, frames.
 
-Each picture is one or more commands, which stand beside it; OpenEXR files (in runs/flare, OUT in the commands) that are
-there are not made again. Shown is the sum of what the commands made, renders denoised (Open Image Denoise), brighter by
-some stops, its highlights rolled off from 0.6 on, colours that sRGB does not hold turned towards grey. Writes the
-pictures and their page.
+Beside each picture stand the commands that made it. A picture is the sum of what they made. Renders are denoised (Open
+Image Denoise). Pictures are brightened by some stops, highlights are rolled off from 0.6 on, and colours that sRGB does
+not hold are turned towards grey. `python -m experiments flare-gallery` writes the pictures and this page; OpenEXR files
+that are in runs/flare already (OUT in the commands) are not made again.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ _N = ("2.8", "5.6", "11", "22")
 PICTURES = (
     Picture(
         "sun",
-        "A low sun over a lake, by a 24 mm retrofocus lens at f/8 with single-layer coatings, 2% of its front dusty: "
-        "ghosts, the star of six blades, and a veil about the sun, by 63 million photons. The plate is by "
-        "the thin lens whose focal length images the sun at the same place.",
+        "A low sun over a lake, through a 24 mm retrofocus lens at f/8 with single-layer coatings. Dust covers 2% of "
+        "its front. The flare has ghosts, the star of six blades, and a veil about the sun by 63 million photons. The "
+        "plate is by the thin lens whose focal length images the sun at the same place.",
         (
             f"neurolens render {_SUN} --camera thin:{_RETRO} --focal-length 23.9 --channels beauty -o OUT/sun.exr",
             f"{_OF_SUN} --f-number 8 --coating single-layer --starburst --width 1280 -o OUT/sun-flare.exr",
@@ -82,8 +82,8 @@ PICTURES = (
     ),
     Picture(
         "headlights",
-        "A wet street at night by a 50 mm double Gauss at f/8 with single-layer coatings, its six blades in the stars "
-        "of the headlights. The plate is by the thin lens of the same frame.",
+        "A wet street at night, through a 50 mm double Gauss at f/8 with single-layer coatings. The stars of the "
+        "headlights show its six blades. The plate is by the thin lens of the same frame.",
         (
             f"neurolens render {_ROAD} --camera thin:{_GAUSS} --channels beauty -o OUT/road.exr",
             f"{_FLARE} laikin_double_gauss_50 --lights {_ROAD} --most 8 --focus 14 --f-number 8 --blades 6 --starburst "
@@ -94,8 +94,8 @@ PICTURES = (
     ),
     Picture(
         "coatings",
-        "The sun above by what is on the glass: on the left over the plate and with the same veil of dust, all exposed "
-        "alike, on the right the ghosts alone, brighter by the stops that each panel states.",
+        "The same sun with four coatings. On the left the flare is over the plate, with the same veil of dust, and all "
+        "panels are exposed alike. On the right are the ghosts alone, brighter by the stops that each panel states.",
         tuple(
             f"{_OF_SUN} --f-number 8 {coating}--width 640 -o OUT/coating-{name}.exr"
             for name, coating in ((name, "" if name == "bare" else f"--coating {name} ") for name in _COATINGS)
@@ -112,16 +112,17 @@ PICTURES = (
     ),
     Picture(
         "stops",
-        "The same sun alone by the same lens, bare, opened and stopped down, exposed alike: ghosts take the shape of "
-        "the stop, and light that diffraction sends aside grows.",
+        "The same sun alone through the same lens without coatings, opened and stopped down, exposed alike. Ghosts "
+        "take the shape of the stop, and diffraction sends more light aside.",
         tuple(f"{_OF_SUN} --starburst --f-number {n} --width 640 -o OUT/stop-{n}.exr" for n in _N),
         tuple(Panel((f"stop-{n}",), f"f/{n}") for n in _N),
         columns=2,
     ),
     Picture(
         "anamorphic",
-        "The street by an anamorphic lens, shown unsqueezed: its cylinders draw ghosts out to streaks in both "
-        "meridians. Bare, and with multi-layer coatings, its strongest streak made blue and stronger.",
+        "The street through an anamorphic lens, shown unsqueezed. Its cylinders draw ghosts out to streaks in both "
+        "meridians. Above it is bare. Below it has multi-layer coatings, and its strongest streak is made blue and "
+        "stronger.",
         (
             f"neurolens render {_ROAD} --camera lenses/cooke_anamorphic_42.toml --film 24x18 --width 640 "
             "--channels beauty -o OUT/squeezed.exr",
@@ -136,7 +137,7 @@ PICTURES = (
     ),
     Picture(
         "animation",
-        "A light that crosses the frame, by keys in a list: `" + _KEYS.strip().replace("\n", "`, `") + "`.",
+        "A light crosses the frame, by keys in a list: `" + _KEYS.strip().replace("\n", "`, `") + "`.",
         (f"{_ACROSS} --frames 1:6 -o OUT/across.exr",),
         tuple(Panel((f"across.{frame:04d}",), f"frame {frame}") for frame in range(1, 7)),
         columns=3,

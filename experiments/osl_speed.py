@@ -353,10 +353,10 @@ PICTURES_OPTIONS = [
 def run_pictures(args: argparse.Namespace) -> None:
     """One scene in Blender's Cycles: its own depth of field beside lenses of the library as shaders.
 
-    Each lens stands where its subject is as large as in the other pictures, at its widest stop; Cycles's own camera
-    stands there too, with the same focal length, f-number and sensor (of the anamorphic lens: its squeeze as the ratio
-    of the aperture; of the fisheye: the equisolid panorama). Every picture is denoised by Cycles's OpenImageDenoise.
-    Writes README.md and a JPEG a lens.
+    Each lens stands where its subject is as large as in the other pictures, at its widest stop. Cycles's own camera
+    stands there, too, with the same focal length, f-number and sensor. For the anamorphic lens its aperture has the
+    ratio of the squeeze; for the fisheye it is the equisolid panorama. Cycles's OpenImageDenoise denoises every
+    picture. Writes README.md and a JPEG a lens.
     """
     python = checked_python(args.blender_python, "osl-pictures")
     lab.quiet_glasses()

@@ -192,11 +192,12 @@ def _plain(value: Any) -> Any:
 _HEAD = """\
 # What real lenses do
 
-Small scenes after the figures of two theses (Steinert 2009, Willi 2021), each through the exact lens, a surrogate of it
-and a thin lens with its pupil that shows the plane in focus at the same size; the last column is the difference of
-surrogate and exact in luminance, the same random numbers in both. The difference and all numbers are those of the
-renders; the pictures are shown after Open Image Denoise. Below each figure stands what is measured of the effect. Axes
-are millimetres of film, pictures upright. Made by `python -m experiments gallery`; one effect by the command beside it.
+Small scenes after the figures of two theses (Steinert 2009, Willi 2021). Each is drawn through the exact lens, a
+model of it, and a thin lens with its pupil, which shows the plane in focus at the same size. The last column is the
+difference of model and exact lens in luminance, from the same random numbers. The difference and all numbers are
+those of the renders; the pictures are shown after Open Image Denoise. A table below each figure measures the effect.
+Axes are millimetres of film, and pictures are upright. `python -m experiments gallery` made this page; the command
+beside an effect makes that effect alone.
 """
 
 
