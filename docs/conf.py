@@ -101,8 +101,8 @@ def _prepare(app: Any, document: str, content: list[str]) -> None:
     if not document.startswith("docs/pages/"):
         content[0] = f"---\norphan: true\n---\n{content[0]}"
     elif document.endswith(("/index", "/results")):
-        own = "results/" if document.endswith("/results") else ""  # other pages that it names are in other menus
-        pages = re.findall(rf"\]\(({own}[\w/-]+)\.md\)", content[0])
+        own = "results/" if document.endswith("/results") else ""  # other pages that they name are in other menus
+        pages = re.findall(rf"\]\(({own}[\w-]+(?:/index)?)\.md\)", content[0])
         content[0] += "\n```{toctree}\n:hidden:\n:maxdepth: 2\n\n" + "\n".join(dict.fromkeys(pages)) + "\n```\n"
 
 
