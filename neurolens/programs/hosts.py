@@ -201,8 +201,9 @@ def rays(
 
         - origin (scene units), direction (length 1): [H, W, S, 3]. newton: camera_rays [H, W, S, 2, 3]; gsplat: rays
           [S, H, W, 6]; 3dgrut: rays_ori, rays_dir [S, H, W, 3].
-        - weight: [H, W, S] or [S, H, W]; with "rgb" three for each ray, with "importance" [H, W]. wavelength_nm: one
-        for each ray. - to_world: [4, 4], from the host's camera frame to the world.
+        - weight: [H, W, S] or [S, H, W]; with "rgb" three for each ray, with "importance" [H, W].
+        - wavelength_nm: one for each ray.
+        - to_world: [4, 4], from the host's camera frame to the world.
 
         With `compact`, in place of rays, origin_xy (int16) times origin_step, in the plane plane_z, and direction_xy
         (float32), whose z has the sign `ahead` (`from_compact`); weights and wavelengths are float16.
