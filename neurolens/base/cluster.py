@@ -259,7 +259,7 @@ def unpack(data: bytes, folder: Path) -> list[Path]:
 
 
 def with_paths(value: T, move: Callable[[Path], Path]) -> T:
-    """A value of dataclasses and tuples with every path in it moved."""
+    """Return a value of dataclasses and tuples with every path in it moved."""
     if isinstance(value, Path):
         return move(value)  # type: ignore[return-value]
     if isinstance(value, tuple):

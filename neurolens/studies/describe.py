@@ -372,7 +372,7 @@ def swirl(discs: Discs, image_radius_mm: float) -> float:
 
 
 def bubble(discs: Discs, image_radius_mm: float) -> float:
-    """Compute `Character.bubble`. Rays move by their slope times the way of the film."""
+    """Compute `Character.bubble`. As the film moves, a ray moves on it by its slope times that way."""
     place, slope = discs.place_mm, discs.slope
     squares = (place * place, place * slope, slope * slope)
     here, mixed, steep = (float(_mean(v, discs.weight)[0].mean()) for v in squares)

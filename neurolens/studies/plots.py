@@ -125,7 +125,7 @@ def _panel(axes: Any, points: Sequence[_Point], label: str, kinds: Kinds, kind: 
 def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Sequence[str]) -> None:
     """Write each label beside its point where it covers the fewest other points and labels.
 
-    Each label takes the best of twenty-two places round its marker, in pixels, after the labels before it.
+    Labels are placed in order, each at the best of twenty-two places round its marker.
     """
     from matplotlib.transforms import Bbox
 

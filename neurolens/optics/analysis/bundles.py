@@ -44,9 +44,9 @@ class Pattern(NamedTuple):
 
 
 def hexapolar(rings: int) -> Pattern:
-    """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge; 1 + 3 n (n + 1) points.
+    """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge: 1 + 3 n (n + 1) points.
 
-    The weights are the areas nearest to each ring.
+    Each ring has as its weight the area that is nearest to it.
     """
     t, s, w = [0.0], [0.0], [(0.5 / rings) ** 2]
     for k in range(1, rings + 1):

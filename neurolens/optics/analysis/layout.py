@@ -194,7 +194,7 @@ def draw_section(axes: Any, layout: Layout, **axis: Any) -> None:
 
 
 def _limits(layout: Layout) -> tuple[tuple[float, float], float]:
-    """Z from a little before the glass (rays come from there) to a little behind the film, and greatest height."""
+    """The z from a little before the glass (rays come from there) to a little behind the film, and greatest height."""
     height = max(s.semi_diameter_mm for s in layout.surfaces)
     z = np.concatenate([*(s.arc()[:, 0] for s in layout.surfaces), [layout.film_z_mm]])
     ends = float(z.min() - 0.55 * height - 0.04 * np.ptp(z)), float(z.max() + 0.06 * np.ptp(z) + 0.05 * height)

@@ -350,7 +350,7 @@ def _settle_radii(file: File) -> None:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces."""
+    """Set what is known only when all surfaces are read."""
     _settle_radii(file)
     first, *middle, image = file.blocks
     if not middle:

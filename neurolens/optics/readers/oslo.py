@@ -163,7 +163,7 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces."""
+    """Set what is known only when all surfaces are read."""
     waves_nm = [1000 * um for um in file.waves_um]
     for block in file.blocks:  # the indices stand at wavelengths that come after the surfaces
         if block.glass and block.medium.keys() == {"n_d"}:

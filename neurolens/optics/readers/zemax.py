@@ -354,7 +354,7 @@ def _add_ends(file: File) -> None:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces."""
+    """Set what is known only when all surfaces are read."""
     file.skipped["lines of the merit function"] += file.behind.total()
     _check_figures(file)
     first, *middle, image = file.blocks

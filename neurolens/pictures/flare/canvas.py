@@ -119,7 +119,7 @@ class Smear(NamedTuple):
 
     @property
     def coarse(self) -> int:
-        """How many pixels wide the pixels may be with which the smeared picture is drawn."""
+        """Return how many times as wide the pixels may be in which the smeared picture is drawn."""
         (a, b, c, d), weights = self.sides, np.array(self.weights or ((1.0,),))
         parts, steps = max(weights.shape), (np.abs(np.diff(weights, axis=axis)).max(initial=0) for axis in (0, 1))
         # The light may jump between cells, not between their parts; a patch of even light only fades.

@@ -275,9 +275,9 @@ def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = (
 
     There is none where its domain is not the shot's, it has no such form, or its form is one of `without`. Errors are
     those of onnxruntime: compilers take seconds, and C and shaders give the same rays. They are measured within the
-    outline of the exact lens's pupil, from the same points of it: rows of samples leave out the rim of what fills an
-    outline, and two outlines of one lens would differ by a percent of light and 0.2% of the blur. Light that a model
-    passes outside that outline counts as an error of light.
+    outline of the exact lens's pupil, from the same points of it. Each camera's own outline would do less well: rows of
+    samples do not reach an outline's rim, so that two outlines of one lens would differ by a percent of light and 0.2%
+    of the blur. Light that a model passes outside the exact outline counts as an error of light.
     """
     target = trial.target
     compiled = target in OURS and has_compiler()
