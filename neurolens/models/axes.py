@@ -133,8 +133,7 @@ class Axis:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Axis:
-        """Make an axis of what `to_dict` gives. Raises InputError, KeyError, TypeError, ValueError: it is no such
-        table."""
+        """Make an axis of what `to_dict` gives; else raise InputError, KeyError, TypeError or ValueError."""
         stated = tuple((str(k), float(v)) for k, v in dict(data["stated"]).items())
         knots = tuple(float(v) for v in data["knots"])
         return Axis(str(data["name"]), str(data["unit"]), knots, int(data["degree"]), bool(data["reciprocal"]), stated)

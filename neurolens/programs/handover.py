@@ -134,8 +134,7 @@ class Handed:
 
 
 def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
-    """Fit light, relative to the axis, by r^2, r^4, r^6 (least squares); coefficients, and the worst that they
-    leave."""
+    """Fit light, relative to the axis, by r^2, r^4, r^6 (least squares): coefficients and their largest error."""
     lit = light > 0
     powers = np.stack([radius[lit] ** k for k in (2, 4, 6)], 1)
     scale = powers.max(0)

@@ -121,7 +121,7 @@ class Aim:
         return Rays(x, y, z, dx / length, dy / length, dz / length)
 
     def lead_mm(self, u: Tensor, v: Tensor) -> Tensor:
-        """How much longer the path from the object point to the plane across the chief rays is than that of these."""
+        """Return by how much a ray's way from its object point to the front plane is longer than its chief ray's."""
         if self.distance2 is None:
             return torch.zeros_like(u)
         # sqrt(a + b) - sqrt(a) without the loss of digits.
@@ -302,8 +302,7 @@ class Filled:
         return some
 
     def bundle(self, level: int, path: bool = False) -> Bundle:
-        """Trace the bundle of a level of `lit_nodes`. Optical paths take half of the time; without `path` they are
-        NaN."""
+        """Trace the bundle of a level of `lit_nodes`, with optical paths (half of the time) or NaN for them."""
         nodes = lit_nodes(self._passes, self.part, level)
         aim = self._aim(nodes.u.shape[1])
         u, v, area = (c.reshape(-1) for c in nodes)

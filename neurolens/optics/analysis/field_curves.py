@@ -241,7 +241,7 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
 
 
 def _film_light(scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> FilmLight:
-    """The light through a lens on the plane of the pupil, where rays `pupil` [F, P] fill it for each film point."""
+    """Return the light from a lens to film points at `height_mm` [F]; their rays `pupil` [F, P] show where it is."""
     plane_z_mm = pupil_plane_z_mm(scene.lens)
     # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
     zero = torch.zeros_like(height_mm)

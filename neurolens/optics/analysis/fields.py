@@ -217,10 +217,10 @@ class Scene:
         return np.where(reached, field, math.nan).tolist()
 
     def nearest_fields(self, wanted: Sequence[float], *, degrees: bool = False) -> tuple[Array, Array]:
-        """Find the fields in degrees, first from the axis outwards, whose chief rays meet the film at given heights
-        (mm).
+        """Find the fields in degrees whose chief rays meet the film at the heights `wanted` (mm).
 
-        Also returns whether there is such a chief ray; where there is none the nearest one is taken.
+        Of several such fields the one nearest to the axis is returned; where there is none, the field of the chief ray
+        that comes nearest. The second array tells where there is one.
 
         Args:
             degrees: whether the values are angles of fields instead; the nearest that has a chief ray is taken.

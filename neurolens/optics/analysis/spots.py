@@ -101,7 +101,10 @@ def _figures(rays: Bundle, open_energy: Tensor) -> list[Array]:
 
 
 def _scaled(figures: list[Array], airy_um: float) -> dict[str, tuple[Array, Array | float]]:
-    """Name the figures of `_figures` to show, with their scales; the largest radius, one ray's, has fewer digits."""
+    """Give the shown figures of `_figures`, each with the scale its error is judged by.
+
+    The largest radius depends on one ray, so its scale is coarser.
+    """
     rms, geometric, by_wavelength, passed, best, best_rms = figures[:6]
     least = 0.01 * airy_um
     return {

@@ -128,11 +128,13 @@ class Smear(NamedTuple):
         return 1 << max(0, math.floor(math.log2(wide / cells / _FINE)))
 
     def kernel(self, most: int, coarse: int = 1) -> Floats:
-        """The kernel [2 H + 1, 2 W + 1] about the middle of the light; what lies beyond `most` pixels is cut off.
+        """Return the smear as a kernel [2 H + 1, 2 W + 1] about the middle of its light.
 
-        coarse: the width of the kernel's pixels.
+        Its sum is 1, less the light beyond `most` pixels, which is cut off.
 
-        Its sum is 1, less the light that is cut off.
+        Args:
+            most: H and W are at most this.
+            coarse: the width of the kernel's pixels, in pixels of the picture.
         """
         sides = np.array(self.sides).reshape(2, 2) / coarse
         area = abs(float(np.linalg.det(sides)))

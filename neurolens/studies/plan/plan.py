@@ -62,7 +62,8 @@ class Plan:
     """A scene's needs, its effects by falling worth, every camera tried by rising cost, and the one to use.
 
     Attributes:
-        budget_s: the seconds of a plan for a time, whose `budget_px` is then the error of the best camera.
+        budget_s: the seconds the picture may take, or None where an error was asked for. Where given, `budget_px` is
+            the error of the best camera that keeps to them.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
         work: what a path takes besides its camera, in the same unit; none where the camera alone counts.
         alike: names of the cameras within the budget that take about as long as the cheapest; the best is one of them.
