@@ -120,8 +120,7 @@ class Dask(ThreadPoolExecutor):
         raise NeurolensError(_KILLED)
 
     def _sent_and_awaited(self, client: Any, work: Callable[..., Any], args: Any, named: Any) -> Any:
-        """Send a task and return its outcome; TimeoutError once the client is closed, for no outcome would ever
-        come."""
+        """Send a task and return its outcome; raises TimeoutError once the client is closed, for then none comes."""
         sent = [self._shared(client, each) if isinstance(each, Shared) else each for each in args]
         future = client.submit(_answer, work, __version__, self._limit_s, sent, named, pure=False)
         try:
@@ -156,7 +155,7 @@ def _answer(work: Callable[..., Any], version: str, limit_s: float, args: Any, n
 
 
 def _in_time(work: Callable[..., Any], limit_s: float, args: Any, named: Any) -> Any:
-    """Run a task, or give Failed after a time: then the worker ends after its answer, for no thread can be stopped."""
+    """Run a task; after `limit_s`, return Failed and end the worker soon after, for no thread can be stopped."""
     pool = ThreadPoolExecutor(1)
     try:
         return pool.submit(work, *args, **named).result(limit_s)
@@ -259,7 +258,7 @@ def unpack(data: bytes, folder: Path) -> list[Path]:
 
 
 def with_paths(value: T, move: Callable[[Path], Path]) -> T:
-    """A value of dataclasses and tuples with every path in it moved."""
+    """Return a value of dataclasses and tuples with every path in it moved."""
     if isinstance(value, Path):
         return move(value)  # type: ignore[return-value]
     if isinstance(value, tuple):

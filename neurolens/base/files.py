@@ -145,7 +145,7 @@ def _temporary(target: Path) -> Path:
 
 
 def _remove_abandoned(new: Path) -> None:
-    """Remove temporary files beside `new` that are much older, by the clock of that disk, once a process."""
+    """Remove temporary files in the folder of `new` that are a day older than it, once for each folder in a process."""
     if new.parent in _cleaned:
         return
     _cleaned.add(new.parent)
@@ -262,7 +262,7 @@ def _mine(found: os.stat_result) -> bool:
 
 
 def seal(temporary: Path, mode: int = 0o600) -> None:
-    """Write the SHA-256 of a file of a cache behind its content, before it has its final name (`atomic_path`)."""
+    """Append the SHA-256 of a cache's file to its content, before the file gets its final name (`atomic_path`)."""
     data = temporary.read_bytes()
     with temporary.open("ab") as file:
         file.write(hashlib.sha256(data).digest())
@@ -295,7 +295,7 @@ def keep_newest(new: Path, most: int) -> None:
 
 
 def safe_name(text: str) -> str:
-    """The name of a file or of an archive's entry that holds `text`, wherever that text comes from.
+    """Return a name of a file, or of an archive's entry, for `text`, wherever that comes from.
 
     It has letters, digits and "._+-" of ASCII, no dot at its beginning, and at most 100 characters. A text that has to
     change for this gets digits of its SHA-256 as well, so that the names of two texts differ.

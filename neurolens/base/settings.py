@@ -111,8 +111,7 @@ class Option:
 
 
 def setting(default: Any, about: str, **details: Any) -> Any:
-    """Declare a field of a settings dataclass that is also an option (`Option`); with the default `...` it is
-    required."""
+    """Declare a settings field that is also an option (`Option`); with `...` as its default it is required."""
     metadata = {"option": Option(about, **details)}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 

@@ -3,7 +3,7 @@
 One integer per ray, the same codes for the exact tracer and for exported models:
 
     0                 passed
-    1                 outside the domain of a model; of a lens, a wavelength at which no glass of it is stated
+    1                 outside the domain of a model; for a lens, a wavelength for which none of its glasses is stated
     2                 no solution found (inverse maps of models only)
     4 (k + 1) + r     ended at surface k (0-based, counted from the scene), for reason r:
                       1 missed the surface, 2 blocked by its rim (or by the stop), 3 total reflection

@@ -297,8 +297,7 @@ def keep_memory() -> None:
 
 
 def _context(modules: list[str]) -> Any:
-    """Return what starts processes: forks of a small server without threads, which imported the first task's
-    modules."""
+    """Return what starts processes: forks of a threadless server that has imported the first task's modules."""
     kind = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context: Any = multiprocessing.get_context(kind)
     if kind == "forkserver":

@@ -96,7 +96,7 @@ class _Longer:
 
 
 class _Writer:
-    """Values are named by strings; arrays have the graphs on their first axis, T."""
+    """Writes graphs as nodes of ONNX. Values are named by strings; arrays have the graphs on their first axis, T."""
 
     def __init__(self, graphs: Sequence[Graph], mixing: Mixing | None = None, prefix: str = "") -> None:
         self.graphs, self.mixing, self.prefix = graphs, mixing, prefix
@@ -413,7 +413,7 @@ def _clip(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 
 def _between(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """False for NaN, whatever Clip makes of it."""
+    """Write a test that is false for NaN, whatever Clip makes of that."""
     x, limits = w.name(node.inputs[0]), arrays[0]  # [T, R, 2]
     if node.rows == 1:
         low, high = (w.numbers(limits[:, 0, k]) for k in (0, 1))

@@ -119,7 +119,7 @@ class Axis:
         return np.asarray(self.features(min(max(value, self.range[0]), self.range[1])) @ self.to_features)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
+        """Return the axis as data for JSON."""
         return {
             "name": self.name,
             "unit": self.unit,
@@ -133,7 +133,7 @@ class Axis:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Axis:
-        """The inverse of `to_dict`. Raises InputError, KeyError, TypeError, ValueError: what is no such table."""
+        """Make an axis of what `to_dict` gives; else raise InputError, KeyError, TypeError or ValueError."""
         stated = tuple((str(k), float(v)) for k, v in dict(data["stated"]).items())
         knots = tuple(float(v) for v in data["knots"])
         return Axis(str(data["name"]), str(data["unit"]), knots, int(data["degree"]), bool(data["reciprocal"]), stated)

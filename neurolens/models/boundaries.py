@@ -56,7 +56,7 @@ Features = Callable[[LightField], Tensor]  # [M, N] of N rays
 
 
 def features_of(exponents: Exponents, hidden: Features | None = None) -> Features:
-    """Monomials of the invariants, after the features of a hidden layer where there is one."""
+    """A function from light fields to features: those of a hidden layer, if any, then monomials of invariants."""
 
     def features(field: LightField) -> Tensor:
         own = [] if hidden is None else [hidden(field)]

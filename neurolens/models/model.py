@@ -63,7 +63,7 @@ class Domain:
     nearest_m: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able, with infinity written as the string "inf"."""
+        """Return the domain as data for JSON, with infinity as the string "inf"."""
         data = {
             f.name: getattr(self, f.name) for f in fields(self)
         }  # a zoom mixes many: asdict takes ten times as long
@@ -166,8 +166,8 @@ class Encoding:
 class Gate:
     """A boundary that blocks rays: the scalar output is positive where surface `surface` stops the ray for `reason`.
 
-    `reason` RIM: scalar = (r / rim radius)^2 - 1, or of depths where a sphere ends near its rim. MISSED or
-    TOTAL_REFLECTION: the negated discriminant.
+    For the reason RIM it is (r / rim radius)^2 - 1, or the same of depths where a sphere ends near its rim. For MISSED
+    and TOTAL_REFLECTION it is the negated discriminant.
     """
 
     surface: int

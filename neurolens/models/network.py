@@ -76,8 +76,8 @@ def fit_network(
 ) -> Network:
     """Fit a network of `layers` tanh layers of `units` units, in float64 on one thread.
 
-    Position and direction weigh by their film-equivalent error, the stop crossing, the transmittance and the gates
-    modestly. Several random starts are tried, and the best goes on.
+    Position and direction weigh by their film-equivalent error; the stop crossing, the transmittance and the gates
+    weigh little beside them. Several random starts are tried, and the best goes on.
 
     Args:
         data: half the rays come from `pairs.train`, half from those near the boundaries and beyond (`boundary`).

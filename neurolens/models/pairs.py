@@ -261,7 +261,7 @@ _BATCH = 65536
 
 @dataclass(frozen=True)
 class PairSettings:
-    """How many rays of each split, and the seed."""
+    """How many rays each split has, and the seed."""
 
     train: int = 30000
     held_out: int = 30000
@@ -337,7 +337,7 @@ class RayPairs:
 
 
 def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
-    """Exact images of camera rays, with every crossing."""
+    """Trace camera rays to their exact images, and note every crossing on the way."""
     rays = camera_rays(inputs.film_x, inputs.film_y, inputs.film_z, inputs.pupil_x, inputs.pupil_y, pupil_z)
     every, parts = range(len(lens.surfaces)), []
     fields = rays.x.new_empty(4, len(every), len(rays.x))  # most of the memory of a lens with many surfaces: taken once

@@ -233,7 +233,7 @@ def shifted(encoding: Encoding, passing: PairSet, shift: Shift) -> Encoding:
 
 
 def _weights(encoding: Encoding, m: float) -> tuple[float, float]:
-    """The weights of p0 and u0, the crossings in mm, in p - m u, with p = p0 / P and u = (u0 - c p0) / U."""
+    """Return the weights of the crossings p0 and u0 (mm) in p - m u, with p = p0 / P and u = (u0 - c p0) / U."""
     from_u = m / encoding.pupil_scale_mm
     return 1 / encoding.film_scale_mm + encoding.chief * from_u, -from_u
 

@@ -68,8 +68,10 @@ class Problem:
 
     @cached_property
     def curvature(self) -> Tensor:
-        """Second derivatives of half a ray's loss by its outputs, [N, 3 V + S]: AA, AB, BB of each vector, each
-        scalar."""
+        """Return the second derivatives of half a ray's loss by its outputs, [N, 3 V + S].
+
+        They are AA, AB, BB of each of V vectors, then one of each of S scalars.
+        """
         pairs = ((self.p, self.p), (self.p, self.u), (self.u, self.u))
         dots = torch.stack([(a * b).sum(1) for a, b in pairs], 1)  # [1 or V, 3, N]
         vectors = (self.vector_weights**2)[:, None] * dots

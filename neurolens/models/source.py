@@ -205,7 +205,7 @@ def _taken(word: str) -> bool:
 def write_program(
     program: Program, target: Path, language: str, name: str, comment: Sequence[str], extras: Extras
 ) -> Written:
-    """Write any program as a function of a checked name."""
+    """Write any program as a function whose name was checked before."""
     atomic_write_text(target, WRITERS[language](program, name, comment, extras))
     return Written(target, Signature.of(program, name), sum(program.count().values()))
 

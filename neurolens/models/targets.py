@@ -100,7 +100,7 @@ def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tup
     """Weigh the rays of `boundary_rays` for the fits of the gates [G, N] and of the stop crossing [N].
 
     A gate decides where its value is near 0 and no other boundary stops the ray. The stop crossing counts wherever the
-    ray passes, because the stop may be closed, and more near the middle, where an error meets smaller openings. Rays
+    ray passes, because the stop may be closed, and more near the middle, which is all that a small opening uses. Rays
     that are lost before a boundary weigh 0.
     """
     every = (*gates, Gate(lens.stop_index, st.RIM))

@@ -134,8 +134,7 @@ class Handed:
 
 
 def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
-    """Fit light, relative to the axis, by r^2, r^4, r^6 (least squares); coefficients, and the worst that they
-    leave."""
+    """Fit light, relative to the axis, by r^2, r^4, r^6 (least squares): coefficients and their largest error."""
     lit = light > 0
     powers = np.stack([radius[lit] ** k for k in (2, 4, 6)], 1)
     scale = powers.max(0)
@@ -144,8 +143,8 @@ def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
 
 
 # The two lookup pictures of NVIDIA's schema OmniLensDistortionLutAPI, by which a USD camera gets a lens's projection.
-# #
-# # `enter` has the picture's size. Its R, G and B are the direction that a pixel sees (x right, y up, -z forward);
+#
+# `enter` has the picture's size. Its R, G and B are the direction that a pixel sees (x right, y up, -z forward);
 # where no light arrives they are 0, 0, 1, which is behind the camera. `exit` is a square. Its R and G say where the
 # picture shows a direction, from 0 to 1 from its upper left corner; -1 where it does not show it. Directions are folded
 # onto the square as onto an octahedron, with forward in its middle; x grows to the right, and y, which is up, from the

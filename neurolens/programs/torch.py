@@ -228,7 +228,7 @@ class _Lens:
         self.program = lower(graph)
 
     def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
-        """Origins and directions [3, N], weights and status [N] for [N, 2], [N, 2] and [N]; without gradients."""
+        """Origins and directions [3, N], weights and status [N] of rays; film and square are [N, 2], light is [N]."""
         if self.compiled:  # numpy transposes arrays of two columns ten times as fast as torch
             points, places = (np.ascontiguousarray(t.numpy().T) for t in (film, square))
             rays = self.camera.sample(points, places, np.ascontiguousarray(light.numpy()))

@@ -1,4 +1,4 @@
-"""Check of a model against the promises of its card, on fresh rays through the exact lens and the ONNX model."""
+"""Checks a model against the promises of its card, on fresh rays through the exact lens and the ONNX model."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from neurolens.studies.measure import (
 )
 from neurolens.studies.rays import ZONES, EachRay, false_shares, ray_errors
 
-# How much worse than promised a figure may be on other rays: standard deviations of the estimate from a sample of this
-# size, at least a tenth, at most a half. A largest error has no such bound: more rays find larger ones.
+# How much worse than promised a figure may be on other rays: so many standard deviations of the estimate from a sample
+# of this size, at least a tenth, at most a half. A largest error has no such bound: more rays find larger ones.
 SIGMAS, LEAST, MOST = 4.0, 0.10, 0.50
-# The errors per ray from which a figure is computed.
+# The errors per ray from which each figure is computed.
 _RMS = {
     "rms_um": "focus_um",
     "rms_infinity_um": "infinity_um",
@@ -62,7 +62,7 @@ _FRESH = 7919  # added to the seed of the fit
 
 @dataclass(frozen=True)
 class Promise:
-    """One figure of a card against fresh rays; `allowed` is the promise with its tolerance, None where it has none."""
+    """One figure of a card beside fresh rays; `allowed` is the promise with its tolerance, None where it has none."""
 
     key: str
     promised: float
@@ -83,15 +83,15 @@ def check_model(
 
     Args:
         lens: the exact lens, as `lens_of_card` gives it.
-        rays: rays that the lens passes, eight times as many where a few bad ones decide an error; four times as many
-            test what passes and what is blocked.
+        rays: how many rays that the lens passes; eight times as many where a few bad rays decide an error. Four times
+            as many test what passes and what is blocked.
         seed: None takes one that differs from the fit's.
 
-    Returns the figures (those of `measure.Findings`, flat, with stopped_down, zones, rays and seed) and the promises of
-        the card: over the whole film, stopped down ("2_stops.false_pass") and of zones ("full.edge.rms_um").
+    Returns the figures (those of `measure.Findings`, flat, with stopped_down, zones, rays and seed) and the card's
+    promises: over the whole film, stopped down ("2_stops.false_pass") and by zone ("full.edge.rms_um").
 
     Warns:
-        NeurolensWarning: a seed that is the fit's own.
+        NeurolensWarning: the seed is the fit's own.
     """
     domain, seed = Domain.from_dict(model.card["domain"]), _fresh_seed(model, seed)
     fresh = fresh_rays(lens, domain, passing_rays(lens, domain, rays, seed), count=4 * rays, seed=seed)
@@ -112,7 +112,7 @@ def _fresh_seed(model: OnnxLens, seed: int | None) -> int:
 
 
 def promises_of(errors: Mapping[str, Any], fresh: FreshRays, findings: Findings) -> list[Promise]:
-    """The promises of a card's `errors` against what a model's `measure` findings on fresh rays."""
+    """Hold the promises in a card's `errors` against the findings of `measure` on fresh rays."""
     promises, passing, promised_of = [], int(fresh.passes.sum()), _numbers(errors).get("passing")
     for key, promised in _numbers(errors).items():
         if key in SHARES:
@@ -143,19 +143,19 @@ def promises_of(errors: Mapping[str, Any], fresh: FreshRays, findings: Findings)
 
 
 def _tables(value: Any, names: Collection[str]) -> list[tuple[str, Mapping[str, Any]]]:
-    """The tables of these names in a table."""
+    """Return the tables of these names in a table."""
     items = value.items() if isinstance(value, Mapping) else ()
     return [(name, inner) for name, inner in items if name in names and isinstance(inner, Mapping)]
 
 
 def _numbers(table: Mapping[str, Any]) -> dict[str, float]:
-    """The finite numbers of a table."""
+    """Return the finite numbers of a table."""
     numbers = {k: v for k, v in table.items() if isinstance(v, int | float) and not isinstance(v, bool)}
     return {key: float(value) for key, value in numbers.items() if math.isfinite(value)}
 
 
 def _error(place: str, promised: float, measured: float | None, each: EachRay, promised_of: float | None) -> Promise:
-    """A promised error against fresh rays, with a tolerance from their spread."""
+    """Hold a promised error against fresh rays, with a tolerance from their spread."""
     key = place.rpartition(".")[2]
     value = math.nan if measured is None else float(measured)
     if key not in _RMS and key not in _P99:
@@ -168,7 +168,7 @@ def _error(place: str, promised: float, measured: float | None, each: EachRay, p
 
 
 def _p99_deviation(values: Tensor) -> float:
-    """Relative standard deviation of the 99th percentile, from the quantile one deviation of its rank higher."""
+    """The relative standard deviation of the 99th percentile, from the quantile one deviation of its rank higher."""
     if not len(values):
         return 0.0
     higher = min(1.0, 0.99 + math.sqrt(0.99 * 0.01 / len(values)))
@@ -179,11 +179,11 @@ def _p99_deviation(values: Tensor) -> float:
 def share_promise(
     place: str, promised: float, measured: float | None, rays: float, promised_of: float | None
 ) -> Promise:
-    """A promised share of `promised_of` rays against one of `rays`.
+    """Hold a promised share of `promised_of` rays against one of `rays`.
 
-    Both are counts of rare events, whose tails are longer than a normal law's: their square roots, which vary by half
-    a count whatever the count is, are compared (Huffman 1984, Applied Statistics 33, 224). Where many were counted,
-    this is `SIGMAS` standard deviations of the difference.
+    Both are counts of rare events, whose tails are longer than a normal law's. So their square roots are compared,
+    which vary by half a count whatever the count is (Huffman 1984, Applied Statistics 33, 224). Where many were
+    counted, this is `SIGMAS` standard deviations of the difference.
     """
     rays, other = max(rays, 1.0), max(promised_of or rays, 1.0)
     ratio = rays / other
@@ -195,14 +195,14 @@ def share_promise(
 def lens_of_card(
     card: Mapping[str, Any], lens_file: str | Path | None = None, model_file: str | Path = "model"
 ) -> Lens:
-    """The exact lens of a model, in the model's zoom state, size and stop.
+    """Return the exact lens of a model, in the model's zoom state, size and stop.
 
     Args:
         lens_file: None looks for the card's lens id in lenses/: beside the model, beside its folder (a run keeps its
-            lens there), of the working folder and of this project.
+            lens there), in the working folder, and in this project.
 
     Raises:
-        InputError: no such file, or one whose prescription is not the card's in any zoom state.
+        InputError: there is no such file, or its prescription is the card's in no zoom state.
     """
     path = Path(lens_file) if lens_file is not None else find_lens(str(card["lens"]["id"]), Path(model_file))
     tabled = read_any(path)
@@ -218,10 +218,10 @@ def _another_lens(lens: Lens, card: Mapping[str, Any], path: Path, model_file: s
 
 
 def find_lens(lens_id: str, model_file: Path) -> Path:
-    """The lens file of an id: in lenses/ beside the model or its folder, of the working folder, or of this project.
+    """Find the lens file of an id: in lenses/ beside the model, its folder, the working folder or this project's.
 
     Raises:
-        InputError: no such file.
+        InputError: there is no such file.
     """
     name, beside = f"{Path(lens_id).name}.toml", model_file.resolve().parent
     for root in (beside, beside.parent, Path("."), library()):
@@ -231,11 +231,11 @@ def find_lens(lens_id: str, model_file: Path) -> Path:
 
 
 def _states(tabled: Lens, efl_mm: float) -> Iterator[Lens]:
-    """The lens in every zoom state, as tabled and at the focal length of the card."""
+    """Yield the lens in every zoom state, as tabled and at the card's focal length."""
     for configuration in (None, *(c.name for c in tabled.configurations)):
         lens = set_lens(tabled, zoom=configuration)
         yield lens
-        # The card has the computed focal length; the requested one, needed bit by bit, had fewer digits.
+        # The card has the computed focal length. The requested one, needed bit by bit, had fewer digits.
         for digits in (9, 12, 15):
             wanted = float(f"{efl_mm:.{digits}g}")
             if abs(first_order(lens).efl_mm / wanted - 1) > 1e-12:
@@ -246,13 +246,13 @@ RAY_KEYS = (
     "rms_um", "rms_um_at_21_6", "p99_um", "max_um", "rms_infinity_um", "direction_rms_deg", "position_rms_um",
     "transmittance_rms",
 )  # fmt: skip
-# Relative tolerance of an error that is the worst of other states and other rays.
+# Relative tolerance of an error that is the worst over other states and other rays.
 TOLERANCE = 0.25
-_VIGNETTING = 4  # rays that test it, for every ray that passes
+_VIGNETTING = 4  # rays that test vignetting, for every ray that passes
 
 
 def random_states(axes: Sequence[Axis], count: int, seed: int) -> list[State]:
-    """States uniform over the ranges, as float32 holds them: of every axis, one in each of `count` equal parts."""
+    """Draw states uniform over the ranges, rounded to float32; each axis has one in each of `count` equal parts."""
     generator = np.random.default_rng(seed)
     columns = []
     for axis in axes:
@@ -263,13 +263,13 @@ def random_states(axes: Sequence[Axis], count: int, seed: int) -> list[State]:
 
 
 def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed: int) -> dict[str, Any]:
-    """Figures of one state: `RAY_KEYS` of `rays.RayErrors`, `SHARES` of four times as many rays, the state by axis.
+    """Measure one state: `RAY_KEYS` of `rays.RayErrors`, `SHARES` on four times as many rays, and the state by axis.
 
-    What is not finite is None. `film_z_um`: how far the card's paraxial image is from the exact lens's film, um.
+    What is not finite is None. `film_z_um` is how far the card's paraxial image is from the exact lens's film (um).
     """
     here, lens = model.at(*state), space.lens_at(state)
     domain, predict = Domain.from_dict(here.card["domain"]), onnx_predictor(here)
-    # The stop is the card's: the graph guards its radius, and between nodes the last digits differ.
+    # The stop is the card's, whose radius the graph tests: between nodes the last digits differ.
     lens = lens.with_stop_radius(domain.stop_radius_mm)
     passing = passing_rays(lens, domain, rays, seed)
     ray = ray_errors(lens, domain, passing, predict)
@@ -285,7 +285,7 @@ def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed:
 
 
 def card_errors(rows: Sequence[Mapping[str, Any]], rays: int) -> dict[str, Any]:
-    """The errors for a card: the worst over the measured states, their median, and every state."""
+    """Return the errors for a card: the worst over the measured states, their median, and every state."""
 
     def over(how: Any) -> dict[str, float | None]:
         columns = {key: [r[key] for r in rows] for key in (*RAY_KEYS, *SHARES)}
@@ -298,10 +298,10 @@ def card_errors(rows: Sequence[Mapping[str, Any]], rays: int) -> dict[str, Any]:
 def space_of_card(
     card: Mapping[str, Any], axes: Sequence[Axis], lens_file: Path | None, model_file: Path
 ) -> StateSpace:
-    """The exact lens of a model of many states.
+    """Return the exact lens of a model of many states.
 
     Raises:
-        InputError: no such file, or one whose prescription is not the card's at its first state.
+        InputError: there is no such file, or its prescription is not the card's at the card's first state.
     """
     path = lens_file if lens_file is not None else find_lens(str(card["lens"]["id"]), model_file)
     states = card["states"]

@@ -1,8 +1,8 @@
-"""A lens in figures, a folder of lenses as a table, their sections, and the character of a lens in five numbers.
+"""Describes lenses: one in figures, a folder of them as a table, their sections, and their character in five numbers.
 
 Character is that of a lens wide open. Its discs are those of lights at infinity while the lens is focused at 30 focal
 lengths, where lenses on films of one size frame a subject alike: on the axis, at 0.6 and at 0.95 of the field.
-Vignetting follows the rims: where the file's are derived or estimated, cat's eye and swirl are, too.
+Vignetting follows the rims: where the file's rims are derived or estimated, cat's eye and swirl are, too.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ from neurolens.pictures.flare.ghosts import GhostTracer, ghost_table
 from neurolens.pictures.flare.lights import Light
 
 _RAYS = 65536
-_NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not listed
+_NEGLIGIBLE = 1e-4  # a surface that blocks a smaller share of the rays is not listed
 
 
 def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
-    """Figures of a lens placed by `set_lens`, over a domain, as JSON has them; d line unless stated otherwise.
+    """Return the figures of a lens placed by `set_lens` over a domain, in JSON's types; d line unless stated otherwise.
 
-    They are those of the file, those of `FirstOrder` (of an anamorphic lens in the y-z plane), and:
+    They are those of the file, those of `FirstOrder` (for an anamorphic lens in the y-z plane), and:
 
         efl_x_mm: in the x-z plane; None for a round lens.
-        working_f_number: of the real marginal ray (y-z); None where no ray passes.
+        working_f_number: that of the real marginal ray (y-z); None where no ray passes.
         image_radius_from: how the radius is known.
         half_field_deg: as the file states it.
-        half_field_reached_deg: mean angle of the rays that reach the edge of the domain's film, along y of an
-            anamorphic lens; None where none does. half_field_reached_x_deg is None for a round lens, too.
-        passing_share: of rays uniform over the film and pupil discs of the domain.
+        half_field_reached_deg: mean angle of the rays that reach the edge of the domain's film (for an anamorphic lens
+            along y); None where none does. half_field_reached_x_deg is None for a round lens, too.
+        passing_share: share of rays uniform over the domain's film and pupil discs that pass.
         ended: what stops the others, a list of {status, text, share}, largest share first.
         warnings: sentences.
     """
@@ -63,7 +63,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
     radius, radius_from = image_radius_mm(lens)
     passing, ended = passing_share(lens, domain)
     working = working_f_number(Scene(lens, domain.focus_m[0]), lens.reference_nm)
-    # A round lens has the same field along y; the mean over rays along x is used.
+    # A round lens has the same field along y; for it the mean over rays along x is used.
     reached = field_reached_deg(lens, domain, film_z, "y" if squeezed else "x")
     reached_x = field_reached_deg(lens, domain, film_z, "x") if squeezed else reached
     notes = warnings_of(lens, first_order(at_infinity(lens)).f_number, reached, math.isinf(domain.focus_m[0]))
@@ -98,9 +98,10 @@ _ROUND = {"conic": 0.0, "asphere": {}, "cylinder": None, "across": None, "focal_
 
 
 def glass_table(lens: Lens) -> list[dict[str, Any]]:
-    """The prescription row by row, every figure of it: n_d and V_d are the catalogue's where a glass rules; asphere is
-    {power: coefficient}; figure says in words what it is; coating None or {name, layers: [[index, thickness in nm, V_d
-    if known], ...]}.
+    """Return the prescription row by row with all figures.
+
+    n_d and V_d are the catalogue's where a glass rules. asphere is {power: coefficient}; figure says in words what it
+    is. coating is None or {name, layers: [[index, thickness in nm, V_d if known], ...]}.
     """
     rows = []
     for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True)):
@@ -117,12 +118,13 @@ def glass_table(lens: Lens) -> list[dict[str, Any]]:
 
 
 def field_reached_deg(lens: Lens, domain: Domain, film_z: float, axis: Literal["x", "y"] = "x") -> float | None:
-    """Mean angle to the axis (degrees) of the rays from the edge of the film to the scene; None where none passes.
+    """Return the mean angle to the axis (degrees) of rays from the film's edge to the scene; None where none passes.
 
     The edge is that on the x or the y axis of the film.
     """
     grid = torch.linspace(-domain.pupil_radius_mm, domain.pupil_radius_mm, 200, dtype=torch.float64)
-    u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[100:], indexing="ij"))  # symmetric across
+    # half of it, for it is symmetric across
+    u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[100:], indexing="ij"))
     edge, zero = torch.full_like(u, domain.film_radius_mm), torch.zeros_like(u)
     film, pupil = ((edge, zero), (u, v)) if axis == "x" else ((zero, edge), (v, u))
     with torch.no_grad():
@@ -135,7 +137,7 @@ def field_reached_deg(lens: Lens, domain: Domain, film_z: float, axis: Literal["
 
 
 def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, list[dict[str, Any]]]:
-    """Share of a domain's rays that pass, and what ends the others: {status, text, share}, largest share first."""
+    """Return the share of a domain's rays that pass, and what ends the others: {status, text, share}, largest first."""
     rays = sample_domain(domain, _RAYS, seed)
     with torch.no_grad():
         start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
@@ -153,14 +155,14 @@ def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, lis
 
 
 def file_doubts(tabled: Lens, states: bool = True) -> list[str]:
-    """Doubts about a lens file as sentences, with or without those of its states. See also `warnings_of`."""
-    # A smaller stop than stated is a choice, not a doubt.
+    """Return doubts about a lens file as sentences, with or without those about its states. See also `warnings_of`."""
+    # A stop that is smaller than stated is a choice, not a doubt.
     checks = [c for c in check_lens(tabled) if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)]
     return doubts([c for c in checks if states or not c.state])
 
 
 def rim_doubts(lens: Lens) -> list[str]:
-    """A sentence on rims that are not the source's."""
+    """Return a sentence about rims that are not the source's, if there are any."""
     return {
         "estimated": ["rim diameters are estimated, not the source's: vignetting is a guess"],
         "derived": ["rim diameters are derived by a rule, the source has none: vignetting follows that rule"],
@@ -168,12 +170,12 @@ def rim_doubts(lens: Lens) -> list[str]:
 
 
 def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: bool) -> list[str]:
-    """Warnings about a lens in its state, as sentences; see `file_doubts` for its file, and the reader's own warnings.
+    """Return warnings about a lens as it is set, in sentences; `file_doubts` and the reader's warnings are of its file.
 
     Args:
-        f_number: of the lens focused at infinity, as the source states it.
+        f_number: of the lens at infinity focus, as the source states it.
         reached_deg: half field that reaches the edge of the film.
-        far: whether the lens is focused at infinity, where its source states the field.
+        far: whether the lens is at infinity focus, for which its source states the field.
     """
     sentences = rim_doubts(lens)
     if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
@@ -186,10 +188,10 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
 
 
 def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
-    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
+    """Return a lens's section with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
 
     Args:
-        lens: placed by `set_lens`; where it is not, the film is that of the domain's farthest focus.
+        lens: placed by `set_lens`; else the film is that of the domain's farthest focus.
     """
     if lens.film_z_mm is None:
         lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
@@ -197,16 +199,16 @@ def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
 
 
 def read_quietly(path: Path) -> Lens:
-    """A lens read without warnings, which its check repeats."""
+    """Read a lens without warnings, which its check repeats."""
     with warned():
         return read_any(path)
 
 
 def library_row(path: Path, checked: bool = True, characters: bool = False) -> dict[str, Any]:
-    """A lens file in a table of many.
+    """Return a lens file as a row of a table.
 
-    Returns: lens, file, notes (the warnings of its reader), `lens_row`, checked or not, and its character, None unless
-        asked for; of a file that cannot be read the verdict "unreadable" with the error as its doubt.
+    Returns: lens, file, notes (the warnings of its reader), `lens_row`, checked or not, and its character (None unless
+    asked for). A file that cannot be read has the verdict "unreadable", with the error as its doubt.
     """
     with warned(path) as notes:
         try:
@@ -222,12 +224,12 @@ _STATED = ("name", "believed_to_be", "stated_efl_mm", "half_field_deg", "image_r
 
 
 def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
-    """A lens as read from its file, in a table of many, with its `check_lens` or (None) without.
+    """Return a lens, as read from its file, as a row of a table, with its `check_lens` or (None) without.
 
-    Returns: name, believed_to_be, maker, year, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only),
-        stated_efl_mm, back_focus_mm, f_number of the stop, half_field_deg as stated, image_radius_mm as stated,
-        refractions, aspheres, cylinders, states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks
-        "read"), doubts, and checks: a list of {state, quantity, computed, stated, doubt}.
+    Returns: name, believed_to_be, maker, year, efl_mm and efl_x_mm computed (the latter only for an anamorphic lens),
+    stated_efl_mm, back_focus_mm, f_number of the stop, half_field_deg as stated, image_radius_mm as stated,
+    refractions, aspheres, cylinders, states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks "read"),
+    doubts, and checks: a list of {state, quantity, computed, stated, doubt}.
     """
     data, cylinders = first_order(lens), sum(s.figure.axis is not None for s in lens.surfaces)
     return {
@@ -245,37 +247,38 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
     }
 
 
-FOCUS, FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field's edge
-_LEVEL = 3  # of the pupil's nodes: some 12,000 rays a disc
-_POWER = 4  # of the squared distance from the centre that tells the rim's light
-_SEEN = 0.01  # of the image's radius: the standard deviation of a disc that shows its shape
-_UNCUT = 1.5  # times the disc on the axis; where that at the field's edge is larger, aberrations and no rims shape it
-_HALF_DIAGONAL_MM = 21.6  # of a picture of 36 x 24 mm, to which spots are scaled
+FOCUS, FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths at which a lens is focused; shares of the field's edge
+_LEVEL = 3  # level of the pupil's nodes: some 12,000 rays for a disc
+_POWER = 4  # power of the squared distance from the centre, by which the rim's light is weighted
+_SEEN = 0.01  # of the image's radius: from this standard deviation on a disc shows its shape
+# a disc at the field's edge that is larger, over that on the axis, is shaped by aberrations and not by rims
+_UNCUT = 1.5
+_HALF_DIAGONAL_MM = 21.6  # half the diagonal of a picture of 36 x 24 mm, to which spots are scaled
 _GHOST_RAYS = 2000
 _SIDE, _DISC = 32, 0.92  # pixels of a disc's picture; share of the side that the widest disc takes,
-_WIDEST = 1.5  # which counts as no more than so many times that on the axis
+_WIDEST = 1.5  # where a disc counts as at most so many times as wide as that on the axis
 
 
 @dataclass(frozen=True)
 class Character(Result):
-    """What a lens is known for; NaN where a figure cannot be had.
+    """What a lens is known for. A figure that cannot be had is NaN.
 
-    In the first three, discs that are small in the picture count in proportion: whole from a standard deviation on the
-    axis of 1% of the image's radius on.
+    In the first three figures, discs that are small in the picture count less, in proportion: they count in full when
+    their standard deviation on the axis is 1% of the image's radius or more.
 
     Attributes:
-        cats_eye: area of the disc of a light far out of focus at 0.95 of the field over that on the axis: 1 where no
-            rim cuts it. NaN above 1.5: aberrations shape such discs, as of condensers, which are no picture lenses.
+        cats_eye: area of the disc of a light far out of focus at 0.95 of the field, over that on the axis: 1 where no
+            rim cuts it. NaN above 1.5, where aberrations shape the disc, as in condensers, which are no picture lenses.
         swirl: how much narrower the disc at 0.6 of the field is along the picture's radius than across it, compared
-            with the axis: 1 less the ratio of the standard deviations of its light; 0 for a round one. Field curvature
-            and astigmatism make it, too.
-        bubble: light near the rim of the disc on the axis behind the focus over that of an even disc, where light
-            counts by the eighth power of its distance from the centre: 1 if even, up to 5 for a bright rim alone. The
-            film is moved to where the deviation is 1% of the image's radius, so that discs of one size are compared;
-            NaN where the sharpest one is larger.
-        softness_um: RMS radius of a white point on the axis at the best focus of a far light, on a picture of
-            43.2 mm across its corners.
-        flare: light of all ghosts of two reflections on the film's plane over that of the image, of a light at half
+            with the axis: 1 less the ratio of the standard deviations of its light; 0 for a round disc. Field curvature
+            and astigmatism make swirl, too.
+        bubble: light near the rim of the disc on the axis behind the focus, over that of an even disc; light counts by
+            the eighth power of its distance from the centre. It is 1 if even, up to 5 for a bright rim alone. The film
+            is moved to where the deviation is 1% of the image's radius, so that discs of one size are compared; NaN
+            where the sharpest disc is larger.
+        softness_um: RMS radius of a white point on the axis at the best focus of a far light, in a picture of 43.2 mm
+            across its corners.
+        flare: light of all ghosts of two reflections on the film's plane, over that of the image, for a light at half
             the field; glass without a coating in the file is bare.
     """
 
@@ -288,9 +291,9 @@ class Character(Result):
 
 @dataclass(frozen=True)
 class Discs:
-    """Rays of F fields, tangential and sagittal [F, 2, P] from their centre: places on the film, and slopes there.
+    """Rays of F fields: places on the film from their centre, and slopes there, tangential and sagittal [F, 2, P].
 
-    `weight` [F, P] is their energy, 0 on the outline, too; `passed` tells whether they reach the film.
+    `weight` [F, P] is their energy, also 0 on the outline; `passed` tells whether they reach the film.
     """
 
     place_mm: Array
@@ -300,10 +303,10 @@ class Discs:
 
 
 def character(lens: Lens) -> tuple[Character, Discs]:
-    """The character of a lens, as its file has it, and its discs.
+    """Return the character of a lens as its file has it, and its discs.
 
     Raises:
-        InputError: a lens that forms no image or passes no light.
+        InputError: the lens forms no image, or passes no light.
     """
     scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
     scene.require_power()
@@ -319,7 +322,7 @@ def character(lens: Lens) -> tuple[Character, Discs]:
 
 
 def character_or_none(lens: Lens) -> tuple[dict[str, float | None] | None, bytes | None]:
-    """The figures of `character` with four digits, None for NaN, and the `picture`; None twice where there are none."""
+    """Return the figures of `character` with four digits (None for NaN), and the `picture`; None twice without any."""
     try:
         found, discs = character(lens)
     except NeurolensError:
@@ -329,7 +332,7 @@ def character_or_none(lens: Lens) -> tuple[dict[str, float | None] | None, bytes
 
 
 def discs_of(lens: Lens, field_deg: list[float]) -> Discs:
-    """Discs of lights at infinity in these fields, the axis first."""
+    """Trace the discs of lights at infinity in these fields, the axis first."""
     near = 1e-3 * FOCUS * abs(float(Scene(lens).first_order.efl_mm))
     scene = Scene(set_lens(lens, focus_m=near, focus_mode="best"))
     rays = Filled(scene, field_deg, scene.waves_nm[:1]).bundle(_LEVEL)
@@ -340,18 +343,18 @@ def discs_of(lens: Lens, field_deg: list[float]) -> Discs:
 
 
 def _mean(values: Array, weight: Array) -> Array:
-    """The mean [F, 2, 1] of values; NaN where there is no light."""
+    """Return the mean [F, 2, 1] of values; NaN where there is no light."""
     with np.errstate(invalid="ignore"):
         return np.asarray((weight[:, None] * values).sum(2, keepdims=True) / weight.sum(1)[:, None, None])
 
 
 def _seen(discs: Discs, image_radius_mm: float) -> float:
-    """The share, up to 1, in which the shapes of discs count. See `Character`."""
+    """Return by which share, up to 1, the shapes of discs count. See `Character`."""
     return min(1.0, math.sqrt(_mean(discs.place_mm**2, discs.weight)[0].mean()) / (_SEEN * image_radius_mm))
 
 
 def cats_eye(discs: Discs, image_radius_mm: float) -> float:
-    """See `Character`. The disc of a light far out of focus has the shape of the rays' slopes."""
+    """Compute `Character.cats_eye`. The disc of a light far out of focus has the shape of the rays' slopes."""
     areas = []
     for slope, outline in zip(discs.slope, discs.passed & (discs.weight == 0), strict=True):
         x, y = slope[:, outline]
@@ -363,13 +366,13 @@ def cats_eye(discs: Discs, image_radius_mm: float) -> float:
 
 
 def swirl(discs: Discs, image_radius_mm: float) -> float:
-    """See `Character`."""
+    """Compute `Character.swirl`."""
     radial, across = np.sqrt(_mean(discs.place_mm**2, discs.weight))[..., 0].T
     return float(1 - radial[1] / across[1] / (radial[0] / across[0])) * _seen(discs, image_radius_mm)
 
 
 def bubble(discs: Discs, image_radius_mm: float) -> float:
-    """See `Character`. Rays move by their slope times the way of the film."""
+    """Compute `Character.bubble`. As the film moves, a ray moves on it by its slope times that way."""
     place, slope = discs.place_mm, discs.slope
     squares = (place * place, place * slope, slope * slope)
     here, mixed, steep = (float(_mean(v, discs.weight)[0].mean()) for v in squares)
@@ -384,7 +387,7 @@ def bubble(discs: Discs, image_radius_mm: float) -> float:
 
 
 def picture(discs: Discs) -> bytes:
-    """The discs side by side as a grey PNG of 96 by 32 pixels, the film's radius upwards; wide ones are cut."""
+    """Draw the discs side by side as a grey PNG of 96 by 32 pixels, the film's radius upwards; wide ones are cut."""
     from PIL import Image
 
     radii = np.where(discs.passed, np.sqrt((discs.place_mm**2).sum(1)), 0.0).max(1)
@@ -392,7 +395,7 @@ def picture(discs: Discs) -> bytes:
     grey = np.zeros((len(radii), _SIDE, _SIDE))
     for disc, place, weight in zip(grey, discs.place_mm, discs.weight, strict=True):
         down, right = np.clip(_SIDE / 2 - 0.5 + scale * np.stack([-place[0], place[1]]), -2, _SIDE + 1)
-        for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):  # a ray's light goes to the four pixels about it
+        for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):  # a ray's light is shared by the four pixels about it
             y, x = np.floor(down).astype(int) + row, np.floor(right).astype(int) + column
             part = (1 - np.abs(y - down)) * (1 - np.abs(x - right)) * weight
             seen = (part > 0) & (np.minimum(y, x) >= 0) & (np.maximum(y, x) < _SIDE)

@@ -1,4 +1,4 @@
-"""Settings of an experiment: one TOML file per run, read by `base.settings`."""
+"""The settings of an experiment: one TOML file per run, read by `base.settings`."""
 
 from __future__ import annotations
 
@@ -26,18 +26,17 @@ from neurolens.optics.readers.lensfile import write_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.studies.rays import PIXELS_ACROSS, frame_width_mm
 
-# Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens), and the object 8 before the
-# front vertex, where a long lens of short focus has less room than that.
+# Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens); for a long lens of short
+# focus, which has less room, the object 8 focal lengths before the front vertex.
 NEAR_LIMIT_FOCAL_LENGTHS, NEAREST_OBJECT_FOCAL_LENGTHS = 14, 8
-# Wavelengths where none are stated, as far as the formulas of the lens's glasses reach.
-# A film that is dark beyond this share of its radius was stated too large.
+# A film that is dark beyond this share of its radius counts as stated too large.
 DARK_FROM = 0.9
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def check_names(field: str, names: Sequence[str]) -> None:
-    """Refuse names that are not valid in file names, as an InputError."""
+    """Refuse, by an InputError, names that are not valid in file names."""
     for name in names:
         if not _NAME.fullmatch(name):
             expected = "a name of letters, digits, '.', '_' and '-', a letter or digit first"
@@ -46,12 +45,12 @@ def check_names(field: str, names: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class LensChoice:
-    """Which lens, in which state: rescaled to a focal length, a zoom state of its file, a stop other than its own.
+    """Which lens, and how it is set: scaled to a focal length, at a zoom state of its file, stopped down.
 
     Attributes:
-        zoom: state of the file by name, or a focal length in mm between its states; "range" asks for one model of all
+        zoom: a state of the file by name, or a focal length in mm between its states; "range" asks for one model of all
             zoom positions between the file's states.
-        focus_mode: "internal" for one model of internal focus from infinity to the near limit.
+        focus_mode: "internal" asks for one model of internal focus from infinity to the near limit.
     """
 
     file: Path
@@ -67,14 +66,14 @@ class LensChoice:
 
     @property
     def state(self) -> str | float | None:
-        """The one zoom state of the models; None for that of the table, and for all of them."""
+        """Return the one zoom state of the models; None for the table's, and where models are of all states."""
         return None if self.zoom == RANGE else self.zoom
 
     def read(self) -> Lens:
-        """The lens at infinity focus with a round stop; cameras apply blades outside the models.
+        """Return the lens at infinity focus with a round stop; cameras apply blades outside the models.
 
         Raises:
-            InputError: a length or f-number that is not positive, and as `read_any` and `set_lens`.
+            InputError: a length or f-number is not positive; as `read_any` and `set_lens`.
         """
         for name, value in (("lens.focal_length_mm", self.focal_length_mm), ("lens.f_number", self.f_number)):
             if value is not None and not value > 0:
@@ -89,8 +88,8 @@ class DomainChoice:
 
     Attributes:
         film_radius_mm: None takes the lit film.
-        focus_m: two object distances from the film; every film position between theirs is in the domain.
-            None takes infinity and `near_limit_m`.
+        focus_m: two object distances from the film; every film position between theirs is in the domain. None takes
+            infinity and `near_limit_m`.
         wavelength_nm: shortest and longest; None takes `wavelengths_nm`.
     """
 
@@ -99,13 +98,13 @@ class DomainChoice:
     wavelength_nm: tuple[float, float] | None = None
 
     def of(self, lens: Lens) -> Domain:
-        """The domain of a lens, with defaults from the lens.
+        """Return the domain of a lens, with defaults from the lens.
 
         Raises:
-            InputError: as `domain_of`; a lens whose image is virtual, so that no film can lie there.
+            InputError: as `domain_of`; the lens's image is virtual, so that no film can lie there.
 
         Warns:
-            NeurolensWarning: a film whose outer part is dark; a default film then ends there.
+            NeurolensWarning: the outer part of the film is dark; a default film then ends there.
         """
         behind = first_order(lens).rear_focal_z_mm
         if not behind > lens.vertices_mm[len(lens.surfaces) - 1]:
@@ -123,7 +122,7 @@ class DomainChoice:
 
 
 def near_limit_m(lens: Lens) -> float:
-    """Default distance from the film to the nearest object in focus."""
+    """Return the default distance from the film to the nearest object in focus."""
     data = first_order(lens)
     f, film_z = abs(data.efl_mm), data.rear_focal_z_mm
     separation = data.rear_principal_z_mm - data.front_principal_z_mm
@@ -132,7 +131,7 @@ def near_limit_m(lens: Lens) -> float:
 
 
 def wavelengths_nm(lens: Lens) -> tuple[float, float]:
-    """`EYE_NM`, or the part of it for which every catalogue glass of the lens is stated (400-700 nm at least)."""
+    """Return `EYE_NM`, or the part for which all catalogue glasses of the lens are stated (at least 400-700 nm)."""
     low, high = EYE_NM
     for surface in lens.surfaces:
         if surface.glass is not None:
@@ -143,11 +142,11 @@ def wavelengths_nm(lens: Lens) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class TargetChoice:
-    """An error asked for, of which models are fitted in turn until one has it: film-equivalent RMS on rays held out.
+    """The error wanted, until which models are fitted in turn: film-equivalent RMS on held-out rays.
 
     Attributes:
         um, px: the error in micrometres, or in pixels of a picture `pixels_across` wide on the 3:2 frame inscribed in
-            the film circle of the models' domain (36 mm for a radius of 21.6 mm). One of the two.
+            the film circle of the models' domain (36 mm for a radius of 21.6 mm). One of the two is given.
     """
 
     um: float | None = None
@@ -162,14 +161,17 @@ class TargetChoice:
             raise InputError("settings", "target", "(both or neither)", "um or px")
 
     def within_um(self, film_radius_mm: float) -> float:
-        """The error in micrometres on a film of this radius."""
+        """Return the error in micrometres on a film of this radius."""
         pitch_um = 1000 * frame_width_mm(film_radius_mm) / self.pixels_across
         return self.um if self.um is not None else (self.px or 0.0) * pitch_um
 
 
 @dataclass(frozen=True)
 class EvaluationChoice:
-    """Rays for false passes and blocks; rounds (0: no race) of the race for speed, on one thread."""
+    """How models are measured: rays for false passes and blocks, and rounds of the race for speed, on one thread.
+
+    With 0 rounds there is no race.
+    """
 
     WITHOUT_EFFECT: ClassVar = ("compile_exact",)
     vignetting_rays: int = 200_000
@@ -178,14 +180,14 @@ class EvaluationChoice:
 
 @dataclass(frozen=True)
 class RenderChoice:
-    """Scenes to render through every camera.
+    """The scenes to render through every camera.
 
     Attributes:
         scenes: scene files.
-        models: names of the models that render; empty: the best polynomial and the best network.
+        models: names of the models that render; if empty, the best polynomial and the best network.
         width, height, samples: of each picture, whose shape must be that of the scenes' film.
-        seeds: renders of each camera, so that errors have a noise floor; at least 4. Pictures are their mean.
-        fused: lens and models as C, where a compiler is there; no other pictures, several times sooner.
+        seeds: renders of each camera, at least 4, so that errors have a noise floor. Pictures are their mean.
+        fused: whether lens and models run as C where a compiler is there. Pictures are the same, several times sooner.
         threads: workers.
     """
 
@@ -207,8 +209,8 @@ class RenderChoice:
 class Experiment:
     """One resolved run: lens, domain, ray pairs, models, measurements and renders.
 
-    Models are fitted in their order, with a `target` only until one has its error. `camera` is what `render` and
-    `export` take where this file is named (that of a plan): as `--camera`, a path in it relative to the file.
+    Models are fitted in order; with a `target` only until one has its error. `camera` is what `render` and `export`
+    take where this file (that of a plan) is named, as by `--camera`; a path in it is relative to the file.
     """
 
     WITHOUT_EFFECT: ClassVar = ("save_pairs",)
@@ -233,10 +235,10 @@ class Experiment:
             raise InputError("settings", "render.models", unknown, f"names of models: {', '.join(labels)}")
 
     def states(self) -> StateSpace:
-        """The state space of the models, if the lens has many states.
+        """Return the state space of the models, if the lens has many states.
 
         Raises:
-            InputError: a rescaled lens, or states that the file does not have.
+            InputError: the lens is rescaled, or the file lacks the states.
         """
         chosen, domain = self.lens, self.domain
         if chosen.focal_length_mm is not None:
@@ -256,10 +258,10 @@ class Experiment:
 
 
 def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
-    """Read an experiment; files that it names lie relative to it.
+    """Read an experiment; files that it names lie relative to its own file.
 
     Raises:
-        InputError: names file, key, value and what was expected.
+        InputError: a mistake; names file, key, value and what was expected.
     """
     folder = Path(path).parent
     return _with_files(read_config(Experiment, path, overrides), lambda file: folder / file)
@@ -274,9 +276,9 @@ def _with_files(experiment: Experiment, moved: Callable[[Path], Path]) -> Experi
 
 
 def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
-    """Write config.toml, and the lens file, in our format, to lenses/ of a run folder, where `check.find_lens` looks.
+    """Write config.toml, and the lens in our format to lenses/ of a run folder, where `check.find_lens` looks.
 
-    Returns the resolved settings, files named relative to the folder.
+    Returns the resolved settings, with files named relative to the folder.
     """
 
     def moved(path: Path) -> Path:
@@ -298,7 +300,7 @@ def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
     return to_dict(resolved)
 
 
-# Models in order of their time as C, tried for an error asked for.
+# Models in the order of their time as C, tried where an error is asked for.
 _LADDER: tuple[dict[str, Any], ...] = (
     *({"method": "ols", "terms": terms} for terms in (12, 20, 28, 40, 64, 100)),
     {"method": "mlp", "units": 16},
@@ -307,9 +309,9 @@ _LADDER: tuple[dict[str, Any], ...] = (
 
 
 def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> Experiment:
-    """The experiment of `neurolens train --lens FILE`: a polynomial and a network, no renders, a minute in all.
+    """Return the experiment of `neurolens train --lens FILE`: a polynomial and a network, no renders, a minute in all.
 
-    With a target among the overrides: as many of a ladder of models, the fastest first, as it takes.
+    With a target among the overrides, it is a ladder of models, fastest first, of which as many are fitted as it takes.
     """
     asked = any(text.partition("=")[0].strip().partition(".")[0] == "target" for text in overrides)
     tables = {

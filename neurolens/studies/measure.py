@@ -1,6 +1,6 @@
-"""Errors of models by zone, on rays not used in any fit, traced once through the exact lens; fits with their errors.
+"""Measures models by zone, on rays that no fit has used, traced once through the exact lens; also fits and measures.
 
-A smaller stop changes no ray, only which of them pass, which the crossing with the stop decides.
+A smaller stop changes no ray, but only which of them pass, which the crossing with the stop decides.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ from neurolens.studies.rays import (
     false_shares,
 )
 
-# Whole stops closed, by the name of the state.
+# How many stops are closed, by the name of the state.
 STOPS = {"full": 0, "2_stops": 2, "4_stops": 4}
 # States whose zones a card contains.
 ZONED = ("full", "2_stops")
-# Fewest rays of a zone for a figure.
+# The fewest rays from which a zone has a figure.
 LEAST_RAYS = 100
-# A root mean square dominated by a few bad rays is measured on MORE times as many rays, if its relative standard
-# deviation is above KNOWN.
+# An RMS that a few bad rays dominate, so that its relative standard deviation is above KNOWN, is measured on MORE times
+# as many rays.
 MORE, MOST, KNOWN = 8, 1_000_000, 0.08
 _BATCH = 65536
 
@@ -80,7 +80,7 @@ class FreshRays:
     stop_square: Tensor
 
     def stop_radius_mm(self, state: str) -> float:
-        """The radius of one of `STOPS`, in mm."""
+        """Return the radius in mm of one of `STOPS`."""
         return self.domain.stop_radius_mm / math.sqrt(2) ** STOPS[state]
 
 
@@ -96,10 +96,10 @@ def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, see
 
 
 def with_more(fresh: FreshRays, seed: int) -> FreshRays:
-    """`MORE` times as many passing rays, the given ones among them; at most `MOST` are added."""
+    """Add passing rays to `MORE` times as many as given; at most `MOST` are added."""
 
     def without_crossings(pairs: PairSet) -> PairSet:
-        """The same rays without the data per surface, which is most of their memory."""
+        """Return the rays without their data by surface, which take most of the memory."""
         by_surface = ("cross_x", "cross_y", "meets", "refracts")
         return replace(pairs, **{name: getattr(pairs, name)[:0].clone() for name in by_surface})
 
@@ -114,7 +114,7 @@ def with_more(fresh: FreshRays, seed: int) -> FreshRays:
 
 
 def passing_rays(lens: Lens, domain: Domain, count: int, seed: int) -> PairSet:
-    """So many rays of a domain that the exact lens passes."""
+    """Draw `count` rays of a domain that the exact lens passes."""
     return make_pairs(lens, domain, PairSettings(train=1, held_out=count, rim=1, seed=seed)).held_out
 
 
@@ -127,12 +127,12 @@ class Findings:
     """Errors of one model on `FreshRays`.
 
     Attributes:
-        figures: those of `rays.RayErrors`, false_pass and false_block at full aperture.
-        stopped_down: false_pass and false_block of the states of `STOPS` but the first.
-        zones: by state of `ZONED` and zone: rms_um, direction_rms_deg of `rays` rays, and false_pass, false_block of
-            `passing` rays that the exact lens passes. None with fewer than `LEAST_RAYS`, or where an RMS is not
-            known to `KNOWN`.
-        each: errors ray by ray, of the rays of `held_out`.
+        figures: those of `rays.RayErrors`, and false_pass and false_block at full aperture.
+        stopped_down: false_pass and false_block of the states of `STOPS`, except the first.
+        zones: by state of `ZONED` and zone: rms_um and direction_rms_deg of `rays` rays, false_pass and false_block of
+            `passing` rays that the exact lens passes. None with fewer than `LEAST_RAYS`, or where an RMS is not known
+            to `KNOWN`.
+        each: errors ray by ray, for the rays of `held_out`.
     """
 
     figures: dict[str, float | None]
@@ -141,13 +141,13 @@ class Findings:
     each: EachRay
 
     def errors(self, keys: tuple[str, ...]) -> dict[str, Any]:
-        """Data for card and record: figures of `keys`, None if not finite, then `zones`."""
+        """Return data for card and record: figures of `keys`, None if not finite, then `zones`."""
         plain = {key: finite(self.figures[key]) for key in keys}
         return {**plain, "stopped_down": self.stopped_down, "zones": self.zones}
 
 
 def measure(fresh: FreshRays, predict: Predict) -> Findings:
-    """Errors of one model; `predict` as `onnx_predictor` gives it."""
+    """Measure the errors of one model; `predict` is such as `onnx_predictor` gives."""
     each = each_ray(fresh.lens, fresh.domain, fresh.held_out, predict)
     model = {s: predict(fresh.drawn, fresh.stop_radius_mm(s)).status == st.PASSED for s in STOPS}
     exact = {s: fresh.passes & (fresh.stop_square <= fresh.stop_radius_mm(s) ** 2) for s in STOPS}
@@ -158,7 +158,7 @@ def measure(fresh: FreshRays, predict: Predict) -> Findings:
 
 
 def well_known(fresh: FreshRays, each: EachRay) -> bool:
-    """Whether the rays determine the errors over the film and of its zones to `KNOWN`."""
+    """Return whether the rays determine the errors over the film, and those of its zones, to `KNOWN`."""
     whole = (each.focus_um, each.infinity_um, each.direction_deg, each.position_um, each.transmittance)
     parts = [zone_of(fresh, each, s, z) for s in ZONED for z in ZONES]
     zones = [v for part in parts for v in (part.focus_um, part.direction_deg) if len(v) >= LEAST_RAYS]
@@ -166,14 +166,14 @@ def well_known(fresh: FreshRays, each: EachRay) -> bool:
 
 
 def rms_deviation(values: Tensor) -> float:
-    """Relative standard deviation of the root mean square of values."""
+    """Return the relative standard deviation of the root mean square of values."""
     square = values * values
     mean = float(square.mean()) if len(values) > 1 else 0.0
     return float(square.std()) / (2 * mean * math.sqrt(len(values))) if mean > 0 else 0.0
 
 
 def zone_of(fresh: FreshRays, each: EachRay, state: str, zone: str) -> EachRay:
-    """Errors of the rays of one zone that pass in one state."""
+    """Return the errors of the rays of one zone that pass in one state."""
     open_ = fresh.held_square <= fresh.stop_radius_mm(state) ** 2
     return each.select(_within(fresh.domain, fresh.held_out.inputs, zone) & open_)
 
@@ -198,31 +198,32 @@ def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor,
 
 
 def _rms(values: Tensor) -> float | None:
-    """RMS with four digits; None with too few rays, or if a few of them dominate."""
+    """Return the RMS with four digits; None for too few rays, or if a few of them dominate."""
     if len(values) < LEAST_RAYS or rms_deviation(values) > KNOWN:
         return None
     return finite(float(f"{float(torch.sqrt((values * values).mean())):.4g}"))
 
 
 def finite(value: float | None) -> float | None:
-    """The value, or None where it is not finite."""
+    """Return the value, or None where it is not finite."""
     return None if value is None or not math.isfinite(value) else value
 
 
-# Keys of the ray and vignetting errors that a model's card promises and its record shows.
+# Keys of the ray and vignetting errors that a card promises and a record shows.
 CARD_KEYS = tuple(
     "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max "
     "false_pass false_block".split()
 )
-# Reported as poor: false passes or blocks beyond this share, an RMS error beyond so many pixels of 4000 across.
+# These are reported as poor: shares of false passes or blocks beyond this, an RMS error beyond so many pixels of 4000
+# across.
 POOR_SHARE, POOR_PX = 0.01, 1.0
-# Added to the seed of the fit's rays: the same seed would give the rays that the rims were fitted to.
+# Added to the seed of the fit's rays, since the same seed would give the rays to which the rims were fitted.
 FRESH = 104729
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One model: its settings, the exported file, its record for `results.json`."""
+    """One model: its settings, its exported file, its record for `results.json`."""
 
     settings: ModelSettings
     file: Path
@@ -230,13 +231,13 @@ class Measured:
 
     @property
     def error(self) -> float:
-        """Film-equivalent RMS, or that of the angle where no ray is within 60 degrees."""
+        """The film-equivalent RMS, or that of the angle where no ray is within 60 degrees."""
         found = self.record.get("rms_um")
         return float(found if found is not None else self.record.get("direction_rms_deg") or 1e9)
 
 
 def onnx_predictor(model: OnnxLens) -> Predict:
-    """An exported model as `rays` and `vignetting` want it."""
+    """Return an exported model as the function that `rays` and `vignetting` call."""
 
     def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         x, y, z, u, v, nm = (np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns())
@@ -250,7 +251,7 @@ def onnx_predictor(model: OnnxLens) -> Predict:
 
 
 def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
-    """The test rays of all models of one lens and domain; many, as a few bad ones, one in 10,000, may dominate."""
+    """Draw the test rays of all models of a lens and domain; many, since one bad ray in 10,000 may dominate."""
     pairs = prepared.pairs
     seed = pairs.settings.seed + FRESH
     rays = fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
@@ -258,13 +259,13 @@ def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
 
 
 def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
-    """Errors of an exported model for its card; keys with units, None if not finite."""
+    """Measure the errors of an exported model for its card; keys have units, and a value is None if not finite."""
     errors = measure(rays, onnx_predictor(model)).errors(CARD_KEYS)
     return {**errors, "poor": what_is_poor(errors), "rays": len(rays.held_out), "passing": int(rays.passes.sum())}
 
 
 def what_is_poor(errors: Mapping[str, Any]) -> list[str]:
-    """Errors of a model that are visible in a picture, as sentences for its card."""
+    """Return the errors of a model that are visible in a picture, as sentences for its card."""
     shares = {key: errors.get(key) or 0.0 for key in ("false_pass", "false_block")}
     poor = [f"{key.replace('_', ' ')} {100 * share:.2g}%" for key, share in shares.items() if share > POOR_SHARE]
     pixels = errors.get("rms_px") or 0.0
@@ -275,7 +276,7 @@ def fit_and_measure(
     prepared: Prepared, settings: ModelSettings, folder: Path, vignetting_rays: int, report: Report,
     rays: Callable[[], FreshRays] | None = None,
 ) -> Measured:  # fmt: skip
-    """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
+    """Fit, export and measure one model, or take one of the same settings and version from the folder.
 
     Errors are of the exported float32 graph in onnxruntime. `rays`: `shared_rays`, where several models share them.
     """
@@ -303,11 +304,11 @@ def export_measured(
     file: Path, fingerprint: str, facts: dict[str, Any], export: Callable[[Path, dict[str, Any]], object],
     errors_of: Callable[[OnnxLens], dict[str, Any]],
 ) -> dict[str, Any]:  # fmt: skip
-    """Export a model, measure the exported file, and export it with its errors; the record is kept beside it.
+    """Export a model, measure the exported file, and export it again with its errors; its record is kept beside it.
 
     Args:
-        fingerprint: by which `known_record` knows the record again.
-        facts: of the record, besides the errors and what the file tells.
+        fingerprint: by which `known_record` recognises the record.
+        facts: entries of the record besides the errors and what the file tells.
         export: writes the model with errors to a path.
     """
     with atomic_path(file) as unmeasured:  # a file without its errors never has the final name
@@ -320,14 +321,14 @@ def export_measured(
 
 
 def seconds_to_load(file: Path) -> float:
-    """Seconds that it takes to load a model."""
+    """Return the seconds that it takes to load a model."""
     start = time.perf_counter()
     load_model(file)
     return time.perf_counter() - start
 
 
 def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The record of an earlier finished fit of the same settings whose model file is unchanged."""
+    """Return the record of an earlier finished fit with the same settings, if its model file is unchanged."""
     data = read_kept(file.with_suffix(".json")) or {}
     if data.get("fingerprint") != fingerprint or not file.is_file() or data["sha256"] != sha256_of(file):
         return None

@@ -1,12 +1,12 @@
-"""Which camera to use, and the contents of pages: tables of records, settings, pictures; `report.html` of a run.
+"""Which camera to use; and the contents of pages: tables of records, settings, pictures, and a run's `report.html`.
 
-The camera is the one decision of `train`, `models`, `plan` and the README. The exact lens has no error and needs no
-fit. A model is worth its error where it makes the whole work `SAVING` times as fast; a plan, which measures the scene,
-takes it wherever the times differ by more than their accuracy. In a picture of our renderer the camera is a small part
-of that work; elsewhere it may be all of it.
+`train`, `models`, `plan` and the README decide by the same rule. The exact lens has no error and needs no fit. A model
+is worth its error where it makes the whole work `SAVING` times as fast; a plan, which measures the scene, takes it
+wherever the times differ by more than their accuracy. In a picture of our renderer the camera is a small part of that
+work; elsewhere it may be all of it.
 
-Templates make HTML of them (`base.html`). The page of a run needs no script and no network. Its pictures are files of
-the run folder, referred to by relative names, so that the folder can be moved or zipped; a picture or link is shown
+Templates make HTML of these contents (`base.html`). The page of a run needs no script and no network. Its pictures are
+files of the run folder, named relative to it, so that the folder can be moved or zipped; a picture or link is shown
 only if its file lies inside the folder. Missing values are shown as a dash.
 """
 
@@ -29,22 +29,22 @@ from neurolens.base.settings import RANGE
 C = TypeVar("C")
 R = TypeVar("R", bound=Mapping[str, Any])
 
-CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a pixel of 36 mm at 4000 across
+CLOSE_UM = 2.0  # within this RMS error a model counts as close: a quarter of a pixel of 36 mm at 4000 across
 SAVING = 1.5
-# Nanoseconds that a path takes besides its camera in the cheapest scene of experiments/results/render_times.
+# Nanoseconds that a path takes besides its camera, in the cheapest scene of experiments/results/render_times.
 PATH_NS = 190.0
-# Nanoseconds of a refraction of the exact lens as C, on the machine that timed models/. It was 2.1 there; since C works
-# in parts, the exact lens takes 0.6 of its former time beside models (experiments/results/fused_speed).
+# Nanoseconds of a refraction of the exact lens as C, on the machine that timed models/. They were 2.1 there; since C
+# works in parts, the exact lens takes 0.6 of its former time relative to models (experiments/results/fused_speed).
 REFRACTION_NS = 1.3
 
 
 def recommended(
     cameras: Iterable[C], cost: Callable[[C], float], exact: C | None, rest: float = 0.0, saving: float = SAVING
 ) -> C | None:
-    """The cheapest of the cameras that keep a budget, or the exact lens where that one does not save enough.
+    """Return the cheapest of the cameras that keep a budget, or the exact lens where that camera does not save enough.
 
     Args:
-        cost: gives the cost of a ray.
+        cost: returns the cost of a ray.
         exact: None where the exact lens cannot run.
         rest: cost of the rest of the work for each ray.
         saving: how many times as fast the whole work must be.
@@ -58,9 +58,9 @@ def recommended(
 def to_use(
     models: Sequence[R], most: float = CLOSE_UM, key: str = "rms_um", exact: R | None = None, rest: float = 0.0
 ) -> R | None:
-    """The model to use, or the exact lens: see `recommended`. None without any.
+    """Return the model to use, or the exact lens: see `recommended`. None if there is neither.
 
-    Models count that are within an error and not poor; ideal lenses (thin, thick) do not. If no model counts and the
+    Only models within an error that are not poor count; ideal lenses (thin, thick) do not. If no model counts and the
     exact lens was not timed, the closest model is taken.
 
     Args:
@@ -75,19 +75,19 @@ def to_use(
 
 
 def exact_of(records: Iterable[R]) -> R | None:
-    """The fastest exact tracer that was timed."""
+    """Return the fastest exact tracer that was timed."""
     timed = [r for r in records if time_of(r)]
     return min(timed, key=lambda r: time_of(r)["min"], default=None)
 
 
 def expected_exact(refractions: int) -> dict[str, Any]:
-    """A record of the exact lens as C, where it was not timed."""
+    """Return a record of the exact lens as C for where it was not timed."""
     return {"name": "exact C, expected", "ns_per_ray": {"min": REFRACTION_NS * refractions}}
 
 
 @dataclass(frozen=True)
 class Advice:
-    """The camera to use in one place: its name, the reason, and the command that uses it (empty: none is known)."""
+    """The camera to use in one place: its name, the reason, and the command that uses it (empty if unknown)."""
 
     where: str
     name: str
@@ -99,7 +99,7 @@ class Advice:
 
 
 def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
-    """The cameras of a run to use in our renderer and in other programs; empty for a run without models.
+    """Choose the cameras of a run to use in our renderer and in other programs; empty for a run without models.
 
     Args:
         results: a table of the fields of `records.Results`.
@@ -110,8 +110,9 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
     within = target["within_um"] if target else CLOSE_UM
     lens = folder / "lenses" / f"{Path(str(results.get('lens', {}).get('file') or 'lens')).stem}.toml"
     state = (results.get("settings") or {}).get("lens") or {}
-    names = "focal_length_mm", "zoom", "f_number", "efl_mm", "configuration"  # the last two by their earlier names
-    whole = all(state.get(k) in (None, "none", RANGE) for k in names)  # as its file has it
+    # the last two are earlier names of settings
+    names = "focal_length_mm", "zoom", "f_number", "efl_mm", "configuration"
+    whole = all(state.get(k) in (None, "none", RANGE) for k in names)  # the lens is as its file has it
     advices = []
     for where, rest in (("In this renderer", PATH_NS), ("In other programs", 0.0)):
         best = to_use(models, within, exact=exact, rest=rest)
@@ -127,7 +128,7 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
             scene = Path("experiments/scenes/room.toml")
             words = [str(scene if scene.is_file() else library() / scene), "--camera", file, "-o", "room.exr"]
             command = f"{program()} render {shlex.join(words)}"
-        else:  # one model of many states is no function of a ray alone
+        else:  # one model of many states is no function of a ray alone, so that it has no source
             command = "" if best.get("states") else f"{program()} export {shlex.quote(file)} --to c -o lens.h"
         advices.append(Advice(where, name, why, command if file else ""))
     return advices
@@ -156,7 +157,7 @@ def _why_model(model: Mapping[str, Any], exact: Mapping[str, Any] | None, within
 
 
 def ns_text(timing: Mapping[str, Any]) -> str:
-    """A time in words, with "~" before a noisy one."""
+    """Return a time in words, with "~" before a noisy one."""
     return f"{'~' * noisy(timing)}{timing['min']:.3g} ns" if timing else "-"
 
 
@@ -165,7 +166,7 @@ DASH = "–"
 
 
 class Table(NamedTuple):
-    """Records as rows, with a name for each, and the columns of their figures."""
+    """Records as rows, each with a name, and the columns of their figures."""
 
     names: Sequence[str]
     records: Sequence[Record]
@@ -185,7 +186,7 @@ class Figure(NamedTuple):
 
 
 def number(record: Mapping[str, Any], key: str) -> float | None:
-    """Finite number at `key` of a record, or None; dots go into nested tables: "ns_per_ray.min"."""
+    """Return the finite number at `key` of a record, or None; dots lead into nested tables: "ns_per_ray.min"."""
     value: Any = record
     for part in key.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -198,7 +199,7 @@ def number(record: Mapping[str, Any], key: str) -> float | None:
 class Column:
     """A column of a table: its heading, the key of its figure in a record, a factor and the significant digits.
 
-    Dots in a key go into nested tables. `about` explains the figure on hover and in the legend.
+    Dots in a key lead into nested tables. `about` explains the figure on hover and in the legend.
     """
 
     heading: str
@@ -208,7 +209,7 @@ class Column:
     about: str = ""
 
     def value(self, record: Record) -> float | None:
-        """The figure, unscaled."""
+        """Return the figure, unscaled."""
         return number(record, self.key)
 
     def cell(self, record: Record, thousands: str = "") -> str:
@@ -223,19 +224,19 @@ class Column:
 
 
 def show(value: float, digits: int, thousands: str = "") -> str:
-    """A number with significant digits. Short ones have no exponent; `thousands` separates the digits of long ones."""
+    """Write a number with significant digits. Short ones have no exponent; `thousands` divides long ones."""
     if value == 0 or 1e-4 <= abs(value) < 10.0**digits:
         return f"{value:.{digits}g}"
     return f"{value:{thousands}.0f}" if 1 <= abs(value) < 1e7 else f"{value:.{digits - 1}e}"
 
 
 def table(names: Sequence[str], records: Sequence[Record], columns: Iterable[Column]) -> Table:
-    """The table of records, without the columns for which no record has a figure."""
+    """Make a table of records, without columns for which no record has a figure."""
     return Table(names, records, [c for c in columns if any(c.value(r) is not None for r in records)])
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """A table of settings as names and texts; nested tables have dotted names."""
+    """Return a table of settings as names and texts; nested tables have dotted names."""
     rows: list[tuple[str, str]] = []
     for key, value in values.items():
         nested = isinstance(value, Mapping)
@@ -244,7 +245,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 
 
 def _plain(value: Any) -> str:
-    if value is None or value != value:  # NaN differs from itself
+    if value is None or value != value:  # NaN, which differs from itself
         return DASH
     if isinstance(value, float):
         return f"{value:.6g}"
@@ -254,12 +255,12 @@ def _plain(value: Any) -> str:
 
 
 def figures_of(folder: Path, figures: Iterable[Mapping[str, Any]], inside: bool = False) -> list[Figure]:
-    """Figures of records with "file" and maybe "title", "caption", "links" and "wide".
+    """Make figures of records with "file" and maybe "title", "caption", "links" and "wide".
 
     A picture or link whose file is not in `folder` has no address.
 
     Args:
-        inside: whether PNG files become part of the page, which then needs no others.
+        inside: whether PNG files become part of the page, which then needs no other files.
     """
     shown = []
     for figure in figures:
@@ -333,7 +334,7 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
     """Write `report.html` into the run folder, which holds the pictures that the results name; return its path.
 
     Raises:
-        InputError: no such folder.
+        InputError: there is no such folder.
     """
     folder = Path(run_dir)
     if not folder.is_dir():
@@ -358,7 +359,7 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
 
 
 def _names(records: Sequence[Record], last: str) -> list[str]:
-    """The scene of each record, then its camera."""
+    """Name each record by its scene, then its camera."""
     return [" · ".join(str(r[key]) for key in ("scene", last) if r.get(key)) for r in records]
 
 
@@ -375,7 +376,7 @@ def _about(results: Results) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def _models(models: Sequence[Record]) -> dict[str, Any]:
-    """All models, by family as recorded; a star marks those on the Pareto front of error and time."""
+    """Collect all models, by family as recorded; a star marks those on the Pareto front of error and time."""
     key = "rms_um" if any(number(m, "rms_um") is not None for m in models) else "direction_rms_deg"
     points = [tuple(math.nan if v is None else v for v in (number(time_of(m), "min"), number(m, key))) for m in models]
     front = set(pareto_front(points))  # type: ignore[arg-type]
@@ -396,7 +397,7 @@ def _models(models: Sequence[Record]) -> dict[str, Any]:
 
 
 def _pictures(folder: Path, records: Sequence[Record]) -> dict[str, Any]:
-    """Pictures with their captions and files, and their errors beside the noise floor."""
+    """Collect pictures with their captions and files, and their errors beside the noise floor."""
     named = [(n or str(r.get("name", "")), r) for n, r in zip(_names(records, "camera"), records, strict=True)]
     figures = [
         {"file": png, "title": name, "caption": r.get("caption"), "links": {"EXR": r.get("file_exr"), "PNG": png}}

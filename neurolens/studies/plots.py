@@ -38,7 +38,7 @@ _Point = tuple[float, float, Record, bool]  # time or size, error, the model, wh
 
 
 def family_colour(family: str | None) -> str:
-    """The colour of a family of models."""
+    """Return the colour of a family of models."""
     return FAMILIES.get(str(family), _OTHER)[1]
 
 
@@ -49,8 +49,8 @@ def trade_plot(
     """Draw error against time (hollow: as C) and against size, logarithmic; returns whether there was anything to draw.
 
     Exact tracers, which have no error, are lines at their time. The staircase is the front that nothing betters. From a
-    noisy time (`records.noisy`) a line leads to the median of its rounds. A ring marks what is advised, at the time
-    that the advice states.
+    noisy time (`records.noisy`) a line leads to the median of its rounds. A ring marks the model that is advised, at
+    the time that the advice states.
 
     Args:
         records: of models by `name`, with errors, ns_per_ray, fused_ns_per_ray, coefficients_per_vector, parameters.
@@ -58,7 +58,7 @@ def trade_plot(
         exact: `records.ExactRecord`s.
         path: PNG, PDF or SVG to write.
         kinds: name, colour and marker of each value that `kind` has in the records.
-        use: name of the model, or of the exact tracer, that is advised.
+        use: name of the advised model or exact tracer.
     """
     error = next((k for k in _ERRORS if any((number(r, k) or 0) > 0 for r in records)), None)
     if error is None:
@@ -97,7 +97,7 @@ def trade_plot(
 
 
 def noisy_lines(axes: Any, lines: Sequence[tuple[Any, float, float]]) -> None:
-    """Lines at heights from the least of a noisy time to its median."""
+    """Draw lines, at heights, from the least of a noisy time to its median."""
     if lines:
         label = f"noisy: to the median, over {NOISY:g} times the least"
         axes.hlines(*zip(*lines, strict=True), color=INK, lw=0.8, alpha=0.6, label=label)
@@ -125,7 +125,7 @@ def _panel(axes: Any, points: Sequence[_Point], label: str, kinds: Kinds, kind: 
 def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Sequence[str]) -> None:
     """Write each label beside its point where it covers the fewest other points and labels.
 
-    Each label takes the best of twenty-two places round its marker, in pixels, after the labels before it.
+    Labels are placed in order, each at the best of twenty-two places round its marker.
     """
     from matplotlib.transforms import Bbox
 
@@ -138,7 +138,7 @@ def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Seque
         extent = note.get_window_extent(renderer)
 
         def cost(corner: tuple[float, float], at: Any = at, extent: Any = extent) -> float:
-            """The markers and labels that a label here would cover; most of all it stays within the axes."""
+            """Return how many markers and labels a label here would cover; staying within the axes counts most."""
             box = Bbox.from_bounds(at[0] + corner[0], at[1] + corner[1], extent.width, extent.height)
             covered = 2.0 * box.padded(6).count_contains(pixels)
             common = (Bbox.intersection(box.padded(3, 1), other) for other in taken)
@@ -153,7 +153,7 @@ def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Seque
 
 
 def _corners(width: float, height: float) -> list[tuple[float, float]]:
-    """Offsets in pixels from a point to the lower left corner of its label, nearest first."""
+    """Return offsets in pixels from a point to the lower left corner of its label, nearest first."""
     corners = []
     for gap in (9.0, 20.0):
         rows = (-height / 2, gap / 2, -height - gap / 2)
@@ -162,26 +162,29 @@ def _corners(width: float, height: float) -> list[tuple[float, float]]:
     return corners
 
 
-_DECADES = 3  # of a scale of errors
+_DECADES = 3  # decades on a scale of errors
 
 
 def error_scale(maps: Iterable[ArrayLike], counted: float) -> tuple[float, float]:
-    """Ends of the logarithmic scale that maps of errors share: three decades up to the counted percentile of the map
-    with the largest errors (not the maximum: fireflies), rounded up."""
+    """Return the ends of the logarithmic scale that maps of errors share, rounded up.
+
+    It has three decades, up to the counted percentile of the map with the largest errors; the maximum would be a
+    firefly's.
+    """
     finite = [m[np.isfinite(m)] for m in map(np.asarray, maps)]
     high = rounded_up(max((float(np.percentile(m, counted)) for m in finite if m.size), default=0.0))
     return high / 10**_DECADES, high
 
 
 def log_norm(low: float, high: float) -> Any:
-    """Matplotlib's logarithmic scale of colours."""
+    """Return matplotlib's logarithmic scale of colours."""
     from matplotlib.colors import LogNorm
 
     return LogNorm(low, high, clip=False)
 
 
 def rounded_up(value: float) -> float:
-    """1, 2 or 5 times a power of ten, at least `value`; 1 where that is not positive."""
+    """Return 1, 2 or 5 times a power of ten that is at least `value`; 1 where that is not positive."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
@@ -191,13 +194,13 @@ def rounded_up(value: float) -> float:
 def illumination_plot(
     curves: Mapping[str, Illumination], path: str | Path, title: str = "Relative illumination"
 ) -> Path:
-    """Relative illumination against film radius: the exact lens as a line, models dashed on it, differences below.
+    """Draw relative illumination over film radius: the exact lens as a line, models dashed on it, differences below.
 
     Args:
         curves: of models by name, all against the same exact lens.
         path: PNG, PDF or SVG to write.
     Raises:
-        InputError: no model, values that are not finite.
+        InputError: there is no model, or values are not finite.
     """
     if not curves or not all(np.isfinite([c.exact, c.model]).all() for c in curves.values()):
         raise InputError("illumination plot", "curves", f"({', '.join(curves) or 'none'})", "finite values of a model")
@@ -226,7 +229,7 @@ AXIS_LABELS = {"zoom": "focal length (mm)", "focus": "1 / distance in focus (1/m
 
 
 def states_plot(models: Mapping[str, Sequence[Mapping[str, Any]]], axis: Axis, path: Path) -> None:
-    """Film-equivalent RMS over the first state axis, and false passes and blocks below it.
+    """Draw film-equivalent RMS over the first state axis, and false passes and blocks below it.
 
     Args:
         models: name to rows of `check.errors_at`.
@@ -253,7 +256,7 @@ def states_plot(models: Mapping[str, Sequence[Mapping[str, Any]]], axis: Axis, p
 
 
 def error_line(axes: Any, axis: Axis, rows: Sequence[Mapping[str, Any]], colour: str, label: str) -> None:
-    """Film-equivalent RMS of rows over a state axis, joined by lines where no other axis varies."""
+    """Draw film-equivalent RMS of rows over a state axis, joined by lines where no other axis varies."""
     ordered = sorted(rows, key=lambda r: r[axis.name])
     several = any(set(r) & set(AXIS_LABELS) - {axis.name} for r in rows)
     y = [r["rms_um"] or float("nan") for r in ordered]
@@ -261,7 +264,7 @@ def error_line(axes: Any, axis: Axis, rows: Sequence[Mapping[str, Any]], colour:
 
 
 def error_axes(axes: Any, axis: Axis, errors: Sequence[float | None]) -> None:
-    """Logarithmic axes of errors over a state axis, its nodes marked."""
+    """Set logarithmic axes of errors over a state axis, with its nodes marked."""
     for knot in axis.knots:
         axes.axvline(knot, color=INK, lw=0.5, ls=":")
     if axis.name == "zoom":
@@ -270,6 +273,6 @@ def error_axes(axes: Any, axis: Axis, errors: Sequence[float | None]) -> None:
     axes.set_yscale("log")
     plain_log_ticks(axes.yaxis)
     known = [e for e in errors if e]
-    if known:  # at least a decade, so that noise is not seen as a trend
+    if known:  # at least a decade, so that noise does not look like a trend
         axes.set_ylim(min(known) / 2, max(10 * min(known), 2 * max(known)))
     axes.grid(True)

@@ -1,9 +1,9 @@
 """Errors of a surrogate against the exact lens: of its rays, of what it passes and blocks, and of its illumination.
 
-Ray errors are over rays of a domain that the exact lens passes, independent of the model's status (false blocks are
-counted by `false_shares`). Film-equivalent error: the exact and the approximate ray meet the plane in focus, and the
-distance between the two points is taken back to the film with the exact lens's local Jacobian at that film point.
-It is given for rays within 60 degrees of the axis; beyond, only angles are given.
+Ray errors are over rays of a domain that the exact lens passes, whatever the model's status (false blocks are counted
+by `false_shares`). For the film-equivalent error, the exact and the approximate ray meet the plane in focus, and the
+distance between the two points is taken back to the film by the exact lens's local Jacobian at that film point. It is
+given for rays within 60 degrees of the axis; beyond, only angles are given.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Predict = Callable[..., Any]
 
 
 def frame_width_mm(radius_mm: float) -> float:
-    """Width of the 3:2 frame inscribed in an image circle (36 mm for 21.63 mm)."""
+    """Return the width of the 3:2 frame inscribed in an image circle (36 mm for 21.63 mm)."""
     return 2 * radius_mm * 3 / math.sqrt(13)
 
 
 def pixel_um(domain: Domain) -> float:
-    """Default pixel pitch: the width of the 3:2 frame inscribed in the domain's film circle, over 4000."""
+    """Return the default pixel pitch: the width of the 3:2 frame inscribed in the domain's film circle, over 4000."""
     return 1000 * frame_width_mm(domain.film_radius_mm) / PIXELS_ACROSS
 
 
@@ -55,11 +55,11 @@ class RayErrors:
     Attributes:
         rms_um, p99_um, max_um: film-equivalent error on the plane in focus of each ray's film position.
         rms_infinity_um, p99_infinity_um, max_infinity_um: the same on the plane at infinity.
-        rms_px, p99_px, max_px, pixel_um: in pixels, and their pitch.
-        rms_um_at_21_6: rms_um after scaling the lens to an image radius of 21.6 mm.
+        rms_px, p99_px, max_px: in pixels. pixel_um: their pitch.
+        rms_um_at_21_6: rms_um of the lens scaled to an image radius of 21.6 mm.
         direction_rms_deg, direction_p99_deg, direction_max_deg: angle between the exact and the predicted direction.
         position_rms_um, position_p99_um: perpendicular distance from the predicted point to the exact ray.
-        rays, share_beyond_60_deg: number of rays, and the share excluded from the micrometres.
+        rays: their number. share_beyond_60_deg: the share left out of the micrometres.
     """
 
     rms_um: float
@@ -98,35 +98,35 @@ class RayErrors:
 
 
 def _spread(values: Tensor) -> tuple[float, float, float]:
-    """RMS, 99th percentile, largest; NaN without values."""
+    """Return RMS, 99th percentile and largest value; NaN without values."""
     rms = float(torch.sqrt((values * values).mean()))
     return (rms, float(torch.quantile(values, 0.99)), float(values.max())) if len(values) else (rms, math.nan, math.nan)
 
 
 def ray_errors(lens: Lens, domain: Domain, held_out: PairSet, predict: Predict) -> RayErrors:
-    """Errors over rays that the exact lens passes.
+    """Measure errors over rays that the exact lens passes.
 
     Args:
-        lens: the exact lens, in the state (zoom, stop) that the model stands for.
-        domain: of the model.
-        held_out: rays uniform over the domain that the lens passes, not used in the fit.
+        lens: the exact lens in the state (zoom, stop) that the model stands for.
+        domain: the model's.
+        held_out: rays uniform over the domain that the lens passes and no fit has used.
         predict: the model.
 
     Raises:
-        InputError: no rays, or rays that the exact lens blocks.
+        InputError: there are no rays, or the exact lens blocks some.
     """
     return RayErrors.over(lens, domain, each_ray(lens, domain, held_out, predict))
 
 
 @dataclass(frozen=True)
 class EachRay:
-    """Errors of N rays, ray by ray.
+    """The errors of N rays, ray by ray.
 
     Attributes:
-        inside: [N] bool, within 60 degrees of the axis; M of them.
+        inside: [N] whether a ray is within 60 degrees of the axis; M rays are.
         focus_um, infinity_um: [M] film-equivalent error on the plane in focus and at infinity.
         direction_deg, position_um: [N].
-        transmittance: [N] absolute.
+        transmittance: [N] absolute error.
     """
 
     inside: Tensor
@@ -137,14 +137,14 @@ class EachRay:
     transmittance: Tensor
 
     def select(self, part: Tensor) -> EachRay:
-        """The rays of a mask [N]."""
+        """Return the errors of the rays of a mask [N]."""
         kept = part[self.inside]
         rest = (self.direction_deg[part], self.position_um[part], self.transmittance[part])
         return EachRay(self.inside[part], self.focus_um[kept], self.infinity_um[kept], *rest)
 
 
 def each_ray(lens: Lens, domain: Domain, held_out: PairSet, predict: Predict) -> EachRay:
-    """Errors of every ray; arguments and what they raise as `ray_errors`."""
+    """Measure the error of every ray; arguments and errors raised are those of `ray_errors`."""
     if len(held_out) == 0 or bool((held_out.status != st.PASSED).any()):
         expected = "at least one ray, all passed by the exact lens"
         raise InputError("ray_errors", "held_out", f"({len(held_out)} rays)", expected)
@@ -166,25 +166,25 @@ def each_ray(lens: Lens, domain: Domain, held_out: PairSet, predict: Predict) ->
 
 
 def angles_deg(a: Rays, b: Rays) -> Tensor:
-    """[N] angle between directions in degrees, by atan2(|a x b|, a.b): exact for small angles, unlike acos."""
+    """Return angles [N] between directions in degrees, by atan2(|a x b|, a.b): exact for small angles, unlike acos."""
     dot = a.dx * b.dx + a.dy * b.dy + a.dz * b.dz
     return torch.rad2deg(torch.atan2(_cross_length(a[3:], b[3:]), dot))
 
 
 def _cross_length(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
-    """Length [N] of the cross products of vectors given by their components."""
+    """Return the length [N] of the cross products of vectors given by their components."""
     x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
     return torch.sqrt(x * x + y * y + z * z)
 
 
 # Central differences over this share of the film radius: truncation and float64 rounding both stay below 1e-6.
 _STEP = 1e-4
-# Lower bound of the Jacobian, as a share of the paraxial one.
+# The least Jacobian that is used, as a share of the paraxial one.
 _LEAST = 0.1
 
 
 def focused_vergence(lens: Lens, film_z: Tensor) -> Tensor:
-    """[N] 1 / distance (1/mm) from the front vertex to the plane in focus, 0 at infinity.
+    """Return 1 / distance [N] (1/mm) from the front vertex to the plane in focus; 0 at infinity.
 
     Film planes closer to the lens than the focal plane focus nothing real; they count as infinity.
     """
@@ -192,9 +192,9 @@ def focused_vergence(lens: Lens, film_z: Tensor) -> Tensor:
 
 
 def _plane_coordinates(rays: Rays, vergence: Tensor) -> Tensor:
-    """[2, N] where rays meet the plane z = -1 / vergence, over the plane's distance; tan(angle) at infinity.
+    """Return where rays meet the plane z = -1 / vergence, [2, N], over its distance; at infinity tan(angle).
 
-    Infinite for rays that do not travel towards the plane.
+    Rays that do not travel towards the plane give infinity.
     """
     forward = -rays.dz
     reach = (1 + rays.z * vergence) / torch.where(forward > 0, forward, torch.nan)
@@ -206,11 +206,11 @@ def _plane_coordinates(rays: Rays, vergence: Tensor) -> Tensor:
 def _film_equivalent_mm(
     lens: Lens, domain: Domain, inputs: FilmRays, exact: Rays, rays: Rays, vergence: Tensor
 ) -> Tensor:
-    """[N] distance on the film (mm) equivalent to the distance between two rays on an object plane."""
+    """Return the distance [N] on the film (mm) equivalent to the distance between two rays on an object plane."""
     dx, dy = _plane_coordinates(rays, vergence) - _plane_coordinates(exact, vergence)
     least = _LEAST / abs(first_order(lens).efl_mm)
     if lens.anamorphic:
-        # By the ray itself, which passes: no one plane holds its chief ray.
+        # By the ray itself, which passes, because its chief ray lies in no one plane.
         along_x, along_y, _ = _differences(lens, domain, inputs, vergence)
         area = (along_x[0] * along_y[1] - along_x[1] * along_y[0]).abs()
         area = area.clamp_min(least / abs(first_order(lens, meridian="x").efl_mm))
@@ -224,12 +224,12 @@ def _film_equivalent_mm(
 
 
 def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor]:
-    """Radial and tangential derivative [N] of `_plane_coordinates` by film position, 1/mm, of the exact lens.
+    """The radial and tangential derivative [N] of `_plane_coordinates` by film position, 1/mm, of the exact lens.
 
-    Central differences in float64 of the ray through the middle of the passing rays (a chief-like ray; the pupil point
-    stays as the film point moves), at each ray's own film radius, film plane and wavelength. The lens is round, so
-    that the two are the whole Jacobian. Where that ray cannot be followed, the ray's own pupil point, which passes,
-    stands in.
+    They are central differences in float64 of the ray through the middle of the passing rays (a chief-like ray whose
+    pupil point stays as the film point moves), at each ray's own film radius, film plane and wavelength. The lens is
+    round, so that the two are the whole Jacobian. Where that ray cannot be followed, the ray's own pupil point, which
+    passes, is taken.
     """
     radius = torch.hypot(inputs.film_x, inputs.film_y)
     zero, middle = torch.zeros_like(radius), pupil_middle(domain, radius)
@@ -247,9 +247,9 @@ def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tenso
 
 
 def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives [2, N] of `_plane_coordinates` by film_x and by film_y, the pupil point kept: central differences.
+    """Return derivatives [2, N] of `_plane_coordinates` by film_x and by film_y, with the pupil point kept.
 
-    Also [N], whether all four rays could be followed.
+    They are central differences. Also returns whether all four rays [N] could be followed.
     """
     h = _STEP * domain.film_radius_mm
     steps = torch.tensor([[h, -h, 0, 0], [0, 0, h, -h]], dtype=torch.float64).repeat_interleave(len(inputs), 1)
@@ -257,7 +257,7 @@ def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor)
     rays = camera_rays(film_x + steps[0], film_y + steps[1], film_z, pupil_x, pupil_y, domain.pupil_z_mm)
     with torch.no_grad():
         out = trace(lens, rays, wavelength)
-    # Rays that only a rim stops go on; the others come back along the axis and would give a wrong derivative.
+    # Rays that only a rim stops go on; others are returned on the axis and would give a wrong derivative.
     lost = (out.status != st.PASSED) & (out.rays.dz == -1.0) & (out.rays.x == 0.0)
     points = _plane_coordinates(out.rays, vergence.repeat(4)).reshape(2, 4, -1)
     along_x, along_y = (points[:, ::2] - points[:, 1::2]).unbind(1)
@@ -265,7 +265,7 @@ def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor)
 
 
 def pupil_middle(domain: Domain, radius: Tensor) -> Tensor:
-    """[N] middle of the passing rays on the pupil plane, along the film point's direction, mm; linear in the table."""
+    """Return the middle [N] of the passing rays on the pupil plane, along the film point's direction (mm)."""
     low, high = (torch.tensor(v, dtype=radius.dtype) for v in (domain.bounds.low_mm, domain.bounds.high_mm))
     middle = torch.where(low <= high, (low + high) / 2, 0.0)
     place = (radius / domain.bounds.film_radius_mm * (len(middle) - 1)).clamp(0, len(middle) - 1)
@@ -274,14 +274,15 @@ def pupil_middle(domain: Domain, radius: Tensor) -> Tensor:
 
 
 ZONES = {"centre": (0.0, 1 / 3), "mid": (1 / 3, 2 / 3), "edge": (2 / 3, 1.0)}  # shares of the film radius
-SEED = 104729  # unlikely as the seed of a fit's rays
+SEED = 104729  # which no fit's rays are likely to have
 
 
 def false_shares(exact_passes: Tensor, model_passes: Tensor) -> dict[str, float | None]:
-    """false_pass and false_block of [N] booleans of rays uniform over the lit film and the domain's pupil disc.
+    """False_pass and false_block from [N] booleans of rays uniform over the lit film and the domain's pupil disc.
 
-    False pass: rays that the model passes and the exact lens blocks, over those that the model passes. False block:
-    rays that the model blocks and the exact lens passes, over those that the exact lens passes. None over no rays.
+    False passes are rays that the model passes and the exact lens blocks, as a share of those that the model passes.
+    False blocks are rays that the model blocks and the exact lens passes, as a share of those that the exact lens
+    passes. None over no rays.
     """
     wrong_pass, wrong_block = model_passes & ~exact_passes, exact_passes & ~model_passes
     return {"false_pass": _share(wrong_pass, model_passes), "false_block": _share(wrong_block, exact_passes)}
@@ -294,11 +295,11 @@ def _share(part: Tensor, whole: Tensor) -> float | None:
 
 @dataclass(frozen=True)
 class Illumination:
-    """Shares of the exact lens's value on the axis, by film radius.
+    """Light by film radius, as a share of the exact lens's on the axis.
 
     Attributes:
         film_radius_mm, exact, model: one value a radius.
-        max_difference: of the two.
+        max_difference: between the two.
     """
 
     film_radius_mm: list[float]
@@ -310,15 +311,15 @@ class Illumination:
 def relative_illumination(
     lens: Lens, domain: Domain, predict: Predict, *, points: int = 16384, rows: int = 17, seed: int = SEED
 ) -> Illumination:
-    """Film irradiance of a uniform environment by film radius, of the exact lens and of the model.
+    """Return film irradiance in uniform surroundings by film radius, for the exact lens and for the model.
 
-    The weight of a ray is T cos^4(theta) / Z^2 over the pupil disc, T the transmittance; wavelengths are uniform over
-    the domain. Both curves are divided by the exact lens's value on the axis, so that a uniformly dark model is
-    visible. The film plane is the domain's nearest to the lens (its farthest focus), the stop the domain's.
+    The weight of a ray is T cos^4(theta) / Z^2 over the pupil disc, with the transmittance T; wavelengths are uniform
+    over the domain. Both curves are divided by the exact lens's value on the axis, so that a model that is darker
+    everywhere shows. The film plane is the domain's nearest to the lens (its farthest focus), the stop the domain's.
 
     Args:
-        points: rays per film radius, the same pupil points and wavelengths for all.
-        rows: film radii.
+        points: rays for each film radius, with the same pupil points and wavelengths for all.
+        rows: how many film radii.
 
     Raises:
         InputError: no ray passes on the axis.

@@ -1,4 +1,4 @@
-"""Scenes of an experiment: renders through every camera, compared with the exact lens's, side by side.
+"""Scenes of an experiment, rendered through every camera, compared with the exact lens's and put side by side.
 
 The image error is the relative MSE on linear radiance and FLIP on a display, each beside its noise floor.
 """
@@ -39,17 +39,17 @@ from neurolens.studies.plots import error_scale, log_norm
 Image = NDArray[np.float64]
 
 MIN_PAIRS = 4  # with fewer pairs the noise floor is too noisy to divide by
-EPS = 1e-2  # squared radiance in the denominator of the relative MSE: dark pixels do not dominate the mean
-PIXELS_PER_DEGREE = 67.0  # of FLIP, its authors' default: 0.7 m from a 0.7 m wide 4K display
+EPS = 1e-2  # squared radiance in the denominator of the relative MSE, so that dark pixels do not dominate the mean
+PIXELS_PER_DEGREE = 67.0  # for FLIP, its authors' default: 0.7 m from a 4K display of 0.7 m width
 # Settings of the comparison for a run's results; the exposure is a factor before the sRGB curve.
 SETTINGS = {"exposure": 1.0, "pixels_per_degree": PIXELS_PER_DEGREE, "eps": EPS}
 
 
 def checked_image(image: ArrayLike, name: str) -> Image:
-    """`image` as float64 [H, W, 3].
+    """Return `image` as float64 [H, W, 3].
 
     Raises:
-        InputError: another shape, an empty picture, or values that are not finite; `name` names the picture.
+        InputError: the picture has another shape, no pixels, or values that are not finite; `name` names it.
     """
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
@@ -71,28 +71,28 @@ def _checked_pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
 
 
 def to_srgb(linear: ArrayLike, exposure: float = 1.0) -> Image:
-    """Linear RGB times `exposure`, clipped to [0, 1], through the sRGB curve (IEC 61966-2-1). Any shape."""
+    """Return linear RGB times `exposure`, clipped to [0, 1], through the sRGB curve (IEC 61966-2-1). Any shape."""
     c = np.clip(np.asarray(linear, dtype=np.float64) * exposure, 0.0, 1.0)
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
 
 
 def rel_mse(test: ArrayLike, reference: ArrayLike) -> float:
-    """Relative mean squared error on linear radiance: mean over pixels and channels of (a - b)^2 / (b^2 + eps).
+    """Return the relative mean squared error of linear radiance: the mean of (a - b)^2 / (b^2 + eps).
 
-    Rousselle, Knaus, Zwicker 2011, "Adaptive sampling and reconstruction using greedy error minimization", with their
-    eps = 0.01.
+    It is over pixels and channels. Rousselle, Knaus, Zwicker 2011, "Adaptive sampling and reconstruction using greedy
+    error minimization", with their eps = 0.01.
 
     Args:
         test, reference: [H, W, 3] linear RGB.
     Raises:
-        InputError: shapes that differ or are not [H, W, 3]; values that are not finite.
+        InputError: shapes differ or are not [H, W, 3]; values are not finite.
     """
     a, b = _checked_pair(test, reference)
     return float(np.mean((a - b) ** 2 / (b**2 + EPS)))
 
 
 def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
-    """LDR-FLIP for each pixel, [H, W] in [0, 1]: what an observer sees when flipping between the two pictures.
+    """Return LDR-FLIP for each pixel, [H, W] in [0, 1]: what an observer sees when flipping between the two pictures.
 
     Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", through their `flip-evaluator`.
     Linear RGB goes through `to_srgb`; the viewing distance is that of `PIXELS_PER_DEGREE`.
@@ -113,19 +113,19 @@ def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
 
 
 def flip(test: ArrayLike, reference: ArrayLike) -> float:
-    """Mean of `flip_map`: 0 for equal pictures, 1 at most."""
+    """Return the mean of `flip_map`: 0 for equal pictures, 1 at most."""
     return float(flip_map(test, reference).mean())
 
 
 @dataclass(frozen=True)
 class ImageErrors:
-    """Errors of a camera's renders: means over `pairs` pairs, the noise floor over all pairs of exact renders.
+    """Errors of a camera's renders: means over `pairs` pairs; the noise floor is over all pairs of exact renders.
 
     Attributes:
-        flip_paired: against the exact render of the same random numbers, where most noise cancels: what the camera
-            itself changes, and the one to judge it by.
+        flip_paired: against the exact render with the same random numbers, where most noise cancels. It is what the
+            camera itself changes, by which it should be judged.
         flip, rel_mse: against an exact render of another seed, noise included.
-        paired_share: of the noise floor; None where that is 0.
+        paired_share: flip_paired over the noise floor; None where that is 0.
     """
 
     flip_paired: float
@@ -138,17 +138,18 @@ class ImageErrors:
 
 
 def compare(renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike]) -> ImageErrors:
-    """Error of a surrogate's renders against exact ones, beside the noise floor.
+    """Compare a surrogate's renders with exact ones, and with the noise floor.
 
     Render i of the surrogate is compared with exact render i, whose random numbers it shares (paired), and with exact
-    render i + 1 (the last with the first), as two independent renders differ. The floor is exact i against that one.
+    render i + 1 (the last with the first), as two independent renders. The noise floor compares exact render i with
+    that one.
 
     Args:
         renders: one or more [H, W, 3] linear renders; number i has the seed of exact render i.
         exact_renders: at least four, and at least as many as `renders`.
 
     Raises:
-        InputError: too few renders, or pictures that do not fit each other.
+        InputError: there are too few renders, or pictures that do not fit each other.
     """
     count = len(exact_renders)
     if count < MIN_PAIRS:
@@ -179,16 +180,16 @@ def side_by_side(
     images: Mapping[str, ArrayLike], error_maps: Mapping[str, ArrayLike], path: str | Path,
     captions: Mapping[str, str] | None = None, title: str = "",
 ) -> Path:  # fmt: skip
-    """Renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
+    """Draw renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
 
     Args:
-        images: name to linear RGB [H, W, 3], shown through `to_srgb`; all of one shape.
-        error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
-            All share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
+        images: linear RGB [H, W, 3] by name, shown through `to_srgb`; all of one shape.
+        error_maps: errors [H, W] by name; a name without one (the reference) keeps its place below for its caption. All
+            share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
         path: PNG, PDF or SVG to write.
-        captions: name to one or two lines shown below its picture.
+        captions: by name, one or two lines shown below its picture.
     Raises:
-        InputError: values that are not finite.
+        InputError: values are not finite.
     """
     pictures = {name: checked_image(image, name) for name, image in images.items()}
     maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
@@ -235,12 +236,12 @@ class Pictures:
 def scene_cameras(
     lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings, fused: bool = False
 ) -> dict[str, Camera]:
-    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens.
+    """Make the exact lens, each model, a thin lens and a pinhole, set as a scene's [camera] asks if the lens can.
 
-    All are in best focus, and show the plane in focus at one size. Lens and models as C if `fused`.
+    All are in best focus, and show the plane in focus at one size. With `fused` lens and models run as C.
     """
     widest = first_order(lens).f_number
-    # The same light for all cameras.
+    # All cameras get the same light.
     real = Shot(
         shot.film_mm, shot.focus_m, max(shot.f_number or widest, widest), wavelength_nm=shot.wavelength_nm,
         runtime=None if fused else "onnxruntime",
@@ -254,12 +255,12 @@ def scene_cameras(
 def render_all(
     choice: RenderChoice, lens: Lens, domain: Domain, models: Mapping[str, Path], folder: Path, report: Report
 ) -> Pictures:
-    """Every scene through every camera with several seeds: for the noise floor, and their mean as the picture."""
+    """Render every scene through every camera with several seeds, for the noise floor; pictures are their mean."""
     records, fused = Pictures(), choice.fused and has_compiler()
     scenes = [load_scene(path) for path in choice.scenes]
     done, total = 0, len(scenes) * (3 + len(models)) * choice.seeds
     for scene in scenes:
-        film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
+        film = replace(scene.settings.film, wavelengths="one")  # so that all cameras share their random numbers
         renders: dict[str, list[FloatArray]] = {}
         for name, camera in scene_cameras(lens, domain, models, scene.settings.camera, fused).items():
             for seed in range(choice.seeds):
@@ -317,9 +318,9 @@ def _compare_scene(
 
 
 def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Depths [N] of what a camera's chief rays of film points [2, N] meet, in m from the film plane along the axis.
+    """The depths [N] of what a camera's chief rays of film points [2, N] meet, in m along the axis from the film.
 
-    inf where they meet nothing, NaN where no light passes.
+    They are inf where rays meet nothing, and NaN where no light passes.
     """
     shot, count = scene.settings.camera, film_mm.shape[1]
     nanometres = np.full(count, np.mean(shot.wavelength_nm), np.float32)

@@ -1,9 +1,9 @@
-"""Speed in nanoseconds per ray, measured in races so that ratios are meaningful, and what may run in them.
+"""Speed in nanoseconds per ray, measured in races so that ratios mean something, and what may run in these.
 
 Candidates run in turn, round after round, on one thread of one process, so that a machine that slows down slows all of
-them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film
-and over the pupil disc of the domain, those that are blocked included, because a render traces them too, and all from
-one film plane, as in a picture. Each candidate uses its fastest batch size.
+them; ratios are taken within rounds. Every candidate does the same rays, from one film plane as in a picture: uniform
+over the film and over the pupil disc of the domain, also those that are blocked, because a render traces them, too.
+Each candidate uses its fastest batch size.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from neurolens.optics.trace.rays import Traced, trace
 from neurolens.optics.trace.tracegraph import exact_graph
 from neurolens.studies.rays import frame_width_mm
 
-# Rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache.
+# Rays of one pass: every batch size divides their number, and a pass's float32 inputs stay in the third-level cache.
 POOL = 65536
 BATCHES = (4096, 8192, 16384)
-_SAMPLE_S = 0.001  # least time of a sample; short ones fit between the interruptions of a busy machine
+_SAMPLE_S = 0.001  # shortest time of a sample; short samples fit between the interruptions of a busy machine
 _SAMPLES = 5  # samples of a round, of which the best counts
-_PREPARING = 0.7  # approximate share of preparation in a race's time
+_PREPARING = 0.7  # about what share of a race's time preparation takes
 
 Call = Callable[[], object]
 
@@ -65,8 +65,8 @@ class Candidate:
 
     Attributes:
         name: for tables.
-        prepare: takes the rays of one batch (float64, one film plane) and gives the call to be timed; conversions
-            belong here, off the clock. Raises `Unavailable` where it cannot run.
+        prepare: takes the rays of one batch (float64, one film plane) and returns the call to be timed; conversions
+            belong in here, off the clock. Raises `Unavailable` where the candidate cannot run.
         batches: batch sizes to choose from.
     """
 
@@ -76,9 +76,9 @@ class Candidate:
 
 
 class Gain(NamedTuple):
-    """A model's times, how many times faster it is (by the minima), and after how many rays it pays off.
+    """A model's times, how many times as fast it is (by the minima), and after how many rays it pays off.
 
-    None where one of the two was not timed; break_even_rays also where the model is no faster.
+    They are None where one of the two was not timed; break_even_rays also where the model is no faster.
     """
 
     ns_per_ray: Timing | None
@@ -92,9 +92,9 @@ class Race:
 
     Attributes:
         ns: nanoseconds per ray of each round (the best of a few short samples), by candidate.
-        batch: rays per call, the best of those tried.
-        unavailable: reason, by candidate that could not run.
-        load: the higher load average of the machine before and after, if known; above 1 it was shared.
+        batch: rays per call, the best number of those tried.
+        unavailable: the reason, by candidate that could not run.
+        load: the machine's load average before or after, whichever is higher, if known; above 1 the machine was shared.
     """
 
     ns: dict[str, list[float]]
@@ -103,7 +103,7 @@ class Race:
     load: float | None = None
 
     def timing(self, name: str) -> Timing | None:
-        """Best and median of the rounds; None where the candidate could not run."""
+        """Return best and median of the rounds; None where the candidate could not run."""
         if name not in self.ns:
             return None
         ns = self.ns[name]
@@ -118,13 +118,13 @@ class Race:
         return {"min": min(self.ns[over]) / min(self.ns[name]), "median": statistics.median(ratios)}
 
     def gain(self, name: str, exact: str, fit_s: float | None, load_s: float | None) -> Gain:
-        """The gain over an exact tracer of a model that took `fit_s` to fit and `load_s` to load."""
+        """Return the gain over an exact tracer of a model that took `fit_s` to fit and `load_s` to load."""
         timing, ratio, slow = self.timing(name), self.speedup(name, exact), self.timing(exact)
         pays = break_even_rays(fit_s, load_s, slow["min"], timing["min"]) if slow and timing else None
         return Gain(timing, ratio["min"] if ratio else None, pays)
 
     def record(self, name: str) -> ExactRecord:
-        """Row for the list of exact tracers in `results.json`."""
+        """Return the row for the list of exact tracers in `results.json`."""
         if name in self.unavailable:
             return {"name": name, "available": False, "reason": self.unavailable[name], "ns_per_ray": None}
         return {"name": name, "available": True, "ns_per_ray": self.timing(name)}
@@ -140,7 +140,7 @@ def race(
     """Time candidates in turn on the same rays of a domain; `report` is called with the fraction done.
 
     Raises:
-        InputError: no rounds, or two candidates of one name.
+        InputError: there are no rounds, or two candidates have one name.
     """
     names = [c.name for c in candidates]
     if rounds < 1 or len(set(names)) < len(names):
@@ -169,7 +169,7 @@ def race(
 
 
 def _pool(domain: Domain) -> FilmRays:
-    """The rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
+    """Return the rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
     rays = sample_domain(domain, POOL, seed=3)
     return replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
 
@@ -182,7 +182,7 @@ class _Pass:
     calls: tuple[Call, ...]
 
     def sample_ns(self, inner: int) -> float:
-        """Nanoseconds of one pass, mean of `inner` in a row."""
+        """Return the nanoseconds of one pass, as the mean of `inner` passes in a row."""
         start = time.perf_counter_ns()
         for _ in range(inner):
             for call in self.calls:
@@ -191,7 +191,7 @@ class _Pass:
 
 
 def _best_batch(candidate: Candidate, pool: FilmRays) -> _Pass:
-    """One pass over the pool in the fastest of the candidate's batch sizes."""
+    """Return one pass over the pool in the fastest of the candidate's batch sizes."""
     passes = []
     for batch in candidate.batches:
         calls = tuple(candidate.prepare(pool.select(slice(i, i + batch))) for i in range(0, len(pool), batch))
@@ -206,13 +206,13 @@ def _load() -> float | None:
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
-# Names of the exact tracers: of torch, and as C.
+# Names of the exact tracers: by torch, and as C.
 EXACT = ("exact eager", "exact C")
 EAGER_BATCHES = (8192, 16384, 32768)
 
 
 def exact_candidate(lens: Lens, domain: Domain) -> Candidate:
-    """The exact tracer of torch in float32: every surface, stop, rims, transmittance and dispersion, status out."""
+    """Return torch's exact tracer in float32: every surface, stop, rims, transmittance and dispersion, status out."""
 
     def run(*columns: Any) -> Traced:
         *points, wavelength = columns
@@ -223,24 +223,24 @@ def exact_candidate(lens: Lens, domain: Domain) -> Candidate:
 
 
 def eager_arguments(rays: FilmRays) -> tuple[Any, ...]:
-    """The columns of rays in float32, with one film plane, as in a picture."""
+    """Return the columns of rays in float32, with one film plane, as in a picture."""
     fx, fy, fz, px, py, wavelength = (c.to(torch.float32).contiguous() for c in rays.columns())
     return fx, fy, fz[0].clone(), px, py, wavelength
 
 
 def exact_c_candidate(lens: Lens, domain: Domain) -> Candidate:
-    """The exact trace as C, by the same writer and flags as the models: the measure of a model as C."""
+    """Return the exact trace as C, by the writer and flags of the models, with which a model as C is compared."""
     graph = exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)
     return program_candidate(EXACT[1], lower(graph), domain)
 
 
 def exact_records(timed: Race) -> list[ExactRecord]:
-    """Records of the exact tracers that a race timed, or that could not run."""
+    """Return records of the exact tracers that a race timed, or that could not run."""
     return [timed.record(name) for name in EXACT if name in timed.ns or name in timed.unavailable]
 
 
 def camera_candidate(camera: Camera, domain: Domain, name: str | None = None) -> Candidate:
-    """A camera of the renderer (thin lens, pinhole), from film points and pupil samples to weighted scene rays."""
+    """A camera of the renderer (thin lens, pinhole): from film points and pupil samples to weighted scene rays."""
 
     def prepare(rays: FilmRays) -> Call:
         film = _float32(torch.stack([rays.film_x, rays.film_y]))
@@ -255,7 +255,7 @@ def _float32(values: torch.Tensor) -> NDArray[np.float32]:
 
 
 def ideal_cameras(lens: Lens, domain: Domain) -> list[Candidate]:
-    """Thin lens and pinhole of the lens's focal length, named "thin lens" and "pinhole"."""
+    """Return a thin lens and a pinhole of the lens's focal length, named "thin lens" and "pinhole"."""
     data = first_order(lens)
     focal, width = abs(data.efl_mm), frame_width_mm(domain.film_radius_mm)
     frame = (width, width * 2 / 3)
@@ -264,7 +264,7 @@ def ideal_cameras(lens: Lens, domain: Domain) -> list[Candidate]:
 
 
 def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candidate:
-    """An exported model, in onnxruntime on one thread."""
+    """Return an exported model that runs in onnxruntime on one thread."""
 
     def prepare(rays: FilmRays) -> Call:
         film_x, film_y, _, pupil_x, pupil_y, wavelength = map(_float32, rays.columns())
@@ -275,7 +275,7 @@ def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candid
 
 
 def model_candidates(files: Mapping[str, Path], domain: Domain) -> list[Candidate]:
-    """Exported models by name, in onnxruntime; and "NAME fused", as C, where that is possible."""
+    """Return exported models by name, in onnxruntime, and as "NAME fused" in C where that is possible."""
     candidates = []
     for name, file in files.items():
         candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
@@ -285,14 +285,14 @@ def model_candidates(files: Mapping[str, Path], domain: Domain) -> list[Candidat
 
 
 def time_model(model: OnnxLens, name: str, *, rounds: int) -> Timing | None:
-    """Nanoseconds per ray of an exported model over its domain."""
+    """Time an exported model over its domain, in nanoseconds per ray."""
     domain = Domain.from_dict(model.card["domain"])
     candidate = model_candidate(name, model, domain.stop_radius_mm)
     return race([candidate], domain, rounds=rounds).timing(name)
 
 
 class CompiledSource:
-    """A program as a shared library in its own temporary folder.
+    """A program as a shared library in a temporary folder of its own.
 
     Args:
         double: whether it computes in double precision, which is not for programs with lookups.
@@ -305,7 +305,7 @@ class CompiledSource:
         self.signature, self._real = Signature.of(program, "lens"), np.float64 if double else np.float32
         self._folder = TemporaryFolder()
         library = Path(self._folder.name) / "lens.so"
-        blocks = bool(program.own_tables)  # lookups: loops of arrays have them apart
+        blocks = bool(program.own_tables)  # functions with lookups: loops over arrays do these apart
         if double:
             text = write_double(program, "lens", ["A timed model."]) + in_double(self._wrapper(False))
         else:
@@ -319,7 +319,7 @@ class CompiledSource:
         self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
 
     def _wrapper(self, blocks: bool) -> str:
-        """All arguments as one array of pointers: ctypes is slow per argument."""
+        """Write a function that takes all arguments as one array of pointers, for ctypes is slow for each argument."""
         s = self.signature
         if blocks:
             first = len(s.per_ray)
@@ -333,12 +333,12 @@ class CompiledSource:
         return f"void neurolens_run(size_t n, void **a) {{ lens_rays(n, {given}); }}\n"
 
     def outputs(self, count: int) -> dict[str, NDArray[Any]]:
-        """Arrays for the results of so many rays."""
+        """Return arrays for the results of `count` rays."""
         found: dict[str, NDArray[Any]] = {name: np.empty(count, self._real) for name in self.signature.outputs}
         return {**found, "status": np.empty(count, np.int32)}
 
     def prepared(self, inputs: Mapping[str, ArrayLike], out: Mapping[str, NDArray[Any]], band: int = 0) -> Call:
-        """A call that computes rays into `out`; inputs by name, arrays [N] or numbers; others are ignored."""
+        """Return a call that computes rays into `out`; inputs go by name, arrays [N] or numbers, others are ignored."""
         s = self.signature
         count = len(out["status"])
         arrays = [np.ascontiguousarray(inputs[name], self._real) for name in (*s.per_ray, *s.per_call)]
@@ -355,7 +355,7 @@ class CompiledSource:
         return call
 
     def rays(self, inputs: Mapping[str, ArrayLike], band: int = 0) -> dict[str, NDArray[Any]]:
-        """Results of rays, by name, status among them."""
+        """Return the results of rays by name, the status among them."""
         out = self.outputs(len(np.asarray(inputs[self.signature.per_ray[0]])))
         self.prepared(inputs, out, band)()
         return out
@@ -369,12 +369,12 @@ def program_candidate(
     name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None, flags: tuple[str, ...] = FLAGS,
     double: bool = False,
 ) -> Candidate:  # fmt: skip
-    """A program of `models.source`, compiled when the race prepares it; no stop radius: the domain's."""
+    """Return a program of `models.source`, compiled when the race prepares it; the domain's stop without a radius."""
     compiled = cache(lambda: CompiledSource(program, flags, double))
 
     @cache
     def room(count: int) -> dict[str, NDArray[Any]]:
-        """Output memory, which is used again, as tracers and onnxruntime do."""
+        """Return memory for outputs, which is used again and again, as by tracers and onnxruntime."""
         return compiled().outputs(count)
 
     def prepare(rays: FilmRays) -> Call:
@@ -388,7 +388,7 @@ def program_candidate(
 
 
 def fused_candidate(name: str, file: Path, domain: Domain) -> Candidate | None:
-    """The model of an exported file as compiled C; None without a compiler or a form in C."""
+    """Return the model of an exported file as compiled C; None without a compiler or a form in C."""
     try:
         program = fused_program([read_model(file).at()]) if has_compiler() else None
     except (ModelError, InputError):

@@ -1,8 +1,8 @@
-"""A collection of lens files: each read, checked, fitted by default settings and measured, as one record; its table.
+"""Surveys a collection of lens files: each is read, checked, fitted by default settings and measured, as one record.
 
-A task is a file's name and its bytes, and its answer is bytes, too, the same on every machine: whoever runs tasks
-(processes here, workers elsewhere) needs no folder in common with whoever asks. Records are kept, so that a survey
-goes on where it stopped; a page that sorts and filters by itself, CSV and JSON show them.
+A task is a file's name and its bytes, and its answer is bytes, too, the same on every machine. Whoever runs tasks
+(processes here, workers elsewhere) needs no folder in common with whoever asks. Records are kept, so that a survey goes
+on where it stopped. A page that sorts and filters by itself, CSV and JSON show them.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ from neurolens.studies.measure import CARD_KEYS, fit_and_measure, fresh_rays
 from neurolens.studies.pages import DASH, Column, flat, table
 
 SCHEMA = 1
-# A lens that was read is "ok" or "doubtful"; a file that was not is "refused", or met a "fault" of neurolens.
+# A lens that was read is "ok" or "doubtful"; a file that was not read is "refused", or has met a "fault" of neurolens.
 VERDICTS = ("ok", "doubtful", "refused", "fault")
-# Goals of the fit, on rays that it has not seen.
+# What a fit should reach, on rays that it has not seen.
 GOALS = {"direction_rms_deg": 0.004, "false_pass": 0.001, "false_block": 0.001}
-_REASON = 600  # characters
+_REASON = 600  # characters of a reason
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class SurveySettings:
     Attributes:
         fit: whether lenses are fitted and measured, not only read and checked.
         terms: coefficients per vector output of the polynomials.
-        rays: to fit, and to measure; four times as many test what passes.
+        rays: as many to fit as to measure; four times as many test what passes.
         seed: of the rays of the fit.
         half_field_deg: assumed, with a note, where a file gives neither rims nor field.
         verify: whether lenses are held against photographs.
@@ -99,9 +99,9 @@ class Task:
     """One file of a collection.
 
     Attributes:
-        name: of the file in its folder, with "/" between its parts.
+        name: of the file in its folder, with "/" between parts.
         data: its bytes.
-        glasses: names and bytes of further glass catalogues (.agf), which come before those that ship.
+        glasses: names and bytes of further glass catalogues (.agf), whose glasses come before those that ship.
     """
 
     name: str
@@ -111,18 +111,18 @@ class Task:
 
     @property
     def fingerprint(self) -> str:
-        """Hash of all that decides the record."""
+        """Hash everything that decides the record."""
         files = [sha256(data).hexdigest() for data in (self.data, *(data for _, data in self.glasses))]
         return fingerprint_of([SCHEMA, __version__, self.name, asdict(self.settings), files])
 
 
 def run_task(task: Task) -> bytes:
-    """The record of one file as JSON (UTF-8), the same bytes for the same task; never raises for what is in the file.
+    """Make the record of one file as JSON (UTF-8), the same bytes for the same task; nothing in a file makes it raise.
 
-    Keys: file, fingerprint, verdict (see `VERDICTS`), reason (of a file that was not read, or a lens not fitted), notes
-    (what its reader said), and of a lens that was read those of `describe.lens_row`, format, layout (SVG) and fit:
-    None, or the errors of `CARD_KEYS` on fresh rays with film_radius_mm, passing, rays, promises, broken (those of the
-    card that did not hold) and reaches (whether `GOALS` are).
+    Its keys are file, fingerprint, verdict (see `VERDICTS`), reason (why a file was not read, or a lens not fitted) and
+    notes (what its reader said). A lens that was read also has those of `describe.lens_row`, format, layout (SVG) and
+    fit. The fit is None, or the errors of `CARD_KEYS` on fresh rays with film_radius_mm, passing, rays, promises,
+    broken (promises of the card that did not hold) and reaches (whether it reaches `GOALS`).
     """
     record: dict[str, Any] = {"file": task.name, "fingerprint": task.fingerprint, "verdict": "refused", "reason": ""}
     with TemporaryFolder() as folder, ExitStack() as stack, warnings.catch_warnings(), pinned_threads():
@@ -139,17 +139,17 @@ def run_task(task: Task) -> bytes:
 
 
 def _unread(name: str, verdict: str, reason: str) -> dict[str, Any]:
-    """The record of a file of which no task could be made ("refused"), or whose task ended without one ("fault")."""
+    """Make the record of a file that gave no task ("refused"), or whose task ended without a record ("fault")."""
     return {"file": name, "fingerprint": "", "verdict": verdict, "reason": one_line(reason, _REASON)}
 
 
 def is_of(record: Mapping[str, Any], task: Task) -> bool:
-    """Whether a record is one of this task. A fault is none: it is tried again."""
+    """Return whether a record is one of this task; a fault is none, so that it is tried again."""
     return record.get("fingerprint") == task.fingerprint and record["verdict"] in VERDICTS[:3]
 
 
 def _put(folder: Path, name: str, data: bytes) -> Path:
-    """A file of these bytes under its own last name, by which formats are told and messages speak."""
+    """Write a file of these bytes under its own last name, by which formats are recognised and messages speak."""
     folder.mkdir(exist_ok=True)
     file = folder / (PurePosixPath(name).name or "lens")
     file.write_bytes(data)
@@ -164,7 +164,7 @@ def _reason(error: Exception) -> str:
 
 
 def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:
-    """Fill the record, whose entries so far stay where an error ends this."""
+    """Fill the record; an error ends this, and the entries so far stay."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", NeurolensWarning)
         lens, assumed = _read(file, task.settings)
@@ -194,11 +194,11 @@ def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:
 
 
 def _read(file: Path, settings: SurveySettings) -> tuple[Lens, list[str]]:
-    """The lens of a file, and what had to be assumed: a field, where neither it nor the rims are given."""
+    """Read the lens of a file, and say what had to be assumed: a field, where neither it nor the rims are given."""
     try:
         return read_any(file), []
     except InputError as error:
-        if error.field != "diameter":  # as `rims.with_derived_rims` names a missing field
+        if error.field != "diameter":  # the field that `rims.with_derived_rims` misses
             raise
     half = settings.half_field_deg
     lens = read_any(file, ReadOptions(half_field_deg=half))
@@ -206,7 +206,7 @@ def _read(file: Path, settings: SurveySettings) -> tuple[Lens, list[str]]:
 
 
 def _fit(lens: Lens, domain: Domain, settings: SurveySettings, folder: Path) -> dict[str, Any]:
-    """Fit, export and measure; then measure again on rays of another seed, against the card's own promises."""
+    """Fit, export and measure, then measure again on rays of another seed, against the card's own promises."""
     pairs = make_pairs(lens, domain, PairSettings(settings.rays, settings.rays, settings.rays, settings.seed))
     count = 4 * settings.rays
     model = fit_and_measure(
@@ -226,7 +226,7 @@ def _fit(lens: Lens, domain: Domain, settings: SurveySettings, folder: Path) -> 
 
 
 def summary_of(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Counts over the records, and shares and medians of the fits."""
+    """Count the records, and return shares and medians of the fits."""
     read = [r for r in records if r["verdict"] in VERDICTS[:2]]
     fits = [r["fit"] for r in read if r.get("fit")]
     counts = {verdict: sum(r["verdict"] == verdict for r in records) for verdict in VERDICTS}
@@ -247,25 +247,25 @@ def summary_of(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-_KEPT_EVERY_S, _SHARE = 60.0, 20.0  # pages are written so often beside the last time, for 1/20 of the time
-TIME_LIMIT_S = 1800.0  # of one file, far more than any lens takes
+_KEPT_EVERY_S, _SHARE = 60.0, 20.0  # pages are written at most so often, and for at most 1/20 of the time
+TIME_LIMIT_S = 1800.0  # for one file, far more than any lens takes
 
 
 def survey(
     collection: Collection, out: Path, settings: SurveySettings, executor: Executor, progress: Progress, *,
     glasses: Sequence[tuple[str, bytes]] = (), again: bool = False,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Survey all files of a collection; records that are there are not made again. Returns them in the files' order.
+    """Survey all files of a collection and return the records in the order of files; known records are kept.
 
-    The executor (see `base.tasks`) runs a task for each file. The folder `out` gets records/ (one JSON a file),
-    survey.json, survey.csv and survey.html. The sections stay in the files alone: a survey holds some tens of thousands
-    of bytes a lens in memory.
+    The executor (see `base.tasks`) runs a task for each file. The folder `out` gets records/ (one JSON for each file),
+    survey.json, survey.csv and survey.html. Sections stay in their files: in memory a survey holds some tens of
+    thousands of bytes for each lens.
     """
     (out / "records").mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, Any]] = {}
 
     def task_of(name: str) -> Task | None:
-        """The task of a file; of one that cannot be read the record is kept instead."""
+        """Return the task of a file; where it cannot be read, its record is kept and there is none."""
         try:
             data = read_bytes(collection.folder / name, MAX_BYTES, "a lens file")
         except InputError as error:
@@ -284,7 +284,7 @@ def survey(
             found[name] = _without_layout(record)
     if found and missing:
         progress.note(f"{len(found)} of {len(collection.names)} files are done already")
-    tasks = filter(None, map(task_of, missing))  # read one by one, when their turn comes
+    tasks = filter(None, map(task_of, missing))  # files are read one by one, when their turn comes
 
     def write() -> None:
         write_pages([found[name] for name in collection.names if name in found], collection, out, settings)
@@ -383,7 +383,7 @@ def summary_lines(records: Sequence[Mapping[str, Any]], others: Mapping[str, int
 
 
 def _kinds(record: Mapping[str, Any]) -> list[str]:
-    """The names of `_KINDS` that hold for a record."""
+    """Return the names of `_KINDS` that hold for a record."""
     fit, kinds = record.get("fit"), [str(record["verdict"])]
     if fit:
         kinds += ["missed"] * (not fit["reaches"]) + ["broken"] * bool(fit["broken"])
@@ -395,12 +395,12 @@ def _kinds(record: Mapping[str, Any]) -> list[str]:
 def _page(
     records: Sequence[Mapping[str, Any]], collection: Collection, out: Path, settings: SurveySettings
 ) -> Iterator[str]:
-    """The page in parts: a summary, then one row a file with its section, figures and reasons."""
+    """Yield the page in parts: a summary, then one row for each file with its section, figures and reasons."""
     kinds = [_kinds(r) for r in records]
     counts = {kind: sum(kind in each for each in kinds) for kind in _KINDS}
 
     def section(name: str) -> str:
-        """The drawing of a file's record, read one by one."""
+        """Return the drawing of a file's record; records are read one by one."""
         return (read_kept(_record_file(out, name)) or {}).get("layout") or ""
 
     return html_parts(
@@ -418,14 +418,14 @@ def _page(
 
 
 def _remarks(record: Mapping[str, Any]) -> list[str]:
-    """Why a file was refused, doubts, notes, and promises of the card that were not held; each once."""
+    """Return why a file was refused, doubts, notes, and promises of the card that were not held, each once."""
     lines = [record["reason"], *record.get("doubts", ()), *record.get("notes", ())]
     lines += [f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())]
     return list(filter(None, dict.fromkeys(lines)))
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> str:
-    """Texts, then the figures by their keys, then lists, their items parted by " | ", a row for each record."""
+    """Write a row for each record: texts, figures by their keys, then lists, whose items " | " separates."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     inner = [{**(r.get("photographs") or {}), **(r.get("fit") or {})} for r in records]

@@ -1,4 +1,4 @@
-"""One experiment from lens file to report, stage by stage, in one run folder."""
+"""Runs one experiment from lens file to report, stage by stage, in one run folder."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ from neurolens.studies.speed import (
 )
 
 _IDEAL = ("thin lens", "pinhole")
-_LIT_RAYS = 4096  # a film radius: a quarter of a second a model
-# States at which a model of many states is measured for its card, and the rays of each (that pass).
+_LIT_RAYS = 4096  # for each film radius, which takes a quarter of a second a model
+# At how many states a model of many states is measured for its card, and on how many passing rays at each.
 STATES, RAYS = 16, 8_000
 
 
@@ -66,15 +66,15 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Run an experiment and write everything to one folder.
 
-    Writes config.toml (resolved), lenses/ (its lens file), models/*.onnx, pictures/, results.json and report.html; for
-    a lens in many states states.png instead of pictures. A run that was interrupted resumes when it is started again:
-    existing models are not fitted again.
+    It writes config.toml (resolved), lenses/ (its lens file), models/*.onnx, pictures/, results.json and report.html;
+    for a lens in many states states.png in place of pictures. A run that was interrupted goes on when it is started
+    again: existing models are not fitted again.
 
     Returns:
         The results, as in results.json (`records.Results`).
 
     Raises:
-        InputError: mistakes in the lens, the domain, the fits or the scenes; no model that supports many states.
+        InputError: the lens, the domain, the fits or the scenes have a mistake; no model supports many states.
     """
     folder, started, clock = Path(out), datetime.now(UTC), time.perf_counter()
     progress = progress or Progress(quiet=True)
@@ -98,12 +98,12 @@ def run_experiment(
 
 
 def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any]:
-    """The parts of `records.Results` for a lens in one state."""
+    """Return the parts of `records.Results` for a lens in one state."""
     models, pictures = folder / "models", folder / "pictures"
     progress.plan(_plan(experiment))
     lens = experiment.lens.read()
     domain = experiment.domain.of(lens)
-    for each in (models, pictures):  # only now, so that an invalid lens leaves no folder
+    for each in (models, pictures):  # late, so that an invalid lens leaves no folder
         each.mkdir(parents=True, exist_ok=True)
     settings = keep_inputs(experiment, folder)
     with progress.stage("trace ray pairs") as report:
@@ -152,7 +152,7 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
 
 
 def _plan(experiment: Experiment) -> dict[str, float]:
-    """Expected seconds of each stage on two cores, for the time left."""
+    """Estimate the seconds of each stage on two cores, for the time left."""
     plan: dict[str, float] = {"trace ray pairs": 3}
     for m in experiment.model:
         plan[f"fit {m.label}"] = 0.06 * m.steps * (m.units * m.layers / 32) ** 2.5 if m.method in NETWORKS else 3
@@ -185,7 +185,7 @@ def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measure
 
 
 def shown_models(measured: Sequence[Measured], use: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Names of the polynomial and the network in pictures: the model to use, and of the other kind the closest."""
+    """Name the polynomial and the network in pictures: the model to use, and the closest of the other kind."""
     names = []
     for networks in (False, True):
         rows = [m for m in measured if (m.settings.method in NETWORKS) == networks and m.settings.family != "paraxial"]
@@ -198,7 +198,7 @@ def _draw(
     pairs: RayPairs, records: Sequence[Mapping[str, Any]], timed: Race, light: Mapping[str, Illumination],
     folder: Path, use: Mapping[str, Any] | None,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Plots of errors, the lens and its illumination; `use`: the record of what is advised."""
+    """Plot errors, the lens and its illumination; `use` is the record of what is advised."""
     lens = pairs.lens
     exact = [timed.record(n) for n in EXACT if n in timed.ns]
     lens_layout(layout_profile(lens, pairs.domain), folder / "layout.png")
@@ -240,7 +240,7 @@ def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
 
 
 def _of_many_states(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any]:
-    """The parts of `records.Results` for a lens in many states: a zoom's whole range, internal focus, or both."""
+    """Return the parts of `records.Results` for a lens in many states: a zoom's range, internal focus, or both."""
     models = folder / "models"
     models.mkdir(parents=True, exist_ok=True)
     space, settings = experiment.states(), keep_inputs(experiment, folder)
@@ -273,10 +273,10 @@ def _of_many_states(experiment: Experiment, folder: Path, progress: Progress) ->
 
 
 def state_settings(settings: ModelSettings, rays: int, seed: int) -> StateSettings:
-    """The settings of a model of one state as those of many states.
+    """Return the settings of a model of one state as those of a model of many states.
 
     Raises:
-        InputError: another method than "ols".
+        InputError: the method is not "ols".
     """
     if settings.method != "ols":
         raise InputError("settings", "model", settings.label, 'method "ols" on the invariants, for many states')
@@ -293,7 +293,7 @@ def fit_and_measure_states(
 ) -> dict[str, Any]:  # fmt: skip
     """Fit, export and measure one model of many states, or take an existing one of the same settings and version.
 
-    Errors are those of the exported float32 graph, in onnxruntime, at random states: the record's own are the worst.
+    Errors are those of the exported float32 graph in onnxruntime, at random states; the record's own are the worst.
     """
     file = folder / f"{settings.label}.onnx"
     made_of = [a.to_dict() for a in space.axes], space.zoom, space.f_number, _first_domain(space).to_dict()

@@ -1,9 +1,9 @@
-"""Bundles of rays from the scene that fill the real stop, traced to the film, for every lens whose chief rays exist.
+"""Bundles of rays from the scene that fill the real stop, traced to the film; for every lens that has chief rays.
 
 The chief ray is found from the stop outwards (`optics.trace.aiming`), as pupils may move with the field (fisheyes). Its
-neighbours start on the plane across it at the front of the lens, and Newton's method on that plane takes each to its
-point of the stop; rays for which this fails at once walk there from the chief ray in small steps. The derivative of
-the mapping also turns stop area into the energy that a ray carries.
+neighbours start on the plane across it at the front of the lens, and Newton's method on that plane takes each of them
+to its point of the stop. Rays for which this fails walk there from the chief ray in small steps. The derivative of the
+mapping also turns stop area into the energy that a ray carries.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class Pattern(NamedTuple):
 
 
 def hexapolar(rings: int) -> Pattern:
-    """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge; 1 + 3 n (n + 1) points.
+    """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge: 1 + 3 n (n + 1) points.
 
-    The weights are the areas nearest to each ring.
+    Each ring has as its weight the area that is nearest to it.
     """
     t, s, w = [0.0], [0.0], [(0.5 / rings) ** 2]
     for k in range(1, rings + 1):
@@ -61,14 +61,14 @@ def hexapolar(rings: int) -> Pattern:
 
 
 def fan(n: int) -> Pattern:
-    """2 n points: n along the meridional plane from -1 to 1, then n across it. Odd n holds the centre."""
+    """2 n points: n along the meridional plane from -1 to 1, then n across it. With an odd n the centre is there."""
     line = torch.linspace(-1, 1, n, dtype=torch.float64) * (1 - _EDGE)
     zero = torch.zeros_like(line)
     return Pattern(torch.cat([line, zero]), torch.cat([zero, line]), torch.zeros(2 * n, dtype=torch.float64))
 
 
 def points(tangential: list[float], sagittal: list[float]) -> Pattern:
-    """Single points, without weight."""
+    """Return single points, without weight."""
     return Pattern(_tensor(tangential), _tensor(sagittal), torch.zeros(len(tangential), dtype=torch.float64))
 
 
@@ -100,14 +100,14 @@ class Aim:
         self.chief = Rays(*(repeated(c) for c in chief.start))
         origin = scene.object_points(chief.start)
         self.origin = None if origin is None else tuple(repeated(c) for c in origin)
-        # Squared distance from the object point to the plane across the chief ray; None of a distant object.
+        # Squared distance from the object point to the plane across the chief ray; None where the object is distant.
         ends = zip(self.chief[:3], self.origin or (), strict=False)
         self.distance2 = None if origin is None else sum((a - b) ** 2 for a, b in ends)
         self.exists = repeated(chief.exists)
         self.wavelength: Tensor = torch.tensor(waves, dtype=torch.float64)[None, :, None].expand(shape).reshape(-1)
 
     def rays(self, u: Tensor, v: Tensor, rows: Tensor | slice = slice(None)) -> Rays:
-        """Rays at (u, v) mm on the plane across their chief rays: u in the meridional plane, v across it."""
+        """Return rays at (u, v) mm on the plane across their chief rays: u in the meridional plane, v across it."""
         c = Rays(*(p[rows] for p in self.chief))
         if self.along_x:
             x, y, z = c.x + u * c.dz, c.y + v, c.z - u * c.dx
@@ -121,7 +121,7 @@ class Aim:
         return Rays(x, y, z, dx / length, dy / length, dz / length)
 
     def lead_mm(self, u: Tensor, v: Tensor) -> Tensor:
-        """Path from the object point to the plane across the chief rays, less that of the chief ray."""
+        """Return by how much a ray's way from its object point to the front plane is longer than its chief ray's."""
         if self.distance2 is None:
             return torch.zeros_like(u)
         # sqrt(a + b) - sqrt(a) without the loss of digits.
@@ -129,7 +129,7 @@ class Aim:
         return more / (torch.sqrt(self.distance2 + more) + torch.sqrt(self.distance2))
 
     def at(self, pattern: Pattern) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """u, v of the rays through the points of a pattern, whether they were found, and d(beam) / d(stop share)."""
+        """Aim at the points of a pattern: u, v of the rays, whether they were found, and d(beam) / d(stop share)."""
         goal = torch.stack([-pattern.tangential, pattern.sagittal])[:, None, None].expand(2, *self.shape).flatten(1)
         everything = torch.arange(goal.shape[1])
         uv = self._newton(torch.zeros_like(goal), goal, everything, _DIRECT)
@@ -147,7 +147,7 @@ class Aim:
         return u, v, aimed, stretch
 
     def _newton(self, uv: Tensor, goal: Tensor, rows: Tensor, steps: int) -> Tensor:
-        """Newton's steps from places [2, N]; a step that leaves the lens is halved and tried again."""
+        """Take Newton's steps from places [2, N]; a step that leaves the lens is halved and tried again."""
         good = uv
         for _ in range(steps):
             stop, exists, (tu, tv, su, sv) = self._map(uv, rows)
@@ -161,13 +161,13 @@ class Aim:
         return uv
 
     def _error(self, uv: Tensor, goal: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance from the goal in stop radii (inf for rays that do not exist), and beam area per stop share."""
+        """The distance from the goal in stop radii (inf for rays that do not exist), and beam area per stop share."""
         stop, exists, (tu, tv, su, sv) = self._map(uv, rows)
         error = torch.where(exists, torch.hypot(*(stop - goal)), math.inf)
         return error, math.pi / (tu * sv - tv * su).abs() * self.spread(uv[0], uv[1], rows)
 
     def spread(self, u: Tensor, v: Tensor, rows: Tensor | slice = slice(None)) -> Tensor | float:
-        """Energy of an area on the plane across the chief rays: 1, or of a near object the solid angle, 1/mm^2."""
+        """The energy per area of the plane across the chief rays: 1, or for a near object solid angle in 1/mm^2."""
         if self.distance2 is None:
             return 1.0
         # cos / r^2, with cos = distance / r.
@@ -175,7 +175,7 @@ class Aim:
         return torch.sqrt(distance2) / (distance2 + u * u + v * v) ** 1.5
 
     def _map(self, uv: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Stop coordinates [2, N] (tangential, sagittal; in radii), whether rays exist, and the derivatives."""
+        """Return stop coordinates [2, N] (tangential, sagittal; in radii), whether rays exist, and the derivatives."""
         (u, v), h = uv, self.step_mm
         three = rows.repeat(3)
         rays = self.rays(torch.cat([u, u + h, u]), torch.cat([v, v, v + h]), three)
@@ -202,7 +202,8 @@ class Bundle:
         tangential_mm, sagittal_mm: film points relative to the chief ray of the first wavelength.
         status: of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0.
         weight: energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked.
-        open_weight: the same for all rays through the stop, whatever stops them; of `Filled` without those at rims.
+        open_weight: the same for all rays through the stop, whatever stops them; in `Filled`, rays that rims stop are
+            not there.
         path_mm: optical path from the wavefront (or object point) to the film.
         chief_height_mm: [F], image height of the chief ray of the first wavelength, positive.
     """
@@ -222,21 +223,21 @@ class Bundle:
 
     @property
     def passed(self) -> Tensor:
-        """Whether each ray reaches the film."""
+        """Whether each ray reaches the film, [F, W, P]."""
         return self.status == 0
 
     @property
     def slopes(self) -> tuple[Tensor, Tensor]:
-        """Tangential and sagittal slope (mm per mm along +z) of the rays at the film, [F, W, P]."""
+        """The tangential and sagittal slopes (mm per mm along +z) of the rays at the film, [F, W, P]."""
         return self.scene.image_axes(self.film.dx / self.film.dz, self.film.dy / self.film.dz)
 
     @property
     def cosines(self) -> tuple[Tensor, Tensor]:
-        """Tangential and sagittal direction cosine of the rays at the film, [F, W, P]."""
+        """The tangential and sagittal direction cosines of the rays at the film, [F, W, P]."""
         return self.scene.image_axes(self.film.dx, self.film.dy)
 
     def at_shift(self, shift_mm: float) -> tuple[Tensor, Tensor]:
-        """Tangential and sagittal points with the film moved by `shift_mm` away from the lens, [F, W, P]."""
+        """Return tangential and sagittal points with the film moved by `shift_mm` away from the lens, [F, W, P]."""
         t, s = self.slopes
         return self.tangential_mm + shift_mm * t, self.sagittal_mm + shift_mm * s
 
@@ -250,9 +251,9 @@ def bundle(
     Args:
         scene: lens, object and meridional plane.
         field_deg: angles of the chief ray of the first wavelength, from 0 to below 180; None: `Scene.default_fields`.
-        wavelength_nm: the first is the reference; all share the object point (or direction) of its chief ray. None:
-            `Scene.waves_nm`.
-        pattern: hexapolar with 8 rings where not given.
+        wavelength_nm: the first is the reference; all wavelengths share the object point (or direction) of its chief
+            ray. None: `Scene.waves_nm`.
+        pattern: None is hexapolar with 8 rings.
     """
     pattern = pattern or hexapolar(8)
     fields, waves, chief = _chief(scene, field_deg, wavelength_nm)
@@ -267,7 +268,7 @@ def bundle(
 
 
 class Filled:
-    """Bundles that fill what stop and rims leave open of each field and wavelength, to any accuracy.
+    """Bundles that fill what stop and rims leave open for each field and wavelength, as finely as wanted.
 
     Their rays are nodes of a quadrature on the planes across the chief rays at the front of the lens.
     """
@@ -276,7 +277,7 @@ class Filled:
         self, scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None,
         to_stop: bool = False,
     ) -> None:  # fmt: skip
-        """Find the light; arguments as for `bundle`. `to_stop`: all light that enters the stop, whatever rims take."""
+        """Find the light; arguments as for `bundle`. With `to_stop` it is all light that enters the stop."""
         self.scene = scene
         self.lens = scene.to_stop if to_stop else scene.traced
         self.fields, self.waves, self.chief = _chief(scene, field_deg, wavelength_nm)
@@ -291,7 +292,7 @@ class Filled:
         self.part = lit_part(self._passes, low - margin, high + margin, torch.zeros_like(low))
 
     def only(self, fields: list[int]) -> Filled:
-        """The same for some of the fields, by their numbers."""
+        """Return the same for some of the fields, by their numbers."""
         some = copy(self)
         start, exists, height, film = self.chief
         rays = (Rays(*(c[fields] for c in r)) for r in (start, film))
@@ -301,14 +302,14 @@ class Filled:
         return some
 
     def bundle(self, level: int, path: bool = False) -> Bundle:
-        """The bundle of a level of `lit_nodes`. Without `path` the optical paths, half of the time, are NaN."""
+        """Trace the bundle of a level of `lit_nodes`, with optical paths (half of the time) or NaN for them."""
         nodes = lit_nodes(self._passes, self.part, level)
         aim = self._aim(nodes.u.shape[1])
         u, v, area = (c.reshape(-1) for c in nodes)
         return _traced(self.scene, self.fields, self.chief, aim, (u, v), aim.exists, area * aim.spread(u, v), path)
 
     def energy(self, level: int) -> Tensor:
-        """Energy [F] of all wavelengths, in the units of `Bundle.weight`."""
+        """Return the energy [F] of all wavelengths, in the units of `Bundle.weight`."""
         nodes = lit_nodes(self._passes, self.part, level)
         u, v = (c.reshape(-1) for c in nodes[:2])
         weight = nodes.area * self._passes(*nodes[:2])
@@ -327,7 +328,7 @@ class Filled:
 def _chief(
     scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: Sequence[float] | None
 ) -> tuple[tuple[float, ...], tuple[float, ...], ChiefRays]:
-    """Fields, wavelengths and chief rays of a bundle."""
+    """Return fields, wavelengths and chief rays of a bundle."""
     fields = scene.default_fields() if field_deg is None else tuple(float(f) for f in field_deg)
     waves = tuple(float(w) for w in wavelength_nm or scene.waves_nm)
     return fields, waves, scene.chief_rays(fields, waves[0])
@@ -356,19 +357,19 @@ def _traced(
 
 
 def _path_mm(scene: Scene, points: Sequence[Rays], wavelength_nm: Tensor) -> Tensor:
-    """Optical path along the points of rays on the surfaces."""
+    """Return the optical path along the points of rays on the surfaces."""
     path = torch.zeros_like(points[0].x)
     for medium, before, after in zip(media(scene.traced, wavelength_nm), points, points[1:], strict=False):
-        # Along the ray, not the distance: steps back to the stop inside an element count as negative.
+        # Along the ray, which is no distance: steps back to the stop inside an element count as negative.
         path = path + medium.n * sum((b - a) * d for a, b, d in zip(before[:3], after[:3], before[3:], strict=True))
     return path
 
 
 def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> list[str]:
-    """A warning for each of the default fields (None) from which no ray reaches the film.
+    """Warn of each of the default fields (None) from which no ray reaches the film; returns the warnings.
 
     Raises:
-        InputError: a requested field from which no ray reaches the film, or a lens that passes no ray.
+        InputError: no ray of a requested field reaches the film, or the lens passes no ray at all.
     """
     fields = scene.default_fields() if field_deg is None else field_deg
     axis_lit, *lit = (Filled(scene, [0.0, *fields], [wavelength_nm]).part.reach > 0).tolist()

@@ -26,14 +26,14 @@ from neurolens.optics.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.surfaces import Rays
 
-# Share of the stop's radius that stands for the paraxial ray: its error grows with the square.
+# Share of the stop's radius at which a ray stands for the paraxial one: its error grows with the square.
 PARAXIAL = 1e-3
 _ZONES = (PARAXIAL, 0.5**0.5, 1 - 1e-7)
 
 
 @dataclass(frozen=True)
 class Colour(Result):
-    """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens.
+    """Colour of a lens. Focus counts from the film; shifts are positive away from the lens.
 
     Attributes:
         spectrum_nm: [L].
@@ -57,12 +57,13 @@ def colour(
     scene: Scene, *, spectrum_nm: Sequence[float] | None = None, line_nm: Sequence[float] | None = None,
     fields: int = 21,
 ) -> Colour:  # fmt: skip
-    """Longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field.
+    """Compute longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field.
 
-    The spectrum is 380 to 780 nm and the lines are d, F, C and g; of a lens for other light, its range and wavelengths.
+    The spectrum is 380 to 780 nm and the lines are d, F, C and g; for a lens made for other light, its range and
+    wavelengths.
 
     Raises:
-        InputError: a pinhole, which has no focus.
+        InputError: the lens is a pinhole, which has no focus.
     """
     scene.require_power()
     lens = scene.lens
@@ -74,14 +75,14 @@ def colour(
     crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()
     angles = np.linspace(0, scene.edge.field_deg, fields)
     chief = bundle(scene.open, angles.tolist(), line_nm, points([0.0], [0.0]))
-    # Tangential points grow with image height where the field's angle is positive.
+    # Tangential coordinates grow with the image height where the field's angle is positive.
     lateral = 1000 * chief.tangential_mm[..., 0].numpy()
     return Colour(
         spectrum, np.array(_ZONES), crossing, angles, chief.chief_height_mm.numpy(), np.array(line_nm), lateral
     )
 
 
-_CLOSE = 1e-3  # stop radii; differences are central, so that the error is of the order of its square
+_CLOSE = 1e-3  # of the stop's radius; differences are central, so that their error is of the order of its square
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ class Curvature(OverField):
     """Foci over F fields from the axis to the edge, one wavelength.
 
     Attributes:
-        tangential_mm, sagittal_mm: [F] along the axis from the film, positive away from the lens.
-        petzval_mm: [F] the Petzval surface at these heights, drawn through the sagittal focus on the axis.
+        tangential_mm, sagittal_mm: [F] along the axis, counted from the film, positive away from the lens.
+        petzval_mm: [F] the Petzval surface at these heights, through the sagittal focus on the axis.
         petzval_radius_mm: its radius, positive when its centre lies towards +z; inf when flat; NaN with cylinders.
     """
 
@@ -104,10 +105,10 @@ class Curvature(OverField):
 def curvature(
     scene: Scene, *, wavelength_nm: float | None = None, fields: int = 31, edge_deg: float | None = None
 ) -> Curvature:
-    """Sagittal and tangential foci up to the edge of the field, rims ignored.
+    """Compute sagittal and tangential foci up to the edge of the field, without rims.
 
     Raises:
-        InputError: a pinhole, which has no focus.
+        InputError: the lens is a pinhole, which has no focus.
     """
     scene.require_power()
     wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
@@ -124,7 +125,7 @@ def curvature(
 
 
 def _crossing(place: Tensor, slope: Tensor) -> Array:
-    """z from the film at which two rays [F, 2] cross."""
+    """Return z from the film at which two rays [F, 2] cross."""
     return (-(place[:, 1] - place[:, 0]) / (slope[:, 1] - slope[:, 0])).numpy()
 
 
@@ -146,10 +147,10 @@ class Distortion(OverField):
 
     Attributes:
         scale_mm: image height per radian at the axis: the focal length for a distant object.
-        error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
-        best: the projection of least root mean square error over the whole field.
+        error_percent: by projection [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
+        best: the projection with the least root mean square error over the whole field.
         reference: rectilinear below 60 degrees of half field, `best` from there on.
-        edge_percent: error of `reference` at the edge of the field. edge: which edge that is.
+        edge_percent: error of `reference` at the edge of the field. edge: which edge that is, in words.
     """
 
     wavelength_nm: float
@@ -164,7 +165,7 @@ class Distortion(OverField):
 def distortion(
     scene: Scene, *, wavelength_nm: float | None = None, fields: int = 41, edge_deg: float | None = None
 ) -> Distortion:
-    """Distortion against every projection. For a near object of a rectilinear lens, object heights are used."""
+    """Compute distortion against every projection; for a near object of a rectilinear lens, against object heights."""
     wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
     angles = np.linspace(0, scene.edge.field_deg if edge_deg is None else edge_deg, fields)
     small_first = np.concatenate([[_SMALL_DEG], angles])
@@ -184,13 +185,13 @@ def distortion(
 
 
 def _error(height: Array, ideal: Array) -> Array:
-    """Error in percent with the scale that is right at the first, small field; that field left out of the answer."""
+    """Return the error in percent, for the scale that the first, small field has; that field is left out."""
     with np.errstate(divide="ignore", invalid="ignore"):
         error = 100 * (height / ideal * (ideal[0] / height[0]) - 1)
     return np.where(ideal[1:] == 0, 0.0, error[1:])
 
 
-_MARGIN = 0.08  # margin of the grid around the bundle, as film points beside the chief ray see another pupil
+_MARGIN = 0.08  # of the grid around the bundle, since film points off the chief ray see another pupil
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,7 @@ class Illumination(OverField):
         unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
         passed: [F] share of the stop's light that no rim takes.
         cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
-        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        spread: for each figure by name, [F, ...], how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     wavelength_nm: float
@@ -214,9 +215,9 @@ class Illumination(OverField):
 
 
 def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
-    """Relative illumination at the reference wavelength up to the edge of the field, from where rays leave the film.
+    """Compute relative illumination at the reference wavelength, up to the edge of the field, by rays from the film.
 
-    Fields without a chief ray are NaN, and all are where the axis gets no light.
+    Fields without a chief ray are NaN; all are NaN where the axis gets no light.
     """
     angles, nm = np.linspace(0, scene.edge.field_deg, fields), scene.lens.reference_nm
     rays = bundle(scene.open, angles.tolist(), [nm], hexapolar(6))
@@ -225,7 +226,7 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
 
     def shares(light: list[Array]) -> dict[str, tuple[Array, Array | float]]:
         whole, seen = light
-        with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
+        with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, and an axis without light, give NaN
             found = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
         return {k: (v, 1.0) for k, v in zip(("relative", "unvignetted", "passed"), found, strict=True)}
 
@@ -240,7 +241,7 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
 
 
 def _film_light(scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> FilmLight:
-    """Light through a lens on the plane of the pupil; `pupil`: rays [F, P] that fill it for each film point, there."""
+    """Return the light from a lens to film points at `height_mm` [F]; their rays `pupil` [F, P] show where it is."""
     plane_z_mm = pupil_plane_z_mm(scene.lens)
     # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
     zero = torch.zeros_like(height_mm)
@@ -265,17 +266,17 @@ SUMS = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortio
 class Seidel(Result):
     """Third-order (Seidel) sums and the two of colour, in mm, for the present stop and one image height.
 
-    As wavefront aberrations at the edge of pupil and field: W040 = S1/8, W131 = S2/2, W222 = S3/2, W220 = (S3 + S4)/4,
-    W311 = S5/2; of colour, F against C: C1/2 and C2 (of a lens for other light, its shortest wavelength against its
-    longest).
+    As wavefront aberrations at the edge of pupil and field they are W040 = S1/8, W131 = S2/2, W222 = S3/2, W220 = (S3 +
+    S4)/4, W311 = S5/2; those of colour, F against C, are C1/2 and C2 (for a lens made for other light, its shortest
+    wavelength against its longest).
 
     Attributes:
         surfaces: [S, 7], one row per surface; columns as in `SUMS`.
         total: [7].
-        image_height_mm: the paraxial image height that the sums are for.
+        image_height_mm: the paraxial image height to which the sums belong.
         lagrange_mm: H, the Lagrange invariant.
-        petzval_radius_mm: of the Petzval surface, positive when its centre lies towards +z.
-        odd_powers: surfaces whose r^3 or r terms are left out: they have no third-order theory.
+        petzval_radius_mm: that of the Petzval surface, positive when its centre lies towards +z.
+        odd_powers: surfaces whose r^3 or r terms are left out, because they have no third-order theory.
     """
 
     wavelength_nm: float
@@ -289,10 +290,10 @@ class Seidel(Result):
 
 
 def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm: float | None = None) -> Seidel:
-    """Seidel sums at the edge of the field, or at another paraxial image height in mm.
+    """Compute Seidel sums at the edge of the field, or at another paraxial image height in mm.
 
     Raises:
-        InputError: a lens with cylinders: these sums are those of lenses symmetric about their axis; ideal surfaces.
+        InputError: the lens has cylinders (these sums need symmetry about the axis) or ideal surfaces.
     """
     lens = scene.lens
     wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
@@ -316,7 +317,7 @@ def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm:
 
 
 def petzval_curvature(lens: Lens, wavelength_nm: float = LINE_D_NM) -> float:
-    """Curvature of the Petzval surface in 1/mm (positive: centre towards +z); NaN for a lens with cylinders."""
+    """Return the curvature of the Petzval surface in 1/mm (positive: centre towards +z); NaN with cylinders."""
     if lens.anamorphic:
         return math.nan
     system = system_of(lens, wavelength_nm)
@@ -325,11 +326,11 @@ def petzval_curvature(lens: Lens, wavelength_nm: float = LINE_D_NM) -> float:
 
 
 def _rays(scene: Scene, system: System, image_height_mm: float) -> tuple[PathOfRay, PathOfRay]:
-    """Marginal ray to the edge of the stop, and chief ray to -image_height_mm in the paraxial image."""
+    """Return the marginal ray to the edge of the stop, and the chief ray to -image_height_mm in the paraxial image."""
     stop, near = scene.lens.stop_index, 0.0 if math.isinf(scene.focus_m) else -1 / scene.object_z_mm
     scale = scene.lens.stop_radius_mm / system.march(1.0, near).y[stop]
     marginal = system.march(scale, scale * near)
-    # The linear combination of the two through the middle of the stop.
+    # The linear combination of the two rays that goes through the middle of the stop.
     y, u = -system.march(0.0, 1.0).y[stop], system.march(1.0, 0.0).y[stop]
     chief = system.march(y, u)
     image = -marginal.y[-1] / marginal.after[-1]
@@ -338,7 +339,7 @@ def _rays(scene: Scene, system: System, image_height_mm: float) -> tuple[PathOfR
 
 
 def _row(s: Surface, k: int, n: list[float], spread: list[float], m: PathOfRay, b: PathOfRay) -> list[float]:
-    """The sums of a surface by Welford 1986, "Aberrations of Optical Systems", ch. 8 and 10.
+    """Return the sums of a surface by Welford 1986, "Aberrations of Optical Systems", ch. 8 and 10.
 
     y and u are height and slope of the paraxial marginal ray, barred those of the chief ray, A = n (u + y c),
     H = n (u ybar - ubar y). The fifth sum avoids a division by A, which is 0 at a surface that the marginal ray meets
@@ -351,7 +352,7 @@ def _row(s: Surface, k: int, n: list[float], spread: list[float], m: PathOfRay, 
     bend = m.after[k] / after - m.before[k] / before
     inverse, inverse2 = 1 / after - 1 / before, 1 / after**2 - 1 / before**2
     s5 = -a_bar * (a_bar**2 * y * inverse2 - y_bar * (2 * a_bar * y - a * y_bar) * c * inverse)
-    # What the surface departs from the sphere of its vertex curvature, per r^4.
+    # How the surface departs from the sphere of its vertex curvature, per r^4.
     conic = (1 + float(s.figure.conic)) * float(s.curvature) ** 3 - c**3
     g = (conic + 8 * float(dict(s.figure.powers).get(4, 0.0))) * (after - before)
     dispersion = spread[k + 1] / after - spread[k] / before
@@ -388,14 +389,15 @@ class Breath:
 
 
 def breathing(lens: Lens, focus_m: Sequence[float], focus_mode: FocusMode = "paraxial") -> list[Breath]:
-    """The lens, in the zoom position wanted, at several focus distances from object to film, `inf` allowed.
+    """Describe a lens, set to its zoom position, at several focus distances from object to film; inf is allowed.
 
-    With h the radius of the image circle at infinity focus (the film does not grow) and x' the film's distance behind
-    the rear focal point: the magnification is -x'/f, and the chief ray of the film's edge leaves at
-    atan(h / `paraxial.chief_reach_mm`).
+    h is the radius of the image circle at infinity focus (the film does not grow), x' the film's distance behind the
+    rear focal point. Then the magnification is -x'/f, and the chief ray of the film's edge leaves at atan(h /
+    `paraxial.chief_reach_mm`).
 
     Raises:
-        InputError: no distance, or one that the lens does not reach; "internal" for a lens without focus states.
+        InputError: there is no distance, or one that the lens does not reach; "internal" for a lens without focus
+            states.
     """
     if not focus_m:
         raise InputError("breathing", "focus_m", "(none)", "distances in m")
@@ -418,7 +420,7 @@ def breathing(lens: Lens, focus_m: Sequence[float], focus_mode: FocusMode = "par
 
 
 def field_change(breaths: Sequence[Breath]) -> float:
-    """Largest size of the picture over the smallest, less 1: 0 for a lens that does not breathe."""
+    """Return the largest size of the picture over the smallest, less 1: 0 for a lens that does not breathe."""
     tangents = [math.tan(math.radians(b.field_deg / 2)) for b in breaths]
     return max(tangents) / min(tangents) - 1
 
@@ -429,8 +431,8 @@ _DASHES = ((0, ()), (0, (5, 2)))
 def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, list[Breath]]:
     """Compute and draw a lens's breathing from its nearest focus to a thousand focal lengths.
 
-    Three panels share one logarithmic axis of distance, which has no place for infinity; there is a line for each way
-    to focus, both where the lens file has focus states. Returns what is drawn, infinity first.
+    Three panels share one logarithmic axis of distance, on which infinity has no place. There is a line for each way to
+    focus: two where the lens file has focus states. Returns what is drawn, infinity first.
     """
     data = first_order(set_lens(lens))
     nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000

@@ -32,10 +32,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Result:
-    """Base of the results. Arrays are numpy float64, NaN where undefined; keys carry their unit."""
+    """Base of the results. Arrays are numpy float64, NaN where undefined; names carry their unit."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists, numbers and strings by field name; NaN and infinities stay floats."""
+        """Return plain lists, numbers and strings by field name; NaN and infinities stay floats."""
         found: dict[str, Any] = plain(asdict(self), strict=False)
         return found
 
@@ -50,13 +50,14 @@ class OverField(Result):
 
 DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
 
-# Half field from which a lens counts as a wide one: near objects then lie on a sphere, not on a plane.
+# From this half field on a lens counts as wide: near objects then lie on a sphere, not on a plane.
 WIDE_DEG = 60.0
 
 _FRACTIONS = (0.0, 0.5, 0.7, 0.85, 1.0)
 _WIDEST_DEG = 179.0
-_SEARCH, _ROUNDS = 181, 4  # fields tried, denser near the axis; closer looks at neighbours among them
-_MET = 1e-6  # of the film's radius or the field
+# fields that are tried, denser near the axis; how often neighbours among them are looked at more closely
+_SEARCH, _ROUNDS = 181, 4
+_MET = 1e-6  # of the film's radius or of the field: how close a search must come
 
 
 class ChiefRays(NamedTuple):
@@ -64,7 +65,7 @@ class ChiefRays(NamedTuple):
 
     Attributes:
         start: [F] just before the front surface, travelling to the film.
-        exists: [F] bool; False where no ray of this field meets the middle of the stop.
+        exists: [F] bool; False where no ray of a field meets the middle of the stop.
         height_mm: [F] image height, positive.
         film: [F] rays on the film.
     """
@@ -76,7 +77,7 @@ class ChiefRays(NamedTuple):
 
     @property
     def field_rad(self) -> Tensor:
-        """[F], angles to the axis in the scene."""
+        """The angles [F] to the axis in the scene."""
         return torch.atan2(torch.hypot(self.start.dx, self.start.dy), self.start.dz)
 
 
@@ -86,9 +87,9 @@ class FieldEdge(Result):
 
     Attributes:
         field_deg, height_mm: of its chief ray.
-        meant: which edge was looked for: of the film, as the lens file or an option states it; of the field, where the
-            file states only that; else of the film that gets light.
-        reached: False where no chief ray comes from there: then this is the nearest field with a chief ray.
+        meant: which edge was looked for: the film's, as the lens file or an option states it; the field's, where the
+            file states only that; else that of the lit film.
+        reached: False where no chief ray comes from there; this is then the nearest field that has one.
     """
 
     field_deg: float
@@ -103,20 +104,20 @@ class FieldEdge(Result):
 
     @property
     def warning(self) -> str | None:
-        """A sentence on an edge that was not reached."""
+        """A sentence about an edge that was not reached; None where it was."""
         where = f"{self.field_deg:.4g} degrees, {self.height_mm:.4g} mm"
         return None if self.reached else f"no chief ray comes from {self.meant}; fields end at {where}"
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A lens in a state, with its object.
+    """A lens that is set, with its object.
 
     Attributes:
-        lens: placed by `set_lens`; where it is not, the table's last thickness places the film.
-        focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
-            field is a plane across the axis; of a wider one a sphere about the entrance pupil.
-        axis: transverse axis of the meridional plane; matters for anamorphic lenses only.
+        lens: placed by `set_lens`; else the table's last thickness places the film.
+        focus_m: distance from the film to the object, inf allowed. The object is a plane across the axis; for a lens of
+            60 degrees half field or more it is a sphere about the entrance pupil.
+        axis: transverse axis of the meridional plane; it matters for anamorphic lenses only.
         rims: False opens every rim but the stop's; aspheres continue smoothly beyond theirs.
     """
 
@@ -127,12 +128,12 @@ class Scene:
 
     @property
     def film_z_mm(self) -> float:
-        """z of the film."""
+        """The z of the film in mm."""
         return float(self.lens.film_z_mm if self.lens.film_z_mm is not None else self.lens.vertices_mm[-1])
 
     @property
     def waves_nm(self) -> tuple[float, ...]:
-        """Wavelengths of white light, the reference first: d, F and C, or those of a lens made for other light."""
+        """The wavelengths of white light, reference first: d, F and C, or those of a lens made for other light."""
         return DEFAULT_NM if self.lens.visible else self.lens.wavelengths_nm
 
     @property
@@ -141,20 +142,20 @@ class Scene:
 
     @property
     def image_radius_mm(self) -> float:
-        """Radius of the lit film."""
+        """The radius of the lit film."""
         return image_radius_mm(self.lens)[0]
 
     def image_axes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Tangential component, positive towards the image, and sagittal component of x and y on the film."""
+        """Return the tangential component, positive towards the image, and the sagittal one of x and y on the film."""
         return (-x, y) if self.axis == "x" else (-y, x)
 
     @property
     def object_z_mm(self) -> float:
-        """z of the object on the axis, mm; -inf for a distant one."""
+        """The z in mm of the object on the axis; -inf for a distant one."""
         return self.film_z_mm - 1000 * self.focus_m
 
     def chief_rays(self, field_deg: Sequence[float] | Tensor | Any, wavelength_nm: float | None = None) -> ChiefRays:
-        """Chief rays of fields in degrees, 0 to below 180, at one wavelength, that of reference where none is given."""
+        """Return chief rays of fields in degrees, 0 to below 180, at one wavelength (None: the reference)."""
         nm = self.lens.reference_nm if wavelength_nm is None else wavelength_nm
         angles = torch.deg2rad(torch.as_tensor(field_deg, dtype=torch.float64).reshape(-1))
         middle = torch.zeros(len(angles), 1, dtype=torch.float64)
@@ -170,7 +171,7 @@ class Scene:
         return self._from(start, exists[0], nm)
 
     def _from(self, start: Rays, exists: Tensor, nm: float) -> ChiefRays:
-        """Chief rays from before the front surface to the film."""
+        """Trace chief rays from before the front surface to the film."""
         with torch.no_grad():
             out = trace(without_rims(self.lens), start, nm, towards="film")
         exists = exists & (out.status == 0)
@@ -179,13 +180,13 @@ class Scene:
         return ChiefRays(start, exists, torch.where(exists, height, math.nan), film)
 
     def object_points(self, chief: Rays) -> tuple[Tensor, Tensor, Tensor] | None:
-        """The points of the object that the chief rays leave, [F] each, mm; None for a distant object."""
+        """Return the points of the object that the chief rays leave, [F] each, mm; None for a distant object."""
         if math.isinf(self.focus_m):
             return None
         if self.wide:
             centre = self.first_order.entrance_pupil_z_mm
             radius = centre - self.object_z_mm
-            # The sphere's far meeting with the ray run backwards: |p - c + t d| = radius.
+            # Of the ray run backwards, the far meeting with the sphere: |p - c + t d| = radius.
             z = chief.z - centre
             b = chief.x * chief.dx + chief.y * chief.dy + z * chief.dz
             t = -b - torch.sqrt(b * b - (chief.x**2 + chief.y**2 + z * z - radius * radius))
@@ -202,26 +203,27 @@ class Scene:
         """The widest field that is analysed.
 
         Raises:
-            InputError: a lens that forms no image, or one whose chief rays do not exist off the axis.
+            InputError: the lens forms no image, or has no chief rays off the axis.
         """
         return _edge(self)
 
     def default_fields(self) -> tuple[float, ...]:
-        """The axis, 50%, 70%, 85% and the edge of the field, degrees."""
+        """Return the axis, 50%, 70%, 85% and the edge of the field, in degrees."""
         return tuple(share * self.edge.field_deg for share in _FRACTIONS)
 
     def fields_at(self, height_mm: Sequence[float]) -> list[float]:
-        """Fields in degrees whose chief rays meet the film at these heights; NaN for one that none reaches."""
+        """Return the fields in degrees whose chief rays meet the film at these heights; NaN where no chief ray does."""
         field, reached = self.nearest_fields(height_mm)
         return np.where(reached, field, math.nan).tolist()
 
     def nearest_fields(self, wanted: Sequence[float], *, degrees: bool = False) -> tuple[Array, Array]:
-        """Fields in degrees, the first from the axis outwards, whose chief rays meet the film at given heights (mm).
+        """Find the fields in degrees whose chief rays meet the film at the heights `wanted` (mm).
 
-        Also whether there is such a chief ray; where there is none the nearest counts.
+        Of several such fields the one nearest to the axis is returned; where there is none, the field of the chief ray
+        that comes nearest. The second array tells where there is one.
 
         Args:
-            degrees: the values are angles of fields instead, of which the nearest that has a chief ray counts.
+            degrees: whether the values are angles of fields instead; the nearest that has a chief ray is taken.
         """
         target = torch.as_tensor(wanted, dtype=torch.float64).reshape(-1)
         angle = (_WIDEST_DEG * torch.linspace(0, 1, _SEARCH, dtype=torch.float64) ** 2).expand(len(target), -1)
@@ -238,12 +240,12 @@ class Scene:
 
     @property
     def open(self) -> Scene:
-        """The same scene without rims."""
+        """Return the same scene without rims."""
         return replace(self, rims=False)
 
     @property
     def round(self) -> Scene:
-        """The same scene with a round stop."""
+        """Return the same scene with a round stop."""
         return replace(self, lens=replace(self.lens, aperture=None))
 
     @property
@@ -256,7 +258,7 @@ class Scene:
 
     @property
     def to_stop(self) -> Lens:
-        """The lens from the front to the stop, its opening the only rim."""
+        """The lens from the front to the stop, whose opening is the only rim."""
         surfaces = self.open.traced.surfaces[: self.lens.stop_index + 1]
         return replace(self.lens, surfaces=surfaces)
 

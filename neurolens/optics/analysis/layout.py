@@ -1,4 +1,4 @@
-"""The section of a lens with rays from the scene: as plain data, and drawn in millimetres with equal axes."""
+"""The section of a lens with rays from the scene: as plain data, and drawn in mm with equal scales on both axes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neurolens.optics.trace.rays import trace
 from neurolens.optics.trace.shapes import sag_mm
 from neurolens.optics.trace.surfaces import Rays
 
-FIELDS = (0.0, 0.7, 1.0)  # shares of the film radius: axis, the zone of equal areas inside and outside, edge
+FIELDS = (0.0, 0.7, 1.0)  # shares of the film radius: the axis, the height that halves the picture's area, the edge
 RAYS_A_FIELD = 7
 _FAN = 401
 _AIR = 1.01  # a medium of a smaller index is drawn as air
@@ -33,7 +33,7 @@ class Section:
     Attributes:
         radius_mm: inf for a plane.
         n_after: index of the medium behind it.
-        profile: [M, 2] of (z, height) from rim to rim of what is no sphere, else None.
+        profile: [M, 2] points (z, height) from rim to rim of a surface that is no sphere, else None.
         ideal: whether it is an ideal thin lens.
     """
 
@@ -46,9 +46,10 @@ class Section:
     ideal: bool = False
 
     def arc(self) -> Array:
-        """[M, 2] of (z, height) from rim to rim.
+        """Return points [M, 2] of (z, height) from rim to rim.
 
-        Points of a sphere are even in angle, not height: the rim of a front lens close to a half ball stays smooth.
+        On a sphere they are evenly spaced in angle, not in height: the rim of a front lens near a half ball stays
+        smooth.
         """
         if self.profile is not None:
             return self.profile
@@ -77,7 +78,7 @@ class Layout(Result):
         height: transverse axis of the section, "x" or "y".
 
     Raises:
-        InputError: a surface whose semi-diameter is not positive and finite.
+        InputError: a surface has a semi-diameter that is not positive and finite.
     """
 
     surfaces: tuple[Section, ...]
@@ -96,9 +97,10 @@ class Layout(Result):
 
 
 def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
-    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the film, reference wavelength.
+    """Return a lens's section with meridional fans of rays to the axis, 70% and the edge of the film.
 
-    The edge of the film is that of the image circle if not given. A field of which none passes has no rays.
+    They are of the reference wavelength. The edge of the film is that of the image circle if not given. A field of
+    which no ray passes has none.
     """
     lens = scene.lens
     radius = scene.image_radius_mm if film_radius_mm is None else film_radius_mm
@@ -131,7 +133,7 @@ def _profile(s: Surface, vertex_mm: float, axis: str) -> Array | None:
 
 
 def state_text(scene: Scene) -> str:
-    """Focal length, f-number, refractions and focus of a scene, for headings."""
+    """Return the focal length, f-number, refractions and focus of a scene as text for headings."""
     data, count = scene.first_order, scene.lens.refractions
     focus = "infinity" if math.isinf(scene.focus_m) else f"{scene.focus_m:.4g} m"
     plane = f", {scene.axis}-z plane" if scene.lens.anamorphic else ""
@@ -139,21 +141,21 @@ def state_text(scene: Scene) -> str:
 
 
 def _fan_lines(scene: Scene, field: float) -> list[Array]:
-    """Polylines (z, height) of rays that pass, evenly spread over the open part of the stop."""
+    """Return polylines (z, height) of rays that pass, evenly spread over the open part of the stop."""
     line = fan(_FAN)
     tangential = Pattern(*(v[:_FAN] for v in line))
     rays = bundle(scene, [field], [scene.lens.reference_nm], tangential)
     passing = torch.nonzero(rays.passed[0, 0])[:, 0]
     if len(passing) == 0:
         return []
-    # Slightly inside the ends: the outermost rays touch a rim.
+    # Slightly inside the ends, where the outermost rays touch a rim.
     places = torch.linspace(0.01, 0.99, RAYS_A_FIELD, dtype=torch.float64) * (len(passing) - 1)
     chosen = passing[places.round().long()]
     start = Rays(*(c[0, 0][chosen] for c in rays.start))
     with torch.no_grad():
         path = trace(scene.lens, start, towards="film", path=True).path
     film = Rays(*(c[0, 0][chosen] for c in rays.film))
-    # From a plane in front of all surfaces, or for a fisheye from the same distance.
+    # From a plane in front of all surfaces; for a fisheye, from the same distance.
     reach = 4 * max(d for d in scene.lens.semi_diameters_mm if math.isfinite(d))
     first = path[0]
     far = first._replace(x=first.x - reach * start.dx, y=first.y - reach * start.dy, z=first.z - reach * start.dz)
@@ -186,13 +188,13 @@ def draw_section(axes: Any, layout: Layout, **axis: Any) -> None:
     unnamed = {ray.label for ray in layout.rays}
     for ray in layout.rays:
         colour = FIELD_COLOURS[ray.field % len(FIELD_COLOURS)]
-        label = ray.label if ray.label in unnamed else None  # one entry of the legend for the rays of a field
+        label = ray.label if ray.label in unnamed else None  # the rays of a field have one entry in the legend
         unnamed.discard(ray.label)
         axes.plot(*ray.points.T, color=colour, lw=0.85, alpha=0.85, zorder=3.5, label=label)
 
 
 def _limits(layout: Layout) -> tuple[tuple[float, float], float]:
-    """z from a little before the glass (rays come in from there) to a little behind the film, and greatest height."""
+    """The z from a little before the glass (rays come from there) to a little behind the film, and greatest height."""
     height = max(s.semi_diameter_mm for s in layout.surfaces)
     z = np.concatenate([*(s.arc()[:, 0] for s in layout.surfaces), [layout.film_z_mm]])
     ends = float(z.min() - 0.55 * height - 0.04 * np.ptp(z)), float(z.max() + 0.06 * np.ptp(z) + 0.05 * height)
@@ -200,9 +202,10 @@ def _limits(layout: Layout) -> tuple[tuple[float, float], float]:
 
 
 def element_outline(front: Section, back: Section) -> Array:
-    """Closed outline [K, 2] of the glass between two surfaces: both arcs, flats to the wider rim, the cylinder edge.
+    """Return the closed outline [K, 2] of the glass between two surfaces.
 
-    Where the flats would cross (a thin-edged lens of unlike rims) the edge runs straight from rim to rim.
+    It has both arcs, flats out to the wider rim, and the cylindrical edge. Where the flats would cross (a thin-edged
+    lens with unlike rims) the edge runs straight from rim to rim.
     """
     a, b = front.arc(), back.arc()
     edge = max(front.semi_diameter_mm, back.semi_diameter_mm)
@@ -225,7 +228,7 @@ def _draw_glass(axes: Any, surfaces: Sequence[Section]) -> None:
 
 
 def _draw_rims(axes: Any, surfaces: Sequence[Section]) -> None:
-    """A tick outside each rim of glass, which blocks rays; the stop as two solid bars."""
+    """Draw a tick outside each rim of glass, which blocks rays, and the stop as two solid bars."""
     height = max(s.semi_diameter_mm for s in surfaces)
     for s in surfaces:
         if s.ideal:
@@ -237,12 +240,12 @@ def _draw_rims(axes: Any, surfaces: Sequence[Section]) -> None:
             axes.plot((z, z), (sign * h, sign * reach), label=label, **look)
 
 
-_WIDTH, _LEAST, _MOST = 240.0, 60.0, 200.0  # pixels of a thumbnail: width; height
+_WIDTH, _LEAST, _MOST = 240.0, 60.0, 200.0  # pixels of a thumbnail: width, least and largest height
 _SVG_RAYS = ("#3b6fb6", "#3d9a50", "#c2502e")
 
 
 def thumbnail(layout: Layout) -> str:
-    """The section as a small SVG element (a few kB, no ids), for tables of many lenses."""
+    """Return the section as a small SVG element (a few kB, no ids), for tables of many lenses."""
     (left, right), top = _limits(layout)
     scale = min(_WIDTH / (right - left), _MOST / (2 * top))
     width, height = scale * (right - left), max(2 * scale * top, _LEAST)

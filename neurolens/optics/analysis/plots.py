@@ -31,7 +31,7 @@ _STYLE: Any = {
 
 
 def style() -> Any:
-    """A context in which a figure is built and written: the user's own settings are neither used nor changed."""
+    """Return a context in which a figure is made and written, untouched by the user's own settings of matplotlib."""
     try:
         import matplotlib
     except ImportError as error:
@@ -40,7 +40,7 @@ def style() -> Any:
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """A matplotlib Figure on an Agg canvas: no pyplot, no window, nothing left open."""
+    """Return a matplotlib Figure on an Agg canvas: no pyplot, no window, nothing left open."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -51,14 +51,14 @@ def new_figure(width_in: float, height_in: float) -> Any:
 
 @contextmanager
 def drawing(path: str | Path, width_in: float, height_in: float, title: str = "", subtitle: str = "") -> Iterator[Any]:
-    """A figure in the common style, written to `path` (PNG, PDF or SVG, by its suffix) at the end of the block.
+    """Yield a figure in the common style; it is written to `path` (PNG, PDF or SVG, by its suffix) after the block.
 
     A title stands at its top left, with the subtitle in a lighter colour below it.
     """
     with style():
         figure = new_figure(width_in, height_in)
         if title:
-            room = "\n\n" + "\n" * subtitle.count("\n") if subtitle else ""  # the layout keeps these lines free
+            room = "\n\n" + "\n" * subtitle.count("\n") if subtitle else ""  # lines that the layout keeps free
             figure.suptitle(title + room, x=0.01, ha="left", fontsize=12, fontweight="bold")
             figure.text(0.01, 1 - 0.36 / height_in, subtitle, ha="left", va="top", fontsize=9, color="#555b63")
         yield figure
@@ -82,7 +82,7 @@ def plain_log_ticks(*axes: Any) -> None:
 
 
 def _wavelength_colour(wavelength_nm: float) -> str:
-    """A colour similar to that of the wavelength, legible on white."""
+    """Return a colour similar to that of the wavelength, legible on white."""
     limits = ((450, "#7b4fa3"), (505, "#0072b2"), (600, "#009e73"), (1e9, "#d55e00"))
     return next(colour for limit, colour in limits if wavelength_nm < limit)
 
@@ -99,7 +99,7 @@ def _wavelengths(wavelength_nm: Iterable[float]) -> str:
 def _curves(
     path: str | Path, size: tuple[float, float], title: str, subtitle: str, labels: dict[str, Any], columns: int = 0
 ) -> Iterator[Any]:
-    """Axes with a grid for curves, the legend inside them or, in some columns, below; `labels` go to `axes.set`."""
+    """Yield axes with a grid for curves, the legend inside or, in some columns, below; `labels` go to `axes.set`."""
     with drawing(path, *size, title, subtitle) as figure:
         axes = figure.add_subplot()
         axes.grid(True)
@@ -112,7 +112,7 @@ def _curves(
 
 
 def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> None:
-    """Longitudinal colour by zones against wavelength, and lateral colour against field."""
+    """Plot longitudinal colour by zones against wavelength, and lateral colour against field."""
     with drawing(path, 9.4, 4.6, title, f"Colour; {subtitle}") as figure:
         left, right = figure.subplots(1, 2)
         names = ("paraxial", f"zone {data.zone[1]:.2f}", "edge of the stop")
@@ -132,7 +132,7 @@ def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> No
 
 
 def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str) -> None:
-    """Sagittal, tangential and Petzval foci (across) against image height (up), as lens catalogues draw them."""
+    """Plot sagittal, tangential and Petzval foci (across) against image height (up), as lens catalogues draw them."""
     text = f"Field curvature and astigmatism, {data.wavelength_nm:.0f} nm\n{subtitle}"
     labels = {"xlabel": "focus from the film, away from the lens (mm)", "ylabel": "image height (mm)"}
     with _curves(path, (6.4, 5.2), title, text, labels) as axes:
@@ -145,7 +145,7 @@ def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str)
 
 
 def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: str) -> None:
-    """Distortion against the closest projections, the reference drawn thick."""
+    """Plot distortion against the closest projections; the reference is a thick line."""
     limit = max(2.0, 1.25 * float(np.nan_to_num(np.abs(data.error_percent[data.reference])).max()))
     text = f"Distortion, {data.wavelength_nm:.0f} nm; {subtitle}"
     labels = {"xlabel": "field (degrees)", "ylabel": "distortion (%)", "ylim": (-limit, limit)}
@@ -159,7 +159,7 @@ def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: st
 
 
 def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: str) -> None:
-    """Relative illumination and its factors, against image height."""
+    """Plot relative illumination and its factors against image height."""
     rows = (
         (data.relative, "relative illumination", FIELD_COLOURS[0], "-", 2.2),
         (data.unvignetted, "without the rims", FIELD_COLOURS[2], "-", 1.2),
@@ -176,7 +176,7 @@ def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: 
 
 
 def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
-    """MTF against frequency: a colour per field, tangential solid, sagittal dashed."""
+    """Plot MTF against frequency: a colour per field, tangential solid, sagittal dashed."""
     text = f"Geometric MTF at {_wavelengths(data.wavelength_nm)}, without diffraction; {subtitle}"
     labels: dict[str, Any] = {"xlabel": "frequency (cycles/mm)", "ylabel": "contrast", "ylim": (0, 1.02)}
     labels["xlim"] = (0, data.frequency_per_mm[-1])
@@ -192,7 +192,7 @@ def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
 
 
 def plot_mtf_over_height(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
-    """MTF against image height: a colour per frequency, tangential solid, sagittal dashed."""
+    """Plot MTF against image height: a colour per frequency, tangential solid, sagittal dashed."""
     text = f"Geometric MTF at {_wavelengths(data.wavelength_nm)}, without diffraction; {subtitle}"
     labels: dict[str, Any] = {"xlabel": "image height (mm)", "ylabel": "contrast", "ylim": (0, 1.02)}
     labels["xlim"] = (0, float(np.nanmax(data.height_mm)))
@@ -205,7 +205,7 @@ def plot_mtf_over_height(data: Mtf, path: str | Path, title: str, subtitle: str)
 
 
 def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> None:
-    """Seidel sums as bars, surface by surface, with their total apart."""
+    """Plot Seidel sums as bars, surface by surface, with their total apart."""
     text = f"Seidel sums at {data.image_height_mm:.1f} mm image height, {data.wavelength_nm:.0f} nm; {subtitle}"
     with drawing(path, max(8.4, 0.3 * len(data.surfaces) + 3), 10.0, title, text) as figure:
         rows = figure.subplots(len(data.names), 1, sharex=True)
@@ -223,12 +223,12 @@ def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> No
 
 
 def _degrees(axes: Any, data: Any, across: bool = False) -> None:
-    """A second axis with the field in degrees, beside that of image heights."""
+    """Add an axis with the field in degrees to that of image heights."""
     known = np.isfinite(data.height_mm)
     height, field = data.height_mm[known], data.field_deg[known]
     if len(height) < 2 or not (np.diff(height) > 0).all():
         return
-    # Both go on linearly at their ends, for ticks beyond them.
+    # Both are continued linearly at their ends, for ticks beyond them.
     height, field = (
         np.concatenate([[v[0] - 100 * (v[1] - v[0])], v, [v[-1] + 100 * (v[-1] - v[-2])]]) for v in (height, field)
     )
@@ -243,7 +243,7 @@ _SHIFTS = 5
 
 
 def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> None:
-    """Spots: rows are fields, columns the film moved through focus, the middle one unshifted, with the Airy disc."""
+    """Plot spots: a row per field, a column per focus with the unshifted film in the middle, and the Airy disc."""
     rows, columns = len(data.field_deg), min(_SHIFTS, len(data.shift_mm))
     shifts, half = np.linspace(data.shift_mm[0], data.shift_mm[-1], columns), _half_width(data)
     size = 1.4 + 1.6 * max(columns, 2), 1.75 * rows + 1.3
@@ -266,7 +266,7 @@ def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> None
 
 
 def _points(data: Spots, field: int, shift_mm: float) -> tuple[Any, Any]:
-    """Tangential and sagittal points [W, P] of a field from their middle, with the film moved; NaN where blocked."""
+    """Tangential and sagittal points [W, P] of a field from their middle, with the film moved; NaN if blocked."""
     t = data.tangential_um[field] + 1000 * shift_mm * data.slope_tangential[field]
     s = data.sagittal_um[field] + 1000 * shift_mm * data.slope_sagittal[field]
     return (t, s) if np.isnan(t).all() else (t - np.nanmean(t), s - np.nanmean(s))
@@ -286,7 +286,7 @@ def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
 
 
 def _half_width(data: Spots) -> float:
-    """Half width that contains nearly all rays at every focus shown."""
+    """Return the half width that contains nearly all rays at every focus shown."""
     reach = [data.airy_um * 1.5] if math.isfinite(data.airy_um) else []
     for shift in (data.shift_mm[0], 0.0, data.shift_mm[-1]):
         away = [np.hypot(*_points(data, i, shift)) for i in range(len(data.field_deg))]
@@ -295,7 +295,7 @@ def _half_width(data: Spots) -> float:
 
 
 def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> None:
-    """Ray fans: a row per field, tangential left and sagittal right, one scale for all."""
+    """Plot ray fans: a row per field, tangential left and sagittal right, one scale for all."""
     rows = len(data.field_deg)
     every = np.concatenate([data.tangential_um.ravel(), data.sagittal_um.ravel()])
     reach = 1.1 * float(np.nanmax(np.abs(every))) if np.isfinite(every).any() else 1.0
@@ -319,7 +319,7 @@ def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> None:
 
 
 def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> None:
-    """Point spread: geometric above, diffraction below, square root of the values so that faint light shows."""
+    """Plot point spread: geometric above, diffraction below; the square root of the values shows faint light."""
     columns = len(data.field_deg)
     text = f"Point spread, brightness as square root; {subtitle}"
     with drawing(path, max(9.0, 2.25 * columns), 6.0, title, text) as figure:

@@ -8,10 +8,10 @@ x' = x / z, y' = y / z, r^2 = x'^2 + y'^2, t the angle to z, and the pixel c + (
     kannala-brandt  (u, v) = d (x, y) / |(x, y)|, d = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8): OpenCV's fisheye
     f-theta         the same with d = sum of a_i t^i in pixels, fy = 1, fx the c of NVIDIA's linear transformation
 
-A lens centred on its axis has p1 = p2 = 0 and its principal point in the picture's middle: neither is fitted. One
-without cylinders has fx = fy. All of these have one centre; `RayTable` has a ray of its own for every pixel. Sources:
-OpenCV, modules calib3d and fisheye; Kannala and Brandt 2006, IEEE PAMI 28(8); NVIDIA, documentation of NCore, sensor
-models; Schoeps et al. 2020, "Why Having 10,000 Parameters in Your Camera Model Is Better Than Twelve", CVPR.
+A lens centred on its axis has p1 = p2 = 0 and its principal point in the picture's middle, so that neither is fitted;
+without cylinders it has fx = fy. All of these have one centre; `RayTable` has a ray of its own for every pixel.
+Sources: OpenCV, modules calib3d and fisheye; Kannala and Brandt 2006, IEEE PAMI 28(8); NVIDIA, documentation of NCore,
+sensor models; Schoeps et al. 2020, "Why Having 10,000 Parameters in Your Camera Model Is Better Than Twelve", CVPR.
 """
 
 from __future__ import annotations
@@ -40,30 +40,30 @@ NAMES = {
     "f-theta": ("a1", "a2", "a3", "a4", "a5"),
 }
 PLANAR = ("opencv", "opencv-rational")
-WIDEST_DEG = 85.0  # of what is divided by z
+WIDEST_DEG = 85.0  # of projections that divide by z
 _FIXED = ("p1", "p2")
-_RATIO = ("k4", "k5", "k6")  # of the denominator
+_RATIO = ("k4", "k5", "k6")  # in the denominator
 _REACH = (
     1.25  # over the widest angle's radius: so far a ratio has no pole, for programs show a margin beyond the picture
 )
-_ROUNDING = 1e-6  # imaginary part of a real root over its size
-_TINY = 1e-24  # square of the sine below which the axis begins
-_NOT_FOLDED = 179.0, 89.9  # degrees to which a fold is looked for, about the lens and on the plane
-_ANGLES = 4097  # that are tried for it
-_STEP = 1e-30  # of derivatives along the imaginary axis, which are exact
-_BINS = 5  # fields of a report
-_SMOOTH = 1e-9  # weight of a table's bending over that of its points: it leads on where the picture is dark
+_ROUNDING = 1e-6  # imaginary part over size, below which a root counts as real
+_TINY = 1e-24  # square of the sine: a smaller one is on the axis
+_NOT_FOLDED = 179.0, 89.9  # degrees up to which a fold is looked for: about the lens, and on the plane
+_ANGLES = 4097  # angles that are tried for it
+_STEP = 1e-30  # of derivatives along the imaginary axis, which have no error of differences
+_BINS = 5  # parts of the field in a report
+_SMOOTH = 1e-9  # weight of a table's bending over that of its points: it continues the table where the picture is dark
 
 
 @dataclass(frozen=True)
 class Projection:
-    """A projection with its numbers.
+    """A projection of some kind, with its numbers.
 
     Attributes:
         kind: one of `NAMES`. size: of the picture in pixels.
-        focal_px: fx, fy; see f-theta.
-        coefficients: by the names of the kind.
-        widest_rad: the picture ends at this angle.
+        focal_px: fx, fy; for f-theta see the module.
+        coefficients: in the order of the kind's names.
+        widest_rad: the angle at which the picture ends.
     """
 
     kind: str
@@ -74,24 +74,24 @@ class Projection:
 
     @property
     def centre_px(self) -> tuple[float, float]:
-        """The principal point."""
+        """The principal point in pixels."""
         return (self.size[0] - 1) / 2, (self.size[1] - 1) / 2
 
     @property
     def named(self) -> dict[str, float]:
-        """Coefficients by name."""
+        """Return the coefficients with their names, such as k1."""
         return dict(zip(NAMES[self.kind], self.coefficients, strict=True))
 
     @property
     def numbers(self) -> Array:
-        """fx, fy and the coefficients."""
+        """fx, fy and the coefficients, in one array."""
         return np.array([*self.focal_px, *self.coefficients])
 
     def project(self, direction: Array, numbers: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Pixels [..., 2] of directions [..., 3] of any length; as the formula goes on, also beyond the picture.
+        """Return pixels [..., 2] of directions [..., 3] of any length; the formula also holds beyond the picture.
 
-        NaN where a projection that divides by z sees nothing. `numbers`: fx, fy and the coefficients, instead of its
-        own; complex ones give complex pixels.
+        They are NaN where a projection that divides by z sees nothing. `numbers` replaces its own fx, fy and
+        coefficients; complex ones give complex pixels.
         """
         values = self.numbers if numbers is None else numbers
         x, y, z = np.moveaxis(np.asarray(direction, np.float64), -1, 0)
@@ -106,7 +106,7 @@ class Projection:
 
     @cached_property
     def fold_rad(self) -> float:
-        """Angle from which on radii shrink, of any azimuth; if they do not, the last that is tried."""
+        """Return the angle from which on radii shrink, at any azimuth; if they never do, the last that is tried."""
         end = math.radians(_NOT_FOLDED[self.kind in PLANAR])
         angle = np.linspace(0, end, _ANGLES)[:, None]
         turn = np.linspace(0, math.pi / 2, 7)
@@ -117,13 +117,13 @@ class Projection:
 
     @property
     def pole(self) -> bool:
-        """Whether a denominator is zero within the picture."""
+        """Return whether a denominator is zero within the picture."""
         bottom = [self.named.get(name, 0.0) for name in _RATIO]
         return self.kind in PLANAR and has_pole(bottom, (_REACH * math.tan(self.widest_rad)) ** 2)
 
     @property
     def sharp_rad(self) -> Array:
-        """Angles of the picture at which a denominator is least: rings that points on a grid may miss."""
+        """Return the angles of the picture at which a denominator is least: rings that points on a grid may miss."""
         at = roots([self.named.get(name, 0.0) for name in _RATIO]).real if self.kind in PLANAR else np.zeros(0)
         angle = np.arctan(np.sqrt(at[at > 0]))
         return np.asarray(angle[angle <= self.widest_rad])
@@ -135,25 +135,25 @@ class Projection:
 
 
 def _series(coefficients: NDArray[Any], x: Array) -> Any:
-    """A polynomial, lowest coefficient first."""
+    """Return the value of a polynomial whose lowest coefficient comes first."""
     return np.polynomial.polynomial.polyval(x, coefficients)
 
 
 def roots(bottom: Sequence[float]) -> NDArray[np.complex128]:
-    """The x at which 1 + k x + l x^2 + ... is zero."""
+    """Return the x at which 1 + k x + l x^2 + ... is zero."""
     return np.asarray(np.roots([*reversed(bottom), 1.0]), np.complex128)
 
 
 def has_pole(bottom: Sequence[float], widest: float) -> bool:
-    """Whether 1 + k x + l x^2 + ... is zero for a real x from 0 to the widest."""
+    """Return whether 1 + k x + l x^2 + ... is zero for a real x from 0 to `widest`."""
     at = roots(bottom)
-    # Two real roots that are close come out of the rounding as a pair with small imaginary parts.
+    # Rounding turns two real roots that are close into a pair with small imaginary parts.
     real = np.abs(at.imag) <= _ROUNDING * np.abs(at)
     return bool((real & (at.real > 0) & (at.real <= widest)).any())
 
 
 def _bent(kind: str, c: NDArray[Any], x: Array, y: Array) -> tuple[Any, Any]:
-    """The images of points x', y' of the plane."""
+    """Return the images of points x', y' of the plane."""
     r2 = x * x + y * y
     k1, k2, p1, p2, k3 = c[:5]
     q = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -165,12 +165,12 @@ def _bent(kind: str, c: NDArray[Any], x: Array, y: Array) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Residual:
-    """The distances in pixels that a fitted projection leaves.
+    """What a fitted projection leaves: distances in pixels.
 
     Attributes:
-        rms_px, worst_px: over all points. worst: the point of the worst. worst_at_deg: its field.
-        by_field: (from, to) in degrees, RMS and worst, of equal parts of the field.
-        field_deg: the widest angle of the points. fold_deg: from here on the projection turns back.
+        rms_px, worst_px: over all points. worst: number of the point with the worst. worst_at_deg: its field.
+        by_field: for equal parts of the field: from and to in degrees, RMS and worst.
+        field_deg: the widest angle of the points. fold_deg: the angle from which on the projection turns back.
     """
 
     rms_px: float
@@ -183,7 +183,7 @@ class Residual:
 
     @property
     def sound(self) -> bool:
-        """Whether the projection goes on rising over the whole field."""
+        """Whether the projection rises over the whole field."""
         return self.fold_deg > self.field_deg * (1 - 1e-9)
 
 
@@ -196,16 +196,17 @@ def fit(
     source: str = "projection",
     light: Array | None = None,
 ) -> Projection:
-    """The projection of least mean squared distance of the pixels, weighed by their light.
+    """Fit a projection with the least mean squared distance from pixels, weighted by their light.
 
     Args:
-        direction: [N, 3] unit vectors, and pixel [N, 2], where a lens shows them; spread evenly over the picture.
-        size: of the picture. focal_px: paraxial fx and fy; equal: they stay equal.
+        direction: [N, 3] unit vectors. pixel: [N, 2] where a lens shows them; both spread evenly over the picture.
+        size: of the picture. focal_px: paraxial fx and fy; where they are equal, they stay equal.
         source: what errors name.
-        light: [N], that arrives; none: all alike. At the rim of an image circle only some colours do, from elsewhere.
+        light: [N] that arrives; None weights all alike. At the rim of an image circle only some colours arrive, and
+            from elsewhere.
 
     Raises:
-        InputError: a field too wide for this kind, fewer points than numbers.
+        InputError: the field is too wide for this kind, or there are fewer points than numbers.
     """
     widest = float(_angle(direction).max(initial=0))
     if kind in PLANAR and math.degrees(widest) > WIDEST_DEG:
@@ -214,7 +215,8 @@ def fit(
     if len(pixel) < 2 * len(NAMES[kind]) + 2:
         raise InputError(source, "picture", f"({len(pixel)} lit points)", "a picture that light reaches")
     start = Projection(kind, size, focal_px, (0.0,) * len(NAMES[kind]), widest)
-    # A ratio with a term too many spends it on a pole beside a zero: terms of the denominator go until none is there.
+    # A ratio with one term too many spends it on a pole beside a zero: terms of the denominator are dropped until no
+    # pole is left.
     weight = np.ones((1, 1)) if light is None else np.sqrt(light)[:, None]
     for dropped in range(4 if kind == "opencv-rational" else 1):
         fixed = _RATIO[len(_RATIO) - dropped :]
@@ -225,12 +227,12 @@ def fit(
 
 
 def _angle(direction: Array) -> Array:
-    """Angles to the axis in rad of directions [N, 3]."""
+    """Return angles to the axis in rad of directions [N, 3]."""
     return np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
 
 
 def residual(projection: Projection, direction: Array, pixel: Array) -> Residual:
-    """The residual of a projection at pixels [N, 2] of directions [N, 3] that it was not fitted to."""
+    """Return the residual of a projection at pixels [N, 2] of directions [N, 3] to which it was not fitted."""
     miss = np.linalg.norm(projection.project(direction) - pixel, axis=-1)
     angle = np.degrees(_angle(direction))
     widest = float(angle.max())
@@ -252,7 +254,7 @@ def _rms(values: Array) -> float:
 def _adjusted(
     start: Projection, direction: Array, pixel: Array, weight: Array, round_: bool, dropped: Sequence[str] = ()
 ) -> Projection:
-    """The projection whose numbers, found from the paraxial ones, have the least squares of distances; some stay 0."""
+    """Adjust the numbers of a projection from the paraxial ones to the least squares of distances; some stay 0."""
     theta = start.kind == "f-theta"
     first, tied = start.numbers, round_ and not theta
     if theta:
@@ -278,7 +280,7 @@ def _adjusted(
 
 
 def inverse_polynomial(projection: Projection) -> tuple[float, ...]:
-    """Coefficients b_1 to b_5 of the angle over the radius in pixels of an f-theta, NVIDIA's other direction."""
+    """Return b_1 to b_5 of an f-theta's other direction at NVIDIA: the angle by powers of the radius in pixels."""
     angle = np.linspace(0, min(projection.widest_rad, projection.fold_rad), _ANGLES)
     radius = angle * _series(projection.numbers[2:], angle)
     powers = radius.max() ** np.arange(1, 6)
@@ -288,14 +290,15 @@ def inverse_polynomial(projection: Projection) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class RayTable:
-    """A camera without a centre: rays of pixels, between control values by uniform cubic B-splines along both sides.
+    """A camera without a centre: rays of pixels, from control values by uniform cubic B-splines along both sides.
 
-    It is the model "noncentral-generic" of Schoeps et al.; they count pixels from the first one's corner.
+    It is the model "noncentral-generic" of Schoeps et al., who count pixels from the corner of the first one.
 
     Attributes:
         size: of the picture in pixels.
-        first, last: columns and rows of the outermost pixels that have rays.
-        grid: [H, W, 6] control values of a point of the ray (m) and of its direction; the outermost lie beyond.
+        first, last: column and row of the first and of the last pixel with rays.
+        grid: [H, W, 6] control values of a point of the ray (m) and of its direction; the outermost lie beyond the
+            picture.
     """
 
     size: tuple[int, int]
@@ -304,7 +307,7 @@ class RayTable:
     grid: Array
 
     def __call__(self, pixel: Array) -> Array:
-        """Points (m) and unit directions [N, 6] of the rays of pixels [N, 2]."""
+        """Return points (m) and unit directions [N, 6] of the rays of pixels [N, 2]."""
         rays = np.asarray(NdBSpline(self._knots, self.grid, 3)(self._place(pixel)))
         rays[:, 3:] /= np.linalg.norm(rays[:, 3:], axis=1, keepdims=True)
         return rays
@@ -315,16 +318,16 @@ class RayTable:
         return rows, columns
 
     def _place(self, pixel: Array) -> Array:
-        """Rows and columns of the grid at pixels."""
+        """Return rows and columns of the grid at pixels."""
         first, end = np.array(self.first) - 0.5, np.array(self.last) + 0.5
         cells = np.array(self.grid.shape[1::-1]) - 3
         return np.ascontiguousarray((1 + cells * (pixel - first) / (end - first))[:, ::-1])
 
     def fitted(self, pixel: Array, rays: Array, weight: Array) -> RayTable:
-        """The table of this shape with the least squares of distances from rays [N, 6] of pixels, by weights [N]."""
+        """Fit a table of this shape to rays [N, 6] of pixels by least squares of distances, with weights [N]."""
         height, width = self.grid.shape[:2]
         rows = NdBSpline.design_matrix(self._place(pixel), self._knots, 3)
-        rows.resize(len(pixel), height * width)  # it ends with the last value that is used
+        rows.resize(len(pixel), height * width)  # it would end with the last value that is used
         weighed = rows.multiply(weight[:, None]).T.tocsc()
         normal = weighed @ rows
         bend = [diags([1.0, -2.0, 1.0], [0, 1, 2], (n - 2, n)) for n in (height, width)]

@@ -21,20 +21,20 @@ _SHIFTS = 21
 
 @dataclass(frozen=True)
 class Spots(OverField):
-    """Spots of F fields, W wavelengths, P rays; shifts of the film are positive away from the lens.
+    """Spots of F fields, W wavelengths and P rays. Shifts of the film are positive away from the lens.
 
     Attributes:
         tangential_um, sagittal_um: [F, W, P] from the chief ray of the first wavelength, NaN where blocked; rings over
             the stop, to draw. The figures below are converged over what stop and rims leave open (`pupil_nodes`).
         slope_tangential, slope_sagittal: [F, W, P], for spots at another focus.
         rms_um: [F] root mean square distance from the centroid, over all wavelengths, weighted by energy.
-        geometric_um: [F] the largest distance from the centroid; NaN, as all sizes, where no ray passes.
+        geometric_um: [F] the largest distance from the centroid; NaN, like all sizes, where no ray passes.
         rms_by_wavelength_um: [F, W], each from its own centroid.
         passed: [F] share of the stop's light that no rim takes.
         airy_um: radius of the first dark ring on the axis, 1.22 lambda N with the working f-number.
-        shift_mm, through_focus_um: [K] and [F, K], RMS radius with the film moved.
-        best_shift_mm, best_rms_um: [F], where each field's RMS radius is least; NaN where rays stay parallel.
-        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        shift_mm, through_focus_um: [K] shifts of the film, and [F, K] the RMS radius there.
+        best_shift_mm, best_rms_um: [F] where each field's RMS radius is least; NaN where rays stay parallel.
+        spread: for each figure by name, [F, ...], how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     wavelength_nm: Array
@@ -59,7 +59,7 @@ def spots(
     scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None, *,
     rings: int = _RINGS, shift_mm: Sequence[float] | None = None,
 ) -> Spots:  # fmt: skip
-    """Spot diagrams; the fields are those of `Scene.default_fields` and the shifts span the best foci if not given."""
+    """Compute spots. Without fields they are `Scene.default_fields`, without shifts these span the best foci."""
     rays = bundle(scene, field_deg, wavelength_nm, hexapolar(rings))
     waves = rays.wavelength_nm
     n, airy = _airy(scene, waves[0])
@@ -81,7 +81,7 @@ def spots(
 
 
 def _figures(rays: Bundle, open_energy: Tensor) -> list[Array]:
-    """The figures of `Spots` that depend on the sampling of the pupil, and the second moments, each [F, ...].
+    """Return the figures of `Spots` that depend on the sampling of the pupil, and the second moments, each [F, ...].
 
     They stand in the order of `_scaled`; `open_energy` [F] is the light that enters the stop.
     """
@@ -101,7 +101,10 @@ def _figures(rays: Bundle, open_energy: Tensor) -> list[Array]:
 
 
 def _scaled(figures: list[Array], airy_um: float) -> dict[str, tuple[Array, Array | float]]:
-    """The figures of `_figures` that are shown, with their scales: the largest radius, of one ray, to fewer digits."""
+    """Give the shown figures of `_figures`, each with the scale its error is judged by.
+
+    The largest radius depends on one ray, so its scale is coarser.
+    """
     rms, geometric, by_wavelength, passed, best, best_rms = figures[:6]
     least = 0.01 * airy_um
     return {
@@ -115,9 +118,9 @@ def _scaled(figures: list[Array], airy_um: float) -> dict[str, tuple[Array, Arra
 
 
 def _moments(rays: Bundle, along: tuple[int, ...]) -> tuple[list[Tensor], list[Tensor]]:
-    """Centroid of a spot, and the energy-weighted second moments of points, of points with slopes, and of slopes.
+    """Return the centroid, and the energy-weighted second moments of points, of points with slopes, and of slopes.
 
-    From these its RMS radius at every focus follows: its square is a parabola.
+    From these follows the RMS radius at every focus, whose square is a parabola.
     """
     weight = rays.weight / rays.weight.sum(along, keepdim=True)
     centroid, sums = [], [torch.zeros(1, dtype=torch.float64)] * 3
@@ -131,15 +134,15 @@ def _moments(rays: Bundle, along: tuple[int, ...]) -> tuple[list[Tensor], list[T
 
 
 def _rms_um(moments: Sequence[Array], shift_mm: Array) -> Array:
-    """RMS radius in um by the three second moments, at shifts [K] (or one for each field [F, 1]), shifts last."""
+    """Return the RMS radius in um from three second moments, at shifts [K] (or one a field, [F, 1]), shifts last."""
     a, b, c = (m[..., None] for m in moments)
     return np.asarray(1000 * np.sqrt(np.maximum(a + 2 * b * shift_mm + c * shift_mm**2, 0.0)))
 
 
 def working_f_number(scene: Scene, wavelength_nm: float) -> float:
-    """1 / (2 sin theta') of the outermost real ray of the axis that passes stop and rims; NaN if none does.
+    """Return 1 / (2 sin theta') of the axis's outermost real ray that passes stop and rims; NaN if none does.
 
-    A hole without a lens has that of its distance from the film over its diameter.
+    For a hole without a lens it is the distance from the film over the diameter.
     """
     if is_pinhole(scene.lens):
         return float(scene.first_order.f_number)
@@ -150,13 +153,13 @@ def working_f_number(scene: Scene, wavelength_nm: float) -> float:
 
 
 def _airy(scene: Scene, wavelength_nm: float) -> tuple[float, float]:
-    """Working f-number, and radius in um of the first dark ring about a point on the axis."""
+    """Return the working f-number, and the radius in um of the first dark ring about a point on the axis."""
     n = working_f_number(scene, wavelength_nm)
     return n, 1.22e-3 * wavelength_nm * n
 
 
 def _span(best: Array, f_number: float, wavelength_nm: float) -> Array:
-    """Shifts about the film that include the best foci of the fields, and at least a few depths of focus."""
+    """Return shifts about the film that include the best foci of the fields, and at least a few depths of focus."""
     depth = 4e-6 * wavelength_nm * f_number**2 if math.isfinite(f_number) else 0.0  # Rayleigh's, +- 2 lambda N^2
     reach = max(2 * depth, 1.5 * float(np.median(np.abs(np.nan_to_num(best))))) or 0.1
     return np.linspace(-reach, reach, _SHIFTS)
@@ -168,9 +171,9 @@ class Fans(OverField):
 
     Attributes:
         pupil: [n] share of the stop's radius, -1 to 1.
-        tangential_um: [F, W, n], aberration in the meridional plane of the rays along it.
-        sagittal_um: [F, W, n], aberration across the meridional plane of the rays along the other line.
-            Both from the chief ray of the first wavelength; NaN where a rim blocks.
+        tangential_um: [F, W, n] aberration in the meridional plane of rays along that plane.
+        sagittal_um: [F, W, n] aberration across the meridional plane of rays along the other line. Both count from the
+        chief ray of the first wavelength; NaN where a rim blocks.
     """
 
     wavelength_nm: Array
@@ -182,7 +185,7 @@ class Fans(OverField):
 def fans(
     scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None, *, n: int = 65
 ) -> Fans:
-    """Ray fans of fields (`Scene.default_fields` if not given) with n points along each line of the stop."""
+    """Compute ray fans of fields (`Scene.default_fields` if not given), with n points along each line of the stop."""
     pattern = fan(n)
     rays = bundle(scene, field_deg, wavelength_nm, pattern)
     return Fans(
@@ -200,9 +203,9 @@ class Mtf(OverField):
         frequency_per_mm: [K] cycles per mm on the film.
         tangential: [F, K], contrast of lines across the meridional plane (blur along it counts).
         sagittal: [F, K], contrast of lines along it.
-        diffraction_limit: [K], of a perfect lens of the same working f-number on the axis, first wavelength.
-        shift_mm: how far from the film, positive away from the lens.
-        spread: by direction, [F, k] for the first k frequencies, by how much two samplings of the pupil differ
+        diffraction_limit: [K] that of a perfect lens with the working f-number on the axis, at the first wavelength.
+        shift_mm: how far the film is shifted, positive away from the lens.
+        spread: by direction, [F, k] for the first k frequencies, how much two samplings of the pupil differ
             (`pupil_nodes.converged`).
     """
 
@@ -216,16 +219,16 @@ class Mtf(OverField):
     spread: dict[str, Array]
 
 
-_SHOWN_PER_MM = 50.0  # of the frequencies that are taken where none are given, those up to here must be converged
+_SHOWN_PER_MM = 50.0  # where no frequencies are given, those up to here must be converged
 
 
 def mtf(
     scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None, *,
     frequency_per_mm: Sequence[float] | None = None, shift_mm: float = 0.0,
 ) -> Mtf:  # fmt: skip
-    """Modulus of the energy-weighted mean of exp(2 pi i f x) over the rays of all wavelengths; NaN without light.
+    """Compute the modulus of the energy-weighted mean of exp(2 pi i f x) over the rays of all wavelengths.
 
-    The frequencies are 0 to 100 per mm where none are given.
+    It is NaN without light. Without frequencies they are 0 to 100 per mm.
     """
     filled = Filled(scene, field_deg, wavelength_nm)
     f = np.linspace(0, 100, 101) if frequency_per_mm is None else np.asarray(frequency_per_mm, dtype=np.float64)
@@ -254,13 +257,13 @@ def mtf_over_height(
     scene: Scene, wavelength_nm: Sequence[float] | None = None, *,
     frequency_per_mm: Sequence[float] = HEIGHT_PER_MM, fields: int = 21,
 ) -> Mtf:  # fmt: skip
-    """MTF of some frequencies at fields from the axis to the edge: the chart of lens makers."""
+    """Compute the MTF of some frequencies at fields from the axis to the edge: the chart of lens makers."""
     angles = np.linspace(0, scene.edge.field_deg, fields).tolist()
     return mtf(scene, angles, wavelength_nm, frequency_per_mm=sorted(set(frequency_per_mm)))
 
 
 def diffraction_mtf(frequency_per_mm: Array, wavelength_nm: float, f_number: float) -> Array:
-    """MTF of a perfect lens with a round pupil: 2/pi (acos s - s sqrt(1 - s^2)), s = f lambda N (Goodman, 6.3)."""
+    """The MTF of a perfect lens with a round pupil: 2/pi (acos s - s sqrt(1 - s^2)), s = f lambda N (Goodman, 6.3)."""
     s = np.clip(frequency_per_mm * wavelength_nm * 1e-6 * f_number, 0.0, 1.0)
     return np.asarray(2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s)))
 
@@ -271,19 +274,19 @@ def _contrast(x_mm: Tensor, weight: Tensor, frequency: Array) -> Array:
 
 
 def path_to_chief_mm(rays: Bundle) -> Tensor:
-    """Optical path to the plane through the chief ray's film point that stands on the ray, [F, W, P].
+    """Return the optical path [F, W, P] to the plane across the ray through the chief ray's film point.
 
     Raises:
-        InputError: a lens with ideal surfaces, which have a law of rays and none of phases.
+        InputError: the lens has ideal surfaces, which have a law of rays and none of phases.
     """
     rays.scene.lens.require_glass("optical path")
     along_t, along_s = rays.cosines
     return rays.path_mm - rays.tangential_mm * along_t - rays.sagittal_mm * along_s
 
 
-_BINS, _POINTS = 49, 97  # of the geometric and the diffraction image, odd: one on the centre
-_FINEST = 128  # points across the pupil that are still traced
-_ENCIRCLED = 0.98  # share of the geometric spot's energy that the window contains
+_BINS, _POINTS = 49, 97  # points a side of the geometric and the diffraction image; odd, so that one is in the centre
+_FINEST = 128  # the most points across the pupil that are traced
+_ENCIRCLED = 0.98  # share of the geometric spot's energy inside the window
 
 
 @dataclass(frozen=True)
@@ -292,15 +295,15 @@ class Psf(Result):
 
     Attributes:
         half_width_um: [F], from the centre of the image to its edge; NaN without light.
-        geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN
-            without light.
-        diffraction: [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where
-            the aberrations are too large for it (then diffraction is negligible against `geometric`) or almost
-            no light arrives.
-        strehl: [F], greatest value of `diffraction`.
-        pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.
+        geometric: [F, 49, 49] share of all wavelengths' energy in each square, without what lies outside; NaN without
+            light.
+        diffraction: [F, 97, 97] at the first wavelength; 1 is the peak of the same pupil without aberrations. NaN where
+            the aberrations are too large for it (diffraction is then negligible against `geometric`) or almost no light
+            arrives.
+        strehl: [F] the greatest value of `diffraction`.
+        pupil_points: [F] how many points across the pupil the diffraction image needs; 0 without light.
         airy_um: radius of the first dark ring on the axis.
-        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        spread: for each figure by name, [F, ...], how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     field_deg: Array
@@ -315,10 +318,10 @@ class Psf(Result):
 
 
 def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None) -> Psf:
-    """Point spread of fields; the window holds the spot and six Airy radii.
+    """Compute the point spread of fields, in a window that holds the spot and six Airy radii.
 
     Raises:
-        InputError: a pinhole, whose rays do not meet: it has no focus that waves could be summed about.
+        InputError: the lens is a pinhole, whose rays do not meet: there is no focus about which waves could be summed.
     """
     scene.require_power()
     filled = Filled(scene, field_deg, wavelength_nm)
@@ -332,7 +335,7 @@ def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: S
         return {"half_width_um": (found[0], 20 * found[0]), "strehl": (found[2].max((1, 2)), 1.0)}
 
     (half, centre, diffraction, needed), spread = converged(images, scaled, len(filled.fields), first=1)
-    rays = filled.bundle(LEVELS - 1)  # a picture needs rays in every square, whatever figures need
+    rays = filled.bundle(LEVELS - 1)  # a picture needs rays in every square, even where figures need fewer
     each = zip(rays.tangential_mm, rays.sagittal_mm, rays.weight, centre, half, strict=True)
     geometric = np.stack([_histogram(t - c[0], s - c[1], w, h / 1000) for t, s, w, c, h in each])
     return Psf(
@@ -342,9 +345,9 @@ def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: S
 
 
 def _images(rays: Bundle, least_mm: float) -> list[Array]:
-    """Half widths (um), centres (mm), diffraction images and points across the pupil that these need, [F, ...].
+    """Return half widths (um), centres (mm), diffraction images and the points across the pupil for these, [F, ...].
 
-    The windows have at least some half width.
+    The windows have at least the half width `least_mm`.
     """
     rows = []
     for k in range(len(rays.field_deg)):
@@ -361,7 +364,7 @@ def _images(rays: Bundle, least_mm: float) -> list[Array]:
 
 
 def _spot(t: Tensor, s: Tensor, w: Tensor) -> tuple[tuple[float, float], float]:
-    """Centroid (mm) and the radius about it that holds most of the energy."""
+    """Return the centroid (mm), and the radius about it that holds most of the energy."""
     if not w.sum() > 0:
         return (0.0, 0.0), 0.0
     t, s = torch.nan_to_num(t), torch.nan_to_num(s)
@@ -381,7 +384,7 @@ def _histogram(t: Tensor, s: Tensor, w: Tensor, half_mm: float) -> Array:
 
 
 def _needed(rays: Bundle, field: int, half_mm: float) -> int:
-    """Points across the pupil so that the phase anywhere in the window turns by less than half a turn between two."""
+    """The points across the pupil with which the phase, anywhere in the window, turns by less than half a turn."""
     if math.isnan(half_mm) or not rays.passed[field].any():
         return 0
     span = max(float(np.nanmax(v[field]) - np.nanmin(v[field])) for v in rays.cosines)
@@ -392,7 +395,7 @@ def _needed(rays: Bundle, field: int, half_mm: float) -> int:
 def diffraction_image(
     rays: Bundle, centre_mm: tuple[float, float], half_mm: float, points: int = _POINTS, field: int = 0
 ) -> Array:
-    """Diffraction image of a field of a bundle at its first wavelength, [points, points]; see `Psf.diffraction`.
+    """Return the diffraction image [points, points] of a field of a bundle, at its first wavelength (see `Psf`).
 
     Its centre is given as tangential and sagittal distance from the chief ray's film point.
     """
@@ -400,7 +403,7 @@ def diffraction_image(
     keep = rays.passed[field, 0]
     t, s = (c[field, 0][keep] for c in rays.cosines)
     path, weight = path_to_chief_mm(rays)[field, 0][keep], rays.weight[field, 0][keep]
-    # Paths are metres of waves: only their differences may be turned into phases.
+    # Paths are metres of waves: only their differences keep the digits of a phase.
     lead = path - path.mean() + t * centre_mm[0] + s * centre_mm[1]
     amplitude = torch.polar(weight / weight.sum(), wave * lead)
     line = torch.linspace(-half_mm, half_mm, points, dtype=torch.float64)

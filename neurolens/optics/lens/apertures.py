@@ -1,6 +1,7 @@
-"""Shapes of the stop's opening: blades, and any shape from a mask, for numpy arrays (cameras) and torch tensors.
+"""Shapes of the stop's opening, blades or any shape from a mask, for numpy arrays (cameras) and torch tensors.
 
-A shape lies inside the round stop, the circle round the blades' corners. Lens frame: x right, y up, from the film.
+Every shape lies inside the round stop, which is the circle through the corners of the blades. In the lens frame, seen
+from the film, x points right and y up.
 """
 
 from __future__ import annotations
@@ -22,23 +23,24 @@ from neurolens.graph.ir import Graph, Value
 MIN_BLADES, MAX_BLADES = 3, 100
 MAX_MASK = 4096
 THRESHOLD = 0.5
-_AT_ONCE = 1 << 16  # points, each of which takes a number per blade
+_AT_ONCE = 1 << 16  # points at a time, for each of them takes one number per blade
 
 
 @dataclass(frozen=True, eq=False)
 class Aperture:
-    """The opening of a stop: straight or curved blades, or a mask; exactly one of them.
+    """Describes the opening of a stop: either straight or curved blades, or a mask.
 
     Attributes:
-        blades: 3 to 100; None for a mask.
-        rotation_deg: from x towards y: of the first corner from the x axis, or of the whole mask.
-        curvature: of the blades' edges: 0 straight, 1 arcs of the circle through the corners; the bulge of the edge
-            grows linearly between.
-        mask: [H, W] bool, read-only, True where light passes. Row 0 is the top (+y), column 0 the left (-x); its longer
-            side spans the stop's diameter. Numbers are taken at a threshold of one half: light passes or it does not.
+        blades: how many, 3 to 100; None for a mask.
+        rotation_deg: angle from x towards y, of the first corner from the x axis or by which the mask is turned.
+        curvature: of the blades' edges, from 0 (straight) to 1 (arcs of the circle through the corners); the bulge of
+            an edge grows linearly with it.
+        mask: [H, W] bool, read-only, True where light passes. Row 0 is the top (+y), column 0 the left (-x); the longer
+            side spans the stop's diameter. Numbers are compared with one half: light passes or it does not.
 
     Raises:
-        InputError: a value out of range, neither blades nor mask or both, a mask that is too large or passes no light.
+        InputError: a value out of range, both blades and a mask or neither, a mask that is too large or passes no
+            light.
     """
 
     blades: int | None = None
@@ -73,7 +75,7 @@ class Aperture:
 
     @property
     def area_share(self) -> float:
-        """Area of the opening over that of the round stop: n / (2 pi) sin(2 pi / n) for n straight blades."""
+        """The area of the opening over that of the round stop: n / (2 pi) sin(2 pi / n) for n straight blades."""
         if self.blades is None:
             places = ((np.arange(1024) + 0.5) / 512 - 1).astype(np.float64)
             x, y = np.meshgrid(places, places)
@@ -88,16 +90,21 @@ class Aperture:
         return share + radius**2 * (angle - math.sin(angle)) / (2 * half)
 
     def settings(self) -> dict[str, Any]:
-        """Return the description that a picture's metadata holds."""
+        """Return the description of the opening that the metadata of pictures hold."""
         if self.blades is None:
             assert self.mask is not None
             return {"mask": list(self.mask.shape), "rotation_deg": self.rotation_deg, "area_share": self.area_share}
         return {"blades": self.blades, "rotation_deg": self.rotation_deg, "curvature": self.curvature}
 
     def inside(self, x: Any, y: Any, radius_mm: float) -> Any:
-        """Test whether points of the stop lie in the opening: booleans of the shape of x and y; False for NaN.
+        """Test whether points of the stop lie in the opening.
 
-        Numpy arrays or torch tensors x, y and the stop's radius in mm.
+        Args:
+            x, y: positions in the stop, mm; numpy arrays or torch tensors.
+            radius_mm: radius of the stop.
+
+        Returns:
+            Booleans of the shape of x and y; False for NaN.
         """
         tensors = not isinstance(x, np.ndarray)
         library: Any = import_module("torch") if tensors else np
@@ -112,9 +119,10 @@ class Aperture:
     def opening(self, g: Graph, xy: Value, radius: Value) -> Value:
         """Test whether points [2] of a stop of this radius (mm) lie in the opening; a mask is the graph's table `mask`.
 
-        Within every blade's edge: half planes, or discs through two corners each. In units of the radius, a disc of
-        curvature k that touches the edge's middle line at distance e holds what has
-        u (1 - k e) <= e - k (e^2 + x^2 + y^2) / 2, with u the distance along that line; k = 0 is the half plane.
+        A point lies in the opening where it lies within every blade's edge: within half planes, or discs through two
+        corners each. In units of the stop's radius, take a disc of curvature k that touches the edge's middle line at
+        distance e, and let u be the distance along that line: the disc holds the points with u (1 - k e) <= e - k (e^2
+        + x^2 + y^2) / 2. For k = 0 that is the half plane.
         """
         point = xy / radius
         within = g.square(point) <= 1.0
@@ -137,7 +145,9 @@ class Aperture:
     def rim(self, g: Graph, xy: Value, radius: Value, shut: float) -> Value:
         """Return a value that is at most 1 in the opening, continuous across blades, and r^2 / R^2 for a round stop.
 
-        The arguments are those of `opening`; `shut`: the value where a mask passes no light.
+        Args:
+            g, xy, radius: as for `opening`.
+            shut: the value where a mask passes no light.
         """
         point = xy / radius
         if self.mask is not None:
@@ -148,7 +158,7 @@ class Aperture:
         return g.square(point).maximum(along - limit + 1.0)
 
     def _edges(self, g: Graph, point: Value) -> tuple[Value, Value]:
-        """Return two values; a point lies within the blades' edges where the first is at most the second."""
+        """Return two values: a point lies within all the blades' edges where the first is at most the second."""
         assert self.blades is not None
         half = math.pi / self.blades
         rise = self.curvature * (1 - math.cos(half))
@@ -171,7 +181,7 @@ class Aperture:
 
     @cached_property
     def table(self) -> NDArray[np.float32]:
-        """The mask as the table of `opening`, [H W, 1], row after row."""
+        """The mask as the table that `opening` reads, [H W, 1], row after row."""
         assert self.mask is not None
         return self.mask.reshape(-1, 1).astype(np.float32)
 
@@ -186,7 +196,7 @@ def _real(value: object) -> bool:
 
 
 def _read_only(mask: ArrayLike) -> NDArray[np.bool_]:
-    """Check a mask and copy it; an array that is not two-dimensional, is too large or passes no light is refused."""
+    """Check a mask and return a copy; refuse one that is not two-dimensional, is too large or passes no light."""
     array = np.asarray(mask)
     if array.ndim != 2 or not 1 <= min(array.shape) <= max(array.shape) <= MAX_MASK or array.dtype.kind not in "bfiu":
         raise InputError(

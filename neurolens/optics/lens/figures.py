@@ -1,10 +1,10 @@
 """The figures of surfaces: what shape each has besides its radius of curvature.
 
-A figure is a class below, named in `FIGURES`, and nothing outside asks which class it is. Its fields are the keys of a
-surface in a lens file. It answers what readers, hashes, first-order and Seidel sums and checks ask, and gives
-`optics.trace.shapes` the numbers by which rays meet it: a conic of the surface's radius, a second section across it,
-and a polynomial of the height. Lengths are in mm, heights h are distances from the axis (from the plane of symmetry
-of a cylinder).
+A figure is a class below, named in `FIGURES`, and no other module asks which class it is. Its fields are the keys of a
+surface in a lens file. It answers what the readers, the hashes, the first-order and Seidel sums and the checks ask, and
+gives `optics.trace.shapes` the numbers by which rays meet it: a conic with the surface's radius, a second section
+across that, and a polynomial of the height. Lengths are in mm; a height h is a distance from the axis (of a cylinder,
+from its plane of symmetry).
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Slopes at the rim of an asphere's powers, all of one sign, from which on they are summed about the middle of the zone,
-# and of those powers, from which on Chebyshev's polynomials take their place. Float32 loses 6e-8 rad for each 1; below
-# 180 no lens that ships gains by it (`python -m experiments precision`).
+# Slope at the rim that an asphere's powers add up to if all have one sign: from 100 on they are summed about the middle
+# of the zone; where the powers about the middle still add up to it, as Chebyshev's polynomials. Float32 loses 6e-8 rad
+# for each unit of that slope; below 180 no lens that ships gains by it (`python -m experiments precision`).
 CANCELS = 100.0
 MOST_Q_TERMS = 20
 LEAST_NORM_MM = 1e-3
-WIDEST_Q = 2.0  # rim radius over the normalisation radius of a Qcon; beyond, its terms overflow
+WIDEST_Q = 2.0  # rim radius over the normalisation radius of a Qcon; beyond this ratio its terms overflow
 Bound = tuple[str, float, float, float, str]
 
 
 class Centred(NamedTuple):
-    """Sums of A_p h^(p - 2) and of p A_p h^(p - 2) about the middle of the zone inside the rim.
+    """An asphere's sums of A_p h^(p - 2) and of p A_p h^(p - 2), expanded about the middle of the zone inside the rim.
 
     Attributes:
-        scale: of t = scale h^2 - 1 (scale h - 1 where odd powers occur), from -1 on the axis to 1 at the rim; float32
-            has it exactly.
-        sag, slope: coefficients of powers of t, lowest first; of Chebyshev's polynomials where `chebyshev` is true.
+        scale: the sums are series in t = scale h^2 - 1 (scale h - 1 where odd powers occur), which runs from -1 on the
+            axis to 1 at the rim; a float32 holds it exactly.
+        sag, slope: coefficients of the two series, lowest first: of powers of t, or of Chebyshev's polynomials of t.
+        chebyshev: whether they are coefficients of Chebyshev's polynomials.
     """
 
     scale: Any
@@ -45,14 +46,15 @@ class Centred(NamedTuple):
 
 @dataclass(frozen=True)
 class Figure:
-    """A conic, of which a sphere is the simplest, and a polynomial of the height added to it.
+    """A conic, of which a sphere is the simplest, plus a polynomial of the height.
 
     Attributes:
-        conic: Schwarzschild's K (0 sphere, -1 paraboloid): c h^2 / (1 + sqrt(1 - (1 + K) c^2 h^2)).
-        asphere: (power, coefficient) pairs, sorted by power: sum of A_p h^p, A_p in mm^(1 - p). Odd powers and p = 2
-            (which adds 2 A_2 to the curvature at the vertex) are allowed.
+        conic: Schwarzschild's constant K (0 sphere, -1 paraboloid): the depth is c h^2 / (1 + sqrt(1 - (1 + K) c^2
+            h^2)).
+        asphere: (power p, coefficient A_p) pairs, sorted by power, whose sum of A_p h^p is added, A_p in mm^(1 - p).
+            Odd powers are allowed, and so is p = 2, which adds 2 A_2 to the curvature at the vertex.
 
-    Both may be 0-d tensors where gradients with respect to them are wanted.
+    Values of both may be 0-d tensors where gradients with respect to them are wanted.
     """
 
     conic: Any = 0.0
@@ -60,28 +62,30 @@ class Figure:
 
     @property
     def axis(self) -> str | None:
-        """The transverse axis, "x" or "y", of a figure that is not round: along it runs the curve of the radius."""
+        """The transverse axis, "x" or "y", along which the curve of the radius runs; None where the figure is round."""
         return None
 
     @property
     def across(self) -> tuple[float, float | None] | None:
-        """Radius of the section across that curve, None where it is straight, and the section's conic constant, None
-        where the curve is turned about a line parallel to its axis."""
+        """Radius and conic constant of the section across the curve of the radius; None where that section is straight.
+
+        The conic constant is None for a curve that is turned about a line parallel to its axis.
+        """
         return None
 
     @property
     def power(self) -> float:
-        """1 / focal length of an ideal lens; 0.0 of a surface that refracts."""
+        """1 / focal length of an ideal lens, in 1/mm; 0.0 for a surface that refracts."""
         return 0.0
 
     @property
     def powers(self) -> tuple[tuple[int, Any], ...]:
-        """The polynomial that is added to the conic, as (power, coefficient) pairs: sum of A_p h^p."""
+        """The polynomial that is added to the conic: pairs of p and A_p, whose sum is that of A_p h^p."""
         return self.asphere
 
     @property
     def aspheric(self) -> bool:
-        """Whether the curve of the radius is more than a circle; a conic constant that is a tensor may become so."""
+        """Whether the curve of the radius is no circle, or may become another because its conic is a tensor."""
         return bool(self.powers) or not isinstance(self.conic, int | float) or self.conic != 0
 
     @property
@@ -91,50 +95,51 @@ class Figure:
 
     @property
     def bends(self) -> bool:
-        """Whether rays are bent by it even where the radius is infinite."""
+        """Whether the figure bends rays even where the radius is infinite."""
         return bool(self.powers or self.across or self.power)
 
     def vertex_curvature(self, curvature: Any, meridian: str) -> Any:
-        """Curvature at the vertex along "x" or "y" in 1/mm, of a surface of this curvature."""
+        """Return the curvature at the vertex along "x" or "y", in 1/mm, for a surface of this curvature."""
         if self.axis not in (None, meridian):
             return 0.0 if self.across is None else 1.0 / self.across[0]
         return curvature + sum(2 * a for p, a in self.powers if p == 2)
 
     def centred(self, rim_mm: float) -> Centred | None:
-        """The polynomial about the middle of the zone inside the rim; None where float32 carries its powers.
+        """Return the polynomial about the middle of the zone inside the rim; None where float32 copes with its powers.
 
-        The powers of Forbes's polynomials of n terms exceed their sum by 6^n, those about the middle by 2.4^n,
-        Chebyshev's polynomials hardly.
+        Powers of opposite sign cancel, and float32 loses the digits. Of a sum of n of Forbes's polynomials, single
+        powers of h exceed the sum by a factor of up to 6^n, powers about the middle by 2.4^n, Chebyshev's polynomials
+        hardly.
         """
         return _centred(tuple((int(p), number_of(a)) for p, a in self.powers if p >= 2), rim_mm)
 
     def scaled(self, factor: float) -> Figure:
-        """Return the figure with all lengths times `factor`."""
+        """Return the figure of a surface all of whose lengths are multiplied by `factor`."""
         return replace(self, asphere=tuple((p, a * factor ** (1 - p)) for p, a in self.asphere))
 
     def bounds(self, rim_mm: float) -> list[Bound]:
-        """What `optics.setting.rims.check_figures` checks: key, size, least, most, and what the size is of."""
+        """Return what `optics.setting.rims.check_figures` checks: key, size, least, most, and the unit of the size."""
         sags = [float(a) * rim_mm**p for p, a in self.powers]
         sag = max(1e-6 * sum(map(abs, sags)), abs(sum(sags)))
         return [("conic", abs(self.conic), 0.0, 1e9, ""), ("asphere", sag, 0.0, 1e6, " mm of sag at the rim")]
 
     @classmethod
     def read(cls, row: Any) -> dict[str, Any]:
-        """Fields from a surface of a lens file, an `optics.readers.source.Table`; raises its errors."""
+        """The fields, read from a surface of a lens file (an `optics.readers.source.Table`); raises its errors."""
         example = "a table such as { 4 = 1e-6, 6 = 2e-9 }"
         found: dict[str, Any] = {"conic": row.number("conic")} if "conic" in row else {}
         return found | ({"asphere": row.powers("asphere", example)} if "asphere" in row else {})
 
     def cells(self) -> dict[str, Any]:
-        """Values by the keys of a lens file, without those that say nothing."""
+        """Return the values by the keys of a lens file, without those that have no effect."""
         given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
         given |= {"conic": float(self.conic)} if "conic" in given else {}
         return given | ({"asphere": {str(p): float(a) for p, a in self.asphere}} if self.asphere else {})
 
     def record(self) -> dict[str, Any]:
-        """Numbers by key, for hashes, caches and files of models, from which `figure_of` makes the figure again.
+        """Return the numbers by key for hashes, caches and files of models; `figure_of` makes the figure of them again.
 
-        Hashes of lens files are made of them: keys and their order do not change.
+        The hashes of lens files are computed from them, so the keys and their order must not change.
         """
         found = self.cells()
         found |= {"asphere": [(int(p), float(a)) for p, a in self.asphere]} if self.asphere else {}
@@ -142,7 +147,7 @@ class Figure:
         return rest | ({"across": self.across} if self.across else {})
 
     def words(self) -> str:
-        """What a table of surfaces says of it besides the radius, by the keys of lens files; empty for a sphere."""
+        """Return what a table of surfaces says of the figure, by the keys of lens files; empty for a sphere."""
         found = self.cells()
         if powers := list(found.pop("asphere", ())):
             found = {"asphere": "-".join(dict.fromkeys((powers[0], powers[-1])))} | found
@@ -156,7 +161,7 @@ SPHERE = Figure()
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Figure):
-    """A curve along one transverse axis, straight along the other.
+    """A curve along one transverse axis that is straight along the other.
 
     Attributes:
         cylinder: the axis along which it is curved, "x" or "y".
@@ -180,10 +185,10 @@ class Cylinder(Figure):
 
 @dataclass(frozen=True, kw_only=True)
 class Toroid(Cylinder):
-    """A curve along one transverse axis, turned about a line parallel to that axis.
+    """A curve along one transverse axis that is turned about a line parallel to that axis.
 
     Attributes:
-        across_mm: radius at which it is turned.
+        across_mm: radius of the circle that the curve's vertex is turned on.
     """
 
     across_mm: float
@@ -200,7 +205,7 @@ class Toroid(Cylinder):
 
     @classmethod
     def read(cls, row: Any) -> dict[str, Any]:
-        """As `Figure.read`; an infinite radius leaves a cylinder."""
+        """Return the fields as `Figure.read` does; with an infinite radius they are those of a cylinder."""
         found = super().read(row)
         if "across_mm" not in row:
             raise row.error("across_mm", "(missing)", "the radius that across_conic goes with")
@@ -212,7 +217,7 @@ class Toroid(Cylinder):
 
 @dataclass(frozen=True, kw_only=True)
 class Biconic(Toroid):
-    """Two conic sections, along both transverse axes, without a polynomial.
+    """A surface with a conic section along each of the transverse axes, and without a polynomial.
 
     Attributes:
         across_mm, across_conic: radius and conic constant of the second section.
@@ -237,10 +242,10 @@ class Biconic(Toroid):
 
 @dataclass(frozen=True, kw_only=True)
 class Ideal(Figure):
-    """An ideal thin lens in air, a plane that refracts nothing: slopes change by -x / f and -y / f.
+    """An ideal thin lens in air: a plane that refracts nothing, but changes slopes by -x / f and -y / f.
 
     Attributes:
-        focal_mm: f.
+        focal_mm: the focal length f.
     """
 
     focal_mm: float
@@ -270,13 +275,13 @@ class Ideal(Figure):
 
 @dataclass(frozen=True, kw_only=True)
 class Qcon(Figure):
-    """A conic and Forbes's strong asphere: with u = h / `norm_mm` and Jacobi's P, u^4 sum a_m P_m^(0,4)(2 u^2 - 1).
+    """A conic plus Forbes's strong asphere u^4 sum a_m P_m^(0,4)(2 u^2 - 1), with u = h / `norm_mm` and Jacobi's P.
 
-    G. W. Forbes, "Shape specification for axially symmetric optical surfaces", Opt. Express 15, 5218 (2007).
+    Source: G. W. Forbes, "Shape specification for axially symmetric optical surfaces", Opt. Express 15, 5218 (2007).
 
     Attributes:
-        qcon: a_0, a_1, ... in mm.
-        norm_mm: normalisation radius, usually that of the rim.
+        qcon: the coefficients a_0, a_1, ... in mm.
+        norm_mm: the normalisation radius, usually the radius of the rim.
     """
 
     qcon: tuple[float, ...]
@@ -315,7 +320,8 @@ class Qcon(Figure):
         return super().read(row) | {"qcon": [each.number(key) for key in each.data], "norm_mm": norm}
 
 
-# The key of a surface that marks each figure, of several the last; a surface with none of them is a `Figure`.
+# The key that marks each figure in a surface's table; where several are given, the last counts. A surface with none of
+# them is a plain `Figure`.
 FIGURES: dict[str, type[Figure]] = {
     "cylinder": Cylinder,
     "across_mm": Toroid,
@@ -328,7 +334,7 @@ KEYS = tuple(dict.fromkeys(f.name for kind in FIGURES.values() for f in fields(k
 
 
 def figure_of(record: Mapping[str, Any]) -> Figure:
-    """Return the figure of numbers by key, as `Figure.record` or `Figure.read` gives them; other keys are ignored."""
+    """Return the figure of numbers by key, as `Figure.record` or `Figure.read` gives them; ignores other keys."""
     given = {key: value for key, value in record.items() if value is not None}
     across_mm, across_conic = given.pop("across", (None, None))
     given |= {} if across_mm is None else {"across_mm": across_mm}
@@ -341,7 +347,7 @@ def figure_of(record: Mapping[str, Any]) -> Figure:
 
 
 def read_figure(row: Any) -> Figure:
-    """Return the figure of a surface of a lens file, an `optics.readers.source.Table`; raises its errors."""
+    """Return the figure of a surface of a lens file (an `optics.readers.source.Table`); raises its errors."""
     kind = _kind(row.data)
     found = figure_of(kind.read(row))
     known = {f.name for f in fields(kind)}
@@ -359,13 +365,13 @@ def _kind(given: Mapping[str, Any]) -> type[Figure]:
 
 
 def number_of(value: Any) -> float:
-    """Return a number that may be a 0-d tensor."""
+    """Return a number, also where it is given as a 0-d tensor."""
     return float(value.detach() if hasattr(value, "detach") else value)
 
 
 @lru_cache(maxsize=4096)
 def qcon_powers(a: tuple[float, ...], norm_mm: float) -> tuple[tuple[int, Fraction], ...]:
-    """The powers of h of a Qcon sum, exactly."""
+    """Return a Qcon sum as powers of h with exact coefficients."""
     found = [Fraction()] * len(a)
     for m, value in enumerate(a):
         for k in range(m + 1):
@@ -381,7 +387,7 @@ def _centred(powers: tuple[tuple[int, float | Fraction], ...], rim_mm: float) ->
         scale = float(np.float32(2 / np.float64(rim_mm) ** down))
     if not (CANCELS < reach < 1e30 and 0 < scale < math.inf):
         return None
-    # Exact, but for one rounding of each coefficient.
+    # Exact fractions: each coefficient is rounded only once, at the end.
     terms = [((p - 2) // down, p, Fraction(a) / Fraction(scale) ** ((p - 2) // down)) for p, a in powers]
     degrees = range(max(j for j, _, _ in terms) + 1)
     exact = [
@@ -395,7 +401,7 @@ def _centred(powers: tuple[tuple[int, float | Fraction], ...], rim_mm: float) ->
 
 
 def _chebyshev(powers: Sequence[Fraction]) -> list[Fraction]:
-    """Return the coefficients of Chebyshev's polynomials of a sum of powers, both lowest first, exactly."""
+    """Return, exactly, the coefficients of Chebyshev's polynomials that equal a sum of powers, both lowest first."""
     found = [Fraction()] * len(powers)
     for k, a in enumerate(powers):  # 2^k t^k = sum C(k, j) T_|k - 2 j|
         for j in range(k + 1):

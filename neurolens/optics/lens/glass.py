@@ -1,8 +1,8 @@
 """Glasses: manufacturers' catalogues with dispersion and absorption, and the medium after a surface.
 
-The table (data/glasses.json) is made by experiments/make_glass_table.py from the refractiveindex.info database (CC0).
-Without a catalogue glass the dispersion is Cauchy's, A + B / lambda^2 + C / lambda^4, from n_d and the Abbe number V_d:
-two figures leave the partial dispersion open, and it is that of a mean glass of the same V_d.
+The table (data/glasses.json) is made by experiments/make_glass_table.py from the refractiveindex.info database (CC0). A
+glass without an entry has Cauchy's dispersion, A + B / lambda^2 + C / lambda^4, from n_d and the Abbe number V_d. These
+two figures leave the partial dispersion open: it is taken to be the mean of the catalogue's glasses of that V_d.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ from neurolens.optics.lens.prescription import LINE_D_NM, Lens, Medium, Surface
 LINE_F_NM = 486.1327
 LINE_C_NM = 656.2725
 LINE_G_NM = 435.8343
-# How far a stated n_d or V_d may be from the catalogue's: rounding to three decimals and one, and other melts.
+# How far a stated n_d or V_d may be from the catalogue's: sources round to three decimals and one, and melts differ.
 TOLERANCE_N_D = 5e-4
 TOLERANCE_V_D = 0.5
 
-# P_gF of the catalogue's glasses by powers of V_d, and the range of V_d; tests/optics/trace/test_catalogue.py fits it.
+# The partial dispersion P_gF of the catalogue's glasses as a polynomial in V_d, and the range of V_d where it holds.
+# tests/optics/trace/test_catalogue.py repeats the fit.
 P_GF = (0.7186, -0.004859, 3.169e-5)
 _GLASSES_V_D = (15.0, 100.0)
 
-# Positive and finite, in float32 too: the light of media whose index does not change.
+# The light that media of constant index take: any wavelength that is positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
 # Where every formula of the catalogue is finite; reading warns of a glass that its source states for less.
 _FINITE_NM = (380.0, 780.0)
@@ -50,14 +51,16 @@ _BY_FIGURES_NM, _AT_MOST_NM = (365.0, 1014.0), (300.0, 2500.0)
 
 @dataclass(frozen=True, eq=False)  # compared by identity: the catalogue has one object per glass
 class Glass:
-    """Dispersion and absorption of one optical material.
+    """Describes one optical material: its dispersion and its absorption.
 
     Attributes:
         maker, name: as in the catalogue.
-        form: "sellmeier", n^2 = 1 + sum of B L^2 / (L^2 - C), or "power", n^2 = sum of a_p L^p; L in um.
-        coefficients: B, C (um^2), B, C, ... of Sellmeier's form; a_4, a_2, a_0, a_-2, a_-4, ... of the other.
-        range_um: wavelengths from and to which the source states the formula for.
-        absorption: (wavelength in nm, Napierian absorption in 1/mm) at increasing wavelengths; empty where unknown.
+        form: "sellmeier", n^2 = 1 + sum of B L^2 / (L^2 - C), or "power", n^2 = sum of a_p L^p, with the wavelength L
+            in um.
+        coefficients: B, C (um^2), B, C, ... of Sellmeier's form; a_4, a_2, a_0, a_-2, a_-4, ... of the power form.
+        range_um: the shortest and longest wavelength for which the source states the formula.
+        absorption: pairs of a wavelength in nm and the Napierian absorption in 1/mm, wavelengths increasing; empty
+            where unknown.
     """
 
     maker: str
@@ -71,17 +74,19 @@ class Glass:
         return f"{self.maker}:{self.name}"
 
     def index(self, wavelength_nm: Any) -> Any:
-        """Refractive index relative to air at a wavelength in nm (number, value of a graph, or tensor of its dtype).
+        """Return the refractive index relative to air at a wavelength in nm.
 
-        Outside `range_um` the formula is extrapolated (`check_light` says so); it is finite for 380-780 nm in every
-        glass of the catalogue, and meaningless or NaN beyond the poles in the ultraviolet (below 300 nm).
+        The wavelength may be a number, a value of a graph, or a tensor, whose dtype the result has. Outside `range_um`
+        the formula is extrapolated (`check_light` says so). In every glass of the catalogue it is finite for 380-780
+        nm; in the ultraviolet, beyond its poles (below 300 nm), it is meaningless or NaN.
         """
         square = (wavelength_nm * 1e-3) * (wavelength_nm * 1e-3)
         c = self.coefficients
         if self.form == "sellmeier":
             terms = [c[k] * square / (square - c[k + 1]) for k in range(0, len(c), 2)]
             return _root(sum(terms[1:], terms[0]) + 1.0)
-        # Horner's scheme in 1 / L^2 for the negative powers; the catalogues have none above the fourth.
+        # Horner's scheme in 1 / L^2 serves the negative powers. Of positive ones the catalogues have none above the
+        # fourth.
         inverse = 1.0 / square
         total = inverse * c[-1]
         for a in c[-2:2:-1]:
@@ -89,10 +94,11 @@ class Glass:
         return _root(total + c[2] + square * (c[1] + square * c[0]))
 
     def absorption_per_mm(self, wavelength_nm: Any) -> Any:
-        """Napierian absorption, 4 pi k / wavelength, in 1/mm, at a wavelength in nm; None where the source has none.
+        """The Napierian absorption 4 pi k / wavelength, in 1/mm, at a wavelength in nm; None where it is unknown.
 
-        Internal transmittance of t mm is exp(-absorption t). Linear between the source's wavelengths, and constant
-        outside them (350-1060 nm at the most): there, on the ultraviolet side, glass is darker than this says.
+        The internal transmittance of t mm is exp(-absorption t). The absorption is linear between the source's
+        wavelengths and constant outside them (they span at most 350-1060 nm): beyond them in the ultraviolet, a glass
+        is darker than this says.
         """
         if not self.absorption:
             return None
@@ -105,10 +111,10 @@ class Glass:
         return total
 
     def bends(self) -> list[tuple[float, float]]:
-        """Return the piecewise linear absorption as hinges: wavelength, and the change of the derivative there.
+        """Return the piecewise linear absorption as hinges: a wavelength, and by how much the derivative changes there.
 
-        Faster than a search, fusible, and from the red end, where absorption is least, so that float32 does not lose
-        it.
+        A sum of hinges is faster than a search for the piece, and a compiler can fuse it. It starts at the red end,
+        where the absorption is least, so that float32 does not lose that.
         """
         points = self.absorption
         steps = [(a - b) / (right - left) for (left, a), (right, b) in zip(points[:-1], points[1:], strict=True)]
@@ -117,34 +123,34 @@ class Glass:
 
     @property
     def n_d(self) -> float:
-        """Index at the helium line, 587.5618 nm."""
+        """The refractive index at the helium line, 587.5618 nm."""
         return self.index(LINE_D_NM)
 
     @property
     def V_d(self) -> float:
-        """Abbe number (n_d - 1) / (n_F - n_C)."""
+        """The Abbe number (n_d - 1) / (n_F - n_C)."""
         return (self.n_d - 1.0) / (self.index(LINE_F_NM) - self.index(LINE_C_NM))
 
     def covers(self, wavelength_nm: float) -> bool:
         """Test whether the source states the formula for this wavelength."""
         low, high = self.range_um
-        return low - 1e-9 <= wavelength_nm * 1e-3 <= high + 1e-9  # 700 * 1e-3 is a digit more than 0.7
+        return low - 1e-9 <= wavelength_nm * 1e-3 <= high + 1e-9  # 700 * 1e-3 is more than 0.7
 
 
 def _root(square: Any) -> Any:
-    """Square root; a negative number gives NaN as a tensor's does, where Python's own power gives a complex one."""
+    """Return the square root; a negative number gives NaN, as with tensors, where Python's power would be complex."""
     if hasattr(square, "sqrt"):
         return square.sqrt()
     return math.nan if isinstance(square, float) and square < 0 else square**0.5
 
 
-# A name that several makers use is that of the first one here.
+# In this order: of a name that several makers use, the first maker's glass is meant.
 MAKERS = ("Schott", "Ohara", "Hoya", "Hikari", "CDGM", "Sumita", "LZOS", "generic")
 
 _BY_LETTERS = {maker.upper(): maker for maker in MAKERS}
-_LONGEST = 100  # characters of a name that count
+_LONGEST = 100  # Only so many characters of a name count.
 
-# Other names for the same dispersion. Schott published one set of coefficients for BK7 and N-BK7.
+# Other names of the same dispersion: Schott publishes one set of coefficients for BK7 and N-BK7.
 ALIASES = {
     **{"BK7": "Schott:N-BK7", "silica": "generic:fused silica", "SiO2": "generic:fused silica"},
     **{"fluorite": "generic:CaF2", "acrylic": "generic:PMMA", "PC": "generic:polycarbonate"},
@@ -155,8 +161,8 @@ ALIASES = {
 }
 
 
-# Glasses of catalogues that a command names (`optics.readers.glasses`) by every key that finds them, and those not
-# read.
+# The glasses of the catalogues that a command names (`optics.readers.glasses`), by every key that finds them, and why
+# others in them were not read.
 _ADDED: dict[str, list[Glass]] = {}
 _REFUSED: dict[str, str] = {}
 # Glasses looked up so far. A plain dictionary, because torch.compile can trace through it to the coefficients.
@@ -165,7 +171,7 @@ _FOUND: dict[str, Glass] = {}
 
 @contextmanager
 def added(glasses: Iterable[Glass], refused: Mapping[str, str]) -> Iterator[None]:
-    """Put glasses before those of the table within a block; `refused`: why others are not there, by name."""
+    """Put glasses before those of the table within a block; `refused` tells, by name, why others are missing."""
     before = {key: [*known] for key, known in _ADDED.items()}, dict(_REFUSED)
     for glass in glasses:
         for key in (_key(glass.name), _key(str(glass))):
@@ -185,11 +191,16 @@ def added(glasses: Iterable[Glass], refused: Mapping[str, str]) -> Iterator[None
 def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") -> Glass:
     """Return the glass of a name: "N-BK7", or with its maker "Schott:N-BK7", "schott N-BK7", "N-BK7 (SCHOTT)".
 
-    Case, blanks, hyphens and brackets do not count. Of several makers' glasses of one name it is that of the first in
-    `MAKERS` (`same_name` lists them). A name without N- is not matched to the glass with it: SK16 is Hikari's.
+    Case, blanks, hyphens and brackets do not count. Where several makers have a glass of that name, the one first in
+    `MAKERS` is returned (`same_name` lists them all). A name without N- does not find the glass with N-: SK16 is
+    Hikari's.
+
+    Args:
+        name: the name to look up.
+        file, where: the place that an error names.
 
     Raises:
-        InputError: an unknown name, at the place `file`, `where`; the nearest ones are suggested.
+        InputError: an unknown name; the nearest known ones are suggested.
     """
     glasses = same_name(name)
     if not glasses:
@@ -199,7 +210,7 @@ def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") 
 
 
 def same_name(name: str) -> tuple[Glass, ...]:
-    """Every maker's glass of a name, in the order of `MAKERS`; of one maker only if the name says so; may be empty."""
+    """Every maker's glass of a name, in the order of `MAKERS`, or one maker's where it is named; may be empty."""
     maker, key = _split(name)
     found = (_glass(row) for row in _rows_by_key().get(key, ()))
     added = dict.fromkeys((*_ADDED.get(_key(name), ()), *_ADDED.get(key, ())))
@@ -208,15 +219,19 @@ def same_name(name: str) -> tuple[Glass, ...]:
 
 
 def all_glasses() -> tuple[Glass, ...]:
-    """Return the whole catalogue: what was added, then by maker in the order of `MAKERS`."""
+    """Return the whole catalogue: the added glasses, then the table's by maker, in the order of `MAKERS`."""
     added = dict.fromkeys(glass for glasses in _ADDED.values() for glass in glasses)
     return (*added, *(_glass(row) for row in range(len(_table()["glasses"]))))
 
 
 def by_code(code: str, count: int = 3) -> list[Glass]:
-    """Return the glasses nearest to a six-digit code: "517642", also written "517.642" or "517/642", is 1.517 and 64.2.
+    """Return the `count` glasses nearest to a six-digit code.
 
-    Of those that share a code the order is that of `MAKERS`. Anything but six digits is an InputError.
+    The code "517642", also written "517.642" or "517/642", stands for n_d = 1.517 and V_d = 64.2. Glasses that share a
+    code come in the order of `MAKERS`.
+
+    Raises:
+        InputError: a code that is not six digits.
     """
     digits = re.sub(r"[./ ]", "", code)
     if not re.fullmatch(r"[0-9]{6}", digits):
@@ -224,7 +239,7 @@ def by_code(code: str, count: int = 3) -> list[Glass]:
     n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
 
     def rank(g: Glass) -> float:
-        # Rounded as codes are, so that all glasses of one code are equally near.
+        # Rounded as codes are, so that all glasses of one code count as equally near.
         return round(math.hypot((round(g.n_d, 3) - n_d) / 0.001, (round(g.V_d, 1) - V_d) / 0.5), 6)
 
     return sorted(all_glasses(), key=rank)[:count]
@@ -238,7 +253,7 @@ _ALIAS_KEYS = {_key(alias): name for alias, name in ALIASES.items()}
 
 
 def _split(name: str) -> tuple[str | None, str]:
-    """Return the maker (None where the name does not say) and key of a name as people write it."""
+    """Split a name as people write it into the maker (None where it names none) and the key of the rest."""
     text = " ".join(name[:_LONGEST].split())
     bare, bracket, inside = text.rpartition("(") if text.endswith(")") else ("", "", "")
     if bracket and (maker := _BY_LETTERS.get(inside[:-1].strip().upper())) and bare.strip():
@@ -261,7 +276,7 @@ def _suggestion(name: str) -> str:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, Any]:
-    """Return the rows of the table's file in the order of `MAKERS`, read at the first lookup."""
+    """Return the rows of the table's file in the order of `MAKERS`; the file is read at the first lookup."""
     text = (resources.files("neurolens.optics.lens") / "data" / "glasses.json").read_text(encoding="utf-8")
     table = json.loads(text)
     table["glasses"].sort(key=lambda row: MAKERS.index(row[0]))
@@ -270,7 +285,7 @@ def _table() -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _rows_by_key() -> dict[str, list[int]]:
-    """Return the places in the table by the key of a name, in the order of `MAKERS`."""
+    """Return, by the key of a name, the places of its glasses in the table, in the order of `MAKERS`."""
     rows: dict[str, list[int]] = {}
     for place, (_, name, *_) in enumerate(_table()["glasses"]):
         rows.setdefault(_key(name), []).append(place)
@@ -286,29 +301,29 @@ def _glass(place: int) -> Glass:
 
 
 def inverse_square_um(wavelength_nm: Any) -> Any:
-    """1 / lambda^2 in 1/um^2 for a wavelength in nm (number or tensor)."""
+    """Return 1 / lambda^2 in 1/um^2 for a wavelength in nm (number or tensor)."""
     inverse = 1000.0 / wavelength_nm
     return inverse * inverse
 
 
 def cauchy(n_d: Any, V_d: float) -> tuple[Any, Any, Any]:
-    """A, B (um^2) and C (um^4) of Cauchy's A + B / lambda^2 + C / lambda^4 for an index and an Abbe number.
+    """Return A, B (um^2) and C (um^4) of Cauchy's A + B / lambda^2 + C / lambda^4 for an n_d and an Abbe number.
 
-    n(d) = n_d, n_F - n_C = (n_d - 1) / V_d, and n_g - n_F = P_gF (n_F - n_C). P_gF is a parabola in V_d, by least
-    squares through the catalogue's glasses up to n_d = 2.1: its residual is 0.004, that of a straight "normal line"
-    0.011, that of A + B / lambda^2 up to 0.09. All three are linear in n_d.
+    They follow from n(d) = n_d, n_F - n_C = (n_d - 1) / V_d, and n_g - n_F = P_gF (n_F - n_C). P_gF is a parabola in
+    V_d, fitted by least squares to the catalogue's glasses up to n_d = 2.1. It leaves 0.004; a straight "normal line"
+    would leave 0.011, and A + B / lambda^2 alone up to 0.09. All three coefficients are linear in n_d.
     """
     d, f, c, g = (inverse_square_um(nm) for nm in (LINE_D_NM, LINE_F_NM, LINE_C_NM, LINE_G_NM))
     within = min(max(V_d, _GLASSES_V_D[0]), _GLASSES_V_D[1])
     partial = P_GF[0] + within * (P_GF[1] + within * P_GF[2])
-    # (u - f) (u - c) is 0 at both lines, which leaves n_F - n_C as it is.
+    # (u - f) (u - c) vanishes at both lines, so this term leaves n_F - n_C as it is.
     bend = (partial - (g - f) / (f - c)) / ((g - f) * (g - c))
     slope, spread = 1 / (f - c) - bend * (f + c), (n_d - 1.0) / V_d
     return n_d - spread * d * (slope + bend * d), spread * slope, spread * bend
 
 
 def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
-    """`cauchy`'s index at a wavelength in nm (number, array or tensor); the constant n_d where V_d is unknown."""
+    """Return the index by `cauchy` at a wavelength in nm (number, array or tensor); n_d itself where V_d is None."""
     if V_d is None:
         return n_d
     a, b, c = cauchy(n_d, V_d)
@@ -317,7 +332,7 @@ def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
 
 
 def glass_of(name: str) -> Glass:
-    """`find`, cached. Before using a glass under torch.compile, look it up once."""
+    """Return the glass of a name as `find` does, cached; torch.compile can use a glass that was looked up before."""
     found = _FOUND.get(name)
     if found is None:
         found = _FOUND[name] = find(name)
@@ -325,10 +340,10 @@ def glass_of(name: str) -> Glass:
 
 
 def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
-    """Fields of a surface whose glass the catalogue does not know, by its n_d and V_d; the name stays for people.
+    """Return the fields of a surface whose glass the catalogue lacks: its n_d and V_d, and the name for people.
 
     Warns:
-        NeurolensWarning: always, with the dispersion taken; `place` is the file and the field.
+    NeurolensWarning: always, and tells the dispersion taken; `place` names the file and the field.
     """
     message = f"glass {name} is not in the catalogue: taken by n_d {n_d:g} and V_d {V_d:g}"
     message += ", and the partial dispersion of a mean glass (Cauchy), without absorption"
@@ -337,12 +352,14 @@ def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
 
 
 def index_of(surface: Surface | Medium, wavelength_nm: Any) -> Any:
-    """Refractive index of a medium, or of that after a surface, at a wavelength in nm (number, or tensor of any shape).
+    """Return the refractive index of a medium, or of that after a surface, at a wavelength in nm.
 
-    The catalogue's where it names a glass; else by its n_d and V_d, constant where V_d is unknown.
+    The wavelength is a number, or a tensor of any shape. A glass of the catalogue has the catalogue's index; else n_d
+    and V_d give it, and where V_d is unknown it is n_d at every wavelength.
 
     Raises:
-        InputError: a glass that the catalogue does not have, or one beside an n_d whose gradient is wanted.
+        InputError: a glass that the catalogue does not have, or a catalogue glass beside an n_d whose gradient is
+            wanted.
     """
     if surface.glass is not None:
         if getattr(surface.n_d, "requires_grad", False):
@@ -353,7 +370,7 @@ def index_of(surface: Surface | Medium, wavelength_nm: Any) -> Any:
 
 
 def stated_nm(lens: Lens) -> tuple[float, float]:
-    """Range of wavelengths in which the index of some glass of a lens is known, and no formula is out of its sense."""
+    """Return the range (nm) in which at least one glass's index is known and every catalogue formula makes sense."""
     glasses = [glass_of(m.glass) if m.glass else None for m in lens.media if m.glass or m.V_d is not None]
     ends = [_AT_MOST_NM if g is None else tuple(1e3 * v for v in g.range_um) for g in glasses]
     low, high = zip(*ends, _FINITE_NM, strict=True)
@@ -361,9 +378,9 @@ def stated_nm(lens: Lens) -> tuple[float, float]:
 
 
 def check_light(lens: Lens, wavelength_nm: float) -> None:
-    """Refuse a wavelength at which the index of no glass of a lens is known, and warn where that of one is not.
+    """Refuse a wavelength at which no glass of a lens has a known index, and warn where some glass has none.
 
-    Visible light passes: reading a lens says which of its glasses are not stated there.
+    Visible light passes without a warning: reading a lens has told which of its glasses are not stated there.
     """
     if LIGHT_NM[0] <= wavelength_nm <= LIGHT_NM[1]:
         return
@@ -394,13 +411,14 @@ def absorption_of(surface: Surface, wavelength_nm: Any) -> Any:
 
 
 def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
-    """Look a surface's glass up when a lens is read; nothing to do for a surface without one.
+    """Check a surface's glass against the catalogue when a lens is read; a surface without a glass passes.
 
-    `file` and `where`, for example "surface 3, ", are the place that messages name.
+    Args:
+        file, where: the place that messages name, for example "surface 3, ".
 
     Warns:
-        NeurolensWarning: the stated n_d or V_d (n_d = 1 and None count as not stated) is not the catalogue's within
-            5e-4 and 0.5, or the catalogue's formula does not reach over 400-700 nm and is extrapolated.
+        NeurolensWarning: the stated n_d or V_d differs from the catalogue's by more than 5e-4 or 0.5 (n_d = 1 and None
+            count as not stated), or the catalogue's formula does not cover 400-700 nm and is extrapolated.
 
     Raises:
         InputError: a glass that the catalogue does not have.
@@ -428,13 +446,14 @@ def table_notes(surface: Surface) -> list[str]:
         low, high = (round(1000 * v) for v in glass.range_um)
         notes.append(f"the index of {glass} is stated for {low}-{high} nm and extrapolated outside")
     if len(glass.coefficients) == 2:
-        # Plastics of which the source has one term of Sellmeier's: E48R comes out with V_d = 51.8, its maker says 56.
+        # The source gives these plastics one term of Sellmeier's formula: E48R gets V_d = 51.8, where its maker says
+        # 56.
         notes.append(f"the index of {glass} is a fit with one term: good to 0.002, and V_d is up to a tenth too low")
     return notes
 
 
 def _contradiction(surface: Surface, glass: Glass) -> str:
-    """Name the stated values that differ from this glass's; empty where they agree."""
+    """Return the stated values that differ from this glass's, as text; empty where they agree."""
     n_d, V_d = float(surface.n_d), surface.V_d
     wrong = [f"n_d = {n_d:.6g}"] if n_d != 1 and abs(glass.n_d - n_d) > TOLERANCE_N_D else []
     if V_d is not None and abs(glass.V_d - V_d) > TOLERANCE_V_D:

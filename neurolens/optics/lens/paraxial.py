@@ -1,6 +1,7 @@
 """First-order (paraxial) data: focal length, principal planes, pupils, focus, by default at `Lens.reference_nm`.
 
-Film, pupils and framing by numbers alone, and the colours of best focus, serve lenses and cameras.
+The functions that place a film, a pupil or a framing from a few numbers alone, and the colours of best focus, serve
+both lenses and cameras.
 """
 
 from __future__ import annotations
@@ -19,26 +20,27 @@ from neurolens.optics.lens.glass import check_light, index_of
 from neurolens.optics.lens.prescription import Lens
 
 Meridian = Literal["x", "y"]
-COLOURS = 7  # wavelengths that stand for a range
-_SAME_NM = 0.1  # files round spectral lines
-_FAR_M = 1e15  # an object beyond is at infinity: its image is, to the last digit of a float64
-_LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light has a focus, too
+COLOURS = 7  # wavelengths that stand for a range of light
+_SAME_NM = 0.1  # lens files round spectral lines by as much
+_FAR_M = 1e15  # an object farther off counts as at infinity, for its image is the same to the last digit of a float64
+_LEAST = 1e-3  # least weight of a colour, also where the eye sees none: infrared light has a focus, too
 
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """First-order data of a lens, lens frame, mm.
+    """Holds the first-order data of a lens, in mm and in the lens frame.
 
     Attributes:
-        efl_mm: effective focal length, of the image side (negative for a diverging lens): -y / u' of a ray that comes
-            parallel to the axis. The media are those of the lens, wherever it stands.
-        back_focus_mm: last vertex to rear focal point.
+        efl_mm: effective focal length of the image side (negative for a diverging lens): -y / u' of a ray that comes
+            parallel to the axis. The media in front and behind are those of the lens.
+        back_focus_mm: distance from the last vertex to the rear focal point.
         rear_focal_z_mm, front_focal_z_mm: focal points on the axis.
-        rear_principal_z_mm, front_principal_z_mm: H' and H.
-        entrance_pupil_z_mm, entrance_pupil_diameter_mm: paraxial image of the stop seen from the scene.
-        exit_pupil_z_mm, exit_pupil_diameter_mm: seen from the film; z is infinite for an image-telecentric lens.
-        f_number: efl / entrance-pupil diameter; infinite for a closed stop.
-        front_efl_mm: focal length of the object side: efl_mm times the index in front over that behind.
+        rear_principal_z_mm, front_principal_z_mm: principal points H' and H.
+        entrance_pupil_z_mm, entrance_pupil_diameter_mm: the stop's paraxial image as seen from the scene.
+        exit_pupil_z_mm, exit_pupil_diameter_mm: the stop's image as seen from the film; z is infinite for an
+            image-telecentric lens.
+        f_number: focal length over the diameter of the entrance pupil; infinite for a closed stop.
+        front_efl_mm: focal length of the object side: `efl_mm` times the index in front over that behind.
     """
 
     efl_mm: float
@@ -55,15 +57,19 @@ class FirstOrder:
     front_efl_mm: float
 
     def image_z_mm(self, object_z_mm: float) -> float:
-        """Return the paraxial image (mm) of a point on the axis, by Newton's x x' = -f f'."""
+        """Return the z (mm) of the paraxial image of a point on the axis, by Newton's x x' = -f f'."""
         return self.rear_focal_z_mm - self.efl_mm * self.front_efl_mm / (object_z_mm - self.front_focal_z_mm)
 
 
 @dataclass(frozen=True)
 class System:
-    """A lens to first order: curvatures [S] in 1/mm, gaps [S - 1] between surfaces, indices [S + 1] of the media.
+    """A lens to first order.
 
-    `ideal` [S]: powers in 1/mm of ideal thin lenses, 0 of other surfaces.
+    Attributes:
+        curvature: of the surfaces [S], 1/mm.
+        gap_mm: between the surfaces [S - 1].
+        index: of the media [S + 1].
+        ideal: powers of ideal thin lenses [S], 1/mm; 0 for other surfaces.
     """
 
     curvature: list[Any]
@@ -72,18 +78,18 @@ class System:
     ideal: list[float]
 
     def turned(self) -> System:
-        """Return the system as light meets it that comes from the other side."""
+        """Return the system as light from the other side meets it."""
         return System([-c for c in reversed(self.curvature)], self.gap_mm[::-1], self.index[::-1], self.ideal[::-1])
 
     def behind(self, surface: int) -> System:
-        """Return the surfaces behind one."""
+        """Return the surfaces behind the given one."""
         rest = slice(surface + 1, None)
         return System(self.curvature[rest], self.gap_mm[rest], self.index[rest], self.ideal[rest])
 
     def march(self, y: Any, u: Any) -> PathOfRay:
         """Return the paraxial ray of height y (mm) at the first surface and slope u before it.
 
-        Smith, Modern Optical Engineering, ch. 2.
+        Source: Smith, Modern Optical Engineering, ch. 2.
         """
         path = PathOfRay([], [], [])
         n = self.index
@@ -97,7 +103,7 @@ class System:
 
 
 class PathOfRay(NamedTuple):
-    """A paraxial ray: height at every surface (mm), slope before and after it."""
+    """A paraxial ray: its height at every surface (mm), and its slopes before and after each."""
 
     y: list[Any]
     before: list[Any]
@@ -115,22 +121,25 @@ def system_of(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian
 
 
 def _pupil(system: System, stop: int) -> tuple[Any, Any]:
-    """Distance of the stop's image behind the last vertex, and its magnification, by the surfaces after the stop."""
+    """Return how far behind the last vertex the stop's image lies, and its magnification by the surfaces behind it."""
     behind = system.behind(stop)
     if not behind.curvature:
         return 0.0, 1.0
-    slanted = behind.march(system.gap_mm[stop] * 1.0, 1.0)  # from the axial point of the stop
-    level = behind.march(1.0, 0.0)  # parallel, at height 1 in the stop
+    slanted = behind.march(system.gap_mm[stop] * 1.0, 1.0)  # from the point of the stop on the axis
+    level = behind.march(1.0, 0.0)  # parallel to the axis, at height 1 in the stop
     distance = -slanted.y[-1] / slanted.after[-1] if slanted.after[-1] != 0 else math.inf
     return distance, (level.y[-1] + level.after[-1] * distance if math.isfinite(distance) else math.inf)
 
 
 def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> FirstOrder:
-    """First-order data at one wavelength (None: `Lens.reference_nm`); of one meridian, where a lens has cylinders,
-    toroids or biconics.
+    """Return the first-order data of a lens at one wavelength, in one meridian.
 
-    For a lens without power (a pinhole, filters before or behind it) the film's centre counts as the focal point, and
-    the distance from the hole to the film, by which it maps angles to the film, as the focal length.
+    A lens without power (a pinhole, with filters before or behind it) gets its film's centre as the focal point, and as
+    its focal length the distance from the hole to the film, by which it maps angles to the film.
+
+    Args:
+        wavelength_nm: None takes `Lens.reference_nm`.
+        meridian: matters for a lens with cylinders, toroids or biconics.
 
     Raises:
         InputError: an afocal lens (no finite focal length).
@@ -168,9 +177,9 @@ def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridi
 
 
 def light_of(lens: Lens) -> dict[str, Any]:
-    """At which wavelength first-order data stand, and focal length and back focus at the source's primary one, as JSON.
+    """Return, as JSON, the wavelength of first-order data, and focal length and back focus at the source's primary one.
 
-    `primary` is None where the source states none, or the same.
+    `primary` is None where the source states no wavelength or the same one.
     """
     at, primary = lens.reference_nm, next(iter(lens.wavelengths_nm), lens.reference_nm)
     found = None
@@ -182,12 +191,12 @@ def light_of(lens: Lens) -> dict[str, Any]:
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Test whether no surface bends light: a hole, perhaps behind plane filters."""
+    """Test whether no surface bends light: the lens is a hole, perhaps among plane filters."""
     return all(math.isinf(s.radius_mm) and not s.figure.bends for s in lens.surfaces)
 
 
 def _pinhole(lens: Lens, system: System) -> FirstOrder:
-    """Return the data of a hole among planes: planes shorten what lies behind them, seen from the other side, by n."""
+    """Return the data of a hole among planes; seen through a plane plate of index n, distances are n times as short."""
     k, n, front, rear = lens.stop_index, len(lens.surfaces), system.index[0], system.index[-1]
     depth = [s.thickness_mm / i for s, i in zip(lens.surfaces, system.index[1:], strict=True)]
     last_z = lens.vertices_mm[n - 1]
@@ -200,7 +209,7 @@ def _pinhole(lens: Lens, system: System) -> FirstOrder:
 
 
 def chief_reach_mm(lens: Lens) -> float:
-    """Film height (mm) over the slope of the paraxial chief ray in the scene, which passes the entrance pupil."""
+    """Return film height (mm) over slope in the scene of the paraxial chief ray, which passes the entrance pupil."""
     data = first_order(lens)
     assert lens.film_z_mm is not None
     focal_points = data.front_focal_z_mm, data.rear_focal_z_mm
@@ -208,38 +217,43 @@ def chief_reach_mm(lens: Lens) -> float:
 
 
 def framing_mm(lens: Lens, focus_m: float) -> tuple[float, float]:
-    """Image distances (mm) of two ideal lenses that show the plane `focus_m` metres from the film at the lens's size.
+    """Return the image distances (mm) with which two ideal lenses show the plane in focus as large as the lens does.
 
-    Chief rays of a film point then meet that plane in one point, also where the film is not in the paraxial image.
-    `set_lens` has placed the lens.
+    With them, the chief rays of a film point meet that plane in one point, also where the film is not in the paraxial
+    image.
+
+    Args:
+        lens: as placed by `set_lens`.
+        focus_m: distance of the plane from the film, m.
 
     Returns:
-        That of a thin lens or a hole so far before the film, and of a lens in this one's front principal plane.
+        The image distance of a thin lens or a hole that stands so far before the film, and that of a lens in the front
+        principal plane of this one.
     """
     data, reach = first_order(lens), chief_reach_mm(lens)
     if math.isinf(focus_m):
         return reach, reach
     assert lens.film_z_mm is not None
     plane = lens.film_z_mm - 1000 * focus_m
-    size = (data.entrance_pupil_z_mm - plane) / reach  # of the plane in focus over that on the film
+    size = (data.entrance_pupil_z_mm - plane) / reach  # size of the plane in focus over its size on the film
     return 1000 * focus_m / (1 + size), (data.front_principal_z_mm - plane) / size
 
 
 def stop_radius_mm(lens: Lens, f_number: float) -> float:
-    """Return the radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
-    # From an opening of 1 mm: a closed stop has no f-number to scale.
+    """Return the radius of the stop (mm) for an f-number, focal length over entrance pupil at infinity focus."""
+    # Scaled from an opening of 1 mm, for a closed stop has no f-number that could be scaled.
     return first_order(lens.with_stop_radius(1.0)).f_number / f_number
 
 
 def distance_m(focus_m: float) -> float:
-    """Return the distance, as infinity where no float64 of an image tells the two apart."""
+    """Return a distance (m), or infinity where the image of so far an object is, to a float64, the one at infinity."""
     return math.inf if focus_m > _FAR_M else focus_m
 
 
 def film_z_mm(lens: Lens, focus_m: float) -> float:
-    """Return the film plane that focuses an object `focus_m` metres from the film, see `film_z_of_planes_mm`.
+    """Return the z (mm) of the film that focuses an object `focus_m` metres from it; see `film_z_of_planes_mm`.
 
-    A pinhole's film stays in place: it is equally sharp at every distance.
+    The film of a pinhole stays in place: it is equally sharp at every distance.
 
     Raises:
         InputError: an object nearer than four focal lengths, for which no film plane exists.
@@ -252,7 +266,7 @@ def film_z_mm(lens: Lens, focus_m: float) -> float:
 
 
 def image_z_mm(lens: Lens, object_z_mm: float) -> float:
-    """Return the paraxial image of a point on the axis, lens frame, at `Lens.reference_nm`; of a pinhole, the film."""
+    """Return the z (mm) of a point's paraxial image on the axis, at `Lens.reference_nm`; a pinhole's is its film."""
     data = first_order(lens)
     if is_pinhole(lens):
         return float(data.rear_focal_z_mm)
@@ -267,16 +281,21 @@ def film_z_of_planes_mm(
     file: str | Path = "camera",
     ratio: float = 1.0,
 ) -> float:
-    """Film plane (mm, frame of the principal planes) that focuses an object `focus_m` metres (or inf) from the film.
+    """Return the z (mm) of the film that focuses an object `focus_m` metres (or inf) from it.
 
-    `ratio` r is the index of the medium in front of the lens over that of the medium behind it. With D the distance
-    less the separation of the principal planes, the image lies behind the rear one by the smaller root of
-    s'^2 - B s' + D f = 0, B = D + (1 - r) f. Written 2 D f / (B + sqrt(B^2 - 4 D f)) it keeps its digits: the usual
-    form, (B - sqrt(B^2 - 4 D f)) / 2, is the difference of two numbers that are nearly equal for a far object.
+    Let D be the distance less the separation of the principal planes, f the focal length and r the `ratio`. The image
+    lies behind the rear principal plane by the smaller root of s'^2 - B s' + D f = 0, with B = D + (1 - r) f. Written
+    as 2 D f / (B + sqrt(B^2 - 4 D f)) it keeps its digits, where (B - sqrt(B^2 - 4 D f)) / 2 would be the difference of
+    two nearly equal numbers for a far object.
+
+    Args:
+        efl_mm, front_principal_z_mm, rear_principal_z_mm: of the lens, in the frame of the result.
+        file: what an error names.
+        ratio: index of the medium in front of the lens over that of the medium behind it.
 
     Raises:
-        InputError: an object nearer than (1 + sqrt(r))^2 focal lengths, which are four in one medium, or a distance
-            that is not a positive number.
+        InputError: an object nearer than (1 + sqrt(r))^2 focal lengths, which is four where both media are the same, or
+            a distance that is not a positive number.
     """
     if not focus_m > 0:
         raise InputError(file, "focus_m", focus_m, "a distance in m above 0, or inf")
@@ -295,12 +314,12 @@ def film_z_of_planes_mm(
 
 
 def index_ratio(card_lens: Mapping[str, Any]) -> float:
-    """The index in front of a model's lens over that behind it, 1 where the card's table of the lens has none."""
+    """The index in front of a model's lens over that behind it; 1 where the card's table of the lens has none."""
     return float(card_lens.get("index_ratio", 1.0))
 
 
 def film_z_of_card_mm(card_lens: Mapping[str, Any], focus_m: float) -> float:
-    """`film_z_of_planes_mm` of the lens of a model's card."""
+    """Return `film_z_of_planes_mm` for the lens of a model's card."""
     efl, front, rear = (card_lens[key] for key in ("efl_mm", "front_principal_z_mm", "rear_principal_z_mm"))
     return film_z_of_planes_mm(efl, front, rear, focus_m, ratio=index_ratio(card_lens))
 
@@ -308,9 +327,9 @@ def film_z_of_card_mm(card_lens: Mapping[str, Any], focus_m: float) -> float:
 def reach_mm(
     efl_mm: float, front_efl_mm: float, focal_z_mm: tuple[float, float], entrance_pupil_z_mm: float, film_z_mm: float
 ) -> float:
-    """Film height (mm) over the slope of the chief ray, of a lens known by its focal points, front and rear, and pupil.
+    """Return film height (mm) over the slope of the chief ray, for a lens known by its focal points and pupil.
 
-    f + x' e / f', with f and f' the focal lengths of the object and of the image side, x' the film's distance behind
+    It is f + x' e / f', with f and f' the focal lengths of the object and image sides, x' the film's distance behind
     the rear focal point and e the pupil's behind the front one.
     """
     film, pupil = film_z_mm - focal_z_mm[1], entrance_pupil_z_mm - focal_z_mm[0]
@@ -320,15 +339,16 @@ def reach_mm(
 def entrance_pupil_z_mm(
     efl_mm: float, front_efl_mm: float, focal_z_mm: tuple[float, float], exit_pupil_z_mm: float
 ) -> float:
-    """The entrance pupil of which the exit pupil (inf allowed) is the image, by the focal points (x x' = -f f')."""
+    """Return the z (mm) of the entrance pupil whose image is the exit pupil (inf allowed), by x x' = -f f'."""
     behind = exit_pupil_z_mm - focal_z_mm[1]
     return focal_z_mm[0] - efl_mm * front_efl_mm / behind if behind else math.inf
 
 
 def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the wavelengths (nm) in the middle of equal parts of a range and their weights in the spot of best focus.
+    """Return wavelengths (nm), the middles of equal parts of a range, and their weights in the spot of best focus.
 
-    A picture is judged by its luminance: weights are the eye's photopic sensitivity (CIE V, as a Gaussian of 559 nm).
+    A picture is judged by its luminance, so the weights are the eye's photopic sensitivity (CIE V, as a Gaussian about
+    559 nm).
     """
     low, high = range_nm
     count = COLOURS if low < high else 1
@@ -338,16 +358,17 @@ def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray
 
 @dataclass(frozen=True)
 class PupilBounds:
-    """Bounds of the passing rays on the pupil plane at equally spaced film radii (as pbrt: Pharr et al. 2016, 6.4.5).
+    """Bounds of the passing rays on the pupil plane at equally spaced film radii (as in pbrt: Pharr et al. 2016,
+    6.4.5).
 
-    For a film point at radius r along +x, passing rays lie within `low` <= u <= `high` along +x and |v| <= `half`
-    across.
+    For a film point at radius r along +x, the passing rays lie within `low` <= u <= `high` along +x and within |v| <=
+    `half` across.
 
     Attributes:
-        pupil_z_mm: the plane.
-        film_radius_mm: radius of the last row; the first row is the axis.
-        low_mm, high_mm, half_mm: one value per film radius; an empty row (low > high) where no ray passes.
-        disc_mm: radius of the axial disc that holds all passing rays.
+        pupil_z_mm: the pupil plane.
+        film_radius_mm: film radius of the last row; the first row is for the axis.
+        low_mm, high_mm, half_mm: one value per film radius; a row is empty (low > high) where no ray passes.
+        disc_mm: radius of the disc about the axis that holds all passing rays.
     """
 
     pupil_z_mm: float
@@ -359,7 +380,7 @@ class PupilBounds:
 
     @property
     def lit_radius_mm(self) -> float:
-        """The first film radius from which on every row is empty; that of the film where its edge is lit."""
+        """The film radius from which on every row is empty; `film_radius_mm` where light reaches the film's edge."""
         rows = enumerate(zip(self.low_mm, self.high_mm, strict=True))
         last = max((k for k, (low, high) in rows if low <= high), default=0)
         return self.film_radius_mm * min(last + 1, len(self.low_mm) - 1) / (len(self.low_mm) - 1)

@@ -35,17 +35,17 @@ class Coating:
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface. Lengths in mm, lens frame.
+    """Describes one surface, in the lens frame, with lengths in mm.
 
     Attributes:
-        radius_mm: positive when the centre of curvature lies towards the film; `inf` for a plane.
-        thickness_mm: axial distance to the next surface (for the last one: to the film as tabled).
-        diameter_mm: full clear diameter of the rim; of the opening, for the stop.
-        n_d: refractive index at 587.56 nm of the medium after the surface.
-        V_d: Abbe number of that medium; None where unknown (constant index) or air.
+        radius_mm: radius of curvature, positive when its centre lies towards the film; `inf` for a plane.
+        thickness_mm: distance along the axis to the next surface (of the last one, to the film as tabled).
+        diameter_mm: full clear diameter inside the rim; of the opening, for the stop.
+        n_d: refractive index, at 587.56 nm, of the medium after the surface.
+        V_d: Abbe number of that medium; None for air, or where unknown (the index is then constant).
         material: name of the glass in the source, for people only.
-        stop: whether this row is the aperture stop.
-        figure: its shape besides the radius (`optics.lens.figures`); a sphere, or a plane, by default.
+        stop: whether this surface is the aperture stop.
+        figure: the shape besides the radius (`optics.lens.figures`); by default that of a sphere or a plane.
         glass: name in the glass catalogue (`neurolens.optics.lens.glass`); its dispersion rules over n_d and V_d.
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
@@ -86,7 +86,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Medium:
-    """The medium in front of a lens, described by the fields of `Surface` that describe the medium after a surface."""
+    """The medium in front of a lens, described by the fields with which `Surface` describes the medium after it."""
 
     n_d: Any = 1.0
     V_d: float | None = None
@@ -96,10 +96,10 @@ class Medium:
 
 @dataclass(frozen=True)
 class Configuration:
-    """A zoom or focus state of the source: thicknesses that replace those of the table, by surface index.
+    """A zoom or focus state of the source, with the thicknesses that replace those of the table, by surface index.
 
-    None: not stated by the source, the lens's own value holds. A focus state has an `object_distance_mm`,
-    from the object to the front vertex; without one the object is at infinity.
+    A field that is None is not stated by the source, and the lens's own value holds. A focus state has an
+    `object_distance_mm`, from the object to the front vertex; without one the object is at infinity.
     """
 
     name: str
@@ -113,24 +113,26 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Lens:
-    """A prescription with the film's place; immutable, `at` returns a new lens.
+    """A prescription with the place of the film; immutable: `at` returns a new lens.
 
     Attributes:
-        name, designer, source, notes: as cited in the lens file.
-        believed_to_be: the product that the source's example is believed to be, "" where nobody says so.
-        measured: what photographs of that product say (`optics.photographs.verify`), as pairs of key and value.
-        rims: whether the rim diameters are the source's own or "estimated" by somebody.
-        f_number: nominal, of the source; the stop's own diameter rules the trace.
-        stated_efl_mm: focal length as the source states it, to check the computed one against; of an anamorphic lens in
-            the y-z plane, and `stated_efl_x_mm` in the x-z plane. None if not stated.
+        name, designer, source, notes: as stated in the lens file.
+        believed_to_be: the product that the source's example is believed to be, or "".
+        measured: what photographs of that product tell (`optics.photographs.verify`), as pairs of key and value.
+        rims: where the rim diameters come from: the "source", somebody who "estimated" them, a rule that "derived"
+            them, or "photographs".
+        f_number: the nominal one, of the source; rays are traced with the stop's own diameter.
+        stated_efl_mm: focal length as the source states it, to check the computed one against; None if not stated. For
+            an anamorphic lens it is that in the y-z plane, and `stated_efl_x_mm` that in the x-z plane.
         image_radius_mm: radius of the image circle, None where only the field is known.
         half_field_deg: half field of view, None where unknown.
-        film_z_mm: film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
+        film_z_mm: film plane in the lens frame; None until `at` has focused the lens, while the last thickness tells
+            it.
         configurations: zoom and focus states of the source.
         path: the file it was read from, for error messages.
         aperture: shape of the stop's opening inside its rim, None where round.
-        derived: description of what is not from the source (a zoom between its states).
-        infinity_mm: thicknesses at infinity focus, by surface index, of the groups that `at` has moved to focus.
+        derived: tells what does not come from the source (such as a zoom between its states).
+        infinity_mm: for the groups that `at` has moved to focus, their thicknesses at infinity focus, by surface index.
         object_medium: medium in front of the first surface. The medium behind the last surface, in which the film
             lies, is that of the last row of `surfaces`.
         wavelengths_nm: wavelengths that the source designs the lens for, its primary one first; empty if unknown.
@@ -160,27 +162,27 @@ class Lens:
 
     @property
     def media(self) -> tuple[Medium | Surface, ...]:
-        """The media from the scene to the film, one more than surfaces: media[k] lies in front of surface k."""
+        """The media from the scene to the film, one more than the surfaces: media[k] lies in front of surface k."""
         return (self.object_medium, *self.surfaces)
 
     @property
     def visible(self) -> bool:
-        """Whether the d line lies within the wavelengths of the source, or the source states none."""
+        """Whether the source designs the lens for a range that holds the d line, or states no range."""
         return not self.wavelengths_nm or min(self.wavelengths_nm) <= LINE_D_NM <= max(self.wavelengths_nm)
 
     @property
     def reference_nm(self) -> float:
-        """Wavelength of first-order data and analyses: the d line, or the source's primary one for other light."""
+        """The wavelength of first-order data and analyses: the d line, or the source's primary one for other light."""
         return LINE_D_NM if self.visible else self.wavelengths_nm[0]
 
     @property
     def light_nm(self) -> tuple[float, float]:
-        """Range of wavelengths that the lens is made for: visible light, or the source's range for other light."""
+        """The range of wavelengths that the lens is made for: visible light, or the source's range for other light."""
         return LIGHT_NM if self.visible else (min(self.wavelengths_nm), max(self.wavelengths_nm))
 
     @property
     def vertices_mm(self) -> list[Any]:
-        """z of every surface's vertex, and last the film plane as tabled."""
+        """The z of every surface's vertex, and last that of the film plane as tabled."""
         return list(accumulate((s.thickness_mm for s in self.surfaces), initial=0.0))
 
     @property
@@ -202,11 +204,11 @@ class Lens:
 
     @property
     def ideal(self) -> list[int]:
-        """The surfaces that are ideal thin lenses."""
+        """The indices of the surfaces that are ideal thin lenses."""
         return [k for k, s in enumerate(self.surfaces) if s.figure.power]
 
     def require_glass(self, what: str) -> None:
-        """Raise InputError for a lens with ideal surfaces, of which there is no `what`."""
+        """Raise InputError where the lens has ideal surfaces: `what` needs glass."""
         for k in self.ideal:
             expected = f"surfaces of glass: an ideal lens has no {what}"
             raise InputError(
@@ -215,7 +217,7 @@ class Lens:
 
     @property
     def dispersive(self) -> bool:
-        """Whether the index of any glass is known to change with wavelength."""
+        """Whether the index of any glass is known to change with the wavelength."""
         return any(m.V_d is not None or m.glass is not None for m in self.media)
 
     @property
@@ -247,8 +249,8 @@ class Lens:
     def scaled(self, factor: float) -> Lens:
         """Return the lens with all lengths times `factor`; angles, indices and f-number stay.
 
-        A grey filter keeps its density (its absorption per mm shrinks as it grows), a catalogue glass absorbs more when
-        it is thicker, and coatings keep their layers.
+        A grey filter keeps its density (as it grows, its absorption per mm shrinks), a thicker catalogue glass absorbs
+        more, and coatings keep their layers.
 
         Raises:
             InputError: a factor that is not positive and finite.
@@ -284,7 +286,7 @@ class Lens:
         return replace(self, surfaces=tuple(surfaces), configurations=tuple(states), infinity_mm=infinity, **stated)
 
     def half_field_in(self, state: Configuration) -> float | None:
-        """Half field in a state: its own, else that of the image circle where there is one (None), else the lens's."""
+        """Return the half field in a state: its own; None where an image circle tells it; else the lens's."""
         return state.half_field_deg or (self.half_field_deg if self.image_radius_mm is None else None)
 
     def with_stop_radius(self, radius_mm: float) -> Lens:
@@ -304,7 +306,7 @@ class Lens:
 
 
 def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = None) -> bool:
-    """Whether the medium is the same before and behind surface k; `in_front`, by default air, lies before the first."""
+    """Test whether the medium is the same before and behind surface k; before the first it is `in_front`, or air."""
     first = surfaces[k - 1] if k else in_front
     before = (first.n_d, first.V_d, first.glass) if first else (1.0, None, None)
     s = surfaces[k]
@@ -312,7 +314,7 @@ def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = N
 
 
 def _terms(m: Surface | Medium) -> list[int]:
-    """The number of terms of `glass.cauchy` where it makes the index of a medium."""
+    """Return how many terms `glass.cauchy` has, where it makes the index of a medium; else nothing."""
     return [3] if m.V_d is not None and m.glass is None else []
 
 

@@ -1,4 +1,4 @@
-"""Measured profiles of lenses: lensfun's database, read where the package `lensfunpy` brings it, and found by name.
+"""Measured profiles of lenses: lensfun's database, which the package `lensfunpy` brings, searched by name.
 
 A profile holds fits to photographs of one copy of a lens: distortion and lateral colour by focal length, and light by
 focal length, aperture and distance. The formulae are lensfun's (lensfun.github.io/manual/latest/group__Lens.html). The
@@ -25,18 +25,19 @@ from neurolens.base.errors import InputError, pip_install
 
 Array = NDArray[np.float64]
 
-FULL_FRAME_MM = math.hypot(36, 24) / 2  # half the diagonal, of crop factor 1
+FULL_FRAME_MM = math.hypot(36, 24) / 2  # half the diagonal, at crop factor 1
 FAR_M = 1000.0  # the distance that stands for infinity
-_FARTHEST = 2.0  # of half the short side, to which the formulae are tabulated
+_FARTHEST = 2.0  # in half short sides: how far the formulae are tabulated
 _STEPS = 2001
 _SAME_FOCAL, _SAME_F = 0.02, 0.04  # relative differences within which two names speak of the same lens
-_CERTAIN, _LIKELY = 0.55, 0.25  # shares of the weight of all words that two names have in common
-_FISHEYE = re.compile("fish-?eye", re.IGNORECASE)  # of a profile that does not state its projection
-_OTHER = 0.5  # times the likeness, where the versions or the mounts differ
+# shares of the weight of all words that two names share, from which a match is certain or likely
+_CERTAIN, _LIKELY = 0.55, 0.25
+_FISHEYE = re.compile("fish-?eye", re.IGNORECASE)  # in the name of a profile that does not state its projection
+_OTHER = 0.5  # factor on the likeness where versions or mounts differ
 
 
 class Light(NamedTuple):
-    """The light of a focal length, aperture and distance: 1 + k1 r^2 + k2 r^4 + k3 r^6, r = 1 in the corner."""
+    """The light at a focal length, aperture and distance: 1 + k1 r^2 + k2 r^4 + k3 r^6, with r = 1 in the corner."""
 
     focal_mm: float
     f_number: float
@@ -45,7 +46,7 @@ class Light(NamedTuple):
 
 
 class Radial(NamedTuple):
-    """Coefficients, lowest power first, of the measured over the ideal radius as a polynomial of the ideal radius."""
+    """The measured over the ideal radius as a polynomial of the ideal radius: coefficients, lowest power first."""
 
     focal_mm: float
     factors: tuple[float, ...]
@@ -53,13 +54,13 @@ class Radial(NamedTuple):
 
 @dataclass(frozen=True)
 class Profile:
-    """What photographs of one copy of a lens gave.
+    """What was measured in photographs of one copy of a lens.
 
     Attributes:
-        maker, model: as lensfun names the lens.
-        crop: half the diagonal of full frame over that of the camera's film; aspect: its long over its short side.
-        projection: that of the ideal picture, "rectilinear" or one of fisheyes.
-        distortion, red, blue: by focal length; of red and blue over green.
+        maker, model: lensfun's names.
+        crop: half the diagonal of full frame over that of the camera's film. aspect: its long over its short side.
+        projection: that of the ideal picture: "rectilinear", or one of a fisheye.
+        distortion, red, blue: by focal length; red and blue relative to green.
         light: by focal length, aperture and distance.
     """
 
@@ -92,7 +93,7 @@ class Profile:
         return np.interp(height_mm / self.unit_mm, real[:rising], factor[:rising], right=math.nan)
 
     def shift_um(self, radial: Radial, height_mm: Array) -> Array:
-        """How much farther from the axis than green a colour lies, at heights of green."""
+        """Return how much farther from the axis than green a colour lies, at heights of green."""
         factor = np.polynomial.polynomial.polyval(height_mm / self.unit_mm, radial.factors)
         return np.asarray(1000 * height_mm * (factor - 1))
 
@@ -109,7 +110,7 @@ class Profile:
         return tuple(sorted(found))
 
     def light_at(self, focal_mm: float) -> list[Light]:
-        """The light at a focal length by aperture, each at the farthest distance that was measured."""
+        """Return the light at a focal length by aperture, each at the farthest distance measured."""
         by_f: dict[float, Light] = {}
         for row in self.light:
             if row.focal_mm == focal_mm and row.distance_m >= by_f.get(row.f_number, row).distance_m:
@@ -118,7 +119,7 @@ class Profile:
 
 
 class Name(NamedTuple):
-    """What a name says of a lens: shortest and longest focal length, f-number at the shortest, and its other words."""
+    """What a name says about a lens: shortest and longest focal length, f-number at the shortest, and other words."""
 
     focal_mm: tuple[float, float]
     f_number: float
@@ -126,7 +127,7 @@ class Name(NamedTuple):
 
 
 class Match(NamedTuple):
-    """A profile for a lens; likeness is the share of the weight of all words that both names have."""
+    """A profile for a lens. The likeness is the share of the weight of all words that both names have."""
 
     profile: Profile
     likeness: float
@@ -144,7 +145,7 @@ _ZEISS = re.compile(rf"\b{_NUMBER}(?:-{_NUMBER})?/{_NUMBER}(?:-{_NUMBER})?\b")  
 _SAME_WORD = {"asph": "aspherical", "mkii": "ii", "mkiii": "iii", "fuji": "fujifilm", "fujinon": "fujifilm",
               "nikkor": "nikon", "zuiko": "olympus", "takumar": "pentax", "rokkor": "minolta",
               "voigtlander": "cosina", "voigtländer": "cosina"}  # fmt: skip
-# Marks of which two names of one lens have the same: the version; and the mount, where both names have one.
+# Marks in which two names of one lens agree: the version, and the mount where both names have one.
 _VERSIONS = frozenset(("ii", "iii", "iv", "v", "vi", "new", "l"))
 _MOUNTS = frozenset(("ef", "rf", "fd", "z", "xf", "xc", "gf", "fe", "da", "fa", "dt", "af", "ai", "m", "tl", "sl"))
 _NO_WORD = frozenset(("mm", "lens", "f", "the", "and", "for", "of", "t", "zoom", "g1", "compatibles"))
@@ -182,7 +183,7 @@ def _marks_agree(one: frozenset[str], other: frozenset[str]) -> bool:
 
 @cache
 def database() -> tuple[Profile, ...]:
-    """All profiles of lensfun's database that hold a measurement.
+    """Return all profiles of lensfun's database that hold a measurement.
 
     Raises:
         InputError: the package lensfunpy is not installed.
@@ -199,7 +200,7 @@ def database() -> tuple[Profile, ...]:
 
 
 def profiles_in(file: Path) -> list[Profile]:
-    """The profiles of a file of lensfun's database."""
+    """Return the profiles of a file of lensfun's database."""
     try:
         root = ElementTree.parse(file).getroot()
     except (OSError, ElementTree.ParseError) as error:
@@ -208,7 +209,7 @@ def profiles_in(file: Path) -> list[Profile]:
 
 
 def _profile(element: ElementTree.Element) -> Profile | None:
-    """One profile; None without a measurement or without the size of its film."""
+    """Return one profile; None without a measurement or without the size of its film."""
     calibration, crop = element.find("calibration"), element.findtext("cropfactor")
     if calibration is None or crop is None:
         return None
@@ -257,13 +258,13 @@ def _colour(e: ElementTree.Element, band: str) -> Radial | None:
 
 @cache
 def _names(profiles: tuple[Profile, ...]) -> tuple[list[tuple[Profile, Name]], Counter[str]]:
-    """The profiles whose names have a focal length, and how many have each word."""
+    """Return the profiles whose names have a focal length, and how many of them have each word."""
     found = [(p, n) for p in profiles if (n := name_of(f"{p.maker} {p.model}")) is not None]
     return found, Counter(word for _, name in found for word in name.words)
 
 
 def matches(texts: Iterable[str], profiles: tuple[Profile, ...] | None = None) -> list[Match]:
-    """Profiles for a lens that goes by these names, the likeliest first: same focal lengths and f-number, like words.
+    """Profiles for a lens that goes by these names, likeliest first: equal focal lengths and f-number, like words.
 
     The weight of a word is the logarithm of how rare it is among the names of all profiles.
     """
@@ -286,10 +287,10 @@ def matches(texts: Iterable[str], profiles: tuple[Profile, ...] | None = None) -
 
 
 def profile_named(name: str, profiles: tuple[Profile, ...] | None = None) -> list[Profile]:
-    """The profiles of exactly this model, with or without its maker, in any case.
+    """Return the profiles of exactly this model, with or without its maker; case does not count.
 
     Raises:
-        InputError: none; names the nearest ones.
+        InputError: there is none; names the nearest ones.
     """
     everything = database() if profiles is None else profiles
     wanted = " ".join(name.lower().split())

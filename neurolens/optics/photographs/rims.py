@@ -1,14 +1,14 @@
-"""Light over image height for any rims, and the rims for which it is the measured one at all apertures together.
+"""The light over image height for any rims, and the rims with which it is as measured at all apertures together.
 
 The light of film points, for any rims and any stop, comes from one trace through the open lens. Rays through a grid of
-the pupil plane are traced without rims; what is kept is how far from the axis they meet each surface. A rim or the stop
-then lets through the part of every grid cell in which that distance is smaller than its radius, as if it were linear
-over a cell: no ray is traced again for another aperture or another rim.
+the pupil plane are traced without rims, and how far from the axis they meet each surface is kept. A rim or the stop
+then lets through the part of each grid cell in which that distance, taken as linear over a cell, is smaller than its
+radius. So no ray is traced again for another aperture or another rim.
 
-Rims are fitted so: on each side of the stop either they are scaled by one factor, or a ring of the mount is put in
-front of the lens or behind it, which a patent does not have and a product does. Nothing cuts the beam of the axis at
-the lens's widest aperture, and no rim is wider than its neighbours allow. What is left is the sensor's own shading, or
-a pupil that differs from the product's.
+Rims are fitted as follows. On each side of the stop either all rims are scaled by one factor, or a ring of the mount is
+put in front of the lens or behind it; a product has such rings, a patent does not state them. Nothing cuts the beam of
+the axis at the lens's widest aperture, and no rim is wider than its neighbours allow. What is left then is the sensor's
+own shading, or a pupil that differs from the product's.
 """
 
 from __future__ import annotations
@@ -35,25 +35,26 @@ from neurolens.optics.trace.rays import trace
 
 Array = NDArray[np.float64]
 
-_COARSE, _FINE = 24, 32  # points a side of the grids that find what is lit, and that measure it
-_WIDER = 1.5  # cells by which what is lit may reach beyond the lit points of a grid
-_FLATTEST = 1e-3  # a slope over the steeper one, below which it makes no difference
-_STOP_SLACK = 1.03  # an aperture named in a profile counts as full where the lens's own is that near
-_FACTORS = (0.4, 1.2)  # of rims, that are tried
-_FRONT = (0.15, 0.3, 0.5, 0.8, 1.2)  # places of rings in front of the lens, over the length of the lens
-_REAR = (0.2, 0.45, 0.7)  # behind it, over the distance from the last vertex to the film
-_RIMS = -1  # the way of a side whose rims are scaled; others are the numbers of its rings
-_TRIED, _ROUNDS, _LEVELS, _CLOSER = 9, 3, 2, 4.0  # values at a time, rounds over both sides, closer looks, how close
-_PREFERENCE = 2e-3  # stops for which a value twice as far from 1 is not worth it
-_FIRST, _HEIGHTS = 0.2, 11  # of the heights to the film's corner: the first as a share of the last
+_COARSE, _FINE = 24, 32  # points a side of the grid that finds what is lit, and of the one that measures it
+_WIDER = 1.5  # cells by which the lit part may reach beyond the lit points of a grid
+_FLATTEST = 1e-3  # a slope over the steeper one: a smaller one makes no difference
+_STOP_SLACK = 1.03  # an aperture of a profile counts as full where the lens's own is this near
+_FACTORS = (0.4, 1.2)  # the least and the largest factor on rims that is tried
+_FRONT = (0.15, 0.3, 0.5, 0.8, 1.2)  # places in front of the lens where rings are tried, over the length of the lens
+_REAR = (0.2, 0.45, 0.7)  # places behind it, over the distance from the last vertex to the film
+_RIMS = -1  # stands for scaled rims on a side; its other ways are numbers of rings
+# values tried at a time, rounds over both sides, closer looks, factor between these
+_TRIED, _ROUNDS, _LEVELS, _CLOSER = 9, 3, 2, 4.0
+_PREFERENCE = 2e-3  # stops that a value twice as far from 1 must gain
+_FIRST, _HEIGHTS = 0.2, 11  # of the heights to the film's corner: the first as a share of the last, and their number
 _RING = 0.01  # stops by which a ring must be better than scaled rims
-_CLOSED = 11.5  # f-number beyond which no rim is seen
+_CLOSED = 11.5  # f-number at and beyond which no rim is seen
 _WIDE_MM = 1e5  # the radius of a ring that is not there
-_DARK = -4.0  # stops that stand for no light
+_DARK = -4.0  # stops, for no light
 
 
 def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
-    """The lens focused at infinity, a zoom at the focal length of a profile; its ends are rounded in names."""
+    """Return the lens at infinity focus, a zoom at a profile's focal length; names round the ends of a zoom."""
     states = [c.efl_mm for c in lens.configurations if c.efl_mm and c.object_distance_mm is None]
     if len(states) > 1 and max(states) > 1.05 * min(states):
         low, high = min(states), max(states)
@@ -62,14 +63,14 @@ def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
 
 
 def stop_for(lens: Lens, f_number: float) -> float:
-    """The radius of the stop at an f-number of a profile; that of the file where it is the lens's widest."""
+    """Return the stop's radius at an f-number of a profile; it is the file's where that is the lens's widest."""
     if f_number <= _STOP_SLACK * lens.f_number:
         return lens.stop_radius_mm
     return float(stop_radius_mm(at_infinity(lens), f_number))
 
 
 def near_f8(f_numbers: Iterable[float]) -> float:
-    """The aperture nearest to f/8, at which hardly any rim of a lens is seen."""
+    """Return the aperture nearest to f/8, at which hardly any rim of a lens is seen."""
     return min(f_numbers, key=lambda f: abs(math.log(f / 8)))
 
 
@@ -79,9 +80,9 @@ class OpenLight:
 
     Attributes:
         radius_mm: [S, F, G, G] distance from the axis on each surface, inf where the ray does not get there.
-        slopes_mm: [2, S, F, G, G] by how much it changes along the sides of a grid cell, above 0.
-        light: [F, G, G] irradiance by a whole cell of radiance 1: cos^4 of its angle times the solid angle in
-            which the axis sees it.
+        slopes_mm: [2, S, F, G, G] by how much that changes along the sides of a grid cell, above 0.
+        light: [F, G, G] irradiance by a whole cell of radiance 1: cos^4 of its angle, times the solid angle in which
+            the axis sees it.
     """
 
     radius_mm: Array
@@ -89,17 +90,17 @@ class OpenLight:
     light: Array
 
     def at(self, rims_mm: Array) -> Array:
-        """The light [F] of the film points with rims of these radii [S], the stop's among them."""
+        """Return the light [F] of the film points with rims of these radii [S], the stop's among them."""
         inside = np.min([self.inside(k, radius) for k, radius in enumerate(rims_mm)], axis=0)
         return np.asarray((inside * self.light).sum(axis=(1, 2)))
 
     def inside(self, surface: int, rim_mm: float) -> Array:
-        """The part of every cell [F, G, G] that a rim of this radius lets through."""
+        """Return the part of every cell [F, G, G] that a rim of this radius lets through."""
         return _covered(rim_mm - self.radius_mm[surface], *self.slopes_mm[:, surface])
 
 
 def _covered(margin: Array, a: Array, b: Array) -> Array:
-    """The part of a unit cell in which a linear function is positive, by its value in the middle and both slopes.
+    """Return the part of a unit cell in which a linear function is positive, by its value in the middle and two slopes.
 
     It is the convolution of two boxes as wide as the slopes, integrated up to the value.
     """
@@ -109,7 +110,7 @@ def _covered(margin: Array, a: Array, b: Array) -> Array:
 
 
 def with_rims(lens: Lens, rims_mm: Array) -> Lens:
-    """The lens with rims and stop of these radii [S]."""
+    """Return the lens with rims and stop of these radii [S]."""
     rows = zip(lens.surfaces, rims_mm, strict=True)
     return replace(lens, surfaces=tuple(replace(s, diameter_mm=2 * float(radius)) for s, radius in rows))
 
@@ -119,7 +120,7 @@ def open_light(lens: Lens, height_mm: Array, rims_mm: Array, rear: tuple[float, 
 
     Args:
         rims_mm: [S] the widest radii of rims and stop for which light will be computed.
-        rear: radius and z of the disc through which all light comes to the film; None: the last of these rims.
+        rear: radius and z of the disc through which all light comes to the film; None takes the last of these rims.
     """
     bare = without_rims(replace(lens, aperture=None))
     film = float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
@@ -135,11 +136,11 @@ def open_light(lens: Lens, height_mm: Array, rims_mm: Array, rear: tuple[float, 
 
 
 def _grid(box: Array, side: int) -> tuple[Array, Array, Array]:
-    """Middles u, v [F, G, G] of the cells of grids over boxes, of which v is the upper half, and the cells' sizes."""
+    """Return middles u, v [F, G, G] of the cells of grids over boxes (only upper halves in v), and the cells' sizes."""
     step = (np.arange(side) + 0.5) / side
     size = (box[1] - box[0]) / side
     u = box[0, 0][:, None] + step * (box[1] - box[0])[0][:, None]
-    v = step * box[1, 1][:, None]  # the lens is its own mirror image
+    v = step * box[1, 1][:, None]  # the lower half is its mirror image
     shape = (len(u), side, side)
     return (
         np.broadcast_to(u[:, :, None], shape),
@@ -149,7 +150,7 @@ def _grid(box: Array, side: int) -> tuple[Array, Array, Array]:
 
 
 def _traced(lens: Lens, film: float, plane: float, height_mm: Array, u: Array, v: Array) -> tuple[Array, Array]:
-    """Distances from the axis [S, F, G, G] at the surfaces, and cos^4 of the rays."""
+    """Return distances from the axis [S, F, G, G] at the surfaces, and cos^4 of the rays."""
     shape = u.shape
     x = np.broadcast_to(height_mm[:, None, None], shape)
     flat = [torch.from_numpy(np.ascontiguousarray(a).reshape(-1)) for a in (x, np.zeros(shape), u, v)]
@@ -168,7 +169,7 @@ def _traced(lens: Lens, film: float, plane: float, height_mm: Array, u: Array, v
 
 
 def _around(lit: Any, u: Array, v: Array, box: Array) -> Array:
-    """Boxes about what is lit, wider by what may lie between the points; as they were where nothing is."""
+    """Return boxes about the lit points, wider by what may lie between points; unchanged where nothing is lit."""
     step = _WIDER * (box[1] - box[0]) / lit.shape[1]
     low_u = np.where(lit, u, np.inf).min(axis=(1, 2)) - step[0]
     high_u = np.where(lit, u, -np.inf).max(axis=(1, 2)) + step[0]
@@ -179,7 +180,7 @@ def _around(lit: Any, u: Array, v: Array, box: Array) -> Array:
 
 
 def _slopes(radius: Array, axis: int) -> Array:
-    """How much distances change from cell to cell; beside rays that get lost, on the side of the others."""
+    """Return how much distances change from cell to cell; beside rays that get lost, on the side of the others."""
     with np.errstate(invalid="ignore"):
         step = np.abs(np.diff(radius, axis=axis, prepend=np.inf, append=np.inf))
     step = np.where(np.isfinite(step), step, np.inf)
@@ -189,7 +190,7 @@ def _slopes(radius: Array, axis: int) -> Array:
 
 
 def _measured(radius: Array, cos4: Array, cell: Array) -> OpenLight:
-    """What is kept of the fine grid."""
+    """Return what is kept of the fine grid."""
     slopes = np.stack([_slopes(radius, axis) for axis in (-2, -1)])
     slopes = np.where(np.isfinite(slopes), slopes, 1.0)
     least = np.maximum(_FLATTEST * slopes.max(axis=0), 1e-9)
@@ -197,11 +198,11 @@ def _measured(radius: Array, cos4: Array, cell: Array) -> OpenLight:
 
 
 class Ring(NamedTuple):
-    """An opening of the mount: a plane in air.
+    """An opening of the mount, which is a plane in air.
 
     Attributes:
-        before: the surface of the table in front of which it lies; the number of surfaces: behind the last.
-        distance_mm: from the vertex of that surface; of one behind the last, from the last.
+        before: the surface of the table in front of which it lies; the number of surfaces for a ring behind the last.
+        distance_mm: from the vertex of that surface; for a ring behind the last, from that one.
         radius_mm: of the opening.
     """
 
@@ -215,10 +216,11 @@ class FittedRims(Result):
     """Rims that were fitted to photographs.
 
     Attributes:
-        front, rear: factors of the rims in front of the stop and behind it.
-        rings: of the mount, at most one a side.
+        front, rear: factors on the rims in front of the stop and behind it.
+        rings: of the mount, at most one on each side.
         rims_mm: [S] radii.
-        before_stops, after_stops: residual of the light by f-number, root mean square over heights.
+        before_stops, after_stops: residual of the light by f-number, before and after the fit; root mean square over
+            heights.
         unused: f-numbers that the fit did not use.
     """
 
@@ -237,15 +239,15 @@ class FittedRims(Result):
 
 
 class RimLight:
-    """The light of a lens by aperture, for other rims and for rings of the mount."""
+    """The light of a lens by aperture, with other rims and with rings of the mount."""
 
     def __init__(self, lens: Lens, profile: Profile, lights: Sequence[Light]) -> None:
-        """`lens`: focused at infinity, its stop open."""
+        """`lens` is at infinity focus, with its stop open."""
         self.rims, self.count = np.array(lens.semi_diameters_mm), len(lens.surfaces)
         self.rings, ringed = _with_rings(lens)
         self._sides: dict[tuple[bool, float], Array] = {}
         rows = [k for k, s in enumerate(ringed.surfaces) if s.diameter_mm < _WIDE_MM]
-        self.place = np.array(rows)  # of the table's surfaces among those with the rings
+        self.place = np.array(rows)  # places of the table's surfaces among those with the rings
         self.stop, self.stop_place = lens.stop_index, rows[lens.stop_index]
         widest = np.full(len(ringed.surfaces), _WIDE_MM)
         widest[self.place] = _FACTORS[1] * self.rims
@@ -259,7 +261,7 @@ class RimLight:
         self.opened = open_light(ringed, np.concatenate([[0.0], height]), widest, rear)
         radii = [stop_for(lens, f_number) for f_number in self.f_numbers]
         self.stops = [self.opened.inside(self.stop_place, radius) for radius in radii]
-        # The beam of the axis, as the table's own rims let it through: beyond them rays may fold back into the stop.
+        # The beam of the axis is what the table's own rims let through: beyond them rays may fold back into the stop.
         tabled = np.full(len(widest), math.inf)
         tabled[self.place] = self.rims
         axis = self.opened.radius_mm[:, 0]
@@ -273,21 +275,22 @@ class RimLight:
         self.limit_mm = np.maximum(np.maximum(limit, self.beam_mm[self.place]), self.rims)
 
     def scaled(self, front: float, rear: float) -> Array:
-        """The radii of the rims for factors of both sides of the stop."""
+        """Return the radii of the rims for factors on both sides of the stop."""
         factor = np.where(np.arange(self.count) < self.stop, front, rear)
         radii = np.clip(factor * self.rims, self.beam_mm[self.place], self.limit_mm)
         radii[self.stop] = self.rims[self.stop]
         return radii
 
     def ring(self, number: int, value: float) -> Ring:
-        """A ring between the beam of the axis (0) and what is lit (1)."""
+        """Return a ring between the beam of the axis (value 0) and what is lit (value 1)."""
         place, ring = self.rings[number]
         low, high = self.beam_mm[place], self.lit_mm[place]
         radius_mm = float(low + value * (high - low))
-        return ring._replace(radius_mm=math.ceil(1e4 * radius_mm) / 1e4)  # up: never less than the beam
+        # rounded up, so that it is never smaller than the beam
+        return ring._replace(radius_mm=math.ceil(1e4 * radius_mm) / 1e4)
 
     def side(self, front: bool, way: int, value: float) -> Array:
-        """What one side lets through, [F, G, G], with scaled rims or a ring."""
+        """Return what one side lets through, [F, G, G], with scaled rims or with a ring."""
         if way != _RIMS:
             ring = self.opened.inside(self.rings[way][0], self.ring(way, value).radius_mm)
             return np.minimum(self.side(front, _RIMS, 1.0), ring)
@@ -299,7 +302,7 @@ class RimLight:
         return self._sides[front, value]
 
     def residuals(self, front: Array, rear: Array) -> Array:
-        """Root mean square over heights [A] of computed less measured light, for what both sides let through."""
+        """Residuals [A] by aperture: computed less measured light, RMS over heights, for what both sides let pass."""
         both = np.minimum(front, rear)
         light = np.stack([(np.minimum(both, stop) * self.opened.light).sum(axis=(1, 2)) for stop in self.stops])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -308,7 +311,7 @@ class RimLight:
         return np.asarray(np.sqrt(np.nanmean(off**2, axis=1)))
 
     def fit(self, used: Sequence[int]) -> list[tuple[int, float]]:
-        """The way and value of the front and of the rear, one side after the other, then by closer looks."""
+        """Fit the way and the value of the front and of the rear, one side after the other, then by closer looks."""
         chosen = [(_RIMS, 1.0), (_RIMS, 1.0)]
         ways = [[k for k, (_, ring) in enumerate(self.rings) if (ring.before == 0) == front] for front in (True, False)]
         sides = [self.side(True, *chosen[0]), self.side(False, *chosen[1])]
@@ -331,7 +334,7 @@ class RimLight:
 
 
 def with_ring(lens: Lens, ring: Ring) -> Lens:
-    """The lens with a ring as a plane surface in air; states of a zoom follow."""
+    """Return the lens with a ring as a plane surface in air; states of a zoom follow."""
     at, gap = ring.before, ring.distance_mm
     row = Surface(math.inf, gap, 2 * ring.radius_mm)
     surfaces = list(lens.surfaces)
@@ -355,7 +358,7 @@ def with_ring(lens: Lens, ring: Ring) -> Lens:
 
 
 def _with_rings(lens: Lens) -> tuple[list[tuple[int, Ring]], Lens]:
-    """The rings that are tried, each with its place among the surfaces of a lens that has them all, and that lens."""
+    """Return the rings that are tried, each with its place among a lens's surfaces that has all, and that lens."""
     z = [float(v) for v in lens.vertices_mm]
     _, rear_z = rear_opening_mm(lens, float(lens.film_z_mm or z[-1]))
     last = min(range(len(lens.surfaces)), key=lambda k: abs(z[k] - rear_z))
@@ -374,10 +377,10 @@ def _with_rings(lens: Lens) -> tuple[list[tuple[int, Ring]], Lens]:
 
 
 def fit_rims(lens: Lens, profile: Profile, unused: Collection[float] = ()) -> FittedRims:
-    """Fit the rims of a lens to the light of a profile, of a zoom at its shortest focal length, but for some f-numbers.
+    """Fit the rims of a lens to the light of a profile, except at `unused` f-numbers; a zoom at its shortest end.
 
     Raises:
-        InputError: a profile without light at apertures of this lens.
+        InputError: the profile has no light at apertures of this lens.
     """
     focal_mm = min((row.focal_mm for row in profile.light), default=math.nan)
     lights = [row for row in profile.light_at(focal_mm) if row.f_number <= _CLOSED]
@@ -395,7 +398,7 @@ def fit_rims(lens: Lens, profile: Profile, unused: Collection[float] = ()) -> Fi
 
 
 def with_fitted_rims(lens: Lens, found: FittedRims) -> Lens:
-    """The lens of a file with fitted rims, which neighbours that touch trim, and rings; its stop stays."""
+    """Return the lens of a file with fitted rims and rings; touching neighbours trim rims, and the stop stays."""
     pairs = zip(lens.surfaces, found.rims_mm, strict=True)
     radii = [s.semi_diameter_mm if s.stop else round(float(radius), 4) for s, radius in pairs]
     lens = replace(narrowed_rims(with_rims(lens, np.array(radii))), rims="photographs")

@@ -1,7 +1,7 @@
 """The verdict of photographs on a lens file: which profile, what differs over image height, and what that means.
 
-What a profile leaves free is taken out: the scale of the picture (the central one, too: fits to photographs are loose
-there), and the light on the axis. The distance of the photographs is not stated either: rays come from infinity.
+What a profile leaves free is taken out: the scale of the picture (also that in the centre, where fits to photographs
+are loose) and the light on the axis. The distance of the photographs is not stated either, and rays come from infinity.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from neurolens.optics.photographs.rims import Array, at_focal_length, near_f8, o
 from neurolens.optics.setting.pupils import image_radius_mm
 from neurolens.optics.setting.states import at_infinity
 
-# Residuals of the shape of distortion (percent) and of light (stops, root mean square over heights) that half and nine
-# tenths of sound tables keep: see experiments/results/photographs.md.
+# Residuals of the shape of distortion (percent) that half and nine tenths of sound tables keep, and with them those of
+# light (stops, root mean square over heights): see experiments/results/photographs.md.
 SOUND_PERCENT, DOUBTFUL_PERCENT = 0.1, 0.3
 SOUND_STOPS = 0.15
-_OTHER_FOCAL = 0.06  # relative difference of focal length from which a profile is of another lens
+_OTHER_FOCAL = 0.06  # a profile whose focal length differs by more, relatively, is another lens's
 # Broad bands of a camera: those at which rays agree best with lensfun's lateral colour.
 _BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
-_HEIGHTS, _FEWEST = 16, 4  # image heights that are compared; fewest chief rays of a curve
-_INNER = 0.25  # share of half the diagonal from which shapes are compared
-_OUTER_MM = 20.0  # of full frame, to which
-_RAYS, _NEAR_RAD = 25, 1e-4  # chief rays; the angle in the stop of one as good as paraxial
-_FARTHER, _STEEPEST = 1.4, 2.0  # than its slope for the greatest height; the steepest slope in the stop
-_SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor and table
+_HEIGHTS, _FEWEST = 16, 4  # image heights that are compared; the fewest chief rays of a curve
+_INNER = 0.25  # of half the diagonal: where the comparison of shapes begins
+_OUTER_MM = 20.0  # in full frame: where it ends
+_RAYS, _NEAR_RAD = 25, 1e-4  # chief rays of a lens; the angle in the stop of one that is as good as paraxial
+# how much steeper than for the greatest height slopes in the stop may get; the steepest of all
+_FARTHER, _STEEPEST = 1.4, 2.0
+_SIZES = np.linspace(0.97, 1.03, 13)  # sizes of the picture that are tried, relative to crop factor and table
 _IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
           "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
 FREE = "free in a profile, and taken out: the scale, the light on the axis; unknown: the distance of the photographs"
@@ -48,10 +49,10 @@ FREE = "free in a profile, and taken out: the scale, the light on the axis; unkn
 
 @dataclass(frozen=True)
 class Curve(Result):
-    """One measured and one computed figure over image height; what the profile leaves free is taken out.
+    """One figure over image height, measured and computed; what the profile leaves free is taken out.
 
     Attributes:
-        height_mm, measured, computed: [H], NaN beyond what either knows.
+        height_mm, measured, computed: [H]; NaN where one of both is not known.
     """
 
     height_mm: Array
@@ -60,7 +61,7 @@ class Curve(Result):
 
     @property
     def rms(self) -> float:
-        """Root mean square of the difference; NaN where there is none."""
+        """The root mean square of the difference; NaN where there is none."""
         off = self.measured - self.computed
         off = off[np.isfinite(off)]
         return float(np.sqrt(np.mean(off**2))) if len(off) else math.nan
@@ -73,13 +74,14 @@ class Curve(Result):
 
 @dataclass(frozen=True)
 class Comparison(Result):
-    """A lens, in one focal length, against one profile.
+    """A lens, at one focal length, beside one profile.
 
     Attributes:
-        focal_mm: of the profile.
-        distortion_percent: of the image height, mean removed. size: of the picture, for which it agrees best.
-        red_um, blue_um: beside green.
-        light_stops: by f-number, beside the axis.
+        focal_mm: the profile's.
+        distortion_percent: of the image height, with the mean removed.
+        size: of the picture, with which distortions agree best.
+        red_um, blue_um: distance from green.
+        light_stops: by f-number, relative to the axis.
     """
 
     focal_mm: float
@@ -91,7 +93,7 @@ class Comparison(Result):
 
 
 def heights_of(profile: Profile, lens: Lens) -> Array:
-    """Image heights at which shapes are compared: within the profile's film and, where its file tells, the lens's."""
+    """Return image heights at which shapes are compared: on the profile's film and, if its file tells, the lens's."""
     half = profile.half_diagonal_mm
     told = lens.image_radius_mm is not None or lens.half_field_deg is not None
     end = min(_OUTER_MM / profile.crop, image_radius_mm(lens)[0] if told else math.inf)
@@ -99,16 +101,17 @@ def heights_of(profile: Profile, lens: Lens) -> Array:
 
 
 def ideal_heights(profile: Profile, angle: Array) -> Array:
-    """The heights, to a scale, of the ideal picture of a profile at field angles in rad."""
+    """Return the heights, to a scale, of a profile's ideal picture at field angles in rad."""
     return PROJECTIONS[_IDEAL.get(profile.projection, RECTILINEAR)](angle)
 
 
 def chief_angles(lens: Lens, height_mm: float, wavelengths_nm: Sequence[float]) -> tuple[Array, Array]:
-    """Field angles [R] in rad, and by wavelength the image heights [W, R] of the chief rays of a lens whose film is
-    placed, rising to beyond a height where there are such rays.
+    """Return field angles [R] (rad) and, by wavelength, image heights [W, R] of chief rays.
+
+    The lens's film is placed. Rays rise to beyond `height_mm` where there are such rays.
 
     Raises:
-        InputError: ideal lenses.
+        InputError: the lens has ideal surfaces.
     """
     lens.require_glass("verify")
     scene = Scene(lens)
@@ -125,12 +128,12 @@ def chief_angles(lens: Lens, height_mm: float, wavelengths_nm: Sequence[float]) 
 
 
 def _rising(height_mm: Array) -> int:
-    """How many heights of chief rays rise from the axis on."""
+    """Return how many heights of chief rays rise from the axis on."""
     return int(np.argmin(np.diff(height_mm, append=-math.inf) > 0)) + 1 if height_mm[0] > 0 else 0
 
 
 def between(height_mm: Array, known_mm: Array, values: Array) -> Array:
-    """Values at heights between known ones, as far as these rise; NaN beyond, and where too few are known."""
+    """Interpolate values at heights, while the known heights rise; NaN beyond these, and where too few are known."""
     count = _rising(known_mm) if len(known_mm) else 0
     if count < _FEWEST:
         return np.full_like(height_mm, math.nan)
@@ -139,15 +142,15 @@ def between(height_mm: Array, known_mm: Array, values: Array) -> Array:
 
 
 def shapes(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> tuple[Array, Array, float]:
-    """Measured and computed shapes of the distortion, percent beside the mean of the heights at which both exist, and
-    the size of the picture for which they agree best; NaN where no chief ray reaches.
+    """Return measured and computed shapes of the distortion, and the size of the picture with which they agree best.
 
-    Crop factors are rounded, and a patent's example is seldom of the product's very focal length: heights are free by
+    Shapes are percent relative to the mean of the heights at which both exist; NaN where no chief ray reaches. Crop
+    factors are rounded, and a patent's example seldom has the product's very focal length, so that heights are free by
     some percent.
 
     Args:
         measured: [H] the measured image height over that of the ideal picture, to a scale.
-        real_mm, stretch: [R] image heights of chief rays, and the same of them.
+        real_mm, stretch: [R] image heights of chief rays, and the same ratio for these.
     """
     real_mm = np.where(np.isfinite(stretch), real_mm, math.nan)
     count = _rising(real_mm) if len(real_mm) else 0
@@ -164,7 +167,7 @@ def shapes(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) ->
 
 
 def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curve, float]:
-    """The shape of the distortion, measured and computed, and the size of the picture for which both agree best."""
+    """Return the shape of the distortion, measured and computed, and the picture's size with which they agree best."""
     height = heights_of(profile, lens)
     angle, (real,) = chief_angles(lens, float(height.max()), [lens.reference_nm])
     theirs, ours, size = shapes(height, profile.stretch(radial, height), real, real / ideal_heights(profile, angle))
@@ -172,7 +175,7 @@ def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curv
 
 
 def colour_curves(lens: Lens, profile: Profile, radials: Mapping[str, Radial | None]) -> dict[str, Curve | None]:
-    """How much farther from the axis red and blue lie than green, in um, over broad bands as a camera's."""
+    """Return how much farther from the axis red and blue lie than green (um), in broad bands as a camera's are."""
     height = heights_of(profile, lens)
     _, real = chief_angles(lens, float(height.max()), [nm for band in _BANDS_NM.values() for nm in band])
     red, green, blue = (np.mean(part, axis=0) for part in np.split(real, len(_BANDS_NM)))
@@ -184,7 +187,7 @@ def colour_curves(lens: Lens, profile: Profile, radials: Mapping[str, Radial | N
 
 
 def light_curves(lens: Lens, profile: Profile, lights: Sequence[Light]) -> dict[float, Curve]:
-    """The light over image height by f-number, in stops beside the axis."""
+    """Return the light over image height by f-number, in stops relative to the axis."""
     height, stop = heights_of(profile, lens), lens.stop_index
     rims = np.array(lens.semi_diameters_mm)
     opened = open_light(lens, np.concatenate([[0.0], height]), rims)
@@ -216,13 +219,13 @@ def compare(lens: Lens, profile: Profile, focal_mm: float) -> Comparison:
 
 @dataclass(frozen=True)
 class Verified(Result):
-    """A lens held against a profile.
+    """A lens beside a profile.
 
     Attributes:
-        profile: as lensfun names it, with its maker. certainty: of the match, in a word; also: other likely profiles.
+        profile: lensfun's name with the maker. certainty: of the match, in a word. also: other likely profiles.
         crop: that of the profile's camera.
         comparisons: by focal length of the profile.
-        uncertainty_percent: of the profile's own distortion, where several cameras were measured; NaN where one was.
+        uncertainty_percent: of the profile's own distortion, by several cameras; NaN where one was measured.
         verdict: sentences.
     """
 
@@ -236,11 +239,11 @@ class Verified(Result):
 
     @property
     def distortion_percent(self) -> float:
-        """Median over focal lengths of the residual; NaN where distortion was not measured."""
+        """The median residual over focal lengths; NaN where distortion was not measured."""
         return _median(c.distortion_percent.rms for c in self.comparisons if c.distortion_percent is not None)
 
     def light_stops(self, *, widest: bool) -> float:
-        """Median over focal lengths of the residual of light, at the widest aperture or at the one nearest to f/8."""
+        """The median residual of light over focal lengths, at the widest aperture or at the one nearest to f/8."""
         each = []
         for c in (c for c in self.comparisons if c.light_stops):
             f_number = min(c.light_stops) if widest else near_f8(c.light_stops)
@@ -248,8 +251,10 @@ class Verified(Result):
         return _median(each)
 
     def told(self, figure: str, unit: str) -> str:
-        """The residual of "distortion" or of "light" at the widest aperture: its median over focal lengths and its
-        worst, of distortion as a root mean square, of light at any height."""
+        """Say the residual of "distortion", or of "light" at the widest aperture: median over focal lengths, and worst.
+
+        For distortion the worst is a root mean square, for light it is at any height.
+        """
         known = self.curves(figure)
         middle = f"median RMS {median(c.rms for _, c in known):.2g}"
         if figure == "distortion":
@@ -259,7 +264,7 @@ class Verified(Result):
         return f"{middle}, worst {curve.worst:.2g}{unit} at {focal:g} mm"
 
     def curves(self, figure: str) -> list[tuple[float, Curve]]:
-        """Focal lengths with their curves of that figure, as far as they are known."""
+        """Return focal lengths with their curves of that figure, where they are known."""
         if figure == "distortion":
             each = [(c.focal_mm, c.distortion_percent) for c in self.comparisons]
         else:
@@ -268,7 +273,7 @@ class Verified(Result):
 
     @property
     def measured(self) -> dict[str, Any]:
-        """What a lens file and the cards of its models keep."""
+        """What a lens file and the cards of its models keep of this."""
         figures = {
             "distortion_percent": self.distortion_percent,
             "light_widest_stops": self.light_stops(widest=True),
@@ -284,8 +289,11 @@ def _median(values: Iterable[float]) -> float:
 
 
 def names_of(lens: Lens) -> list[str]:
-    """The names under which a lens is looked for: what it is believed to be, its own, that of its file, and what stands
-    in brackets in its own, as "US 8,169,718 Example 4 (Nikon ...)" has it."""
+    """Return the names under which a lens is looked for.
+
+    They are what it is believed to be, its own name, that of its file, and what stands in brackets in its own, as in
+    "US 8,169,718 Example 4 (Nikon ...)".
+    """
     stem = Path(lens.path).stem.replace("_", " ")
     names = lens.believed_to_be, f"{lens.designer} {lens.name}".strip(), stem, *re.findall(r"\(([^()]+)\)", lens.name)
     return [name for name in names if name]
@@ -294,13 +302,13 @@ def names_of(lens: Lens) -> list[str]:
 def found_for(
     lens: Lens, wanted: str | None = None, *, any_focal: bool = False
 ) -> tuple[Match, list[Profile], tuple[str, ...]]:
-    """The profile for a lens, all profiles of that name, and the names of others that are likely.
+    """Find the profile for a lens, all profiles of that name, and the names of other likely ones.
 
-    `any_focal`: also where the table's focal length is another, for tables that are doubted.
+    With `any_focal` a profile need not have the table's focal length, for tables that are doubted.
 
     Raises:
-        InputError: a lens with cylinders, which has two distortions; no profile; none of the name that is wanted, or of
-            no focal length of the lens.
+        InputError: a lens with cylinders has two distortions; there is no profile, none of the name that is wanted, or
+            none at a focal length of the lens.
     """
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
@@ -324,7 +332,7 @@ def found_for(
 
 
 def _by_film(profiles: Sequence[Profile], lens: Lens) -> list[Profile]:
-    """Profiles in the order of use: of the largest film that the lens lights, then with light, then others."""
+    """Sort profiles by use: those of the largest film that the lens lights first, then those with light."""
     several = len({p.crop for p in profiles}) > 1
     radius = 1.1 * (image_radius_mm(at_infinity(lens))[0] if several else math.inf)
     return sorted(profiles, key=lambda p: (p.half_diagonal_mm > radius, p.crop, not p.light))
@@ -334,7 +342,7 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
     """Compare a lens of a file with the profile that its name finds, at every focal length of the profile.
 
     Raises:
-        InputError: as `found_for`; a lens that reaches none of the profile's focal lengths.
+        InputError: as `found_for`; the lens reaches none of the profile's focal lengths.
     """
     match, profiles, also = found_for(lens, profile)
     used = profiles[0]
@@ -342,7 +350,7 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
     for focal in used.focal_mm:
         try:
             whole.append(compare(lens, used, focal))
-        except InputError as error:  # a zoom that has no such position between its states
+        except InputError as error:  # the zoom has no such position between its states
             missed[focal] = error
     if not whole:
         raise next(iter(missed.values()))
@@ -355,7 +363,7 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
 
 
 def _check_focal_length(lens: Lens, profile: Profile) -> None:
-    """Raise where no focal length of the profile is one of the lens."""
+    """Raise InputError where no focal length of the profile is one of the lens."""
     efl = [float(first_order(at_infinity(lens)).efl_mm)]
     efl += [c.efl_mm for c in lens.configurations if c.efl_mm and c.object_distance_mm is None]
     low, high = min(efl) * (1 - _OTHER_FOCAL), max(efl) * (1 + _OTHER_FOCAL)
@@ -365,7 +373,7 @@ def _check_focal_length(lens: Lens, profile: Profile) -> None:
 
 
 def _spread(profiles: Sequence[Profile], lens: Lens) -> float:
-    """Root mean square difference of distortion between the profiles of one lens, on the smaller film of two."""
+    """Return the RMS difference of distortion between the profiles of one lens, on the smaller film of two."""
     each = []
     first = profiles[0]
     for other in profiles[1:]:
@@ -378,7 +386,7 @@ def _spread(profiles: Sequence[Profile], lens: Lens) -> float:
 
 
 def _said(found: Verified, fitted: bool) -> list[str]:
-    """The verdict in sentences; `fitted`: whether the rims are fitted to photographs already."""
+    """Write the verdict in sentences; `fitted`: whether the rims are fitted to photographs already."""
     off, slack = found.distortion_percent, found.uncertainty_percent
     lines = []
     if math.isnan(off):
@@ -412,7 +420,7 @@ def _said_of_light(found: Verified, fitted: bool) -> str:
     return f"the real lens is {word} wide open, {found.told('light', ' stops')}: {cause}"
 
 
-_MOST = 6  # apertures, or focal lengths, that are drawn
+_MOST = 6  # of apertures, or focal lengths, that are drawn
 
 
 def plot_verified(found: Verified, path: Path, title: str) -> None:
@@ -451,7 +459,7 @@ def _both(axes: Any, curve: Curve, colour: str, label: str) -> None:
 
 
 def _some_of(items: list[Any]) -> list[Any]:
-    """At most `_MOST` of a list, evenly spread, both ends among them."""
+    """Return at most `_MOST` items of a list, evenly spread, with both ends."""
     if len(items) <= _MOST:
         return items
     return [items[round(k * (len(items) - 1) / (_MOST - 1))] for k in range(_MOST)]

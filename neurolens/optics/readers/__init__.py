@@ -1,1 +1,1 @@
-"""Lens files of this project, and by public format definitions of others; `any_format.read_any` reads all of them."""
+"""Readers of lens files: this project's own, and by public definitions those of others. `read_any` reads all."""

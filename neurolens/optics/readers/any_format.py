@@ -1,4 +1,4 @@
-"""Reading of lens files of any format, recognised by content, else by suffix."""
+"""Reads lens files of any format, which is recognised by the content, else by the suffix."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HEAD = 20_000  # characters by which a format is recognised
 
 @dataclass(frozen=True)
 class Format:
-    """A format that lenses are read from; `like` finds its mark in the beginning of a text."""
+    """A format that lenses are read from; `like` is a pattern that is found at the beginning of its texts."""
 
     name: str
     suffixes: tuple[str, ...]
@@ -32,7 +32,7 @@ class Format:
     like: str
 
 
-# Of a table the first line that is no comment holds numbers: a count, or those of a row.
+# In a plain table the first line that is no comment holds numbers: a count, or those of a row.
 _NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]+)?"
 _TABLE = rf"\A(?:[^\S\n]*(?:#.*)?\n)*[^\S\n]*{_NUMBER}(?:(?:[^\S\n]+{_NUMBER}){{3}})?[^\S\n]*(?:[#\n]|\Z)"
 FORMATS = (
@@ -50,12 +50,12 @@ SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixe
 
 
 def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """The lens of a file in any format that neurolens reads, its own TOML too, with what the file lacks from `options`.
+    """Return the lens of a file in any format, also our own TOML; `options` give what the file lacks.
 
     The content decides; the suffix is used if the content is not recognised.
 
     Raises:
-        InputError: a file in no known format, or the mistake in it; names file and line. Where an option of `neurolens
+        InputError: the file is in no known format, or has a mistake; names file and line. Where an option of `neurolens
             convert` would help, and `options` is None, the message says how.
     """
     if options is None:
@@ -86,7 +86,7 @@ def format_of(path: str | Path) -> Format:
     """Return the format of a file, by its content, else by a suffix that no other format has.
 
     Raises:
-        InputError: neither tells.
+        InputError: neither tells the format.
     """
     head = "\n".join(read_text(path)[:_HEAD].splitlines())
     suffix = Path(path).suffix.lower()
@@ -107,7 +107,7 @@ def kind_of(path: str | Path) -> str:
 
 @dataclass(frozen=True)
 class Collection:
-    """The files of a folder: those that may be lenses, by name with "/" between its parts, and how many are not.
+    """The files of a folder that may be lenses, by name with "/" between its parts, and how many others there are.
 
     Attributes:
         others: how many files of other kinds lie in the folder, by suffix.
@@ -119,10 +119,10 @@ class Collection:
 
 
 def collection_of(folder: Path) -> Collection:
-    """Return the files of a folder and of its folders by suffix; hidden ones and links to folders are others.
+    """Find the lens files of a folder and of its folders by suffix; hidden files and links to folders do not count.
 
     Raises:
-        InputError: no such folder, or no lens file in it.
+        InputError: there is no such folder, or no lens file in it.
     """
     if not folder.is_dir():
         raise InputError(folder, "FOLDER", "(no folder)", "a folder of lens files")
@@ -147,5 +147,5 @@ def collection_of(folder: Path) -> Collection:
 
 
 def lens_files(folder: Path) -> list[Path]:
-    """The lens files of a folder and of its folders, by name; raises InputError as `collection_of`."""
+    """Return the lens files of a folder and of its folders, by name; raises InputError as `collection_of`."""
     return [folder / name for name in collection_of(folder).names]

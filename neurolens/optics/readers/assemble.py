@@ -1,13 +1,13 @@
-"""What a file says otherwise than a lens does, or leaves open: Forbes's aspheres, stop, f-number, film and rims.
+"""Completes what a file says differently from a lens, or leaves open: Forbes's aspheres, stop, f-number, film, rims.
 
 Forbes's mild aspheres (Qbfs) become even powers of the height (G. W. Forbes, Opt. Express 15, 5218, 2007); the strong
 ones are a figure of their own (`optics.lens.figures.Qcon`). With u the height over a normalisation radius and x = u^2,
 
     sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x),
 
-whose slopes along the normal are orthonormal (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic,
-Thorlabs's ASL5040-UV is sharp). The cosine is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it.
-Conics so steep that the lens model's powers do not reach that are refused.
+whose slopes along the normal are orthonormal. (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic,
+Thorlabs's ASL5040-UV is sharp.) The cosine is no polynomial: a polynomial as close as `CLOSE_MM` up to the rim stands
+for it. Conics so steep that the lens model's powers do not come so close are refused.
 """
 
 from __future__ import annotations
@@ -34,36 +34,39 @@ if TYPE_CHECKING:
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
-_SHORTEST = 0.01  # focal length over the thickest glass: of 391 lenses none is below 0.19
-_SLIGHTLY = 0.1  # of a rim's diameter
-_TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
+_SHORTEST = 0.01  # focal length over the thickest glass, at least: of 391 lenses none is below 0.19
+_SLIGHTLY = 0.1  # share of a rim's diameter
+# f-number by the stop's diameter over the stated one: where radii were meant by diameters, and where all is right
+_TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)
 
-CLOSE_MM, WORST_MM = 1e-11, 1e-9  # of sag, in the unit of the heights: what is aimed at, and what steep conics get
+# error of sag, in the unit of the heights: what is aimed at, and what is accepted for steep conics
+CLOSE_MM, WORST_MM = 1e-11, 1e-9
 _DIGITS = 80
 _SAMPLES = 101
-_ROUNDING_MM = 2e-8  # of sag: what rounding the coefficients to float64 may change; float32 carries what passes this
+# of sag: how much rounding the coefficients to float64 may change; float32 carries what passes this
+_ROUNDING_MM = 2e-8
 Terms = tuple[tuple[int, float], ...]
 
 
 def finish(
     lens: Lens, *, pupil_mm: float | None = None, film_given: bool = True, stop_limit_mm: float | None = None
 ) -> Lens:
-    """Return a lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
+    """Return the lens of a file's rows with what follows from them: its f-number or stop, and the back focus.
 
     Rims that the file does not give stay `UNKNOWN`; states and overlaps are for the caller (`with_rims`,
     `check_states`).
 
     Args:
-        lens: rows as read; `UNKNOWN` for a diameter that is not given, NaN for an f-number that is not (it sizes
-            the stop where neither pupil nor stop diameter are known).
+        lens: rows as read; `UNKNOWN` for a diameter that is not given, NaN for an f-number that is not (it sizes the
+            stop where neither pupil nor stop diameter is known).
         pupil_mm: diameter of the entrance pupil, where the file gives that; it rules over the stop's diameter.
         film_given: whether the last thickness is the file's; else it becomes the paraxial back focus.
-        stop_limit_mm: diameter of the aperture that the file sets on the stop itself; the smaller of it and of what
-            pupil or f-number ask for is taken, with a warning.
+        stop_limit_mm: diameter of the aperture that the file sets on the stop itself. It is taken, with a warning,
+            where pupil or f-number ask for a wider stop.
 
     Raises:
-        InputError: no row, too many, no stop or several, a figure out of range, a stop that nothing sizes, no image
-            behind the lens.
+        InputError: there is no row, or too many; no stop, or several; a figure is out of range; nothing sizes the stop;
+            there is no image behind the lens.
     """
     _check_stop(lens)
     stop = lens.surfaces[lens.stop_index]
@@ -101,7 +104,7 @@ def finish(
 
 
 def pupil_of(lens: Lens, object_na: float, distance: float) -> float:
-    """Diameter of the entrance pupil that gives light from a near object this numerical aperture, else InputError."""
+    """Return the diameter of the entrance pupil at which a near object has this numerical aperture, else InputError."""
     sine = object_na / float(lens.object_medium.n_d)
     reach = distance + first_order(lens.with_stop_radius(1.0)).entrance_pupil_z_mm
     if not (sine < 1 and 0 < reach < math.inf):
@@ -111,7 +114,7 @@ def pupil_of(lens: Lens, object_na: float, distance: float) -> float:
 
 
 def smaller_stop(file: str, wanted: float, limit: float | None, state: str = "") -> float:
-    """The smaller of two diameters of the stop: by pupil or f-number, and of its own aperture; warns of the latter."""
+    """Return the smaller diameter of the stop: by pupil or f-number, or by its own aperture, with a warning."""
     if limit is None or not limit < wanted * (1 - NARROWER):
         return wanted
     message = f"{state}pupil or f-number ask for a stop {wanted:.6g} wide, its own aperture is {limit:.6g}"
@@ -120,9 +123,10 @@ def smaller_stop(file: str, wanted: float, limit: float | None, state: str = "")
 
 
 def first_order(lens: Lens) -> FirstOrder:
-    """Return the first-order data in the y-z plane; of a lens without power there, in the x-z plane.
+    """Return the first-order data in the y-z plane; for a lens without power there, in the x-z plane.
 
-    Raises InputError for a lens without power, or whose entrance pupil is a point or infinite; a figure out of range.
+    Raises InputError for a lens without power, one whose entrance pupil is a point or infinite, or a figure out of
+    range.
     """
     _check_stop(lens)
     try:
@@ -169,10 +173,10 @@ def _check_stop(lens: Lens) -> None:
 
 
 def with_stop(draft: Draft, wanted: str | None) -> Draft:
-    """The draft with a stop: the surface wanted, that of the file, or else that whose rim limits the beam of the axis.
+    """The draft with a stop: the surface wanted, the file's, or the surface whose rim limits the beam of the axis.
 
     Raises:
-        InputError: no surface of that number.
+        InputError: there is no surface of that number.
     """
     names = [row.name or str(k) for k, row in enumerate(draft.rows)]
     if wanted is not None:
@@ -185,11 +189,11 @@ def with_stop(draft: Draft, wanted: str | None) -> Draft:
         rows = tuple(row.surface for row in draft.rows)
         lens = Lens("", "", rows, math.nan, path=draft.file, object_medium=Medium(**draft.object_medium))
         check_rows(lens)
-        heights = system_of(lens).march(1.0, 0.0).y  # of a beam 2 mm wide
+        heights = system_of(lens).march(1.0, 0.0).y  # of a beam that is 2 mm wide
         shares = [s.semi_diameter_mm / abs(y) if y else math.nan for s, y in zip(rows, heights, strict=True)]
         k = min(range(len(rows)), key=lambda k: math.inf if math.isnan(shares[k]) else shares[k])
         assume(draft.file, f"no stop is marked: surface {names[k]}, whose rim limits the beam of the axis, is taken")
-    # Its rim stays, where the f-number or pupil of the file would have a wider one.
+    # Its rim stays, even where the file's f-number or pupil would make it wider.
     marked = (replace(row, surface=replace(row.surface, stop=i == k)) for i, row in enumerate(draft.rows))
     return replace(draft, rows=tuple(replace(row, aperture=row.aperture or row.surface.stop) for row in marked))
 
@@ -201,10 +205,10 @@ def stop_aperture(draft: Draft) -> float | None:
 
 
 def with_likely_rims(lens: Lens, draft: Draft) -> Lens:
-    """Return the lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
+    """Return the lens with rims of half the width, where stop and spheres tell that diameters are meant as radii."""
     f_number = draft.f_number or draft.nominal
     if not any(s.stop for s in lens.surfaces):
-        return lens  # `finish` says so
+        return lens  # `finish` reports it
     beyond = [k for k, s in enumerate(lens.surfaces) if s.semi_diameter_mm > end_mm(s) * (1 + 1e-6)]
     evidence = f"the rim of surface {beyond[0]} is wider than its sphere" if beyond else ""
     if f_number and not math.isnan(lens.stop_radius_mm):  # some files write 0 for none
@@ -221,8 +225,9 @@ def with_likely_rims(lens: Lens, draft: Draft) -> Lens:
 
 
 def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.setting.rims`), with a
-    warning, in which `in_file` calls surfaces as the file does.
+    """Return the lens with the rims that its file lacks, by rule (`neurolens.optics.setting.rims`), with a warning.
+
+    In the warning `in_file` calls surfaces as the file does.
     """
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:
@@ -237,7 +242,7 @@ def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
 
 
 def _as_beside(lens: Lens) -> Lens | None:
-    """The lens with rims as wide as those on the other side of the same glass; None where some have no such rim."""
+    """The lens with missing rims as wide as those on the other side of the glass; None where some are not there."""
     rows = list(lens.surfaces)
     for k, s in enumerate(lens.surfaces):
         before, behind = rows[max(k - 1, 0) : k], lens.surfaces[k + 1 : k + 2] if s.n_d != 1 else ()
@@ -251,8 +256,8 @@ def _as_beside(lens: Lens) -> Lens | None:
 def narrowed(lens: Lens, draft: Draft) -> Lens:
     """Return the lens with rims no wider than their spheres and than where neighbours touch, in every state.
 
-    Unless rims are `drawn`, a table stays as it is where rims are much wider (`_SLIGHTLY`) than their spheres, or would
-    have to be much narrower and then cut the beam of the axis: its figures are wrong.
+    A table whose rims are not `drawn` stays as it is where rims are much wider (`_SLIGHTLY`) than their spheres, or
+    would have to be so narrow that they cut the beam of the axis: its figures are wrong.
     """
     found = narrowed_rims(lens)
     pairs = list(zip(lens.surfaces, found.surfaces, strict=True))
@@ -282,7 +287,7 @@ def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, 
         a: a_0, a_1, ... radius: normalisation radius. rim: height up to which the surface is used.
 
     Raises:
-        ValueError: a conic that is too steep; coefficients that float64 cannot hold.
+        ValueError: the conic is too steep, or float64 cannot hold the coefficients.
     """
     with localcontext(Context(prec=_DIGITS)):
         s2, k = (Decimal(curvature) * Decimal(radius)) ** 2, Decimal(conic)

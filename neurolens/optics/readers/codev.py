@@ -1,4 +1,4 @@
-"""CODE V sequence files (.seq): commands of three letters, S lines with radius or curvature, thickness, glass."""
+"""CODE V sequence files (.seq): commands of three letters, and S lines with radius or curvature, thickness, glass."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from neurolens.optics.readers.glasses import by_indices, named_glass
 from neurolens.optics.readers.source import Line, ReadOptions, assume, by_word, read_lines, warn
 
 UNITS = {"M": "mm", "C": "cm", "I": "in"}
-ROOM = 20  # degrees, at which the catalogues measure
+ROOM = 20  # degrees Celsius, at which catalogues measure
 FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
 # Settings, weights, labels, control codes of variables, tolerances: written to most files, and no ray depends on them.
 HARMLESS = frozenset(
     """LEN WTW WTF WTA INI DOR PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
     DLN DLF DLR IRR SCC KXC""".split()
 )
-# What changes rays and is not read: what is expected in its place.
+# What changes rays and is not read, with what is expected in its place.
 REFUSED = by_word(
     ("NA", "EPD, FNO or NAO to size the stop"),
     ("MOD", "a surface that is no ideal lens (a module)"),
@@ -37,7 +37,7 @@ REFUSED = by_word(
 )
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
 SHAPES = ("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "AAS")
-# Of special surfaces: how the names of their coefficients begin, before the power of the first term.
+# How the names of a special surface's coefficients begin, before the power of the first term.
 SPECIAL = {"ODD": "AR", "QBF": "QB", "QCN": "QC"}
 ALONG = ("KX", "KY", "AR", "BR", "CR", "DR", "AP", "BP", "CP", "DP")  # of AAS
 # Coefficients of an ASP surface: r^4, r^6, ... r^20.
@@ -45,17 +45,17 @@ LETTERS = {letter: 4 + 2 * k for k, letter in enumerate("ABCDEFGHJ")}
 NONE_BUT_0 = ("CUF", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
 READ = (*"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM".split(), *SHAPES, *ALONG, *LETTERS, *NONE_BUT_0)
 ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
-# Control codes, fields, vignetting factors, weights, wavelengths.
+# Control codes, fields, vignetting factors, weights and wavelengths, which move no ray in a zoom.
 NOT_ZOOMED = frozenset(
     """THC CCY GLC KC VUX VLX VUY VLY XAN YAN XIM YIM XRI YRI XOB YOB WTF WTW WTA WL REF DER""".split()
 )
-_THICKEST = 5.0  # of a glass, over the radius of its spheres; no lens of the library is above 1.1
+_THICKEST = 5.0  # of a glass, over the radius of its spheres; the library has none above 1.1
 _MAX_COMMAND = 100_000  # characters of one command with all its continuation lines
 
 
 @dataclass(frozen=True)
 class Command:
-    """One command: its name as written, three letters of it (which is all that counts), its words, where it begins."""
+    """One command: its word as written, the three letters of it that count, its further words, where it begins."""
 
     word: str
     name: str
@@ -63,16 +63,16 @@ class Command:
     line: Line
 
     def numbers(self, words: Sequence[str] | None = None, least: int = 1) -> list[float]:
-        """Its values as numbers."""
+        """Return its values as numbers."""
         return self.line.numbers(self.name, self.words if words is None else words, least)
 
     def first(self, words: Sequence[str] | None = None) -> float:
-        """The first of its values."""
+        """Return the first of its values."""
         return self.line.first(self.name, self.words if words is None else words)
 
 
 def commands(lines: Sequence[Line]) -> Iterator[Command]:
-    """The commands of a file: "!" begins a comment, ";" ends a command, "&" at the end of a line continues it."""
+    """Yield the commands of a file: "!" begins a comment, ";" ends a command, "&" at the end of a line continues it."""
     text, start = "", None
     for line in lines:
         bare = _outside_quotes(line.text, "!")[0]
@@ -107,18 +107,18 @@ def _outside_quotes(text: str, mark: str) -> list[str]:
 
 @dataclass
 class Block(draft.Block):
-    """One surface with what CODE V says of it."""
+    """One surface, with what CODE V says about it."""
 
     kind: str = "SPH"
     curvature_x: float | None = None
-    unsaid: bool = False  # whether its first number may be a radius or a curvature, as which it stands
+    unsaid: bool = False  # whether its first number may be a radius or a curvature; it is kept as a curvature
     terms: dict[str, float] = field(default_factory=dict)
     special: dict[str, float] | None = None  # coefficients of a special surface
 
 
 @dataclass
 class File(Draft):
-    """A file while it is read."""
+    """The state of reading a file."""
 
     kind: str = "CODE V"
     blocks: list[Block] = field(default_factory=list)
@@ -136,7 +136,7 @@ def read_seq(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a CODE V sequence file.
 
     Raises:
-        InputError: see the module; also tilts, mirrors and everything else that the lens model cannot represent.
+        InputError: see the module; also for tilts, mirrors and everything else that the lens model cannot represent.
     """
     file = File(str(path))
     for command in commands(read_lines(path)):
@@ -157,7 +157,7 @@ def read_seq(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def _private(file: File, command: Command) -> None:
-    """Inside PRV: PWL gives wavelengths, each row a glass by its name; END closes."""
+    """Read a command inside PRV: PWL gives wavelengths, each row a glass by its name; END closes."""
     if command.name == "END":
         file.private_nm = None
     elif command.name == "PWL":
@@ -169,7 +169,7 @@ def _private(file: File, command: Command) -> None:
 
 
 def _system(file: File, command: Command) -> bool:
-    """Carry out a command of the whole system; False where it is none."""
+    """Carry out a command of the whole system; False where it is no such command."""
     name, words, line = command.name, command.words, command.line
     match name:
         case "RDM":
@@ -254,7 +254,7 @@ def _surface(file: File, command: Command) -> None:
 
 
 def _special_data(block: Block, command: Command, words: Sequence[str]) -> None:
-    """SPS with a type and a normalisation radius, or SCO with the name and value of a coefficient."""
+    """Read SPS with a type and a normalisation radius, or SCO with the name and value of a coefficient."""
     name = words[0].upper() if words else ""
     if command.name == "SCO":
         if block.special is None:
@@ -293,7 +293,7 @@ def _new_surface(file: File, command: Command) -> None:
 
 
 def _zoom(file: File, command: Command) -> None:
-    """ZOO and the count of positions, or a quantity with one value a position."""
+    """Read ZOO with the count of positions, or with a quantity and one value for each position."""
     words, line, zoom = command.words, command.line, file.zoom
     if words and words[0].isdecimal():
         zoom.begin(line, "ZOO", int(words[0]))
@@ -326,7 +326,7 @@ def _zoom(file: File, command: Command) -> None:
 
 
 def _one_gap(file: File, command: Command) -> None:
-    """THI Sk Zn value."""
+    """Read THI Sk Zn value."""
     surface, place = command.words[0][1:], command.words[1][1:]
     count = file.zoom.count
     if not (surface.isdecimal() and place.isdecimal() and int(surface) < len(file.blocks) and 1 <= int(place) <= count):
@@ -335,7 +335,7 @@ def _one_gap(file: File, command: Command) -> None:
 
 
 def _settle_radii(file: File) -> None:
-    """Tell by pupil and glasses whether the first numbers of surfaces are radii, where no RDM says so."""
+    """Tell by pupil and glasses whether the first numbers of surfaces are radii, where no RDM says it."""
     if not (unsaid := [block for block in file.blocks if block.unsaid]):
         return
     pupil = (file.pupil or 0.0) * max(abs(block.curvature) for block in unsaid) / 2
@@ -350,14 +350,14 @@ def _settle_radii(file: File) -> None:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces."""
+    """Set what is known only when all surfaces are read."""
     _settle_radii(file)
     first, *middle, image = file.blocks
     if not middle:
         raise InputError(file.file, "S", "(no surface)", "at least one surface between object and image")
     if image.curvature:
         warn(file.file, "the image surface is curved; the film is taken as plane")
-    last, defocus = middle[-1], image.thickness  # the image lies off the last thickness by that of SI
+    last, defocus = middle[-1], image.thickness  # the thickness of SI says how far from it the image lies
     last.thickness += defocus
     for k, block in enumerate(middle[:-1], start=1):
         if block.solved:
@@ -381,7 +381,7 @@ def _complete(file: File) -> None:
 
 
 def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
-    """Return the field point farthest from the axis; None where the file has none of that kind."""
+    """Return the field point farthest from the axis; None where the file has no field of that kind."""
     far = 0.0
     for x, y in pairs:
         across, up = file.fields.get(x, []), file.fields.get(y, [])
@@ -394,9 +394,10 @@ def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
 def medium(
     command: Command, words: Sequence[str], private: Mapping[str, tuple[Command, Sequence[float]]]
 ) -> dict[str, Any]:
-    """Fields of a surface for the medium behind it: a name, "NAME_MAKER", a code, n:V, n V, or nothing for air.
+    """Return the fields of a surface for the medium behind it.
 
-    A code is the fraction of the index and the Abbe number without its point: 517.642, 517642 or 516800.641700.
+    It is a name, "NAME_MAKER", a code, n:V, n V, or nothing for air. A code is the fraction of the index and the Abbe
+    number without its point: 517.642, 517642 or 516800.641700.
     """
     if not words or words[0].upper() in ("AIR", ""):
         return {}
@@ -434,8 +435,8 @@ def _private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[st
 def shape_of(block: Block) -> dict[str, Any]:
     """Return the radius and the figure of a surface, for `Block.row`.
 
-    YTO is a curve in y (curvature CUY, K, A y^4, ...) turned about an axis along y at 1 / CUX; XTO likewise in x; a
-    cylinder where one of both is zero. AAS with its two conics K and KX is a biconic.
+    YTO is a curve in y (curvature CUY, K, A y^4, ...) turned about an axis along y at 1 / CUX; XTO is the same in x;
+    where one of both curvatures is zero it is a cylinder. AAS with its two conics K and KX is a biconic.
     """
     if block.special is not None:
         return _special(block)
@@ -463,7 +464,7 @@ def shape_of(block: Block) -> dict[str, Any]:
 
 
 def _biconic(block: Block) -> dict[str, Any]:
-    """AAS; its higher terms are AR to DR, whose shares in x and y are AP to DP."""
+    """Read AAS; its higher terms are AR to DR, with their shares in x and y AP to DP."""
     conic_x = block.terms.get("KX", 0.0)
     for name, value in block.terms.items():
         if value and name != "KX" and not name.endswith("P"):
@@ -473,7 +474,7 @@ def _biconic(block: Block) -> dict[str, Any]:
 
 
 def _special(block: Block) -> dict[str, Any]:
-    """ODD: sum of ARn r^n over NRADIUS^n, which 0 leaves out; Q-types: QBn or QCn, n = 4 + 2 m, of Forbes's sums."""
+    """Read ODD, a sum of ARn r^n over NRADIUS^n (0: none), or QBn and QCn, n = 4 + 2 m, of Forbes's sums."""
     kind, values = block.kind, dict(block.special or {})
     radius, block.conic = values.pop("NRADIUS", 0.0), values.pop("K", 0.0)
     found: dict[int, float] = {}

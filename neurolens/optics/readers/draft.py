@@ -34,12 +34,12 @@ from neurolens.optics.setting.rims import check_states
 
 INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
 MAX_STATES = 200
-LEAST_RADIUS = 1e-3  # by which coefficients of aspheres are normalised, in the unit of the file
+LEAST_RADIUS = 1e-3  # the least that coefficients of aspheres are normalised by, in the unit of the file
 
 
 @dataclass
 class Block:
-    """One surface while a file is read, in the file's unit; readers add what their formats say besides."""
+    """One surface while a file is read, in the file's unit; readers add what else their formats say."""
 
     start: Line
     name: str = ""
@@ -49,7 +49,7 @@ class Block:
     semi_diameter: float = UNKNOWN
     medium: dict[str, Any] = field(default_factory=dict)
     stop: bool = False
-    aperture: bool = False  # as of `Row`
+    aperture: bool = False  # as in `Row`
     solved: bool = False  # whether the thickness follows from others, or from the paraxial image
 
     @property
@@ -62,8 +62,11 @@ class Block:
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
     def crossed(self, curve: dict[str, Any], radius_x: float, conic_x: float | None) -> dict[str, Any]:
-        """A curve in y, as `rotational` has it, bent in x too: turned, or with a conic a biconic; a cylinder where one
-        of both is straight (an infinite radius), and round where they are the same."""
+        """Bend a curve in y, given as by `rotational`, in x too.
+
+        It is turned, or with a conic becomes a biconic. It is a cylinder where one of both is straight (an infinite
+        radius), and round where both are the same.
+        """
         bent = bool(self.curvature or curve["asphere"])
         if math.isinf(radius_x):
             return curve | ({"cylinder": "y"} if bent else {})
@@ -73,7 +76,7 @@ class Block:
         return curve if same and not curve["asphere"] else curve | {"cylinder": "y", "across": (radius_x, conic_x)}
 
     def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
-        """A surface of Forbes's kind, made as by `rotational`: coefficients from m = 0, a normalisation radius."""
+        """A surface of Forbes's kind, as by `rotational`: coefficients from m = 0, and a normalisation radius."""
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MOST_Q_TERMS:
             raise self.start.error(name, f"({len(values)} terms)", f"at most {MOST_Q_TERMS} terms")
@@ -91,7 +94,7 @@ class Block:
         return self.rotational(terms)
 
     def row(self, shape: dict[str, Any]) -> Row:
-        """The row of a surface of this `radius_mm` and figure, by the keys of `figures.figure_of`."""
+        """Return the row of a surface with this `radius_mm` and figure, by the keys of `figures.figure_of`."""
         lengths = shape["radius_mm"], self.thickness, 2 * self.semi_diameter
         surface = Surface(*lengths, stop=self.stop, figure=figure_of(shape), **self.medium)
         return Row(surface, self.aperture, self.name)
@@ -104,7 +107,7 @@ class Row:
     Attributes:
         surface: its diameter may be `assemble.UNKNOWN`.
         aperture: whether the file sets a clear aperture on it, so that even a plane in air cuts the beam.
-        name: number by which the file calls it; empty where that is its place in the table, from 0.
+        name: the number by which the file calls it; empty where that is its place in the table, from 0.
     """
 
     surface: Surface
@@ -114,13 +117,13 @@ class Row:
 
 @dataclass(frozen=True)
 class State:
-    """A zoom or focus state, in the file's unit; None: as in the table.
+    """A zoom or focus state, in the file's unit. None: as in the table.
 
     Attributes:
-        thickness: by row number of the draft.
+        thickness: by the draft's row number.
         pupil, f_number, stop_diameter: any one of them sizes the stop.
-        object_distance: object to the first row of the draft; `inf` at infinity.
-        film_given: whether the last thickness stands; else it becomes the paraxial back focus of the state.
+        object_distance: from the object to the draft's first row; `inf` at infinity.
+        film_given: whether the last thickness holds; else it becomes the state's paraxial back focus.
     """
 
     name: str
@@ -157,14 +160,15 @@ class Positions:
     def states(
         self, blocks: Sequence[Block], noun: str, rim: str, solve: Callable[[list[float], int], bool]
     ) -> tuple[State, ...]:
-        """The positions of a file as states.
+        """Return the positions of a file as states.
 
         Args:
-            blocks: object, surfaces and image. noun: what a position without a title is called. rim: the keyword of
-                semi-diameters. solve: carries out the solves of gaps at a place, and tells whether its film is given.
+            blocks: object, surfaces and image. noun: what a position without a title is called.
+            rim: the keyword of semi-diameters. solve: carries out the solves of gaps at a place, and tells whether its
+                film is given.
 
         Raises:
-            InputError: a semi-diameter that changes anywhere but at the stop.
+            InputError: a semi-diameter changes that is not the stop's.
         """
         if self.count < 2:
             return ()
@@ -192,20 +196,21 @@ class Positions:
 
 @dataclass
 class Draft:
-    """All data found by a reader; readers of text files fill it line by line. Lengths in the file's unit.
+    """All data found by a reader; readers of text files fill it line by line. Lengths are in the file's unit.
 
     Attributes:
         kind: name of the format, for the source line.
         notes: lines of text.
-        pupil, f_number, object_na: if given, they size the stop (by the numerical aperture n sin(theta) of the beam
-            from the axis of an object that is near); else its diameter does.
+        pupil, f_number, object_na: if one is given, it sizes the stop, else the stop's diameter does. `object_na` is
+            the numerical aperture n sin(theta) of the beam from the axis of a near object.
         unit: "mm", "cm", "in", "m", or None if unknown.
         stated_efl: focal length as the file states it, to be checked.
-        drawn: rims are somebody's measures of a drawing, some of them radii where diameters are meant: halved where
-            they are twice what they can be, and narrowed by however much neighbours would overlap; both are warned of.
-        nominal: f-number that the file states with few digits, to tell radii from diameters by.
+        drawn: whether somebody measured rims in a drawing, and gave some as radii in place of diameters. These are
+            halved where they are twice what they can be, and narrowed where neighbours would overlap; both give
+            warnings.
+        nominal: f-number that the file states with few digits, which tells radii from diameters.
         stop_given: whether the file states the stop's own diameter, which then rules over its f-number.
-        skipped: what was not read since no ray depends on it, and how often it occurs; one warning lists all.
+        skipped: what was not read because no ray depends on it, with how often it occurs; one warning lists all.
         object_medium: fields of `Medium` for the medium in front of the lens.
         wavelengths_nm: as `Lens.wavelengths_nm`.
     """
@@ -234,7 +239,7 @@ class Draft:
     wavelengths_nm: tuple[float, ...] = ()
 
     def in_file(self, text: str) -> str:
-        """Return a message about the rows, each called as the file calls its surface."""
+        """Return a message about rows in which each is called as the file calls its surface."""
 
         def renamed(found: re.Match[str]) -> str:
             rows = [self.rows[k].name for k in map(int, found[1].split(", ")) if k < len(self.rows)]
@@ -244,13 +249,13 @@ class Draft:
 
 
 def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[float, ...]:
-    """Return the wavelengths of a file as `Lens` holds them; those beyond what neurolens traces are left out."""
+    """Return the wavelengths of a file in the order of `Lens`; those beyond what neurolens traces are left out."""
     sound = [round(nm, 6) for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]  # as read in micrometres
     return tuple(sorted(sound, key=lambda nm: nm != round(primary_nm, 6)))
 
 
 def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
-    """The lens of a draft, in mm, checked as by `assemble.finish`; a unit other than the file's is an InputError."""
+    """The lens of a draft, in mm, checked as by `assemble.finish`; another unit than the file's is an InputError."""
     options = options or ReadOptions()
     if +draft.skipped:
         listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
@@ -311,8 +316,8 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
     return lens
 
 
-_ROUNDED_MM = 1e-4  # by which programs round lengths
-_AGREES = 0.03  # relative: f-numbers are printed with two digits
+_ROUNDED_MM = 1e-4  # to which programs round lengths
+_AGREES = 0.03  # relative, since f-numbers are printed with two digits
 _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
 
 
@@ -324,7 +329,7 @@ def _states(draft: Draft) -> tuple[State, ...]:
 
 
 def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
-    """Return a state for the lens file; its stop follows from the pupil or f-number of the state."""
+    """Return a state for the lens file; its stop follows from the state's pupil or f-number."""
     last = len(lens.surfaces) - 1
     thickness = dict(state.thickness)
     if not state.film_given:
@@ -361,7 +366,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
 
 
 def _without_negative_zeros(draft: Draft) -> Draft:
-    """The draft with gaps of less than nothing, by no more than rounding, closed."""
+    """Return the draft with gaps closed that are negative by no more than rounding."""
     least, rows = -_ROUNDED_MM / UNITS_MM.get(draft.unit or "mm", 1.0), list(draft.rows)
     for k, row in enumerate(draft.rows):
         if least <= row.surface.thickness_mm < 0:
@@ -382,7 +387,7 @@ def _without_dummies(draft: Draft) -> Draft:
     kept = [k for k in range(len(rows)) if k not in dropped]
     if not dropped or not kept:
         return draft
-    # To which kept row the thickness of each row belongs; those in front of all (-1) belong to the object's distance.
+    # The kept row to which each row's thickness belongs; those in front of all (-1) belong to the object's distance.
     owner = [bisect_right(kept, k) - 1 for k in range(len(rows))]
 
     def merged(thickness: dict[int, float]) -> tuple[list[float], float]:

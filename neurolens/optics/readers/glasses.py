@@ -1,9 +1,9 @@
 """Glasses of lens files by name or by their indices, and glass catalogues of Zemax (.agf).
 
 In a catalogue a glass begins with `NM name formula MIL n_d V_d ...`; `CD` has the coefficients (wavelengths in um),
-`LD` the range, and each `IT` a wavelength, a transmittance and the thickness in mm that it is of. Formulas as in
-Zemax's manual, "The formulas for dispersion"; those are read that n^2 = 1 + sum of B L^2 / (L^2 - C) or a sum of powers
-of L can write.
+`LD` the range, and each `IT` a wavelength, a transmittance and the thickness in mm to which it belongs. Formulas are
+those of Zemax's manual, "The formulas for dispersion"; read are those that can be written as n^2 = 1 + sum of B L^2 /
+(L^2 - C), or as a sum of powers of L.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from neurolens.optics.readers.source import Line, assume, read_lines, warn
 _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
 _SAME_LINE_NM = 0.1
 _MOULDED = re.compile("([ _-]?MOLD(ED)?|M)$", re.IGNORECASE)
-_MOULDING = 0.01  # by how much moulding lowers an index at the most
+_MOULDING = 0.01  # the most by which moulding lowers an index
 # Discontinued glasses of Schott, of which no dispersion formula is at hand: n_d and V_d (LASF14A and SF58 as in
 # Elphel's optical-design-viewer, SSK4 as Laikin's "Lens Design" prints it).
 _DISCONTINUED: dict[str, tuple[float, float | None]] = {
     **{"LASF14A": (1.82223, None), "SF58": (1.917613, 21.5), "SSK4": (1.6177, 55.11)},
 }
-SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
+SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # by which printed figures may differ from those of a catalogue glass
 MAX_GLASSES, MAX_NAME, MAX_SAMPLES = 5000, 64, 200
 _FORMULAS = (
     *("Schott", "Sellmeier 1", "Herzberger", "Sellmeier 2", "Conrady", "Sellmeier 3", "Handbook of Optics 1"),
     *("Handbook of Optics 2", "Sellmeier 4", "Extended", "Sellmeier 5", "Extended 2", "Extended 3"),
 )
-# Terms of Sellmeier's form; of the others the coefficients in the order of `Glass.coefficients`: L^4, L^2, 1, L^-2, ...
+# The number of terms of Sellmeier's form; for other forms the coefficients in the order of `Glass.coefficients`: L^4,
+# L^2, 1, L^-2, ...
 _SELLMEIER = {2: 3, 6: 4, 11: 5}
 _POWERS = {
     1: (None, 1, 0, 2, 3, 4, 5),
@@ -44,9 +45,9 @@ _POWERS = {
     12: (6, 1, 0, 2, 3, 4, 5),
     13: (2, 1, 0, 3, 4, 5, 6, 7, 8),
 }
-_SIXTH_POWER = {12: 7}  # the coefficient of L^6, for which there is no place
-_OFF = 1e-3  # n_d of the formula and of the NM line: a larger difference is damage
-_DARKEST = 1e-6  # a transmittance of 0 says no more than that
+_SIXTH_POWER = {12: 7}  # place of the coefficient of L^6, which `Glass` cannot hold
+_OFF = 1e-3  # a larger difference between n_d of the formula and of the NM line is damage
+_DARKEST = 1e-6  # a transmittance of 0 says no more than that it is below this
 
 
 def named_glass(
@@ -61,7 +62,7 @@ def named_glass(
     """Return the fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
 
     For a discontinued glass its replacement, with the prefix "N-", is taken. A moulded variant of a glass ("..._MOLD",
-    "...M") has an index lower by some 0.004, which no catalogue here states; its base glass is offered.
+    "...M") has an index lower by some 0.004, which no catalogue here states; the message offers its base glass.
 
     Args:
         makers: the makers' catalogues that the file names; the first that has the glass is meant.
@@ -69,7 +70,7 @@ def named_glass(
         figures: n_d and V_d that the file gives beside the name, for a glass that the catalogue does not know.
 
     Raises:
-        InputError: such a name without figures; the message suggests the nearest.
+        InputError: the name is unknown and there are no figures; the message suggests the nearest name.
     """
     same = catalogue.same_name(name)
     if not same and not figures and (left := _DISCONTINUED.get(name.upper())):
@@ -103,12 +104,12 @@ def named_glass(
 
 
 def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm: Sequence[float]) -> dict[str, Any]:
-    """Fields of a surface from indices at some wavelengths, reduced to n_d and V_d with a warning; one index is n_d.
+    """Return a surface's fields from indices at wavelengths: n_d and V_d, with a warning; one index is n_d.
 
-    Between the wavelengths the index is a polynomial of 1 / lambda^2 through the four that are nearest.
+    Between the wavelengths the index is a polynomial of 1 / lambda^2 through the nearest four.
 
     Raises:
-        InputError: several indices, whose wavelengths do not enclose the lines d, F and C.
+        InputError: the wavelengths of several indices do not enclose the lines d, F and C.
     """
     if len(indices) == 1:
         return {"n_d": indices[0]}
@@ -130,12 +131,12 @@ def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm:
 
 
 def _letters(name: str) -> str:
-    """Return the letters and digits of a name, the rest of which does not count."""
+    """Return the letters and digits of a name, which alone count."""
     return "".join(filter(str.isalnum, name.upper()))
 
 
 def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:
-    """Return the catalogue's glass of that name whose figures are the given ones to the digits printed, or None."""
+    """Return the catalogue's glass of that name if it has the given figures, to the digits printed; else None."""
     if name is None or V_d is None:
         return None
     for known in catalogue.same_name(name):
@@ -145,13 +146,13 @@ def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:
 
 
 def short_name(glass: Glass) -> str:
-    """Return the name that finds a glass again, with its maker only where others have one of that name."""
+    """Return the name that finds a glass again; the maker is in it only where others have a glass of that name."""
     return glass.name if catalogue.find(glass.name) is glass else str(glass)
 
 
 @dataclass
 class _Entry:
-    """One glass while the file is read."""
+    """One glass while its file is read."""
 
     line: Line
     name: str
@@ -163,10 +164,10 @@ class _Entry:
 
 
 def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
-    """Return the glasses of a catalogue, its file's stem their maker; and by name why others are not read.
+    """Return a catalogue's glasses, with its file's stem as their maker, and by name why other glasses are not read.
 
     Raises:
-        InputError: no such file, one too large, a line without its numbers; names file and line.
+        InputError: there is no such file, it is too large, or a line lacks its numbers; names file and line.
     """
     found, refused, maker = [], {}, Path(path).stem
     for entry in _entries(read_lines(path)):
@@ -179,7 +180,7 @@ def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
 
 @contextmanager
 def more_glasses(files: Iterable[str | Path]) -> Iterator[None]:
-    """Add the glasses of these catalogues within a block, before those of the same names that ship."""
+    """Add the glasses of these catalogues inside the block; they come before shipped glasses of the same names."""
     with ExitStack() as stack:
         for found, refused in reversed([read_agf(file) for file in files]):
             stack.enter_context(catalogue.added(found, refused))
@@ -213,7 +214,7 @@ def _entries(lines: Sequence[Line]) -> list[_Entry]:
 
 
 def _glass(entry: _Entry, maker: str) -> Glass:
-    """Return the glass of an entry; ValueError with the reason where it is not read."""
+    """Return the glass of an entry; ValueError with the reason where it cannot be read."""
     kind, (low, high) = entry.formula, entry.range_um
     name = _FORMULAS[kind - 1] if 0 < kind <= len(_FORMULAS) else "unknown"
     if not 0 < low < high:
@@ -227,7 +228,7 @@ def _glass(entry: _Entry, maker: str) -> Glass:
 
 
 def _form(kind: int, c: list[float], name: str) -> tuple[str, tuple[float, ...]]:
-    """`Glass.form` and `Glass.coefficients` of a formula's coefficients, with zeros behind them."""
+    """Return `Glass.form` and `Glass.coefficients` of a formula's coefficients, which zeros may follow."""
     if kind in _SELLMEIER:
         terms = [tuple(c[2 * k : 2 * k + 2]) for k in range(_SELLMEIER[kind])]
         return "sellmeier", tuple(v for term in terms if term[0] for v in term) or (0.0, 0.0)

@@ -1,19 +1,19 @@
 """Prescriptions with named figures, in millimetres: JSON of ours, of DeepLens and of ISET, TOML of "Physical Camera".
 
-Ours is the form that ../shared/data/README.md defines: surfaces with full diameters, a radius of 0 is a plane, an index
+Ours is the form that ../shared/data/README.md defines: surfaces have full diameters, a radius of 0 is a plane, an index
 of null is air, a last thickness of 0 or null stands for the computed back focus, `cyl-x` is a cylinder curved along x.
-Other statements of the file are checked against its table: focal length and back focus, and the object's distance of
-every focus state. States marked as interpolated by the transcriber are left out with a warning.
+What else the file states is checked against its table: focal length and back focus, and the object's distance in every
+focus state. States that the transcriber marked as interpolated are left out with a warning.
 
 DeepLens (differentiable design): surfaces of type Spheric, Aspheric, Stop or Aperture with `r` (semi-diameter), `roc`
 or else `c` (curvature), `d_next` (thickness), `mat2` (medium behind: a name, or "n_d/V_d"), `k` and `ai` (sag a_1 r^2 +
 a_2 r^4 + ...); keys in brackets repeat others. ISET (pbrt lenses of a camera simulator): `radius` (0 is a plane),
 `thickness`, `ior` (one index; 0 marks the stop), `semi_aperture`.
 
-Physical Camera (for Blender): tables `lens` and `focus`, and a `surface` each with radius (0 a plane), thickness, ior
-behind, aperture (full clear diameter), abbe_v (0 unknown); type is spherical or flat where it is missing, "stop",
-"aspheric" (conic, aspheric_coeffs of r^4, r^6, ...), "cylindrical_x" (bent along x) or "cylindrical_y". `focus` has the
-distance of a near object, and thicknesses there.
+Physical Camera (for Blender): tables `lens` and `focus`, and a `surface` each with radius (0 is a plane), thickness,
+ior behind, aperture (full clear diameter) and abbe_v (0 is unknown). The type is spherical or flat if it is missing;
+else it is "stop", "aspheric" (conic, aspheric_coeffs of r^4, r^6, ...), "cylindrical_x" (bent along x) or
+"cylindrical_y". `focus` has the distance of a near object, and thicknesses there.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ SURFACE_KEYS = (
     *("aspheric_coefficients", "shape"),
 )
 SHAPES = {"sphere": None, "asphere": None, "cyl-x": "x", "cyl-y": "y"}
-# Words in the notes that indicate diameters not from the source, independent of `diameters_estimated`.
+# Words in notes by which diameters are not the source's, whatever `diameters_estimated` says.
 _NOT_THE_SOURCE_S = frozenset("trimmed enlarged chosen estimated inferred computed reduced".split())
 STATE_KEYS = (
     *("name", "efl_mm", "efl_y_mm", "efl_x_mm", "f_number", "object_distance_mm", "magnification"),
     *("thickness_overrides", "stop_diameter_mm", "interpolated_by_transcriber", "note"),
 )
-DOUBTFUL = 0.05  # relative difference of a stated object distance from the paraxial one that is worth a warning
+DOUBTFUL = 0.05  # relative difference between a stated object distance and the paraxial one that is worth a warning
 AGREES = 1e-4  # relative: more than rounding of the printed figures, less than any wrong digit
-_NUMBER = r"(?<![0-9.])([0-9]{1,9}(?:\.[0-9]{1,9})?)"  # bounded: a search tries every place
+_NUMBER = r"(?<![0-9.])([0-9]{1,9}(?:\.[0-9]{1,9})?)"  # bounded, because a search tries every place
 _DEEPLENS = (
     *("info", "foclen", "fnum", "r_sensor", "d_sensor", "sensor_size", "sensor_res", "hfov", "fov", "float_hfov"),
     *("float_foclen", "float_rfov", "rfov", "surfaces", "r_last"),
@@ -76,13 +76,13 @@ def read_json_lens(path: str | Path, options: ReadOptions | None = None) -> Lens
     """Return the lens of a JSON file, unfocused.
 
     Args:
-        options: name and source that replace those of the file; f-number and half field for a file that states none.
+        options: name and source replace the file's; f-number and half field are for a file that states none.
 
     Warns:
-        NeurolensWarning: for everything left out, computed or doubtful.
+        NeurolensWarning: something was left out, computed, or is doubtful.
 
     Raises:
-        InputError: the first mistake met; it names file, surface and field.
+        InputError: the first mistake; names file, surface and field.
     """
     file = str(path)
     options = options or ReadOptions()
@@ -128,13 +128,13 @@ def read_json_lens(path: str | Path, options: ReadOptions | None = None) -> Lens
 
 
 def _tells_of_other_diameters(notes: str) -> bool:
-    """Test whether a clause has "diameter" and after it one of the words."""
+    """Return whether a clause has "diameter" and after it one of `_NOT_THE_SOURCE_S`."""
     clauses = (clause.partition("diameter")[2] for clause in re.split("[.;]", notes.lower()))
     return any(not _NOT_THE_SOURCE_S.isdisjoint(re.findall(r"\w+", rest)) for rest in clauses)
 
 
 def _load(path: str | Path) -> dict[str, Any]:
-    """Return the top-level object."""
+    """Return the top-level object of a file."""
     try:
         data = parse_json(read_text(path), path)
     except InputError:
@@ -171,7 +171,7 @@ def _surface(row: Table, is_last: bool) -> Surface:
 
 
 def _glass(row: Table) -> dict[str, Any]:
-    """Read a glass; it is that of the catalogue where the named one has the same figures."""
+    """Read a glass; it becomes the catalogue's where the named glass has the same figures."""
     if row.data.get("n_d") is None:
         for key in ("V_d", "material"):
             if row.data.get(key) not in (None, "air"):
@@ -184,8 +184,9 @@ def _glass(row: Table) -> dict[str, Any]:
 
 
 def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """Return the lens with the focal length stated: of several, an anamorphic lens's by meridian, else the first (the
-    table's).
+    """Return the lens with its stated focal length: of several, an anamorphic lens's by meridian, else the first.
+
+    The first is that of the table.
     """
     given = data.get("efl_mm")
     values = [given] if not isinstance(given, list) else given
@@ -222,10 +223,10 @@ def check_computed(lens: Lens, data: Mapping[str, Any]) -> None:
 
 
 def image_and_field(data: Mapping[str, Any], file: str) -> dict[str, Any]:
-    """`image_radius_mm` and `half_field_deg` from the free text of `field_or_image_circle`, if unambiguous.
+    """Read `image_radius_mm` and `half_field_deg` from the free text of `field_or_image_circle`, if it is unambiguous.
 
-    Understood: "image radius 21.6 mm", "image circle 43.2 mm", "38 deg half field", "+-20 deg", "180 deg full field",
-    "AOV 45.2 deg" (full; of several the first), and the keys fullFieldDeg and imageCircleMm. Else a warning.
+    It understands "image radius 21.6 mm", "image circle 43.2 mm", "38 deg half field", "+-20 deg", "180 deg full
+    field", "AOV 45.2 deg" (full; the first of several), and the keys fullFieldDeg and imageCircleMm. Else it warns.
     """
     text = data.get("field_or_image_circle")
     found: dict[str, Any] = {"image_radius_mm": None, "half_field_deg": None}
@@ -282,14 +283,14 @@ def _tables(data: Mapping[str, Any], file: str) -> list[Any]:
 
 
 def _state(lens: Lens, table: Table, name: str) -> Configuration:
-    """One state; what the source leaves open (focal length, object distance) follows from its thicknesses."""
+    """Return one state; focal length and object distance, where the source gives none, follow from its thicknesses."""
     efl, efl_y = table.optional("efl_mm"), table.optional("efl_y_mm")
     efl, distance = efl_y if efl is None else efl, table.data.get("object_distance_mm")
     sizes = {key: table.optional(key) for key in ("f_number", "stop_diameter_mm")}
     gaps = table.gaps("thickness_overrides", len(lens.surfaces), 'an object such as {"5": 26.15}')
     state = Configuration(name, efl, tuple(sorted(gaps)), **sizes)
     table_lens = lens.with_gaps(dict(state.thickness_mm))
-    data = first_order(table_lens)  # of the object in focus on the tabled film, by Newton's x x' = -f f'
+    data = first_order(table_lens)  # distance of the object that the tabled film focuses, by Newton's x x' = -f f'
     beyond = float(table_lens.vertices_mm[-1]) - data.rear_focal_z_mm
     paraxial_mm = data.efl_mm * data.front_efl_mm / beyond - data.front_focal_z_mm if beyond else math.inf
     if isinstance(distance, str):
@@ -308,13 +309,13 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
 
 
 def read_others(data: Mapping[str, Any], file: str, options: ReadOptions) -> Lens | None:
-    """Return the lens of a JSON object of DeepLens or ISET; None where it is of neither.
+    """Return the lens of a JSON object of DeepLens or ISET; None where it is neither.
 
     Warns:
-        NeurolensWarning: a stated focal length that is not that of the surfaces to 1%.
+        NeurolensWarning: a stated focal length differs from that of the surfaces by more than 1%.
 
     Raises:
-        InputError: a kind of surface that neurolens does not know, a key it would ignore, a figure out of range.
+        InputError: a kind of surface is unknown, a key would be ignored, or a figure is out of range.
     """
     rows = data["surfaces"]
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):
@@ -345,13 +346,13 @@ def _deeplens(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: 
 
 
 def _draft_of(file: str, kind: str, surfaces: Sequence[Surface], name: str, **more: Any) -> Draft:
-    """The draft of a table in mm, with its film in the paraxial focus where the last thickness is 0."""
+    """Return the draft of a table in mm; where the last thickness is 0, its film is in the paraxial focus."""
     rows = tuple(Row(s, aperture=not s.stop or not more.get("drawn")) for s in surfaces)
     return Draft(file, kind, rows, name, film_given=surfaces[-1].thickness_mm > 0, unit="mm", **more)
 
 
 def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str]) -> Surface:
-    """One surface; keys that are not known go to `skipped`. A stop without `mat2` stands in the medium before it."""
+    """Return one surface; unknown keys go to `skipped`. A stop without `mat2` stands in the medium before it."""
     given, kind, stop = row.data, row.data.get("type"), row.data.get("type") in _STOPS
     if kind not in ("Spheric", "Aspheric", *_STOPS):
         raise row.error("type", kind, "Spheric, Aspheric, Stop or Aperture")
@@ -372,7 +373,7 @@ def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str])
 
 
 def _radius_mm(row: Table) -> float:
-    """`roc` has more digits than `c`, where both are there; 0 is a plane in both."""
+    """Return the radius: where both are there `roc` has more digits than `c`; 0 is a plane in both."""
     if "roc" in row:
         return row.number("roc", unit="mm", finite=False) or math.inf
     c = row.number("c", unit="1/mm")
@@ -416,7 +417,7 @@ def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str)
 
 
 def _repeats(key: str) -> bool:
-    """Test whether a key is in brackets: it repeats other keys."""
+    """Return whether a key is in brackets, and so repeats other keys."""
     return key.startswith("(") and key.endswith(")")
 
 
@@ -425,15 +426,15 @@ def _line(text: Any) -> str:
 
 
 def is_blender(data: Mapping[str, Any]) -> bool:
-    """Test whether the tables of a TOML file are those of such a lens."""
+    """Return whether the tables of a TOML file are a lens of Physical Camera."""
     return "schema" not in data and isinstance(data.get("surface"), list) and isinstance(data.get("lens"), Mapping)
 
 
 def read_blender(data: Mapping[str, Any], file: str, options: ReadOptions | None = None) -> Lens:
-    """Return the lens of such a file.
+    """Return the lens of a TOML file of Physical Camera.
 
     Raises:
-        InputError: a key or type that is not of the format, a figure out of range.
+        InputError: a key or a type is not of the format, or a figure is out of range.
     """
     top = Table(data, file)
     top.only(("lens", "surface", "focus"))
@@ -474,7 +475,7 @@ def _blender_surface(row: Table) -> Surface:
 
 
 def _states(top: Table, count: int, film_given: bool) -> tuple[State, ...]:
-    """Return the near focus state, where there is one, after that at infinity."""
+    """Return the near focus state, where there is one, behind that at infinity."""
     if "focus" not in top:
         return ()
     focus = top.inner("focus", top.data["focus"], ("close_distance", "variable"))

@@ -1,4 +1,4 @@
-"""Lens files: one prescription in a TOML file, read strictly, written in aligned columns and exact to every figure.
+"""Lens files: one prescription in a TOML file, read strictly, written in aligned columns and with every digit.
 
 docs/pages/reference/lens-file.md describes the format: every key with its unit, default and limits, and an example.
 """
@@ -28,14 +28,14 @@ from neurolens.optics.readers.source import MAX_INDEX, MAX_SURFACES, Table
 from neurolens.optics.setting.rims import check_states, with_derived_rims
 
 SCHEMA = 1
-MAX_TERMS = 1000  # aspheric coefficients of all surfaces: each costs every ray a step, and lenses have at most 400
+MAX_TERMS = 1000  # of all surfaces' aspheric coefficients: each costs every ray a step, and lenses have at most 400
 MAX_LAYERS = 200
 _LONGEST_NM = 780.0  # of visible light
 FILM_KEYS = ("index", "thickness_nm", "V_d")
 MEASURED_TEXTS, MEASURED_NUMBERS = ("profile", "match"), ("distortion_percent", "light_widest_stops", "light_f8_stops")
 RIMS = ("source", "estimated", "derived", "photographs")
 MAX_WAVELENGTHS = 100
-# Keys of the head and the field of `Lens` that each one is, in the order in which they are written.
+# The keys of the head with the fields of `Lens` that they are, in the order of writing.
 HEAD = {
     **{key: key for key in ("name", "believed_to_be", "designer", "source", "f_number")},
     **{"efl_mm": "stated_efl_mm", "efl_x_mm": "stated_efl_x_mm"},
@@ -59,14 +59,15 @@ WRAP = 110
 
 
 def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
-    """The lens of a file in our own format, unfocused (`set_lens` places the film); `data`: its tables, where known.
+    """The lens of a file in our own format, unfocused (`set_lens` places the film); `data`: its tables, if known.
 
     Warns:
-        NeurolensWarning: glasses whose V_d is unknown; their index is taken as constant. A coating that no surface has.
+        NeurolensWarning: the V_d of some glasses is unknown, and their index taken as constant; no surface has a
+            coating.
 
     Raises:
-        InputError: the first mistake met: an unknown or missing key, a wrong type, a value out of range, no stop or
-            two, surfaces that overlap inside their rims in any zoom state. It names file, surface and field.
+        InputError: the first mistake: an unknown or missing key, a wrong type, a value out of range, no stop or two,
+            surfaces that overlap inside their rims in some zoom state. Names file, surface and field.
     """
     data, file = read_toml(path) if data is None else data, str(path)
     table = Table(data, file)
@@ -171,7 +172,7 @@ def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surfa
 
 
 def _glass(row: Table) -> dict[str, Any]:
-    """Return the medium after the surface; what a catalogue knows need not be in the file."""
+    """Return the medium after the surface; what a catalogue knows may be missing in the file."""
     for key in ("V_d", "material", "absorption_per_mm"):
         if key in row and "n_d" not in row and "glass" not in row:
             raise row.error("n_d", "(missing)", f"the index of the glass, as {key} is given")
@@ -257,9 +258,9 @@ def _configurations(lens: Table, n_surfaces: int) -> tuple[Configuration, ...]:
 
 
 def write_lens(lens: Lens, path: str | Path) -> None:
-    """Write a lens file that `read_lens` reads back to the same lens (but for its `path`).
+    """Write a lens file, from which `read_lens` reads the same lens (except for its `path`).
 
-    A lens that was focused keeps its film plane: it becomes the last thickness. What is derived goes into the notes.
+    A focused lens keeps its film plane, which becomes the last thickness. What is derived goes into the notes.
     """
     atomic_write_text(path, format_lens(lens))
 
@@ -292,7 +293,7 @@ def format_lens(lens: Lens) -> str:
 
 
 def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
-    """Layers by name of the coatings that are no designs: those follow from their name and the glass they are on."""
+    """Return the layers, by name, of the coatings that are not designs; name and glass determine a design."""
     found, before = {}, float(lens.object_medium.n_d)
     for s in lens.surfaces:
         if s.coating and not designs.is_design(s.coating, before, float(s.n_d)):
@@ -302,7 +303,7 @@ def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
 
 
 def _blades(lens: Lens) -> str:
-    """Return the table of the stop's blades; a mask is refused, for a lens file has no form for it."""
+    """Return the table of the stop's blades; a mask is refused, because a lens file has no form for it."""
     if lens.aperture is None:
         return ""
     if lens.aperture.blades is None:
@@ -313,7 +314,7 @@ def _blades(lens: Lens) -> str:
 
 
 def _rows(lens: Lens) -> str:
-    """One inline table per surface, keys in columns; a column that no surface uses is left out."""
+    """Return one inline table per surface, with keys in columns; a column that no surface uses is left out."""
     cells = [_cells(s) for s in lens.surfaces]
     if lens.film_z_mm is not None:
         cells[-1]["thickness_mm"] = repr(float(lens.film_z_mm) - float(lens.vertices_mm[-2]))
@@ -326,7 +327,7 @@ def _rows(lens: Lens) -> str:
 
 
 def _cells(s: Surface) -> dict[str, str]:
-    """Return the texts of a surface's figures by key; those that say nothing are left out."""
+    """Return the texts of a surface's figures by key, without those that say nothing."""
     bare = float(s.n_d) == 1 and s.V_d is None and s.material is None and not s.absorption_per_mm
     values: dict[str, Any] = {
         **{key: float(getattr(s, key)) for key in ("radius_mm", "thickness_mm", "diameter_mm")},
@@ -342,7 +343,7 @@ def _cells(s: Surface) -> dict[str, str]:
 
 
 def _wrapped(text: str) -> str:
-    """Return a text in short lines. TOML drops a backslash at the end of a line and the blanks after it."""
+    """Return a text in short lines. TOML drops a backslash at the end of a line and the blanks that follow."""
     if len(text) <= WRAP:
         return format_value(text)
     lines: list[str] = []

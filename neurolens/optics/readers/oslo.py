@@ -1,6 +1,7 @@
-"""OSLO lens files (.len): the simple ones, with a sphere or conic asphere of four terms per surface and round openings.
+"""OSLO lens files (.len) of simple lenses: spheres, conics and aspheres of four terms, with round openings.
 
-"LEN NEW name focal-length surfaces", settings, then the surfaces, object first, each ended by NXT, the image by END.
+They have "LEN NEW name focal-length surfaces", settings, then the surfaces, object first, each ended by NXT, the image
+by END.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from neurolens.optics.readers.source import UNITS_MM, Line, ReadOptions, by_word
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 # Designer, weights, settings of the program, drawings.
 HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
-# What changes rays and is not read, where a number other than 0 or a word follows: what is expected in its place.
+# What changes rays and is not read, if a number other than 0 or a word follows; with what is expected in its place.
 REFUSED = by_word(
     ("NA", "EBR, FNO or NAO to size the stop"),
     ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: the lens model has none"),
@@ -38,7 +39,7 @@ REFUSED = by_word(
 
 @dataclass
 class Block(draft.Block):
-    """One surface with what OSLO says of it."""
+    """One surface, with what OSLO says about it."""
 
     values: dict[str, float] = field(default_factory=dict)
     glass: Line | None = None
@@ -46,7 +47,7 @@ class Block(draft.Block):
 
 @dataclass
 class File(Draft):
-    """A file while it is read."""
+    """The state of reading a file."""
 
     kind: str = "OSLO"
     blocks: list[Block] = field(default_factory=list)
@@ -58,7 +59,7 @@ def read_len(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of an OSLO file.
 
     Raises:
-        InputError: see the module; also solves and pickups that are not carried out in the file.
+        InputError: see the module; also for solves and pickups that the file does not carry out itself.
     """
     file = File(str(path))
     for line in read_lines(path):
@@ -73,7 +74,7 @@ def read_len(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def _parts(text: str) -> list[str]:
-    """Return the commands of a line: "//" begins a comment, ";" ends a command, both only outside quotes."""
+    """Split a line into commands: "//" begins a comment, ";" ends a command, both only outside quotes."""
     bare = re.match(r'(?:[^"/]|"[^"]*"|/(?!/))*', text)
     parts = re.findall(r'(?:[^";]|"[^"]*")+', bare[0] if bare else text)
     return [part.strip() for part in parts if part.strip()]
@@ -89,7 +90,7 @@ def _read(file: File, line: Line) -> None:
         raise line.error(word, "(here)", "LEN NEW before everything else")
     elif file.ended and word in ("CFG", "CF", "C"):
         raise line.error(word, " ".join(rest) or "(here)", "one configuration: others are not read")
-    elif file.ended:  # variables, operands and tolerances, up to an END of their own
+    elif file.ended:  # variables, operands and tolerances come after it, up to their own END
         file.skipped["lines behind the surfaces"] += word != "END"
     elif word in HARMLESS:
         pass
@@ -104,7 +105,7 @@ def _read(file: File, line: Line) -> None:
 
 
 def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -> None:
-    """Carry out a keyword of the system, or of the last surface that was begun."""
+    """Carry out a keyword of the system, or of the last surface."""
     match word:
         case "EBR":
             file.pupil = 2 * line.positive(word, rest)
@@ -151,7 +152,7 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
 
 
 def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
-    """GLA name of the catalogue, or one index."""
+    """Read GLA with a name of the catalogue, or with one index."""
     if not rest:
         raise line.error("GLA", "(nothing)", "the name of a glass, or an index")
     if re.fullmatch(r"[0-9.]+", rest[0]):
@@ -162,9 +163,9 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces."""
+    """Set what is known only when all surfaces are read."""
     waves_nm = [1000 * um for um in file.waves_um]
-    for block in file.blocks:  # indices at the wavelengths, which follow behind the surfaces
+    for block in file.blocks:  # the indices stand at wavelengths that come after the surfaces
         if block.glass and block.medium.keys() == {"n_d"}:
             indices = block.glass.numbers("GLA", block.glass.words[1:])
             block.medium = by_indices(block.glass, "GLA", indices, waves_nm)
@@ -186,5 +187,5 @@ def _row(block: Block) -> Row:
     radius = values.get("RD") or block.radius
     block.curvature = 1 / radius
     terms = sorted((TERMS[name], value) for name, value in values.items() if name in TERMS)
-    # The radius as it is printed, not the inverse of its inverse.
+    # The radius is taken as printed, not as the inverse of its inverse.
     return block.row(block.rotational(terms) | {"radius_mm": radius})

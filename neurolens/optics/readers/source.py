@@ -1,4 +1,4 @@
-"""Limits, lines of text files and strict tables of TOML and JSON for all readers; errors name the line or the key."""
+"""Limits, lines of text files, and strict tables of TOML and JSON, for all readers; errors name the line or key."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_LINES = 100_000
 MAX_LINE = 10_000
 MAX_WORD = 60  # characters of a number
 ENDLESS = 1e30  # more than any program writes for infinity
-LARGEST = 1e15  # of any figure of a table but a radius
+LARGEST = 1e15  # of any figure of a table except radii
 MAX_SURFACES = 500
 MAX_POWER = 42  # Forbes's aspheres of 20 terms reach it
 MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
@@ -31,7 +31,7 @@ UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "m": 1000.0}
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """Facts that a file may leave out, from the user."""
+    """Facts from the user that a file may lack."""
 
     name: str | None = setting(None, "name of the lens (default: the title in the file, else its file name)")
     source: str | None = setting(None, "where the figures come from (default: the file's name)", metavar="SOURCE")
@@ -54,7 +54,7 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a text file: where it stands, and its words."""
+    """One line of a text file: its place and its words."""
 
     file: str
     number: int
@@ -65,7 +65,7 @@ class Line:
         return self.text.split()
 
     def error(self, keyword: str, value: object, expected: str) -> InputError:
-        """Return the error for something on this line."""
+        """Return the error about something on this line."""
         return InputError(self.file, f"line {self.number}, {keyword}", value, expected)
 
     def number_of(self, keyword: str, word: str) -> float:
@@ -93,7 +93,7 @@ class Line:
         return value
 
     def numbers(self, keyword: str, words: Sequence[str], least: int = 1) -> list[float]:
-        """Return the finite numbers from words of this line, at least so many."""
+        """Return the finite numbers from words of this line, at least `least` of them."""
         if len(words) < least:
             found = " ".join(words) or "(nothing)"
             raise self.error(keyword, found, f"{least} number{'s' if least > 1 else ''} after it")
@@ -105,7 +105,7 @@ class Table:
     """One table of a file, read strictly.
 
     Attributes:
-        where: goes in front of the key in errors, with its separator: "surface 3, ".
+        where: what goes in front of the key in errors, with its separator: "surface 3, ".
     """
 
     data: Mapping[str, Any]
@@ -119,11 +119,11 @@ class Table:
         return InputError(self.file, self.where + key, value, expected)
 
     def only(self, known: Sequence[str]) -> None:
-        """Raise for a key that is not known."""
+        """Raise InputError for a key that is not known."""
         reject_unknown(self.file, self.where, self.data, known)
 
     def inner(self, key: str, given: Any, known: Sequence[str], expected: str = "a table") -> Table:
-        """Return what is given at a place of this table as a table that has no other than the known keys."""
+        """Return what is given at a place of this table as a table that has only known keys."""
         if not isinstance(given, Mapping):
             raise self.error(key, given, expected)
         table = Table(given, self.file, f"{self.where}{key}, ")
@@ -145,7 +145,7 @@ class Table:
         return found
 
     def optional(self, key: str, *, above: float | None = 0.0) -> float | None:
-        """Return the number, above 0 unless said otherwise; None where it is absent or null."""
+        """Return a number, or None where it is absent or null; it must be above 0 unless `above` says otherwise."""
         return None if self.data.get(key) is None else self.number(key, above=above)
 
     def gaps(self, key: str, n_surfaces: int, expected: str) -> tuple[tuple[int, float], ...]:
@@ -169,7 +169,7 @@ class Table:
         for power, value in given.items():
             if power not in map(str, range(2, MAX_POWER + 1)):
                 raise self.error(key, power, f"a power from 2 to {MAX_POWER}")
-            if isinstance(value, Mapping) and len(value) == 1:  # TOML takes 4.5 for a key in a key
+            if isinstance(value, Mapping) and len(value) == 1:  # TOML reads 4.5 as a key in a key
                 raise self.error(key, f"{power}.{next(iter(value))}", f"a whole power from 2 to {MAX_POWER}")
             terms.append((int(power), row.number(power)))
         return tuple(sorted(terms))
@@ -200,7 +200,7 @@ class Table:
         return value
 
     def flag(self, key: str) -> bool:
-        """True or false; false where it is absent."""
+        """Return true or false; false where it is absent."""
         value = self.data.get(key, False)
         if not isinstance(value, bool):
             raise self.error(key, value, "true or false")
@@ -217,7 +217,7 @@ class Table:
 
 
 def by_word(*groups: tuple[str, str]) -> dict[str, str]:
-    """Map each keyword to the text that says what is expected in its place, from groups of keywords that share it."""
+    """Map each keyword to the text about what is expected in its place, from groups of keywords that share one."""
     return {word: expected for words, expected in groups for word in words.split()}
 
 
@@ -225,7 +225,7 @@ def read_text(path: str | Path) -> str:
     """Return the text of a lens file of bounded size.
 
     Raises:
-        InputError: as `files.read_bytes` and `decode`; an empty file.
+        InputError: as `files.read_bytes` and `decode`; the file is empty.
     """
     raw = read_bytes(path, MAX_BYTES, "a lens file")
     if not raw.strip():
@@ -237,7 +237,7 @@ def decode(raw: bytes, path: str | Path) -> str:
     """Return the text of a file: UTF-16 by its byte-order mark (or by its zero bytes), else UTF-8, else Latin-1.
 
     Raises:
-        InputError: bytes that are not text.
+        InputError: the bytes are no text.
     """
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         codes = ["utf-16"]
@@ -258,7 +258,7 @@ def decode(raw: bytes, path: str | Path) -> str:
 
 
 def read_lines(path: str | Path) -> list[Line]:
-    """Return the lines of a text file, those without content left out; refuses too many, or one too long."""
+    """Return the lines of a text file that have content; refuses too many lines, or one that is too long."""
     file = str(path)
     rows = read_text(path).splitlines()
     if len(rows) > MAX_LINES:
@@ -273,10 +273,10 @@ def read_lines(path: str | Path) -> list[Line]:
 
 
 def warn(file: str, message: str) -> None:
-    """Warn about something in a file that is still read."""
+    """Warn about something in a file that is read nevertheless."""
     warnings.warn(f"{file}: {message}", NeurolensWarning, stacklevel=3)
 
 
 def assume(file: str, message: str) -> None:
-    """Warn about something that was assumed in the place of what a file lacks."""
+    """Warn about something that was assumed, because the file lacks it."""
     warnings.warn(f"{file}: {message}", AssumedWarning, stacklevel=3)

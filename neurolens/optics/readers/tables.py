@@ -1,26 +1,26 @@
-"""Tables of a row per surface: plain ones of renderers, FlareSim's .lens files, and texts of the Optical Bench.
+"""Tables with a row for each surface: plain ones of renderers, FlareSim's .lens files, texts of the Optical Bench.
 
 Plain tables (pbrt's .dat, appleseed's) have one row per surface from the scene to the film: radius of curvature,
 thickness to the next surface, refractive index behind, aperture (full diameter); mm. "#" begins a comment. appleseed
 puts the count of rows in front. The stop is the row of index 0 (appleseed) or of radius 0 (pbrt, which has no other
-planes). Of a last thickness of 0 the film is put in the paraxial focus. Kolb's tables of 1995 have the separation in
-front of each surface instead, and some have semi-diameters: see `ReadOptions`.
+planes). Where the last thickness is 0 the film is put in the paraxial focus. Kolb's tables of 1995 have the separation
+in front of each surface instead, and some have semi-diameters: see `ReadOptions`.
 
-FlareSim, a simulator of flare for compositing programs, writes `name: TEXT`, `focal_length: MM`, `surfaces:` and a row
-a surface, from the scene to the film: radius (0 a plane, "stop" the stop), thickness, index behind, Abbe number (0
-unknown), semi-diameter of the rim, layers of coating, and for surfaces that are not round the type: cyl_x (axis along
-x, bent in y), cyl_y, toric with the radius of a circle along y, which is turned about a line along y at the radius of
-the first column. The format has no aspheres and no f-number; a collection of it states that in a comment ("f/4.1"), and
-its rims are diameters in the column of radii.
+FlareSim, a simulator of flare for compositing programs, writes `name: TEXT`, `focal_length: MM`, `surfaces:` and one
+row for each surface, from the scene to the film: radius (0 is a plane, "stop" the stop), thickness, index behind, Abbe
+number (0 is unknown), semi-diameter of the rim, layers of coating. Surfaces that are not round have the type behind
+these: cyl_x (axis along x, bent in y), cyl_y, or toric with the radius of a circle along y, which is turned about a
+line along y at the radius of the first column. The format has no aspheres and no f-number; one collection of it states
+the f-number in a comment ("f/4.1"), and its rims are diameters in the column of radii.
 
-The Optical Bench of PhotonsToPhotos holds patents' tables, words parted by tabs, in sections.
-[descriptive data] with the title; [constants]: AsphericalA2, AsphericalOddCount; [variable distances]: a name and a
-value for each state: Focal Length, Angle of View (full, degrees), F-Number, Image Height (diameter of the image
-circle), Aperture Diameter (of the stop), d0 (to the object, "Infinity"), and the gaps that the table names (d5, Bf);
-[lens data]: number, radius ("Infinity"; AS the stop, FS a field stop, CG a cover glass, all plane), thickness or the
-name of a gap, n_d, clear diameter, V_d, and, an extension, glass and maker; [aspherical data]: number, radius, conic
-constant, and coefficients from the 4th power on, even ones: with AsphericalA2 from the 2nd on, with AsphericalOddCount
-n the n odd powers from the 3rd on stand between them. Other sections are words and figures of the page.
+The Optical Bench of PhotonsToPhotos holds patents' tables in sections, with tabs between words. [descriptive data] has
+the title. [constants] has AsphericalA2, AsphericalOddCount. [variable distances] has a name and a value for each state:
+Focal Length, Angle of View (full, degrees), F-Number, Image Height (diameter of the image circle), Aperture Diameter
+(of the stop), d0 (to the object, "Infinity"), and the gaps that the table names (d5, Bf). [lens data] has number,
+radius ("Infinity"; AS the stop, FS a field stop, CG a cover glass, all plane), thickness or the name of a gap, n_d,
+clear diameter, V_d, and, as an extension, glass and maker. [aspherical data] has number, radius, conic constant, and
+coefficients of even powers from the 4th on: with AsphericalA2 from the 2nd on; with AsphericalOddCount n, the n odd
+powers from the 3rd on stand between them. Other sections are words and figures of the page.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ _ROUND = ("spherical", "sphere", "sph")
 _STATED = re.compile(r"(\d+) surfaces,.*?(?:f/(\d+(?:\.\d+)?))?\s*$")
 _PLANE = ("AS", "FS", "CG", "INFINITY", "INF")
 _UNKNOWN = ("", "undefined", "?", "-")
-_SAME = 1e-3  # relative: a radius repeated beside its aspheric coefficients
+_SAME = 1e-3  # relative difference of a radius that is repeated beside its aspheric coefficients
 
 
 def read_table(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a table.
 
     Raises:
-        InputError: a row without four numbers, a count that is not that of the rows, no stop or several.
+        InputError: a row has not four numbers, the count is not that of the rows, there is no stop or several.
     """
     options = options or ReadOptions()
     file, lines = str(path), read_lines(path)
@@ -111,7 +111,7 @@ def read_flaresim(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a .lens file.
 
     Raises:
-        InputError: a type that is not of the format, a row without its six figures, no rows.
+        InputError: a type is not of the format, a row lacks one of its six figures, there are no rows.
     """
     file = str(path)
     draft, rows = Draft(file, "FlareSim", unit="mm", drawn=True, rims="estimated"), list[Surface]()
@@ -175,7 +175,7 @@ def _flaresim_surface(line: Line, words: list[str]) -> Surface:
 
 @dataclass
 class Bench(Draft):
-    """A file while it is read, by section; `gaps` holds the names that the table has in place of thicknesses."""
+    """The state of reading a file, by section; `gaps` has the names that the table has in place of thicknesses."""
 
     kind: str = "Optical Bench"
     unit: str | None = "mm"
@@ -190,7 +190,7 @@ class Bench(Draft):
     field_stops: set[int] = field(default_factory=set)
 
     def value(self, name: str, place: int) -> float | None:
-        """Return a variable in a state, None where it is not stated; "Infinity" is `math.inf`."""
+        """Return a variable in a state; None where it is not stated. "Infinity" is `math.inf`."""
         line, words = self.variables.get(name.lower(), (None, []))
         word = words[place].strip() if place < len(words) else ""
         if line is None or word.lower() in _UNKNOWN:
@@ -199,10 +199,10 @@ class Bench(Draft):
 
 
 def read_opticalbench(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """Return the lens of a text of the Optical Bench, with a state for every column that has all gaps of the table.
+    """Return the lens of a text of the Optical Bench; every column that has all gaps of the table is a state.
 
     Raises:
-        InputError: a section without its columns, a gap without a value, aspheric data of no surface.
+        InputError: a section lacks its columns, a gap has no value, aspheric data belong to no surface.
     """
     file = Bench(str(path))
     section = ""
@@ -313,7 +313,7 @@ def _complete(file: Bench) -> None:
         rows = [replace(s, diameter_mm=opening) if s.stop else s for s in rows]
         file.stop_given = True
     file.object_distance = table.object_distance
-    names = [*file.ids, *[""] * (len(rows) - len(file.ids))]  # a plane that was added has none
+    names = [*file.ids, *[""] * (len(rows) - len(file.ids))]  # a plane that was added has no name
     file.rows = tuple(Row(s, _cuts(file, rows, k), name) for k, (s, name) in enumerate(zip(rows, names, strict=True)))
     file.f_number = table.f_number
     file.film_given = table.film_given
@@ -329,7 +329,7 @@ def _complete(file: Bench) -> None:
 
 
 def _cuts(file: Bench, rows: list[Surface], k: int) -> bool:
-    """Test whether the file sets an aperture: a rim on glass, or a field stop that does not reach into an element."""
+    """Return whether the file sets an aperture: a rim on glass, or a field stop that does not reach into an element."""
     before = rows[k - 1].thickness_mm if k else 0.0
     if k in file.field_stops and min(before, rows[k].thickness_mm) < 0:
         assume(file.file, f"field stop {k}, a ring about an element, is left out: rims are assumed to decide")
@@ -342,7 +342,7 @@ def _positive(value: float | None) -> float | None:
 
 
 def _state(file: Bench, place: int) -> State | None:
-    """Return the state of a column; None where a gap that the table names has no value in it."""
+    """Return the state of a column; None where a gap that the table names has no value in the column."""
     gaps: dict[int, float] = {}
     last = len(file.surfaces) - 1
     for k, (line, name) in file.gaps.items():

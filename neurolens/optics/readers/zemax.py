@@ -1,7 +1,8 @@
 """Zemax OpticStudio lens files (.zmx): sequential systems, UTF-16 or plain text.
 
-Settings of the system, then one block "SURF n" a surface, the object first and the image last, then merit function,
-tolerances and configurations. Curvatures, semi-diameters, thickness to the next surface.
+A file has the settings of the system, then one block "SURF n" for each surface, the object first and the image last,
+then merit function, tolerances and configurations. A block has curvature, semi-diameter, and thickness to the next
+surface.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from neurolens.optics.readers.source import MAX_POWER, Line, ReadOptions, assume
 
 UNITS = {"MM": "mm", "CM": "cm", "IN": "in", "INCH": "in", "METER": "m", "METERS": "m", "M": "m"}
 TYPES = tuple("STANDARD EVENASPH ODDASPHE XASPHERE XOSPHERE TOROIDAL BICONICX PARAXIAL COORDBRK JONESMAT".split())
-Q_TYPE = "Q"  # what the names of Q-type aspheres, and of no other type, begin with
+Q_TYPE = "Q"  # how the names of Q-type aspheres begin, and of no other type
 # Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.
 HARMLESS = frozenset(
     """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EFFL
@@ -33,7 +34,7 @@ HARMLESS = frozenset(
 )
 # Rims and stop decide which rays pass, not the factors that a designer chose.
 VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split())
-# Of a surface: what changes rays, and the lens model has not.
+# What changes rays at a surface and the lens model lacks.
 REFUSED = by_word(
     ("OBSC SQOB ELOB USOB SPID", "no obscuration: the lens model has none"),
     ("SCBD", "no tilt and no decentre of a surface: the lens model has none"),
@@ -43,18 +44,18 @@ REFUSED = by_word(
 UNMOVED = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT PRWV GCRS BLNK".split())
 OPERANDS = ("THIC", "APER", "SDIA", "LTTL")
 MAX_EXTRAS = 240
-_DEEPEST = 1000  # sag of an asphere over its rim
-_SAME_N_D, _SAME_V_D = 0.005, 2.0  # by which the figures of one glass may differ: melts, moulding, other years
+_DEEPEST = 1000  # sag over rim of the deepest asphere
+_SAME_N_D, _SAME_V_D = 0.005, 2.0  # by which the figures of one glass may differ, since melts, moulding and years do
 _EVEN = 8  # terms of EVENASPH by its definition; other programs write more
 
 
 @dataclass
 class Block(draft.Block):
-    """One SURF block. Numbers stay with the line they come from."""
+    """One SURF block. Numbers keep the line from which they come."""
 
     thickness: float = math.nan  # until DISZ has been read
     kind: str = "STANDARD"
-    automatic: bool = True  # whether the program sized the rim from the rays
+    automatic: bool = True  # whether the program sized the rim by the rays
     bends: Line | None = None  # where a curvature other than 0 is given
     glass: Line | None = None  # where the medium is given
     clear: float | None = None  # semi-diameter of an aperture, which rules over the other
@@ -66,10 +67,10 @@ class Block(draft.Block):
         return self.parameters.pop(n, (0.0, self.start))[0]
 
     def extras(self, first: int = 1) -> tuple[float, list[float]]:
-        """Normalisation radius and coefficients of a surface, whose count stands in the extra data at `first`.
+        """Return normalisation radius and coefficients of a surface; their count is in the extra data at `first`.
 
         Raises:
-            InputError: a count that is not whole, or beyond `MAX_EXTRAS`; a radius that is not above 0.
+            InputError: the count is not whole, or beyond `MAX_EXTRAS`; the radius is not above 0.
         """
         (count, line), (radius, _) = (self.extra.pop(first + k, (k, self.start)) for k in (0, 1))
         if not (0 <= count <= MAX_EXTRAS and count == int(count)):
@@ -82,7 +83,7 @@ class Block(draft.Block):
 
 @dataclass
 class File(Draft):
-    """A file while it is read."""
+    """The state of reading a file."""
 
     kind: str = "Zemax"
     blocks: list[Block] = field(default_factory=list)
@@ -96,16 +97,17 @@ class File(Draft):
     waves_um: dict[int, float] = field(default_factory=dict)
     waves: int = 0  # how many wavelengths are used, where the file says so
     primary: int = 1
-    behind: Counter[str] = field(default_factory=Counter)  # what follows a surface without indentation
-    figures: dict[str, list[tuple[Line, tuple[float, float]]]] = field(default_factory=dict)  # behind names of glasses
+    behind: Counter[str] = field(default_factory=Counter)  # keywords that follow a surface without indentation
+    # n_d and V_d that stand behind names of glasses
+    figures: dict[str, list[tuple[Line, tuple[float, float]]]] = field(default_factory=dict)
 
 
 def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a Zemax file.
 
     Raises:
-        InputError: see the module; also tilts, mirrors, obscurations and everything else that the lens model
-            cannot hold, by name and line.
+        InputError: see the module; also for tilts, mirrors, obscurations and everything else that the lens model cannot
+            hold. Names the keyword and the line.
     """
     file = File(str(path))
     for line in read_lines(path):
@@ -142,7 +144,7 @@ def _read(file: File, line: Line) -> None:
 
 
 def _begin(file: File, line: Line, rest: list[str]) -> None:
-    file.skipped += file.behind  # no merit function yet
+    file.skipped += file.behind  # so they were no merit function
     file.behind.clear()
     if not file.blocks and rest[:1] == ["1"]:
         file.blocks.append(Block(line))
@@ -153,7 +155,7 @@ def _begin(file: File, line: Line, rest: list[str]) -> None:
 
 
 def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
-    """Carry out a keyword of the whole system; False where it is none."""
+    """Carry out a keyword of the whole system; False where it is no such keyword."""
     match word:
         case "MODE":
             if rest[:1] != ["SEQ"]:
@@ -177,7 +179,7 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             if line.numbers(word, rest, 2)[:2] != [20.0, 1.0]:
                 warn(file.file, f"indices are those at 20 degrees and 1 atmosphere, not at {' '.join(rest[:2])}")
         case "GCAT":
-            file.makers = [word.upper().split("_")[0] for word in rest]  # catalogues may end in a date
+            file.makers = [word.upper().split("_")[0] for word in rest]  # names of catalogues may end in a date
         case "FTYP":
             numbers = line.numbers(word, rest, 1)
             file.field_type, file.fields, file.waves = int(numbers[0]), *map(int, (*numbers[2:4], 0, 0)[:2])
@@ -198,7 +200,7 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
 
 
 def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -> bool:
-    """Carry out a keyword of a surface; False where it is none."""
+    """Carry out a keyword of a surface; False where it is no such keyword."""
     match word:
         case "TYPE":
             block.kind = rest[0].upper() if rest else ""
@@ -249,7 +251,7 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
 
 def _operand(file: File, line: Line, word: str, rest: list[str]) -> None:
     """Read an operand of the configurations: name, surface, configuration (from 1), value."""
-    if word in UNMOVED or file.zoom.count == 1:  # what one configuration sets stands in the table
+    if word in UNMOVED or file.zoom.count == 1:  # a single configuration only repeats the table
         return
     if word not in OPERANDS:
         expected = f"one of {', '.join(OPERANDS)}: other things that change with the configuration are not read"
@@ -272,7 +274,7 @@ def _operand(file: File, line: Line, word: str, rest: list[str]) -> None:
 
 
 def _thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> float:
-    """Return a thickness; that of the object may be infinite, in words or as a number from 1e9."""
+    """Return a thickness; that of the object may be infinite, in words or as a number of 1e9 or more."""
     if is_object and rest == ["INFINITY"]:
         return math.inf
     value = line.first(word, rest)
@@ -280,10 +282,10 @@ def _thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> fl
 
 
 def _glass(file: File, line: Line, rest: list[str]) -> dict[str, Any]:
-    """GLAS name, type of solve, surface, n_d, V_d.
+    """Read GLAS with name, type of solve, surface, n_d, V_d.
 
-    Solve 1 is a model glass; others leave the glass that is named (2: a pickup, carried out; 3: one that the program
-    may exchange), except 4, an offset from it.
+    Solve 1 is a model glass. Others leave the glass that is named (2 is a pickup that is carried out, 3 a glass that
+    the program may exchange), except 4, an offset from it.
     """
     name, kind = rest[0] if rest else "", rest[1] if len(rest) > 1 else "0"
     if name.upper() == "MIRROR" or not name:
@@ -302,7 +304,7 @@ def _glass(file: File, line: Line, rest: list[str]) -> dict[str, Any]:
     known, figures = catalogue.same_name(name), list[float]()
     with suppress(InputError) if known else nullcontext():
         figures = [line.number_of("GLAS", word) for word in rest[3:5]]
-    # 1.5 and 40 is what the program writes in the place of both.
+    # The program writes 1.5 and 40 where it knows neither.
     stated = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None
     if stated:
         file.figures.setdefault(name, []).append((line, stated))
@@ -310,9 +312,9 @@ def _glass(file: File, line: Line, rest: list[str]) -> dict[str, Any]:
 
 
 def _check_figures(file: File) -> None:
-    """Refuse figures behind unknown names where those behind known ones are another glass's, or a name has two.
+    """Refuse figures behind unknown names where those behind known names are another glass's, or a name has two sets.
 
-    Programs that exchange glasses leave the figures of glasses before.
+    Programs that exchange glasses leave the figures of the previous glasses.
     """
     stale, unknown = "", None
     for name, given in file.figures.items():
@@ -352,14 +354,14 @@ def _add_ends(file: File) -> None:
 
 
 def _complete(file: File) -> None:
-    """Set what follows from all surfaces."""
+    """Set what is known only when all surfaces are read."""
     file.skipped["lines of the merit function"] += file.behind.total()
     _check_figures(file)
     first, *middle, image = file.blocks
     for before, block in zip(file.blocks, file.blocks[1:], strict=False):
         block.semi_diameter = block.semi_diameter if block.clear is None else block.clear
         if block.kind == "COORDBRK" and block.glass is None:
-            block.medium = before.medium  # it stands in the medium of the surface before it
+            block.medium = before.medium  # the block stands in the medium of the surface before it
     file.rows = tuple(b.row(shape_of(b)) for b in middle)
     for block in file.blocks:
         if math.isnan(block.thickness):
@@ -382,7 +384,7 @@ def _complete(file: File) -> None:
 
 
 def _solved(blocks: Sequence[Block], gaps: list[float]) -> bool:
-    """Carry out the thickness solves of a configuration; True where its film is given."""
+    """Carry out the thickness solves of a configuration; returns whether its film is given."""
     film_given = True
     for k, block in enumerate(blocks):
         if block.solve is None:
@@ -401,7 +403,7 @@ def _solved(blocks: Sequence[Block], gaps: list[float]) -> bool:
 
 
 def _set_field(file: File) -> None:
-    """Half field or image radius: the field point farthest from the axis. FTYP 0 angle, 2 and 3 image height."""
+    """Set half field or image radius by the farthest field point. FTYP 0 is an angle, 2 and 3 are image heights."""
     points = [(x, y) for x, y in zip(*(file.heights.get(k, [0.0] * 100) for k in ("XFLN", "YFLN")), strict=False)]
     edge = max((math.hypot(x, y) for x, y in points[: file.fields or None]), default=0.0)
     if edge > 0 and file.field_type == 0:
@@ -415,14 +417,14 @@ def _set_field(file: File) -> None:
 def shape_of(block: Block) -> dict[str, Any]:
     """Return the radius and the figure of a surface, for `Block.row`.
 
-    Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i; the extended ones have XDAT in the place of
-    PARM, and powers of r over a normalisation radius. Q-type: XDAT 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV,
-    CONI and PARM i y^(2 i - 2), i from 2, in the y-z plane, turned about an axis at PARM 1 (0 is infinity: a cylinder).
-    Biconic: CURV, CONI in y, PARM 1 (a radius, 0 is infinity) and PARM 2 (a conic) in x. Paraxial, an ideal lens:
-    PARM 1 is its focal length; PARM 2 counts path lengths in one way or another and moves no ray.
+    Even asphere: sum of PARM i r^(2 i). Odd asphere: sum of PARM i r^i. The extended ones have XDAT in the place of
+    PARM, and powers of r over a normalisation radius. Q-type: XDAT 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV, CONI
+    and PARM i y^(2 i - 2), i from 2, in the y-z plane, turned about an axis at PARM 1 (0 is infinity: a cylinder).
+    Biconic: CURV, CONI in y, PARM 1 (a radius, 0 is infinity) and PARM 2 (a conic) in x. Paraxial, an ideal lens: PARM
+    1 is its focal length; PARM 2 says how path lengths count, and moves no ray.
 
     Raises:
-        InputError: a type, a parameter or a combination of them that the lens model cannot represent; by name and line.
+        InputError: the lens model cannot represent a type, a parameter or their combination; names it and the line.
     """
     match block.kind:
         case "STANDARD":
@@ -465,13 +467,13 @@ def shape_of(block: Block) -> dict[str, Any]:
                 raise block.start.error("PARAXIAL", shape["focal_mm"], "PARM 1, a focal length other than 0, no CURV")
         case "JONESMAT":
             shape = block.rotational()
-            block.parameters.clear()  # a Jones matrix turns polarisation, and no ray
+            block.parameters.clear()  # a Jones matrix, which turns polarisation and no ray
             warn(block.start.file, f"surface {block.name} of the file: a JONESMAT is left out of transmittance")
         case "COORDBRK":
-            shape = block.rotational()  # harmless where every tilt and decentre is 0, which is checked below
+            shape = block.rotational()  # harmless with tilts and decentres of 0, which are tested below
     for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):
         for n, (value, line) in table.items():
-            # The second extra value of a toroid is a normalisation radius, with nothing to normalise.
+            # The second extra value of a toroid is a normalisation radius, for no terms.
             if value != 0 and not (block.kind == "TOROIDAL" and name == "XDAT" and n == 2):
                 raise line.error(f"{name} {n} of {block.kind}", value, "0: the lens model has no such term")
     for word, given in (("CURV", block.bends), ("GLAS", block.glass)):

@@ -1,1 +1,1 @@
-"""A lens set for a frame: zoom, focus, stop, image circle, and rims; checks that a prescription makes sense."""
+"""Sets a lens for a frame: zoom, focus, stop, image circle and rims; checks that a prescription makes sense."""

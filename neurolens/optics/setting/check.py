@@ -1,7 +1,7 @@
-"""Checks of a prescription against its source: every stated figure is recomputed, with the reason of any doubt.
+"""Checks a prescription against its source: every stated figure is recomputed, and any doubt is given its reason.
 
-Dropped aspheres, swapped glasses, transposed digits mostly show: the focal length or the back focus moves, the axis
-blurs, elements cut each other, or no light reaches the edge of the field.
+Dropped aspheres, swapped glasses and transposed digits mostly show: focal length or back focus move, the axis blurs,
+elements cut each other, or no light reaches the edge of the field.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from neurolens.optics.trace.rays import trace
 from neurolens.optics.trace.shapes import sag_mm
 from neurolens.optics.trace.surfaces import Rays
 
-EFL_TOLERANCE = 0.02  # relative; from rounding and the choice of a spectral line in patents
-FOCUS_TOLERANCE = 0.02  # of the focal length
+EFL_TOLERANCE = 0.02  # relative; patents round, and choose a spectral line
+FOCUS_TOLERANCE = 0.02  # as a share of the focal length
 F_NUMBER_TOLERANCE = 0.05
 BEAM_TOLERANCE = 0.03
 FIELD_TOLERANCE_DEG = 1.0
 BLUR_LIMIT = 0.003  # RMS radius over focal length; a good lens has 0.0001 to 0.0005
-SIMPLE = 2  # refractions up to which blur is no sign of a mistake
-DARK = 0.02  # illumination of the corner, relative to the axis
+SIMPLE = 2  # with at most so many refractions, blur is no sign of a mistake
+DARK = 0.02  # illumination of the corner relative to the axis, below which the corner counts as dark
 _TINY_MM = 1e-3
 
 
 @dataclass(frozen=True)
 class Check:
-    """One figure of a lens, computed and stated.
+    """One figure of a lens, as computed and as stated.
 
     Attributes:
-        quantity: name with its unit.
-        computed, stated: None if unknown.
-        doubt: why the figure casts doubt on the table, a clause; empty where it does not.
-        state: zoom or focus state of the file, empty for the table itself.
+        quantity: name of the figure, with its unit.
+        computed, stated: its values; None where unknown.
+        doubt: a clause that tells why the figure casts doubt on the table; empty where it does not.
+        state: the zoom or focus state of the file that it holds for; empty for the table itself.
     """
 
     quantity: str
@@ -58,10 +58,11 @@ class Check:
 
 
 def check_lens(lens: Lens) -> list[Check]:
-    """All checks of a lens as read from its file, d line; the table first, then its states.
+    """Return all checks of a lens as read from its file, at the d line: first those of the table, then of its states.
 
-    Quantities: focal length, back focus, f-number (of the stop, paraxial), f-number of the axial beam (real rays
-    through all rims), edge thickness, half field (of the outermost chief ray), axial blur, illumination of the corner.
+    The quantities are focal length, back focus, f-number of the stop (paraxial) and of the axial beam (real rays
+    through all rims), edge thickness, half field (of the outermost chief ray), axial blur, and illumination of the
+    corner.
     """
     data = first_order(lens)
     found = [*_first_order(lens, data), _beam(lens, data), _edges(lens), *_field(lens)]
@@ -69,7 +70,7 @@ def check_lens(lens: Lens) -> list[Check]:
         found.append(_blur(lens, data))
         found += _corner(lens)
     for c in lens.configurations:
-        # The f-number that the source states. A state without one has the table's stop, and any is as good as another.
+        # The f-number that the source states for this state. A state without one has the table's stop, and any will do.
         same = c.efl_mm is not None and c.efl_mm == lens.stated_efl_mm
         state = replace(in_state(lens, c), f_number=c.f_number or (lens.f_number if same else math.nan))
         try:
@@ -84,14 +85,14 @@ def check_lens(lens: Lens) -> list[Check]:
 
 
 def doubts(checks: list[Check]) -> list[str]:
-    """The doubts as sentences without a full stop, prefixed by the state; those of the table are not repeated."""
+    """Return the doubts as sentences without a full stop, prefixed by their state; those of the table stand once."""
     table = {c.doubt for c in checks if not c.state}
     found = [c for c in checks if c.doubt and not (c.state and c.doubt in table)]
     return [f"{c.state}: {c.doubt}" if c.state else c.doubt for c in found]
 
 
 def verdict(checks: list[Check]) -> str:
-    """Either "ok" or "doubtful"."""
+    """Return "ok", or "doubtful" where any check casts doubt."""
     return "doubtful" if any(c.doubt for c in checks) else "ok"
 
 
@@ -123,7 +124,7 @@ def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
 
 
 def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:
-    """Return the image of an object at the state's distance against the tabled film."""
+    """Check the image of an object at the state's distance against the tabled film."""
     image_z = data.image_z_mm(-(c.object_distance_mm or 0.0))
     if lens.stated_efl_mm is not None:
         yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
@@ -131,7 +132,7 @@ def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:
 
 
 def _beam(lens: Lens, data: FirstOrder) -> Check:
-    """Whether the rims let the axial beam of the stop through: its f-number against that of the widest real beam."""
+    """Check whether the rims let the stop's axial beam through: its f-number against that of the widest real beam."""
     height, blocker = axial_beam(lens)
     n = abs(data.efl_mm) / (2 * height) if height > 0 else math.inf
     wrong = n > (1 + BEAM_TOLERANCE) * max(data.f_number, lens.f_number) and blocker not in (None, lens.stop_index)
@@ -140,7 +141,7 @@ def _beam(lens: Lens, data: FirstOrder) -> Check:
 
 
 def _edges(lens: Lens) -> Check:
-    """Return the thinnest edge of an element, each surface ending flat at its own rim."""
+    """Check the thinnest edge of an element; each surface ends flat at its own rim."""
     edges = {
         k: float(a.thickness_mm) + sag_mm(b, b.semi_diameter_mm, 0.0) - sag_mm(a, a.semi_diameter_mm, 0.0)
         for k, (a, b) in enumerate(zip(lens.surfaces, lens.surfaces[1:], strict=False))
@@ -152,7 +153,7 @@ def _edges(lens: Lens) -> Check:
 
 
 def _field(lens: Lens) -> Iterator[Check]:
-    """Find the last field whose chief ray passes; beyond it, light may still come through the side of the pupil."""
+    """Check the last field whose chief ray passes; light may still come from beyond it, through the pupil's side."""
     stated = lens.half_field_deg
     if stated is None:
         return
@@ -177,14 +178,14 @@ def _field(lens: Lens) -> Iterator[Check]:
 
 
 def _through(lens: Lens, field: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rays of fields [F] to heights [F, H] in the stop: whether such a ray exists, and its status, [F * H]."""
+    """Return whether rays of fields [F] to heights [F, H] in the stop exist, and their status [F * H]."""
     bundle = aim_at_stop(lens, field, heights)
     with torch.no_grad():
         return bundle.reached.reshape(-1), trace(lens, bundle.rays, towards="film").status
 
 
 def _blur(lens: Lens, data: FirstOrder) -> Check:
-    """Return the RMS radius of the axial spot in its best focus, all rims open as tabled, over the focal length."""
+    """Check the RMS radius of the axial spot in its best focus, all rims open as tabled, over the focal length."""
     blur = axial_blur_mm(lens) / data.efl_mm
     doubt = ""
     if blur > BLUR_LIMIT and lens.refractions > SIMPLE:
@@ -204,13 +205,14 @@ def _corner(lens: Lens) -> Iterator[Check]:
 
 
 _FAN = 1001
-_PUPIL = 3.0  # paraxial exit pupils within which the pupil of every film point lies
+_PUPIL = 3.0  # the pupil of every film point lies within so many paraxial exit pupils
 
 
 def axial_beam(lens: Lens) -> tuple[float, int | None]:
-    """Half height (mm, along y) of the widest parallel beam that passes all rims, and the surface that ends it.
+    """Return half the height (mm, along y) of the widest parallel beam that passes all rims, and what ends it.
 
-    The beam ends at the first height that does not pass; None where the whole front surface is used.
+    The beam ends at the first height whose ray does not pass, at the surface returned; None where the beam fills the
+    whole front surface.
     """
     front, reach = lens.surfaces[0], max(s.semi_diameter_mm for s in lens.surfaces)
     low, high = 0.0, min(front.semi_diameter_mm, end_mm(front))
@@ -230,9 +232,9 @@ def axial_beam(lens: Lens) -> tuple[float, int | None]:
 
 
 def axial_blur_mm(lens: Lens) -> float:
-    """Return the RMS radius of the image of an axial point at infinity, in the plane where it is smallest.
+    """Return the RMS radius (mm) of the image of an axial point at infinity, in the plane where it is smallest.
 
-    Both coordinates count, for an anamorphic lens may have two foci; inf where no ray passes.
+    Both coordinates count, because an anamorphic lens may have two foci. Where no ray passes it is inf.
     """
     out = follow(lens, axial_rays(lens, -math.inf), lens.reference_nm, "film")
     r = Rays(*(c[out.status == st.PASSED] for c in out.rays))
@@ -244,7 +246,7 @@ def axial_blur_mm(lens: Lens) -> float:
 
 
 def film_edge_mm(lens: Lens) -> float | None:
-    """Radius of the film to be lit: the file's own, else the image of the half field; None where neither is stated."""
+    """The radius (mm) of film to be lit: the file's, or the image of its half field; None where neither is stated."""
     if lens.image_radius_mm is not None:
         return lens.image_radius_mm
     if lens.half_field_deg is None:
@@ -260,14 +262,14 @@ def film_edge_mm(lens: Lens) -> float | None:
 
 
 def corner_illumination(lens: Lens, radius_mm: float) -> float:
-    """Light at a film radius relative to the middle, film at the focus for infinity (cos^4 and rims, d line).
+    """Return the light at a film radius relative to the middle, by cos^4 and rims, at the d line.
 
-    The corner of an anamorphic lens lies halfway between its planes of symmetry.
+    The film is in focus for infinity. The corner of an anamorphic lens lies halfway between its planes of symmetry.
     """
     across = math.sqrt(0.5) if lens.anamorphic else 0.0
     x, y = (torch.tensor([0.0, radius_mm * share], dtype=torch.float64) for share in (math.sqrt(1 - across**2), across))
     data, plane = first_order(lens), pupil_plane_z_mm(lens)
-    # Seen from the corner the pupil is distorted, but not by more than this.
+    # Seen from the corner the pupil is distorted, but it stays within this.
     half = _PUPIL * data.exit_pupil_diameter_mm / 2
     half = half if plane == data.exit_pupil_z_mm else lens.surfaces[-1].semi_diameter_mm
     high = torch.full((2, 2), half, dtype=torch.float64)

@@ -1,8 +1,8 @@
-"""Focusing: groups that move inside a lens, and the film plane of best focus.
+"""Focuses a lens, by groups that move inside it or by its film, which goes to the plane of best focus.
 
-Internal focusing: the source lists a few states of the groups, between infinity and the nearest, for every zoom
-position. One parameter moves all gaps from state to state linearly (as a focus ring on straight cams would), and is
-solved for so that the paraxial image of the object lies on the film, which is fixed.
+Of internal focusing, a source lists a few states of the groups between infinity and the nearest focus, for every zoom
+position. One parameter moves all gaps linearly from state to state (as a focus ring on straight cams would). It is
+solved for the paraxial image of the object to lie on the film, which stays in place.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Array = NDArray[np.float64]
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
-    """Values [M] at a place between rows of values [R, M] at ascending places x [R]: a row's own at its place.
+    """Interpolate between rows of values [R, M] at ascending places x [R], and return the values [M] at one place.
 
-    Of two rows linear, else piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for
-    constructing local monotone piecewise cubic interpolants": a value stays between those of its two rows, so that no
-    gap can turn negative.
+    Two rows are interpolated linearly, more by the piecewise cubic of Fritsch and Butland (1984), "A method for
+    constructing local monotone piecewise cubic interpolants". A value then stays between those of its two neighbouring
+    rows, so that no gap can turn negative; at a row's place it is the row's own.
     """
     from scipy.interpolate import PchipInterpolator  # type: ignore[import-untyped]
 
@@ -40,7 +40,7 @@ def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) 
     return PchipInterpolator(known, values)(place).tolist()
 
 
-SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources give two decimals
+SAME_MM = 0.005  # gaps of two states that differ by less count as the same: sources give two decimals
 
 
 def at_infinity(lens: Lens) -> Lens:
@@ -61,9 +61,10 @@ def focus_states(lens: Lens) -> list[Configuration]:
 
 
 def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
-    """Return the infinity state of the zoom position of a focus state; None where the file has none: its table then.
+    """Return the infinity state of the zoom position that a focus state belongs to; None where only the table fits.
 
-    It is the one with the fewest different gaps, then with the smallest differences.
+    Of the file's states it is the one with the fewest different gaps, and of those the one with the smallest
+    differences.
     """
 
     def unlikeness(base: Configuration) -> tuple[int, float]:
@@ -75,7 +76,7 @@ def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
 
 
 def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
-    """Return all thicknesses, by surface index, with those of the states on top of the lens's own, in that order."""
+    """Return all thicknesses by surface index: the lens's own, replaced by those of the states in turn."""
     gaps = {k: s.thickness_mm for k, s in enumerate(lens.surfaces)}
     for state in states:
         gaps.update(() if state is None else state.thickness_mm)
@@ -83,10 +84,10 @@ def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
 
 
 def focus_path(lens: Lens) -> dict[int, list[float]]:
-    """How each gap changes while a lens focuses: its changes at infinity, 0, and at the focus states, by surface.
+    """Return how much each gap changes while a lens focuses, by surface: 0 at infinity, then at each focus state.
 
-    The lens is at infinity focus, at a state of its zoom or between (the changes are then interpolated in log EFL). The
-    last gap is the distance to the film.
+    The lens is at infinity focus, in a state of its zoom or between two (the changes are then interpolated in log EFL).
+    The last gap is the distance to the film.
 
     Raises:
         InputError: a file without focus states.
@@ -117,12 +118,12 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
     """Return the lens focused by moving its groups.
 
     Args:
-        lens: at infinity focus; or in a focus state of its file, which is kept where `focus_m` is None.
-        focus_m: distance from object to film; None is infinity.
-        object_mm: from object to front vertex, of a focus state that was chosen by its name.
+        lens: at infinity focus, or in a focus state of its file, which is kept where `focus_m` is None.
+        focus_m: distance from object to film, m; None is infinity.
+        object_mm: distance from the object to the front vertex, for a focus state that was chosen by its name.
 
     Raises:
-        InputError: a file without focus states, or a distance below the nearest, which it names.
+        InputError: a file without focus states, or a distance below the nearest one, which the error names.
     """
     if focus_m is None and object_mm is not None:
         return replace(lens, film_z_mm=paraxial.image_z_mm(lens, -object_mm))
@@ -145,7 +146,7 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
 
 
 def _rounded_up(value: float) -> float:
-    """Return a positive number rounded up to four digits: a distance printed as the limit must be accepted."""
+    """Round a positive number up to four digits: a distance printed as the limit must be accepted."""
     step = 10.0 ** (math.floor(math.log10(value)) - 3)
     return math.ceil(value / step - 1e-9) * step
 
@@ -157,9 +158,9 @@ def nearest_focus_m(lens: Lens) -> float:
 
 
 def _mover(lens: Lens) -> tuple[dict[int, list[float]], Callable[[float], Lens]]:
-    """Return the path of a lens at infinity focus, and the lens with its groups moved along it, film fixed.
+    """Return the path of a lens at infinity focus, and a function that moves its groups along it, the film fixed.
 
-    The place on the path runs from 0 (infinity) to the number of states beyond.
+    The function takes a place on the path, from 0 (infinity) to the number of focus states.
     """
     path, back_mm, film = focus_path(lens), paraxial.first_order(lens).back_focus_mm, len(lens.surfaces) - 1
 
@@ -172,7 +173,7 @@ def _mover(lens: Lens) -> tuple[dict[int, list[float]], Callable[[float], Lens]]
 
 
 def _vergence(lens: Lens) -> float:
-    """1 / distance (1/mm) from the film to the object that is in focus on it; 0 for infinity (Newton: x x' = -f f')."""
+    """Return 1 / distance (1/mm) from the film to the object in focus on it; 0 at infinity (Newton: x x' = -f f')."""
     data = paraxial.first_order(lens)
     assert lens.film_z_mm is not None
     extension = lens.film_z_mm - data.rear_focal_z_mm
@@ -180,22 +181,25 @@ def _vergence(lens: Lens) -> float:
 
 
 _RINGS, _SPOKES = 512, 24
-_RINGS_OF_SPOKES = 64  # where the opening is not round
-_WIDER = 1.1  # the disc of rays over the paraxial entrance pupil: aberrations of the pupil move its edge
-_ROUNDS = 2  # the object's distance counts from the film: each round reduces the step by a factor of 100
-_SPARE = 0.05  # of a film range, added at both ends
-_NEAREST = 0.5  # of the way from the last surface to the paraxial image: no film of a range lies nearer
+_RINGS_OF_SPOKES = 64  # spokes of rays where the opening is not round
+_WIDER = 1.1  # the disc of rays over the paraxial entrance pupil, whose edge moves by aberrations of the pupil
+_ROUNDS = 2  # the object's distance counts from the film, which moves: an error shrinks 100 times a round
+_SPARE = 0.05  # share of a film range that is added at both ends
+_NEAREST = 0.5  # share of the way from the last surface to the paraxial image: no film of a range lies nearer
 
 
 def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] | None = None) -> float:
-    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light,
-    by default `Lens.light_nm`.
+    """Return the z (mm, lens frame) of the film with the least RMS spot of an axial point, for a range of light.
 
     Rays of the colours of `paraxial.colours` are spread evenly over the entrance pupil, and those that stop and rims
-    let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
-    closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
-    thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
-    pinhole's film stays in place.
+    let through count: so the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows
+    in closed form, since the spot's second moment is a parabola in z. With pure third-order spherical aberration it
+    lies two thirds of the way from the paraxial to the marginal focus; for a lens with cylinders it is that of the
+    whole spot. The film of a pinhole stays in place.
+
+    Args:
+        focus_m: distance of the axial point from the film, m.
+        wavelength_nm: shortest and longest wavelength of the light; None takes `Lens.light_nm`.
 
     Raises:
         InputError: no ray passes, or focus nearer than four focal lengths.
@@ -212,13 +216,13 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
 def _least_spot_mm(
     lens: Lens, object_z_mm: float, wavelength_nm: tuple[float, float] | None, stops_mm: Sequence[float] | None = None
 ) -> NDArray[np.float64]:
-    """Film planes of least spot for an axial point, behind the stop as it is or behind round ones of some radii."""
-    # Without dispersion all light is of one colour.
+    """The film planes of an axial point's least spot, behind the stop as it is or behind round ones of some radii."""
+    # Without dispersion all light behaves as one colour.
     one = (lens.reference_nm, lens.reference_nm)
     wavelengths, weights = paraxial.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
     along, across, at_stop = _moments(lens, object_z_mm, wavelengths)
     share = weights[None, :, None, None]
-    if stops_mm is not None:  # rays at the edge count in part
+    if stops_mm is not None:  # rays at the edge of a stop count in part
         square = np.array(stops_mm)[:, None, None, None] ** 2
         ring = (_WIDER * lens.stop_radius_mm) ** 2 / along.shape[1]
         share = share * ((square - at_stop**2) / ring + 0.5).clip(0, 1)
@@ -231,34 +235,33 @@ def _least_spot_mm(
 def best_focus_of_stops_mm(
     lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] | None = None
 ) -> NDArray[np.float64]:
-    """`best_focus_z_mm` at some radii of a round stop, of one set of rays: those that each lets through. Errors as
-    there."""
+    """Return `best_focus_z_mm` at several radii of a round stop, from one set of rays; raises what that raises."""
     widest = replace(lens, aperture=None).with_stop_radius(float(max(stops_mm)))
     whole = best_focus_z_mm(widest, focus_m, wavelength_nm)
     if paraxial.is_pinhole(lens):
         return np.full(len(stops_mm), whole)
     object_z = whole - 1000 * focus_m
     found = _least_spot_mm(widest, object_z, wavelength_nm, stops_mm)
-    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    # The object keeps its distance from the film: where the film moves, the image moves by the square of its scale.
     data = paraxial.first_order(lens)
     scale = float(data.efl_mm / (data.front_focal_z_mm - object_z))
     return np.asarray(found + (found - whole) * scale**2)
 
 
 def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
-    """Return a lens that `set_lens` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
+    """Return a lens that `set_lens` has placed, by film or groups, with its film moved to `best_focus_z_mm`."""
     return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
 
 
-_COVER, _COVER_AIR_MM = ("N-BK7", 1.5168, 64.17), 0.5  # its glass with n_d and V_d, and its distance from the film
+_COVER, _COVER_AIR_MM = ("N-BK7", 1.5168, 64.17), 0.5  # glass, n_d, V_d; distance from the film
 
 
 def with_cover_glass(
     lens: Lens, thickness_mm: float, focus_m: float, focus_mode: str, wavelength_nm: tuple[float, float]
 ) -> Lens:
-    """Return a lens whose film is placed with a plane plate before the film, wherever: it does not matter for rays.
+    """Return a lens whose film is placed with a plane plate in front of the film, and the film in focus again.
 
-    The film is in focus again. No plate is added where it has no thickness.
+    Where the plate stands before the film does not matter for rays. A plate of no thickness is not added.
 
     Raises:
         InputError: a plate that is thicker than the room behind the lens.
@@ -273,7 +276,7 @@ def with_cover_glass(
         most = math.floor(100 * (thickness_mm + room * n_d / float(last.n_d))) / 100
         expected = f"at most {most:g} mm: the film lies {lens.film_z_mm - z_mm:.3g} mm behind the last surface"
         raise InputError(lens.path, "cover_glass_mm", thickness_mm, expected)
-    wide = last.diameter_mm + 2 * (film_z - z_mm)  # beyond all rays to the film
+    wide = last.diameter_mm + 2 * (film_z - z_mm)  # wider than any ray to the film needs
     front = Surface(math.inf, thickness_mm, wide, n_d)
     front = replace(front, V_d=V_d, material=name, glass=name) if lens.dispersive else front
     back = Surface(math.inf, _COVER_AIR_MM, wide, last.n_d, last.V_d, last.material, glass=last.glass)
@@ -286,17 +289,17 @@ def with_cover_glass(
 
 
 def _paraxial_film_z_mm(lens: Lens, focus_m: float) -> float:
-    """Film in the paraxial image; where it stands, of a lens whose groups have moved to focus."""
+    """Return the z (mm) of the paraxial image; of a lens whose groups have moved to focus, that of its film."""
     if lens.infinity_mm and lens.film_z_mm is not None:
         return float(lens.film_z_mm)
     return paraxial.film_z_mm(lens, focus_m)
 
 
 def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]) -> tuple[float, float]:
-    """Film planes that hold the paraxial image of an axial point, and its least spot at every aperture and colour.
+    """Return the range of film planes that holds an axial point's paraxial image and its least spot in every case.
 
-    What is least for all rays lies between what is least for each colour and meridian by itself. Arguments are those
-    of `best_focus_z_mm`.
+    Cases are all apertures and colours. The least spot of all rays together lies between those of each colour and
+    meridian by itself. Arguments are those of `best_focus_z_mm`.
     """
     focus_m = paraxial.distance_m(focus_m)
     image = _paraxial_film_z_mm(lens, focus_m)
@@ -315,9 +318,9 @@ def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]
 
 
 def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
-    """Rays [rings * spokes] to the film from a point of the axis (-inf allowed), of equal areas of the entrance pupil.
+    """The rays [rings * spokes] towards the film from a point of the axis, for equal areas of the entrance pupil.
 
-    One spoke stands for all where lens and opening are round.
+    Where lens and opening are round, one spoke stands for all. The point may lie at -inf.
     """
     data = paraxial.first_order(lens)
     round_ = not lens.anamorphic and lens.aperture is None
@@ -327,7 +330,7 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     widest = max(data.entrance_pupil_diameter_mm, paraxial.first_order(lens, meridian="x").entrance_pupil_diameter_mm)
     radius = _WIDER / 2 * widest * ring[:, None]
     x, y = (radius * np.cos(spoke)).reshape(-1), (radius * np.sin(spoke)).reshape(-1)
-    # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
+    # The rays start well in front of every lens, so that a front surface that bulges towards the scene is still ahead.
     front_mm = lens.surfaces[0].diameter_mm
     start = -max(10.0, front_mm if math.isfinite(front_mm) else 10.0)
     if math.isinf(object_z_mm):
@@ -343,18 +346,18 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
 
 
 def _moments(lens: Lens, object_z_mm: float, wavelength_nm: Array) -> tuple[Array, Array, Array]:
-    """x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes], 0 of one that is blocked; and how far from
-    the axis it meets the stop.
+    """Return x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes], and how far out it meets the stop.
 
-    (x0, y0) is where it meets the plane z = 0 and (tx, ty) its slopes: the sum of (x0 + z tx)^2 + (y0 + z ty)^2 is
-    least where the sum of the first makes up for z times that of the second.
+    A ray meets the plane z = 0 at (x0, y0) with the slopes (tx, ty). The sum of (x0 + z tx)^2 + (y0 + z ty)^2 over rays
+    is least at the z where z times the sum of the second is minus the sum of the first. Both are 0 for a blocked ray;
+    the last result is the distance from the axis.
     """
     rays = axial_rays(lens, object_z_mm)
     count, colours = len(rays.x), len(wavelength_nm)
     out = follow(lens, Rays(*(np.tile(c, colours) for c in rays)), np.repeat(wavelength_nm, count), "film")
     r, passed = out.rays, out.status == 0
     shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
-    with np.errstate(all="ignore"):  # of lost rays
+    with np.errstate(all="ignore"):  # lost rays overflow and give NaN
         tx, ty = r.dx / r.dz, r.dy / r.dz
         along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
         at_stop = np.nan_to_num(np.hypot(*out.at_stop))

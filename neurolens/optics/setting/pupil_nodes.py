@@ -1,9 +1,9 @@
 """Quadrature over what stop and rims leave open of a plane, whatever its outline, refined until two levels agree.
 
-Rays on a grid count the light of an opening with an error that falls only as n^-1.5, and rings of the stop lose what a
-rim cuts between two of them. Here the outline itself is searched, along spokes from the middle of what is lit, and
-Gauss's nodes lie along the spokes: figures that are smooth over the pupil converge exponentially. What is dark inside
-the outline is left out ray by ray.
+The light of an opening, counted by rays on a grid, has an error that falls only as n^-1.5, and rings of the stop lose
+what a rim cuts between two of them. Here the outline itself is searched, along spokes from the middle of what is lit,
+and Gauss's nodes lie along the spokes: figures that are smooth over the pupil converge exponentially. What is dark
+inside the outline is left out ray by ray.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from neurolens.optics.trace.surfaces import Rays
 Array = NDArray[np.float64]
 Passes = Callable[[Tensor, Tensor], Tensor]
 
-_LATTICE, _LOOKS = 32, 6  # points a side that find what is lit: in the box that is given, then in that of what is lit
-_CLOSER = 4  # times, where nothing is found
-_SCAN, _ROUNDS = 13, 5  # points along a spoke that find the outline; closer looks
+_LATTICE, _LOOKS = 32, 6  # points a side of a grid that finds what is lit, first in the box given; how often at most
+_CLOSER = 4  # how many times smaller the box becomes where nothing is found
+_SCAN, _ROUNDS = 13, 5  # points along a spoke that find the outline, and how often they are drawn closer
 _SPOKES, _RINGS = 32, 6  # of the coarsest level; every further level has twice as many of both
 LEVELS = 4
-AGREE = 5e-4  # difference of two levels, over the scale of the figure, that is half of a third digit
+AGREE = 5e-4  # share of a figure's scale by which two levels may differ: half of a third digit
 
 
 class Nodes(NamedTuple):
-    """Points of a plane, each [B, N], with the areas they stand for: 0 for those on the outline itself."""
+    """Points of a plane, each [B, N], with the areas they stand for; points on the outline itself stand for none."""
 
     u: Tensor
     v: Tensor
@@ -43,7 +43,7 @@ class Nodes(NamedTuple):
 
 
 class LitPart(NamedTuple):
-    """The middle of what is lit in each of B planes, [B], and how far it reaches from there: 0 where nothing is."""
+    """The middle of what is lit in each of B planes, [B], and how far it reaches from there; 0 where nothing is lit."""
 
     u: Tensor
     v: Tensor
@@ -51,7 +51,7 @@ class LitPart(NamedTuple):
 
 
 def lit_part(passes: Passes, low: Tensor, high: Tensor, near: Tensor) -> LitPart:
-    """Find what is lit inside boxes.
+    """Find what is lit inside boxes, one for each of B planes.
 
     Args:
         passes: tells of points u, v, [B, N], whether they are lit.
@@ -83,14 +83,14 @@ def lit_part(passes: Passes, low: Tensor, high: Tensor, near: Tensor) -> LitPart
 
 
 def lit_nodes(passes: Passes, part: LitPart, level: int) -> Nodes:
-    """Nodes over what is lit; arguments as of `lit_part`, `level` from 0."""
+    """Return nodes over what is lit; `passes` is as for `lit_part`, and `level` counts from 0."""
     spokes, rings = _SPOKES << level, _RINGS << level
     angle = torch.arange(spokes, dtype=torch.float64) * (2 * math.pi / spokes)
     cos, sin = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
     share = torch.linspace(0, 1, _SCAN, dtype=torch.float64)
 
     def places(radius: Tensor) -> tuple[Tensor, Tensor]:
-        """Points [B, S * K] at radii [B, S, K]."""
+        """Return the points [B, S * K] at radii [B, S, K]."""
         u, v = part.u[:, None, None] + radius * cos, part.v[:, None, None] + radius * sin
         return u.flatten(1), v.flatten(1)
 
@@ -101,7 +101,7 @@ def lit_nodes(passes: Passes, part: LitPart, level: int) -> Nodes:
         lit = passes(*places(radius)).reshape(radius.shape)
         last = (lit * torch.arange(_SCAN)).amax(2, keepdim=True)
         low, high = (radius.gather(2, k)[..., 0] for k in (last, (last + 1).clamp_max(_SCAN - 1)))
-    # Gauss's nodes in the square of the radius, of which the area is a linear function.
+    # Gauss's nodes lie in the square of the radius, of which the area is a linear function.
     nodes, weights = (torch.from_numpy(c) for c in np.polynomial.legendre.leggauss(rings))
     end = (low + high) / 2
     radius = torch.cat([end[..., None] * torch.sqrt((nodes + 1) / 2), low[..., None]], 2)
@@ -110,11 +110,12 @@ def lit_nodes(passes: Passes, part: LitPart, level: int) -> Nodes:
 
 
 class FilmLight:
-    """The light that F film points see through a lens, without losses in glass, on a plane.
+    """The light that F film points see through a lens, on a plane; losses in glass are left out.
 
     Args:
-        film_mm: [F] x and [F] y of the points. film_z_mm, plane_z_mm: where film and plane are.
-        low, high, near: as of `lit_part`.
+        film_mm: x and y of the film points, [F] each.
+        film_z_mm, plane_z_mm: where film and plane are.
+        low, high, near: as for `lit_part`.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class FilmLight:
         self.part = lit_part(self._passes, low, high, near)
 
     def only(self, fields: list[int]) -> FilmLight:
-        """The same for some of the film points."""
+        """Return the same for some of the film points."""
         found = copy(self)
         found.film_mm = self.film_mm[0][fields], self.film_mm[1][fields]
         found.part = LitPart(*(c[fields] for c in self.part))
@@ -139,7 +140,7 @@ class FilmLight:
         return passing(self.lens, self._rays(u, v), self.lens.reference_nm).reshape(u.shape)
 
     def sums(self, level: int) -> Array:
-        """Integral [F] of cos^4 over what is lit."""
+        """Return the integrals [F] of cos^4 over what is lit."""
         nodes = lit_nodes(self._passes, self.part, level)
         cos4 = self._rays(*nodes[:2]).dz.reshape(nodes.u.shape) ** 4
         return np.asarray((nodes.area * cos4 * self._passes(*nodes[:2])).sum(1).numpy())
@@ -151,15 +152,18 @@ def converged(
     fields: int,
     first: int = 0,
 ) -> tuple[list[Array], dict[str, Array]]:
-    """Arrays [F, ...]: of each field those of the first level that agrees with the one before it, or of the last.
+    """Compute arrays [F, ...] at finer and finer levels until two agree, field by field; take the last level if none
+    do.
 
     Args:
         compute: gives the arrays of a level, from 0, for some of the fields.
-        figures: by name those that are shown, [F, ...], of all arrays, and the scale on which three digits count: the
-            figures themselves, or 1 for shares of 1.
-        fields: their number. first: the level to begin with.
+        figures: gives of all arrays, by name, the figures that are shown, [F, ...], and the scale on which their three
+            digits count: the figures themselves, or 1 for shares of 1.
+        fields: the number of fields, F.
+        first: the level to begin with.
 
-    Returns the arrays, and by name the difference [F, ...] of the last two levels over the scale, at most 1.
+    Returns:
+        The arrays, and by name how far the last two levels differ [F, ...], over the scale and at most 1.
     """
     rows = list(range(fields))
     result = [np.array(a) for a in compute(first, rows)]

@@ -21,21 +21,22 @@ from neurolens.optics.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
 
-# Azimuths at which lenses with cylinders are searched, 5 degrees apart: at 15, one of them lost 7% of its corners.
-# Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a.
+# Lenses with cylinders are searched at these azimuths, 5 degrees apart: at 15, one of them lost 7% of its corners. The
+# lens is symmetric about both of its planes: what passes at -a is the mirror image of what passes at a.
 _STEP_DEG = 5
 AZIMUTHS = tuple(math.radians(_STEP_DEG * k) for k in range(-18, 19))
-# In groups, the first of which find most of what passes.
+# The azimuths in groups, of which the first find most of what passes.
 GROUPS = (AZIMUTHS[18:19], AZIMUTHS[::9], tuple(a for k, a in enumerate(AZIMUTHS) if k % 9))
-# Azimuths of a film are those at radii this share smaller too: outlines are interpolated between radii.
+# A film radius is searched at the azimuths of radii smaller by this share, too: outlines are interpolated between
+# radii.
 _BETWEEN_RADII = 0.03
 
 
 def pupil_plane_z_mm(lens: Lens) -> float:
-    """z of the plane on which pupil points lie: the paraxial exit pupil, where passing rays crowd together.
+    """Return the z (mm) of the plane of pupil points: the paraxial exit pupil, where passing rays crowd together.
 
-    The rear vertex, that of the glass before a cover glass on the film, stands in where the exit pupil lies near or
-    behind the film or too far in front of it to be useful.
+    Where the exit pupil lies near or behind the film, or too far in front of it to be useful, the rear vertex stands in
+    for it: that of the lens itself, in front of a cover glass on the film.
     """
     data = first_order(lens)
     rear = float(lens.vertices_mm[len(lens.surfaces) - 1])
@@ -46,9 +47,9 @@ def pupil_plane_z_mm(lens: Lens) -> float:
 
 
 def camera_rays(film_x: Any, film_y: Any, film_z: Any, pupil_x: Any, pupil_y: Any, pupil_z: float) -> Rays:
-    """Camera rays from film points towards (or away from) pupil points, all [N] in mm, lens frame; dz is negative.
+    """Return camera rays from film points towards (or away from) pupil points, [N] in mm, lens frame; dz is negative.
 
-    Arrays or tensors; the planes may be numbers.
+    Points are arrays or tensors; the z of their planes may be plain numbers.
     """
     x, y, z = pupil_x - film_x, pupil_y - film_y, 0 * film_x + (pupil_z - film_z)
     scale = -1 / (x * x + y * y + z * z) ** 0.5
@@ -57,7 +58,7 @@ def camera_rays(film_x: Any, film_y: Any, film_z: Any, pupil_x: Any, pupil_y: An
 
 
 def on_plane(rays: Rays, z_mm: float) -> Rays:
-    """Rays moved along themselves to the plane at z."""
+    """Return the rays, moved along themselves to the plane at z."""
     t = (z_mm - rays.z) / rays.dz
     return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=z_mm + 0 * rays.z)
 
@@ -72,20 +73,21 @@ def passes_at_any_azimuth(
     wavelength_nm: float,
     film_mm: tuple[float, float] | None = None,
 ) -> NDArray[np.bool_]:
-    """Test whether light passes from film points on +x through pupil points at any azimuth of the whole, bool [N].
+    """Test whether light passes from film points on +x through pupil points, at any azimuth of the whole, bool [N].
 
     Blades and masks are left out: the round opening about them holds what they let through at every azimuth. Only
-    lenses with cylinders are traced at more than one azimuth, `AZIMUTHS`.
+    lenses with cylinders are traced at more than one azimuth, namely at `AZIMUTHS`.
 
     Args:
-        film_radius, film_z, pupil_x, pupil_y: [N] mm. pupil_z: plane, mm, lens frame.
-        film_mm: width and height of a film; of the azimuths, those at which it has points that far from its middle.
+        film_radius, film_z, pupil_x, pupil_y: [N], mm.
+        pupil_z: plane of the pupil points, mm, lens frame.
+        film_mm: width and height of a film. Only azimuths count at which it has points that far from its middle.
     """
     lens = replace(lens, aperture=None)
     passed, round_ = np.zeros(len(film_radius), bool), not lens.anamorphic
     low, high = (-math.inf, math.inf) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
     for group in ((0.0,),) if round_ else GROUPS:
-        # Together: few rays take nearly as long as many.
+        # Traced together, because few rays take nearly as long as many.
         azimuth = np.array(group)[:, None]
         which, left = np.nonzero(~passed & (low <= abs(azimuth)) & (abs(azimuth) <= high))
         r, u, v = film_radius[left], pupil_x[left], pupil_y[left]
@@ -96,9 +98,10 @@ def passes_at_any_azimuth(
 
 
 def azimuths_on_film(film_radius: Array, film_mm: tuple[float, float]) -> tuple[Array, Array]:
-    """Least and largest azimuth in the first quadrant, rad [N], at which a centred film has points that far out.
+    """Return the least and largest azimuth in the first quadrant, rad [N], at which a film has points that far out.
 
-    With half a step of `AZIMUTHS` beyond either; beyond the corner, those about the corner's.
+    The film is centred, and half a step of `AZIMUTHS` is added at either end; beyond the corner, azimuths about the
+    corner's count.
     """
     width, height = film_mm
     radius = np.maximum(film_radius * (1 - _BETWEEN_RADII), 1e-12)
@@ -108,12 +111,12 @@ def azimuths_on_film(film_radius: Array, film_mm: tuple[float, float]) -> tuple[
     return np.minimum(low, corner) - beyond, np.maximum(high, corner) + beyond
 
 
-_STRIDE = 4  # of the points of a grid that are traced first; then only those that may widen what they found
-FEW = 40  # points of a grid, of which so few pass that it may miss the edges of what passes, or the whole of it
+_STRIDE = 4  # every so many points of a grid are traced first, then only those that may widen what these found
+FEW = 40  # where so few points of a grid pass, it may miss the edges of what passes, or all of it
 
 
 class Box(NamedTuple):
-    """Bounds of passing points for a film point on +x: along it, across it, from the axis, mm; how many were found."""
+    """Bounds (mm) of passing points for a film point on +x: along x, across it, from the axis; and their count."""
 
     low: float
     high: float
@@ -123,14 +126,14 @@ class Box(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A film point on +x: its distance from the axis and its plane, mm."""
+    """A film point on +x, by its distance from the axis and the z of its plane, mm."""
 
     radius: float
     film_z: float
 
 
 def union(boxes: Sequence[Box]) -> Box:
-    """Return the box that holds all; an empty one (low > high) of none."""
+    """Return the box that holds all boxes; for no boxes an empty one (low > high)."""
     if not boxes:
         return Box(1.0, -1.0, 0.0, 0.0)
     return Box(
@@ -147,16 +150,17 @@ def search(
     points: int,
     film_mm: tuple[float, float] | None,
 ) -> list[Box | None]:
-    """Boxes of the passing points of grids over `boxes` (upper halves: the lens is symmetric), a step wider; None for a
-    film point whose grid no ray passes.
+    """Find the boxes of passing points of grids over `boxes`, a step wider; None for a film point without any.
 
-    A coarse grid is traced first. Where enough of it passes, only the points that may lie beyond its extent by less
-    than one of its steps follow; elsewhere all points near those found, or all.
+    Grids cover the upper halves, since the lens is symmetric.
+
+    A coarse grid is traced first. Where enough of it passes, only the points follow that may lie beyond its extent by
+    less than one of its steps; elsewhere all points near those found, or all points.
 
     Args:
-        places, boxes: film points and where to look from each.
-        wavelengths: nm; rays of any of them count.
-        points: of a grid along, and twice those across.
+        places, boxes: film points, and where to look from each.
+        wavelengths: in nm; rays of any of them count.
+        points: of a grid along the box; half of that, for the upper half, are across.
         film_mm: see `passes_at_any_azimuth`.
     """
     if not places:
@@ -187,34 +191,34 @@ def search(
 
 
 def _extent(passed: NDArray[np.bool_], u: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the least and largest u, largest v and largest distance from the axis of the passing points, each [M]."""
+    """Return the passing points' least and largest u, largest v, and largest distance from the axis, [M] each."""
     largest = [np.where(passed, c, -math.inf).max((1, 2)) for c in (-u, u, v, np.hypot(u, v))]
     return -largest[0], largest[1], largest[2], largest[3]
 
 
 def _may_widen(passed: NDArray[np.bool_], u: Array, v: Array, du: Array, dv: Array) -> NDArray[np.bool_]:
-    """Points that may lie beyond the extent found, by less than a step, along, across or from the axis; or more."""
+    """Return points that may lie beyond the extent found, by less than a step, along, across or from the axis."""
     least, most, across, reach = (t[:, None, None] for t in _extent(passed, u, v))
     du, dv = du[:, None, None], dv[:, None, None]
     distance = np.hypot(u, v)
     within = (u > least - du) & (u < most + du) & (v < across + dv) & (distance < reach + np.hypot(du, dv))
     beyond = (u < least) | (u > most) | (v > across) | (distance > reach)
     count = passed.sum((1, 2))[:, None, None]
-    # With few found, all points within two steps are tried; with none, the whole grid.
+    # Where only few were found, all points within two steps are tried; where none were, the whole grid.
     near = (u > least - 2 * du) & (u < most + 2 * du) & (v < across + 2 * dv)
     found: NDArray[np.bool_] = (within & beyond) | ((count < FEW) & near) | (count == 0)
     return found
 
 
-# Where rays are looked for again: within so many paraxial exit pupils of the axis, where the box of the rear rim is so
-# many times wider than that.
+# Where the rear rim's box is more than _FAR times as wide, rays are also looked for within this many paraxial exit
+# pupils of the axis.
 _NEAR, _FAR = 3.0, 4.0
-_CLOSE = 0.25  # of its radius: a rim so close to the film
-_COARSE = 8  # film radii of the illumination that the search for its end leaves out at first
+_CLOSE = 0.25  # a rim that is closer to the film than this share of its radius
+_COARSE = 8  # film radii of the illumination, of which the search for its end first takes every eighth
 
-_AT_MANY_AZIMUTHS = 64  # points of a grid, at most, where each is traced at many azimuths
+_AT_MANY_AZIMUTHS = 64  # at most so many points a grid where each is traced at many azimuths
 
-# Boxes about what passes from film points, looked for over boxes.
+# Finds boxes about what passes from film points, within the boxes given.
 _Look = Callable[[Lens, list[Place], list[Box]], list[Box | None]]
 
 
@@ -229,14 +233,22 @@ def pupil_bounds(
     film_mm: tuple[float, float] | None = None,
     pupil_z_mm: float | None = None,
 ) -> PupilBounds:
-    """Search the pupil plane for passing rays, all film radii together: coarse grids, then grids on what they find.
+    """Search the pupil plane for passing rays, for all film radii together, by coarse grids, then by finer ones.
 
-    Each row is widened by the step of its grid and by its neighbours, so that bounds hold between rows too. `film_mm`
-    (width, height) leaves out of the search of a lens with cylinders what lies beyond a film; see
-    `passes_at_any_azimuth`. `pupil_z_mm` is the plane; None takes `pupil_plane_z_mm`.
+    Each row is widened by the step of its grid and by its neighbours, so that the bounds hold between rows too.
+
+    Args:
+        film_radius_mm: radius of the last row.
+        film_z_mm: nearest and farthest film plane.
+        wavelength_nm: range of the light.
+        rows: number of film radii.
+        points: of a grid along x.
+        film_mm: width and height of a film; what lies beyond it is left out of the search of a lens with cylinders (see
+            `passes_at_any_azimuth`).
+        pupil_z_mm: the plane; None takes `pupil_plane_z_mm`.
 
     Raises:
-        InputError: when no ray passes from any film point.
+        InputError: no ray passes from any film point.
     """
     plane = pupil_plane_z_mm(lens) if pupil_z_mm is None else pupil_z_mm
     if lens.anamorphic:
@@ -275,15 +287,16 @@ def pupil_bounds(
 
 
 def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) -> list[Box]:
-    """Bound the light of a film point on the pupil plane by the rear rim, and also by `near` mm about the exit pupil's
-    middle where the rear rim bounds it badly.
+    """Bound a film point's light on the pupil plane by the rear rim.
+
+    Where that bounds it badly, a second box bounds it by `near` mm about the middle of the exit pupil.
     """
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
     limit = min(rear.semi_diameter_mm, end_mm(rear))
     depths = [sag_mm(rear, limit * t, 0.0) for t in (0.0, 0.5, 0.8, 1 - 1e-12)]
-    # Every ray that enters crosses the rear surface between the planes that hold it, within the rim's radius; seen
-    # from the film point, that cylinder's two ends bound it on the pupil plane.
+    # Every ray that enters crosses the rear surface, which lies between two planes, within the rim's radius. Seen from
+    # the film point, the two ends of this cylinder bound the ray on the pupil plane.
     ends = []
     for z in (rear_z + min(depths), rear_z + max(depths)):
         stretch = (place.film_z - plane) / (place.film_z - z)
@@ -294,17 +307,17 @@ def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) 
         stretch = (place.film_z - plane) / (place.film_z - exit_z)
         centre, reach = place.radius * (1 - stretch), near * abs(stretch)
         if starts[0].high - starts[0].low > _FAR * reach:
-            # A cover glass a millimetre from the film: the pupil is so small that it falls between the points of a
+            # With a cover glass a millimetre from the film, the pupil is so small that it falls between the points of a
             # grid.
             starts.append(Box(centre - reach, centre + reach, reach, 0.0))
     return starts
 
 
 def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> list[Box | None]:
-    """Return the boxes of what passes, by a grid over each start and another over what it finds."""
+    """Return the boxes of what passes, by a grid over each start and another over what that finds."""
     coarse = look(lens, places, starts)
     few = [k for k, box in enumerate(coarse) if box is None or box.points < FEW]
-    # A small stop may lie between the points of the grid: refine where light passes the open one.
+    # A small stop may lie between the points of the grid, so look again where light passes the open stop.
     wide = look(lens.with_stop_radius(math.inf), [places[k] for k in few], [starts[k] for k in few])
     lit = [(k, box) for k, box in zip(few, wide, strict=True) if box]
     closer = look(lens, [places[k] for k, _ in lit], [box for _, box in lit])
@@ -321,10 +334,10 @@ def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> l
 
 @lru_cache(maxsize=16)
 def image_radius_mm(lens: Lens) -> tuple[float, str]:
-    """Return the radius of the lit film, and where it comes from.
+    """Return the radius (mm) of the lit film, and where it comes from.
 
-    The file's own; else f tan(half field) below 60 degrees; beyond, the film radius whose mean passing ray leaves at
-    the half field; else where the relative illumination falls to 10%.
+    It is the file's own; else f tan(half field) below 60 degrees, and beyond the film radius whose mean passing ray
+    leaves at the half field; else where the relative illumination falls to 10%.
     """
     if lens.image_radius_mm is not None:
         return lens.image_radius_mm, "the lens file"
@@ -342,7 +355,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
     known = _illumination(lens, radii[coarse], points)
 
     def last(holds: Callable[[Array, Array], NDArray[np.bool_]]) -> float:
-        """The last radius at which a statement about illumination and angle holds: coarse steps, then those between."""
+        """Return the last radius at which a test of illumination and angle holds, by coarse steps, then fine ones."""
         from_ = int(coarse[holds(*known)].max())
         closer = np.arange(from_, min(from_ + _COARSE, len(radii)))
         return float(radii[closer[holds(*_illumination(lens, radii[closer], points))]].max())
@@ -357,11 +370,11 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
 
 
 def _illumination(lens: Lens, radii: Array, points: int = 48) -> tuple[Array, Array]:
-    """Return the relative film irradiance (any unit) and mean angle (rad) of the passing rays at each film radius."""
+    """Return film irradiance (in any unit) and mean angle (rad) of the passing rays at each film radius."""
     film_z = lens.film_z_mm if lens.film_z_mm is not None else float(lens.vertices_mm[-1])
     rear, rear_z = rear_opening_mm(lens, film_z)
     grid = np.linspace(-rear, rear, points)
-    # The half above the axis stands for both.
+    # By symmetry the half above the axis stands for both.
     film, px, py = (t.reshape(-1) for t in np.meshgrid(radii, grid, grid[points // 2 :], indexing="ij"))
     rays = camera_rays(film, 0 * film, film_z, px, py, rear_z)
     found = follow(lens, rays, lens.reference_nm)
@@ -372,10 +385,10 @@ def _illumination(lens: Lens, radii: Array, points: int = 48) -> tuple[Array, Ar
 
 
 def rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
-    """Return the radius and z of the disc through which light comes to the film: the last rim.
+    """Return the radius and z (mm) of the disc through which light comes to the film: the last rim.
 
-    Of a cover glass that all but lies on the film the light of one film point fills a speck; then it is the rim before,
-    so much wider as the plates between shift rays.
+    On a cover glass that all but lies on the film, the light of a film point fills only a speck. Then it is the rim
+    before that, made wider by as much as the plates between shift rays.
     """
     last, shift = len(lens.surfaces) - 1, 0.0
     while last > 1 and film_z - float(lens.vertices_mm[last]) < _CLOSE * lens.surfaces[last].semi_diameter_mm:

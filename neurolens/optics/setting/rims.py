@@ -1,9 +1,10 @@
-"""Rims: checks that surfaces are clear of each other inside them, and diameters by a stated rule for tables without.
+"""Rims: checks that surfaces do not touch inside them, and a rule for the diameters of tables without any.
 
-The rule: the stop is as wide as the f-number asks; every other rim lets through the whole beam of the axis, and of a
-field the rays whose height in the stop is within a share of the stop's radius that falls linearly from 1 on the axis to
-`vignetting` at the edge of the field. To that comes a clear edge. Where neighbours would touch inside their rims, they
-are shrunk to the height where they meet. Rays are real ones, d line, object at infinity; a zoom counts all its states.
+By the rule, the stop is as wide as the f-number asks. Every other rim lets through the whole beam of the axis; of a
+field it lets through the rays whose height in the stop is within a share of the stop's radius, which falls linearly
+from 1 on the axis to `vignetting` at the edge of the field. A clear edge is added. Where neighbours would touch inside
+their rims, the rims are narrowed to the height where they meet. Rays are real ones of the d line, with the object at
+infinity; of a zoom all states count.
 """
 
 from __future__ import annotations
@@ -18,25 +19,25 @@ from neurolens.optics.lens.paraxial import first_order, stop_radius_mm
 from neurolens.optics.lens.prescription import Configuration, Lens, Surface, same_medium
 from neurolens.optics.trace.shapes import sag_mm
 
-TOUCH_MM = 1e-6  # edge contact is common in patents; only rounding is forgiven
-_FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the ends
-_HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through
+TOUCH_MM = 1e-6  # patents often have elements in contact at the edge; only as much as rounding is forgiven
+_FIELDS = 17  # from the axis to the edge; rims are usually widest for one of the two
+_HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # heights in the stop, as shares of what the rule lets through
 _STEP_MM = 1e-3  # diameters are given to a micrometre
 _STEPS = 64
-_ROUNDS = 12  # rims of aspheres settle in 2 to 4
+_ROUNDS = 12  # at most: rims of aspheres settle in 2 to 4
 
 
 def end_mm(surface: Surface) -> float:
-    """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
+    """Return the distance from the axis at which a surface's conic ends (a sphere's radius); inf where it goes on."""
     sections = [(float(surface.radius_mm), float(surface.figure.conic)), surface.figure.across or (math.inf, 0.0)]
     return min(abs(r) / math.sqrt(1 + (k or 0.0)) if (k or 0.0) > -1 else math.inf for r, k in sections)
 
 
 def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
-    """Raise for figures that no lens has, whose squares and inverses would overflow; a NaN is not yet known.
+    """Raise for figures that no lens has, whose squares and inverses would overflow; a NaN counts as not yet known.
 
     Raises:
-        InputError: names the file, the zoom state if there is one, the surface and the figure.
+        InputError: the error names the file, the zoom state if there is one, the surface and the figure.
     """
     for k, s in enumerate(surfaces):
         if s.figure.power and any(t.n_d != 1 or t.glass for t in surfaces[max(k - 1, 0) : k + 1]):
@@ -58,14 +59,14 @@ def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> No
 
 
 def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
-    """Raise as `check_figures`, for rims beyond the radius of curvature, and for neighbours that overlap inside theirs.
+    """Raise as `check_figures` does, and for rims wider than their sphere and neighbours that overlap inside theirs.
 
-    The gap between two spheres is monotone from the axis outwards, so that axis and the smaller of the two rims
-    decide; other shapes are also tested in between. A stop that bends nothing may lie inside an element beside which
-    it is listed; what stands on both sides of it must be clear of each other.
+    The gap between two spheres is monotone from the axis outwards, so that the axis and the smaller of the two rims
+    decide; other shapes are tested in between, too. A stop that bends nothing may lie inside an element next to it in
+    the list; the surfaces on both sides of it must then be clear of each other.
 
     Raises:
-        InputError: names the file, the zoom state if there is one, the surface and by how much.
+        InputError: the error names the file, the zoom state if there is one, the surface and by how much.
     """
     check_figures(surfaces, file, state)
     for k, s in enumerate(surfaces):
@@ -83,14 +84,14 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
 
 
 def check_states(lens: Lens) -> None:
-    """Raise for rims beyond their sphere and surfaces that overlap, in the table and in every state of it."""
+    """Raise for rims wider than their sphere and for surfaces that overlap, in the table and in each of its states."""
     check_clearance(lens.surfaces, lens.path)
     for c in lens.configurations:
         check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, lens.path, f'configuration "{c.name}", ')
 
 
 def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[float, float]:
-    """The smallest gap between two surfaces inside the smaller of their rims, and its distance from the axis, mm."""
+    """The smallest gap (mm) between two surfaces inside the smaller of their rims, and its distance from the axis."""
     rim = min(before.semi_diameter_mm, after.semi_diameter_mm)
     steps = 1 if before.figure.plain and after.figure.plain else 32
     azimuths = [(1.0, 0.0), (0.0, 1.0)] if before.figure.axis or after.figure.axis else [(1.0, 0.0)]
@@ -105,7 +106,7 @@ def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[flo
 
 
 def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
-    """Pairs of surfaces that may collide, a stop that bends nothing aside, with the distance of their vertices."""
+    """Yield pairs of surfaces that may collide, with their vertices' distance, but no stop that bends nothing."""
     idle = [s.stop and same_medium(surfaces, k) for k, s in enumerate(surfaces)]
     for k in range(len(surfaces) - 1):
         if not idle[k] and not idle[k + 1]:
@@ -117,13 +118,14 @@ def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
 
 @dataclass(frozen=True)
 class RimRule:
-    """The rule by which rims are derived.
+    """Holds the numbers of the rule by which rims are derived.
 
     Attributes:
-        vignetting: share of the stop's height that is kept at the edge of the field, above 0, at most 1. Of 99 primes
-            computed and measured light wide open agree in the median with 0.5 (experiments/results/photographs.md).
-        clear_edge: what a rim is wider than the rays need, relative to its diameter.
-        half_field_deg: edge of the field; None: that of the lens or of its image circle.
+        vignetting: the share of the stop's height that is kept at the edge of the field, above 0 and at most 1. The
+            default is where computed and measured light of 99 primes, wide open, agree in the median
+            (experiments/results/photographs.md).
+        clear_edge: by how much a rim is wider than the rays need, as a share of its diameter.
+        half_field_deg: edge of the field; None takes that of the lens or of its image circle.
     """
 
     vignetting: float = 0.5
@@ -133,13 +135,14 @@ class RimRule:
 
 @dataclass(frozen=True)
 class Rim:
-    """One row of the result; full diameters in mm.
+    """One row of the result of `derive_rims`; full diameters, in mm.
 
     Attributes:
-        tabled_mm: of the lens as it was given.
-        axis_mm, field_mm: what the beam of the axis and those of the field need, before the clear edge.
+        surface: its index.
+        tabled_mm: the diameter of the lens as it was given.
+        axis_mm, field_mm: what the beam of the axis and those of the field need, without the clear edge.
         derived_mm: the diameter taken.
-        trimmed: whether a neighbour left less room than the rays need.
+        trimmed: whether a neighbour leaves less room than the rays need.
     """
 
     surface: int
@@ -151,10 +154,10 @@ class Rim:
 
 
 def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim]]:
-    """Return the lens with derived rims (marked `rims = "derived"`) and stops, and how they compare with those it had.
+    """The lens with derived stops and rims (`rims` is then "derived"), and how the rims compare with the old ones.
 
     Raises:
-        InputError: a rule out of range, a lens without a stated field, a lens with cylinders, a field that no ray
+        InputError: a rule out of range, a lens without a stated field, a lens with cylinders, or a field that no ray
             through the middle of the stop reaches.
     """
     rule = rule or RimRule()
@@ -189,9 +192,10 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
 
 
 def narrowed_rims(lens: Lens) -> Lens:
-    """Return the lens with rims, but never the stop's, narrowed to where spheres end and neighbours touch in any state.
+    """Return the lens with its rims narrowed to where spheres end and where neighbours touch in any state.
 
-    Rims of surfaces whose vertices lie in the wrong order stay: no width helps, and the check of clearance says so.
+    The stop keeps its rim. So do surfaces whose vertices lie in the wrong order: no width helps them, and
+    `check_clearance` says so.
     """
     states = [lens, *(lens.with_gaps(dict(c.thickness_mm)) for c in lens.configurations)]
     ends = [s.diameter_mm if s.stop else min(s.diameter_mm, _end_mm(s)) for s in lens.surfaces]
@@ -204,10 +208,10 @@ def narrowed_rims(lens: Lens) -> Lens:
 
 
 def with_derived_rims(lens: Lens) -> Lens:
-    """Return the lens with a diameter wherever it has none (NaN), by the rule as it is; given ones stay.
+    """Return the lens with a diameter wherever it has none (NaN), by the rule's defaults; given ones stay.
 
     Raises:
-        InputError: as `derive_rims`, and where no field is stated.
+        InputError: what `derive_rims` raises, and where no field is stated.
     """
     missing = ", ".join(str(k) for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm))
     if lens.half_field_deg is None and lens.image_radius_mm is None:
@@ -217,7 +221,8 @@ def with_derived_rims(lens: Lens) -> Lens:
         lens = lens.with_stop_radius(stop_radius_mm(lens, lens.f_number))
     if not any(s.figure.powers and math.isnan(s.diameter_mm) for s in lens.surfaces):
         return replace(_filled(lens, derive_rims(lens)[0]), rims="derived")
-    # Figures of aspheres are followed little beyond a rim: from the rims of their vertex spheres, until they stay.
+    # Figures of aspheres hold little beyond a rim. So start from the rims of their vertex spheres, and repeat until the
+    # rims stay.
     radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)
     figures = (s.figure if s.figure.power else SPHERE for s in lens.surfaces)
     rows = (replace(s, radius_mm=r, figure=f) for s, r, f in zip(lens.surfaces, radii, figures, strict=True))
@@ -236,7 +241,7 @@ def _filled(lens: Lens, other: Lens) -> Lens:
 
 
 def half_field_deg(lens: Lens) -> float:
-    """Return the half field of a lens: its own, or that of its image circle by r = f tan(field).
+    """Return the half field (degrees) of a lens: its own, or that of its image circle by r = f tan(field).
 
     Raises:
         InputError: neither is stated.
@@ -249,7 +254,7 @@ def half_field_deg(lens: Lens) -> float:
 
 
 def _states(lens: Lens) -> Iterator[Lens]:
-    """Return the table and every zoom state of the lens with the stop of its f-number."""
+    """Yield the table and every zoom state of the lens, each with the stop of its f-number."""
     yield lens.with_stop_radius(round(stop_radius_mm(lens, lens.f_number), 5))
     for c in lens.configurations:
         if c.object_distance_mm is None:
@@ -263,9 +268,10 @@ def _moved(lens: Lens, c: Configuration) -> Lens:
 
 
 def _stop_of(lens: Lens, c: Configuration) -> float:
-    """Return the diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop.
+    """Return the diameter of the stop in a state.
 
-    A state without f-number and stop has that of the table.
+    A focus state has the stop of the zoom state with the same tabled stop; a state with neither f-number nor stop has
+    that of the table.
     """
     if c.object_distance_mm is not None:
         same = [z for z in lens.configurations if z.object_distance_mm is None]
@@ -278,8 +284,8 @@ def _stop_of(lens: Lens, c: Configuration) -> float:
 
 
 def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], list[float]]:
-    """Return the semi-diameters that the beam of the axis and those of the field need at every surface, mm."""
-    import torch  # rays are traced; rims are narrowed without it
+    """Return the semi-diameters (mm) that the beams of the axis and of the field need at every surface."""
+    import torch  # only rays need it; rims are narrowed without
 
     from neurolens.optics.trace.aiming import aim_at_stop, without_rims
     from neurolens.optics.trace.rays import trace
@@ -291,7 +297,7 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
     if not bundle.reached[:, len(_HEIGHTS) // 2].all():
         widest = math.degrees(float(bundle.field_rad[-1, len(_HEIGHTS) // 2]))
         expected = f"at most {widest:.3g}, where the chief ray ends"
-        if not 0 < widest < field_deg:  # a chief ray that turns back gives no limit
+        if not 0 < widest < field_deg:  # a chief ray that turns back sets no limit
             expected = "a field whose chief ray meets the middle of the stop: none does (a wrong radius or thickness?)"
         raise InputError(lens.path, "half_field_deg", field_deg, expected)
     every = range(len(lens.surfaces))
@@ -303,12 +309,12 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
 
 
 def _end_mm(surface: Surface) -> float:
-    """Return the widest diameter, just inside where the surface's conic ends."""
+    """Return the widest diameter of a surface, just inside where its conic ends."""
     return 2 * end_mm(surface) * (1 - 1e-9)
 
 
 def _clear_of_neighbours(states: Sequence[Lens], diameters: Sequence[float]) -> list[float]:
-    """Diameters shrunk so that in no state two neighbours overlap inside the smaller of their rims; never the stop."""
+    """Return diameters so narrowed that in no state neighbours overlap inside their rims; the stop keeps its own."""
     found = list(diameters)
     for state in states:
         for k, after, gap in neighbours(state.surfaces):
@@ -324,7 +330,7 @@ def _clear_of_neighbours(states: Sequence[Lens], diameters: Sequence[float]) -> 
 
 
 def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: float) -> tuple[int, ...]:
-    """Choose of two surfaces that meet at height h the one whose flat, ground from there outwards, clears the other."""
+    """Choose, of two surfaces that meet at height h, the one that clears the other if it ends in a flat there."""
 
     def slope(s: Surface) -> float:
         return sag_mm(s, h, 0.0) - sag_mm(s, 0.99 * h, 0.0)
@@ -335,7 +341,7 @@ def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: flo
 
 
 def _meeting_height(before: Surface, after: Surface, gap: float, limit: float) -> float:
-    """Return the distance from the axis, up to `limit`, at which two surfaces first meet, mm."""
+    """Return the distance (mm) from the axis, at most `limit`, at which two surfaces first meet."""
 
     def clear(h: float) -> bool:
         return gap + sag_mm(after, h, 0.0) - sag_mm(before, h, 0.0) >= 0

@@ -131,7 +131,7 @@ def _set_for(lens: Lens, shot: Shot) -> Lens:
 
 
 def state_named(lens: Lens, name: str) -> Configuration:
-    """Return the zoom or focus state of that name; an error lists those of the file."""
+    """Return the zoom or focus state of that name; the error of an unknown one lists those of the file."""
     for c in lens.configurations:
         if c.name == name:
             return c
@@ -140,7 +140,7 @@ def state_named(lens: Lens, name: str) -> Configuration:
 
 
 def in_state(lens: Lens, state: Configuration) -> Lens:
-    """Return the lens with the thicknesses, stop, field and f-number of a state as the source gives them."""
+    """Return the lens with the thicknesses, stop, field and f-number that the source gives a state."""
     near = state.object_distance_mm is not None
     start = gaps_mm(lens, zoom_state_of(lens, state) if near else None)
     moved = lens.with_gaps(start | dict(state.thickness_mm))
@@ -158,7 +158,7 @@ def in_state(lens: Lens, state: Configuration) -> Lens:
 
 
 def _f_number_in(lens: Lens, state: Configuration) -> float:
-    """Nominal f-number of a state: its own, else that of the zoom state which it focuses, else the lens's."""
+    """Return the nominal f-number of a state: its own, that of the zoom state that it focuses, or the lens's."""
     if state.f_number is None and state.object_distance_mm is not None:
         focused = zoom_state_of(lens, state)
         return lens.f_number if focused is None or focused.f_number is None else focused.f_number
@@ -187,8 +187,8 @@ def _check(
 
 
 def _factor_for_field(lens: Lens, field_deg: float) -> float:
-    """Scale at which the chief ray of half the field meets the edge of the image circle, at infinity focus."""
-    import torch  # chief rays are aimed by it; nothing else here takes it
+    """Return the scale at which, at infinity focus, the chief ray of half the field meets the image circle's edge."""
+    import torch  # aims the chief ray; nothing else here needs it
 
     from neurolens.optics.trace.aiming import aim_at_stop
     from neurolens.optics.trace.rays import trace
@@ -208,8 +208,8 @@ def _factor_for_field(lens: Lens, field_deg: float) -> float:
     return radius / height
 
 
-MOVES = 0.02  # a group moves whose travel is above this share of the largest travel
-_STATED = 1e-6  # a focal length this near to a state's, as stated or as computed, is the state's
+MOVES = 0.02  # a group counts as moving where its travel is above this share of the largest
+_STATED = 1e-6  # a focal length is a state's, as stated or as computed, where it differs by less than this share
 _ROUNDS = 40
 
 Vector = NDArray[np.float64]
@@ -217,8 +217,12 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _State:
-    """A zoom state of the source: focal length as computed, and `places`, the distances of the groups' fronts from the
-    film (paraxial image), scene to film, one more than the gaps.
+    """A zoom state of the source, with the places of its groups.
+
+    Attributes:
+        efl_mm: focal length as computed.
+        places: distances of the groups' fronts from the film (paraxial image), from scene to film; one more than the
+            gaps.
     """
 
     source: Configuration
@@ -229,8 +233,8 @@ class _State:
 def zoomed(lens: Lens, efl_mm: float) -> Lens:
     """Return the lens at infinity focus, zoomed to a focal length between those of its states.
 
-    At the focal length of a state, stated or computed, it is that state. Else its `derived` says between which states
-    it lies; stop, field and nominal f-number are interpolated too.
+    At the focal length of a state, stated or computed, it is that state. Elsewhere stop, field and nominal f-number are
+    interpolated too, and `derived` tells between which states the lens lies.
 
     Raises:
         InputError: fewer than two states, a focal length beyond theirs, or groups that would collide on the way.
@@ -273,13 +277,13 @@ def _states(lens: Lens) -> list[_State]:
 
 
 def _varying_gaps(lens: Lens) -> list[int]:
-    """Return the surfaces behind which a zoom state sets the gap, but the last, whose gap ends at the film."""
+    """Return the surfaces behind which zoom states set the gap; not the last surface, whose gap ends at the film."""
     last = len(lens.surfaces) - 1
     return sorted({k for c in infinity_states(lens) for k, _ in c.thickness_mm} - {last})
 
 
 def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) -> Vector:
-    """Places of the groups with this focal length and the paraxial image on the film: Gauss-Newton, least moves."""
+    """The groups' places for this focal length, the paraxial image on the film, by Gauss-Newton with least moves."""
     x = [math.log(s.efl_mm) for s in states]
     target = min(max(math.log(efl_mm), x[0]), x[-1])
     known = np.array([s.places for s in states])
@@ -319,14 +323,14 @@ def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
         return unit
     if moving.sum() == 2:
         return np.asarray(unit[moving])
-    # The first varying gap is kept: what bounds it moves together, or stands still if one of the two does.
+    # The first varying gap is kept: the two groups beside it move together, or stand still if one of them does.
     together = [unit[kept] + unit[kept + 1]] if moving[kept] and moving[kept + 1] else []
     others = [unit[j] for j in np.flatnonzero(moving) if j not in (kept, kept + 1)]
     return np.array(together + others)
 
 
 def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:
-    """Return the stop, half field (by the image's height) and nominal f-number between those of the states that say."""
+    """Return the lens with stop, half field (by image height) and nominal f-number between those of stating states."""
     x = [math.log(s.efl_mm) for s in states]
     place = min(max(math.log(efl_mm), x[0]), x[-1])
 

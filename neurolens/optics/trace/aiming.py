@@ -1,9 +1,10 @@
-"""Rays from a field angle through given points of the stop, found from the stop outwards.
+"""Finds the rays of a field angle that pass given points of the stop, from the stop outwards.
 
-Searching the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief
-ray enters centimetres beside the paraxial pupil). From the stop every start is a ray that exists: its angle in the
-scene usually grows with its angle at the stop, and the wanted field is bracketed from the axis outwards. Where rays are
-lost in between or turn back, the first ray of that field counts: that of the axis's own branch where there is one.
+A search on the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief
+ray enters centimetres beside the paraxial pupil). From the stop, every start is a ray that exists. Its angle in the
+scene usually grows with its angle at the stop, so the wanted field is bracketed from the axis outwards. Where rays are
+lost in between or turn back, the first ray of that field counts: the one on the branch that starts at the axis, where
+that has one.
 """
 
 from __future__ import annotations
@@ -22,20 +23,21 @@ from neurolens.optics.trace.surfaces import Rays
 
 Axis = Literal["x", "y"]
 
-_WIDEST_DEG = 89.9  # of the angles tried at the stop
-_GRID = 721  # odd, so that the axis is included; a step of a quarter of a degree
-_ZOOM, _ROUNDS = 17, 4  # each round narrows the bracket 16 times, until a straight line has the last digit
-_JUMP = 1.0  # rad of field between neighbours in the search: more is a jump, such as to the other side of the axis
-_MET = 1e-7  # rad from the wanted field
+_WIDEST_DEG = 89.9  # widest of the angles that are tried at the stop
+_GRID = 721  # angles tried: an odd number includes the axis, and a step is a quarter of a degree
+_ZOOM, _ROUNDS = 17, 4  # each round narrows the bracket 16 times, until a straight line is exact to the last digit
+_JUMP = 1.0  # rad: fields of neighbours that differ by more belong to two branches, as on two sides of the axis
+_MET = 1e-7  # rad from the wanted field that count as meeting it
 
 
 class Bundle(NamedTuple):
-    """Rays from infinity to points of the stop.
+    """Holds rays from infinity to points of the stop.
 
     Attributes:
-        rays: [F * H], just before the front surface, travelling to the film; field by field.
-        reached: [F, H] bool; where False the ray is that of the nearest field from which this point is reached.
-        field_rad: [F, H], angle of the ray to the axis in front of the lens.
+        rays: [F * H], field by field, just before the front surface and travelling to the film.
+        reached: [F, H] bool; where False, the field does not reach this point, and the ray is of the nearest field that
+            does.
+        field_rad: [F, H], angle between the ray and the axis in front of the lens.
     """
 
     rays: Rays
@@ -44,7 +46,7 @@ class Bundle(NamedTuple):
 
 
 def without_rims(lens: Lens) -> Lens:
-    """Return the lens with every surface, the stop too, open as far as it goes; aspheres continue beyond their rims."""
+    """Return the lens with every surface and the stop as wide as they exist; aspheres continue beyond their rims."""
     ends = (followed_mm(s) if s.figure.powers else math.inf for s in lens.surfaces)
     rows = (replace(s, diameter_mm=math.inf, followed_mm=end) for s, end in zip(lens.surfaces, ends, strict=True))
     return replace(lens, aperture=None, surfaces=tuple(rows))
@@ -53,14 +55,14 @@ def without_rims(lens: Lens) -> Lens:
 def aim_at_stop(
     lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float | None = None
 ) -> Bundle:
-    """Return the meridional rays of collimated light that cross the stop at given heights, rims ignored.
+    """Return the meridional rays of collimated light that cross the stop at given heights; rims are ignored.
 
     Args:
-        field_rad: [F] angles to the axis, from 0 to below pi. The light comes from the positive side of `axis`, and
-            its image lies on the negative side.
+        field_rad: [F] angles to the axis, from 0 to below pi. The light comes from the positive side of `axis`, and its
+            image lies on the negative side.
         height_mm: [F, H] heights in the stop, along `axis`.
-        axis: the meridional plane, for anamorphic lenses.
-        wavelength_nm: that of reference of the lens where none is given.
+        axis: the meridional plane, which matters for anamorphic lenses.
+        wavelength_nm: None takes the lens's reference wavelength.
     """
     front = without_rims(replace(lens, surfaces=lens.surfaces[: lens.stop_index + 1]))
     nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
@@ -86,9 +88,9 @@ def aim_at_stop(
 
 
 def _axial(angle: Tensor, field: Tensor, exists: Tensor) -> Tensor:
-    """Return the index [n] of the last angle [G] before the ray that is parallel to the axis in the scene.
+    """Return the index [n] of the last angle [G] before the ray that leaves the lens parallel to the axis.
 
-    Of several such rays the one that is least inclined at the stop is meant: others graze the lens's edges.
+    Of several such rays, the one least inclined at the stop is meant: the others graze the edges of the lens.
     """
     rises = _joined(field, exists) & (field[:, :-1] < 0) & (field[:, 1:] >= 0)
     inclined = torch.where(rises, (angle[:-1] + angle[1:]).abs(), math.inf)
@@ -97,24 +99,31 @@ def _axial(angle: Tensor, field: Tensor, exists: Tensor) -> Tensor:
 
 
 def _joined(value: Tensor, exists: Tensor, jump: float = _JUMP) -> Tensor:
-    """Test whether neighbours [n, G - 1] both exist and are of one branch."""
+    """Test whether neighbours [n, G - 1] both exist and belong to one branch."""
     return exists[:, 1:] & exists[:, :-1] & ((value[:, 1:] - value[:, :-1]).abs() < jump)
 
 
 def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
-    """Return the distances of fields [n, G] from their targets [n], inf where there is no ray."""
+    """Return the distances of fields [n, G] from their targets [n]; inf where there is no ray."""
     return torch.where(exists, (field - target[:, None]).abs(), math.inf)
 
 
 def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: float = _JUMP) -> Tensor:
-    """Find the first neighbours among increasing angles [n, G] whose values lie on both sides of a target [n]: [n, 3].
+    """Find, among increasing angles [n, G], the first two neighbours whose values lie on both sides of a target [n].
 
-    Else the neighbours of the ray whose value is nearest to it, between which rays may come nearer yet. In the middle
-    of the three stands the angle at which the straight line between the values of the others meets the target.
+    Where there are none, they are the neighbours of the ray whose value is nearest, since rays between them may come
+    nearer still.
 
     Args:
-        value: [n, G] of the ray of each angle. exists: [n, G], whether there is such a ray.
-        jump: values of neighbours that differ by more are of two branches, between which there is nothing.
+        angle: [n, G], increasing.
+        value: [n, G], of the ray of each angle.
+        exists: [n, G], whether there is such a ray.
+        target: [n].
+        jump: values of neighbours that differ by more belong to two branches, with nothing in between.
+
+    Returns:
+        [n, 3]: the two angles, and between them the one at which the straight line through their values meets the
+        target.
     """
     above = value >= target[:, None]
     crosses = _joined(value, exists, jump) & (above[:, 1:] != above[:, :-1])
@@ -128,7 +137,7 @@ def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: 
 
 
 def between(ends: Tensor) -> Tensor:
-    """Return the angles [n, 17] from the first to the last of `bracket`, for the next closer look."""
+    """Return the 17 angles [n, 17] of the next closer look, from the first to the last of those of `bracket`."""
     return ends[:, :1] + (ends[:, 2:] - ends[:, :1]) * torch.linspace(0, 1, _ZOOM, dtype=torch.float64)
 
 
@@ -138,14 +147,16 @@ def from_stop(
     """Trace from the stop to the scene; return the reversed rays [n * G], their field angles and existence [n, G].
 
     Args:
-        front: the lens up to its stop, without rims. height, angle: [n, G] in the stop.
+        front: the lens up to its stop, without rims.
+        height, angle: where the rays start in the stop, and at what angle, [n, G].
     """
     stop, z = front.surfaces[-1], float(front.vertices_mm[-2])
     h, a = height.reshape(-1), angle.reshape(-1)
     known = {float(v): sag_mm(stop, float(v), 0.0) if axis == "x" else sag_mm(stop, 0.0, float(v))
              for v in torch.unique(h)}  # fmt: skip
     sag = torch.tensor([known[float(v)] for v in h[:: angle.shape[1]]], dtype=torch.float64)
-    # The ray starts a millimetre before the stop's surface, so that this too is met and refracts where it is glass.
+    # The ray starts a millimetre before the stop's surface, so that it meets this too, and is refracted where it is
+    # glass.
     across, along = torch.sin(a), -torch.cos(a)
     x, zero = h - across, torch.zeros_like(h)
     start_z = z + sag.repeat_interleave(angle.shape[1]) - along
@@ -154,6 +165,6 @@ def from_stop(
         out = trace(front, start, wavelength_nm)
     r = out.rays
     field = torch.atan2(r.dx if axis == "x" else r.dy, -r.dz)
-    # Reversed and moved back, so that the front surface is still ahead.
+    # The rays are reversed and moved back, so that the front surface is still ahead of them.
     back = Rays(r.x + r.dx, r.y + r.dy, r.z + r.dz, -r.dx, -r.dy, -r.dz)
     return back, field.reshape(angle.shape), (out.status == 0).reshape(angle.shape)

@@ -1,7 +1,8 @@
 """The operations in which a surface step is written, so that one text serves tensors, numpy arrays and graphs.
 
-Operators (+ - * / and comparisons) mean the same in all three. `Arithmetic` names the rest. Torch's fused and guarded
-forms are in `tensors`; the methods here serve numpy arrays and, overridden in `Graphs`, the values of a graph.
+Operators (+ - * / and comparisons) mean the same in all three; `Arithmetic` names the other operations. Its own methods
+serve numpy arrays, `Graphs` overrides them for the values of a graph, and `tensors` for torch, in fused and guarded
+forms.
 """
 
 from __future__ import annotations
@@ -14,36 +15,36 @@ import numpy as np
 
 from neurolens.graph.ir import Graph, Value
 
-# The least number under a square root. What must be positive is tested to be at least this.
+# The least number that a root is taken of. What must be positive is tested to be at least this.
 TINY = 1e-30
 
 
 def is_number(value: Any) -> bool:
-    """Test whether a value is a plain number, which is folded into the operations around it."""
+    """Test whether a value is a plain number, which can be folded into the operations around it."""
     return isinstance(value, int | float)
 
 
 def times(a: Any, k: Any) -> Any:
-    """a k, without an operation where k is the number 1 or -1."""
+    """Return a k, without an operation where k is the number 1 or -1."""
     if is_number(k) and k in (1, -1):
         return a if k == 1 else -a
     return a * k
 
 
 class Arithmetic:
-    """Numpy's arithmetic: NaN is what a root of a negative number gives, and tests fail for it.
+    """Numpy's arithmetic: the root of a negative number is NaN, and NaN fails every test.
 
     Attributes:
-        guard: whether rays that are lost stay finite, which derivatives and recorded crossings need.
-        finite: whether rays that are totally reflected stay finite; they do where lost rays are guarded.
-        polish: steps of an iteration after the one that decides whether it has converged.
+        guard: whether lost rays stay finite, which derivatives and recorded crossings need.
+        finite: whether totally reflected rays stay finite; where `guard` is set, they do anyway.
+        polish: how many steps an iteration takes after the one that decides whether it has converged.
     """
 
     guard = finite = False
     polish = 2
 
     def fma(self, a: Any, b: Any, c: Any, k: Any = 1) -> Any:
-        """a b k + c, where b and k may be numbers."""
+        """Return a b k + c, where b and k may be numbers."""
         if is_number(b):
             b, k = k, b
         if is_number(k) and k == 0:
@@ -53,7 +54,7 @@ class Arithmetic:
         return times(times(a, k), b) + c
 
     def add_to(self, c: Any, a: Any, b: Any, k: Any = 1) -> Any:
-        """a b k + c, which may overwrite c."""
+        """Return a b k + c, which may overwrite c."""
         return self.fma(a, b, c, k)
 
     def dot(self, a: Sequence[Any], b: Sequence[Any]) -> Any:
@@ -64,23 +65,23 @@ class Arithmetic:
         return total
 
     def root(self, square: Any, finite: bool = False) -> Any:
-        """Return the square root; NaN for negative numbers, unless it is to be `finite` or lost rays are guarded."""
+        """Return the square root; NaN for a negative number, unless it shall be `finite` or lost rays are guarded."""
         return np.sqrt(square)
 
     def held_root(self, square: Any, least: float = TINY) -> Any:
-        """Return the square root of a number, or of the least one where it is less."""
+        """Return the square root of a number, or that of `least` where the number is less."""
         return np.sqrt(np.maximum(square, least))
 
     def inverse_root(self, square: Any) -> Any:
-        """1 / square root."""
+        """Return 1 / square root."""
         return 1.0 / np.sqrt(square)
 
     def positive(self, value: Any) -> Any:
-        """Return a divisor. With guards it is 1 where it is not positive."""
+        """Return a value as a divisor: with guards, 1 where it is not positive."""
         return value
 
     def nonzero(self, value: Any) -> Any:
-        """Return a divisor of either sign. With guards it is 1 where its square is 0."""
+        """Return a value as a divisor of either sign: with guards, 1 where its square is 0."""
         return value
 
     def least(self, a: Any, b: Any) -> Any:
@@ -88,27 +89,27 @@ class Arithmetic:
         return np.minimum(a, b)
 
     def abs(self, value: Any) -> Any:
-        """Return the size of a value."""
+        """Return the absolute value."""
         return np.abs(value)
 
     def select(self, low: Any, high: Any, then: Any, otherwise: Any) -> Any:
-        """`then` where low <= high, else `otherwise`, also for NaN."""
+        """Return `then` where low <= high, else `otherwise`, which NaN gives too."""
         return np.where(low <= high, then, otherwise)
 
     def fixed(self, value: Any) -> Any:
-        """Return the value as a constant: derivatives are not taken through it."""
+        """Return the value as a constant, through which no derivative is taken."""
         return value
 
     def constant(self) -> AbstractContextManager[Any]:
-        """Return a context in which derivatives are not followed."""
+        """Return a context in which no derivatives are followed."""
         return nullcontext()
 
     def like(self, value: Any, number: Any) -> Any:
-        """Return a number in the form of a value."""
+        """Return a number in the form that a value has."""
         return np.full_like(value, number)
 
     def horner(self, x: Any, coefficients: Sequence[Any]) -> Any:
-        """Return the polynomial of these coefficients, lowest power first."""
+        """Return the polynomial in x with these coefficients, lowest power first."""
         total: Any = coefficients[-1]
         for c in coefficients[-2::-1]:
             total = total * x + c
@@ -125,9 +126,10 @@ class Arithmetic:
 
 
 class Graphs(Arithmetic):
-    """The arithmetic of a graph's values.
+    """The arithmetic that adds operations to a graph.
 
     Args:
+        graph: the graph whose values these are.
         double: whether the graph will run in double precision, for which iterations are polished.
         guard, finite: as in `Arithmetic`.
     """

@@ -1,6 +1,6 @@
-"""Rays followed as numpy arrays in float64: all that setting a lens and searching its pupil need, without torch.
+"""Rays traced as numpy arrays in float64, without torch: all that setting a lens and searching its pupil need.
 
-The surfaces and their tests are those of the tracer (`surfaces`); derivatives, power and recorded paths are `rays`'.
+Surfaces and their tests are those of the tracer (`surfaces`); only `rays` follows derivatives, power and paths.
 """
 
 from __future__ import annotations
@@ -18,15 +18,20 @@ from neurolens.optics.trace.surfaces import Hit, Rays, Test, cross, media, neare
 
 Array = NDArray[np.float64]
 
-UNIT_SLACK = 1e-3  # how far the squared length of a direction may be from 1; float32 rounding is a thousandth of this
+UNIT_SLACK = 1e-3  # how far a direction's squared length may be from 1; float32 rounding is a thousandth of it
 _CHUNK = 8192  # rays at a time, which fit a core's cache
-_FEWER = 0.8  # of rays, below which those that are left are put together
+_FEWER = 0.8  # share of rays left, below which they are packed together
 
 
 class Followed(NamedTuple):
-    """Rays behind the last surface (lens frame, unit directions), the status of each, and where they met the stop.
+    """Holds rays behind the last surface, their status, and where they met the stop.
 
-    Of rays that are lost only the status means anything.
+    Of a lost ray only the status has a meaning.
+
+    Attributes:
+        rays: lens frame, unit directions.
+        status: of each ray, as in `neurolens.base.status`.
+        at_stop: x and y where each ray met the stop, mm.
     """
 
     rays: Rays
@@ -35,12 +40,12 @@ class Followed(NamedTuple):
 
 
 def follow(lens: Lens, rays: Rays, wavelength_nm: Any, towards: Literal["scene", "film"] = "scene") -> Followed:
-    """Follow rays [N] of one wavelength or [N] through the whole lens, as `rays.trace` does."""
+    """Follow rays [N] of one wavelength, or of [N], through the whole lens, as `rays.trace` does."""
     return _follow(lens, rays, wavelength_nm, towards == "film")
 
 
 def passing(lens: Lens, rays: Rays, wavelength_nm: float) -> NDArray[np.bool_]:
-    """Whether camera rays pass the whole lens, bool [N]; lost ones are left out of the work on later surfaces."""
+    """Test whether camera rays pass the whole lens, bool [N]; lost rays take no more work at later surfaces."""
     passed = np.zeros(len(rays.x), bool)
     for first in range(0, len(rays.x), _CHUNK):
         part = Rays(*(c[first : first + _CHUNK] for c in rays))
@@ -48,7 +53,7 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float) -> NDArray[np.bool_]:
     return passed
 
 
-@np.errstate(all="ignore")  # of lost rays
+@np.errstate(all="ignore")  # lost rays overflow and give NaN
 def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bool = False) -> Followed:
     sense, order = (1, range(len(lens.surfaces))) if to_film else (-1, range(len(lens.surfaces))[::-1])
     mediums, vertex, left = media(lens, wavelength_nm), 0.0, np.arange(len(rays.x))

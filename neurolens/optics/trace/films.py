@@ -1,16 +1,17 @@
-"""Coatings, stacks of thin films, as torch tensors: the power and the amplitudes that they transmit and reflect.
+"""Coatings, which are stacks of thin films, as torch tensors: the power and amplitudes they transmit and reflect.
 
-Powers and amplitudes follow from characteristic matrices. A lossless layer's has the form [[a, -i b], [-i c, d]] with
-real a, b, c, d and a d + b c = 1, and so has every product of them: real arithmetic suffices, which compiles well. A
-p wave is followed by its magnetic field, so that nothing is divided by a cosine that may vanish. Fields go as
-exp(-i omega t). Sources: Born and Wolf, 1.6.2; Macleod, Thin-Film Optical Filters, chapters 2, 3.
+Powers and amplitudes follow from characteristic matrices. That of a lossless layer has the form [[a, -i b], [-i c, d]]
+with real a, b, c, d and a d + b c = 1, and so has every product of them: real arithmetic suffices, which compiles well.
+A p wave is followed by its magnetic field, so that nothing is divided by a cosine that may vanish. Fields go as exp(-i
+omega t). Sources: Born and Wolf, 1.6.2; Macleod, Thin-Film Optical Filters, chapters 2 and 3.
 
-`cos_i` [N] is the cosine of incidence in [0, 1]; `n_before` and `n_after` (number or [N]) are the indices of the
-media as the light meets them; `layers` are (refractive index, thickness in nm) from the scene's side, or (n_d,
-thickness in nm, V_d), as in `prescription.Coating`; `sense` is +1 for light towards the film and -1 for light towards
-the scene; `wavelength_nm` (in vacuum) is a number or [N]. Results are [N] in the dtype of `cos_i`, differentiable,
-also with respect to layers given as 0-d tensors, and never NaN: beyond the critical angle, and for a cosine that is
-NaN, T = 0 and R = 1.
+Arguments are the same everywhere. `cos_i` [N] is the cosine of incidence, in [0, 1]. `n_before` and `n_after` (number
+or [N]) are the indices of the media in the order in which light meets them. `layers` are (refractive index, thickness
+in nm) from the scene's side, or (n_d, thickness in nm, V_d), as in `prescription.Coating`. `sense` is +1 for light
+towards the film, -1 for light towards the scene. `wavelength_nm` (in vacuum) is a number or [N].
+
+Results are [N] in the dtype of `cos_i` and never NaN: beyond the critical angle, and for a cosine that is NaN, T = 0
+and R = 1. They are differentiable, also with respect to layers given as 0-d tensors.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from neurolens.optics.trace.transmission import FLOOR, Passage, Shares, times_fi
 def coated_shares(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int, reflected: bool = False
 ) -> Shares:
-    """Return the shares that a surface transmits, or reflects with `reflected`; arguments as in `reflectance`."""
+    """Return the shares of power that a surface transmits, or with `reflected` reflects."""
     (a, b), (c, d) = power_amplitudes(cos_i, n_before, n_after, layers, wavelength_nm, sense, reflected)
     s, p = a * a + b * b, c * c + d * d
     return Shares((s + p) * 0.5, (s - p) * 0.5, a * c + b * d, b * c - a * d)
@@ -39,16 +40,21 @@ def coated_shares(
 
 Layers = Sequence[tuple[Any, ...]]
 
-# Below this square of the phase in a layer, sine and cosine are summed as series, whose derivatives keep their digits.
+# Where the squared phase in a layer is below this, sine and cosine are summed as series, whose derivatives keep their
+# digits.
 SMALL_PHASE2 = 1e-2
 
 
 class Response(NamedTuple):
-    """One polarisation: u + i v of the incident (`plus`) and the reflected (`minus`) wave that make the same wave
-    behind the stack, and the admittances around it; t = 2 before fade / plus, r = minus / plus.
+    """The response of a stack to one polarisation, for one and the same wave behind it.
 
-    `passes` tells where the wave behind is not evanescent; there `after` is its admittance, else that divided by i.
-    `fade` is the factor that kept evanescent layers from overflowing.
+    With it, t = 2 before fade / plus and r = minus / plus.
+
+    Attributes:
+        before, after: admittances around the stack; where the wave behind is evanescent, `after` is divided by i.
+        plus, minus: real and imaginary part u + i v of the incident and the reflected wave.
+        passes: where the wave behind is not evanescent.
+        fade: the factor that has kept evanescent layers from overflowing.
     """
 
     before: Tensor
@@ -62,7 +68,7 @@ class Response(NamedTuple):
 def reflectance(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1
 ) -> Tensor:
-    """Unpolarised power reflected, (Rs + Rp) / 2 in [0, 1], [N]."""
+    """Return the share of unpolarised power that is reflected, (Rs + Rp) / 2 in [0, 1], [N]."""
     (a, b), (c, d) = power_amplitudes(cos_i, n_before, n_after, layers, wavelength_nm, sense, reflected=True)
     return 0.5 * (a * a + b * b + c * c + d * d)
 
@@ -76,10 +82,10 @@ def power_amplitudes(
     sense: int = 1,
     reflected: bool = False,
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """(real, imaginary) of the s and of the p amplitude, scaled so that its squared modulus is power, each [N].
+    """Return the s and the p amplitude, each as (real, imaginary) [N], scaled so that squared moduli are powers.
 
-    Of transmission, or with `reflected` of reflection, with the signs of Born and Wolf, 1.5.2: r_p = -r_s at normal
-    incidence; s is perpendicular to the plane of incidence, p = k x s. Beyond the critical angle, t is 0.
+    They are of transmission, or with `reflected` of reflection. Signs are those of Born and Wolf, 1.5.2: r_p = -r_s at
+    normal incidence; s is perpendicular to the plane of incidence, and p = k x s. Beyond the critical angle t is 0.
     """
     s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=reflected)
     if reflected:
@@ -88,7 +94,7 @@ def power_amplitudes(
 
 
 def _over_plus(r: Response, x: Any, y: Any) -> tuple[Tensor, Tensor]:
-    """(x + i y) / plus; 0 where the incident wave vanishes (exactly grazing between equal media) or is NaN."""
+    """Return (x + i y) / plus; 0 where the incident wave vanishes (exactly grazing between equal media) or is NaN."""
     u, v = r.plus
     square = u * u + v * v
     sound = square > 0
@@ -99,7 +105,7 @@ def _over_plus(r: Response, x: Any, y: Any) -> tuple[Tensor, Tensor]:
 def _reflected_amplitude(r: Response) -> tuple[Tensor, Tensor]:
     x, y = _over_plus(r, *r.minus)
     u, v = r.plus
-    # Undefined cases count as reflected, like grazing light.
+    # Undefined cases count as reflected, as grazing light does.
     return torch.where(u * u + v * v > 0, x, -1.0), y
 
 
@@ -113,9 +119,12 @@ def _transmitted_amplitude(r: Response) -> tuple[Tensor, Tensor]:
 def _responses(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int, phase_beyond: bool
 ) -> tuple[Response, Response]:
-    """The s and the p response of the stack; `phase_beyond`: whether to compute the phase beyond the critical angle.
+    """Return the s and the p response of the stack.
 
-    q stands for n cos of the angle in each medium (the admittance of s).
+    In here q is the index times the cosine of the angle in a medium, which is the admittance of s.
+
+    Args:
+        phase_beyond: whether to compute the phase of the reflected wave beyond the critical angle, too.
     """
     q0 = n_before * cos_i
     q0_2 = q0 * q0
@@ -156,12 +165,11 @@ def _response(
 
 
 def _film(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """cos, sin / q and q sin of the phase q phase_per_q of a film, and the factor `fade` that all three contain.
+    """Return cos, sin / q and q sin of the phase q * `phase_per_q` of a film, and the factor `fade` in all three.
 
-    Through q2 = 0 they become those of evanescent waves (cosh, sinh).
-
-    cos and sin / q are entire functions of q2: there is no kink at q2 = 0, and none in the derivatives. Without the
-    factor exp(-phase) of evanescent waves a thick film would overflow.
+    Below q2 = 0 they turn into those of evanescent waves (cosh, sinh). Since cos and sin / q are entire functions of
+    q2, neither they nor their derivatives have a kink there. The factor, exp(-phase) for evanescent waves, keeps a
+    thick film from overflowing.
     """
     x = q2 * phase_per_q**2
     small = x.abs() < SMALL_PHASE2
@@ -178,7 +186,7 @@ def _film(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class TensorPassage(Passage):
-    """The power of rays while they are traced with tensors."""
+    """Follows the power of rays while they are traced with tensors."""
 
     def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
         """Return the shares that the coating of surface k transmits or reflects; see `pass_surface`."""

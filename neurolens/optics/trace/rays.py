@@ -1,7 +1,7 @@
-"""The exact tracer, in either direction: the reference for surrogates.
+"""The exact tracer, in either direction: the reference that surrogates are measured by.
 
-Rays are separate tensors of shape [N]; float64 for truth, float32 for speed. A ray that cannot go on carries a
-status and stays finite. Ghosts (`follow`) meet the same surfaces with the same tests, but may be reflected.
+Rays are separate tensors of shape [N], in float64 for truth or in float32 for speed. A ray that cannot go on gets a
+status and stays finite. `follow` traces ghosts: they meet the same surfaces with the same tests, but may be reflected.
 """
 
 from __future__ import annotations
@@ -41,19 +41,21 @@ from neurolens.optics.trace.tensors import Survival, Tensors, at_most
 
 Towards = Literal["scene", "film"]
 
-# Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
+# Rays per chunk: enough to hide the cost of calling an operator, few enough for a core's second-level cache.
 CHUNK = 32768
-# How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
+# How far a direction's squared length may be from 1; float32 rounding is a thousandth of it.
 UNIT_SLACK = 1e-3
-# Of the rays that `passing` follows, the share below which those that are left are put together.
+# Once fewer than this share of the rays is left, `passing` packs them together.
 _FEWER = 0.8
 
 
 class Crossing(NamedTuple):
-    """The crossings of rays with one surface, each [N]: points in mm, margins of Snell's and the sphere's square roots.
+    """The crossings of rays with one surface, each [N].
 
-    `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there. Points on
-    the far half of a sphere, beyond any rim, lie mirrored outwards (see `_unfolded`).
+    Attributes:
+        x, y: points, mm. Those on the far half of a sphere, beyond any rim, lie mirrored outwards (see `_unfolded`).
+        meets: positive where the ray meets the surface: what stands under the square root for the meeting.
+        refracts: positive where the ray is not totally reflected: what stands under the root of Snell's law.
     """
 
     x: Tensor
@@ -63,15 +65,16 @@ class Crossing(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """The result of a trace.
+    """Holds the result of a trace.
 
     Attributes:
         rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
-            were totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
+            were totally reflected are replaced by finite rays along the axis; those that only a rim stops go on.
         status: [N] int32, see `neurolens.base.status`.
-        transmittance: [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
-        crossings: surface index to `Crossing`, for the recorded surfaces.
-        path: the rays on and after every surface, in the order of travel, or empty if not requested.
+        transmittance: [N], share of unpolarised power that arrives, after surfaces and absorption; None unless
+            requested.
+        crossings: the `Crossing` of each recorded surface, by its index.
+        path: the rays on and after every surface, in the order of travel; empty unless requested.
     """
 
     rays: Rays
@@ -91,24 +94,22 @@ def trace(
     record: Sequence[int] = (),
     path: bool = False,
 ) -> Traced:
-    """Trace rays through the whole lens.
+    """Trace rays through the whole lens, differentiably in rays, wavelength and prescription fields that are tensors.
 
     Args:
-        lens: the prescription; its stop's diameter is the opening that clips.
-        rays: points and unit directions [N], lens frame, mm. The dtype (float32 or float64) is that of the result.
-        wavelength_nm: one number, or a tensor [N], of which those outside `glass.stated_nm`, and NaN, have the status
-            of what is outside the domain in a lens that disperses; None takes `Lens.reference_nm`.
+        lens: the prescription; the diameter of its stop is the opening that clips.
+        rays: points and unit directions [N], lens frame, mm. Their dtype (float32 or float64) is that of the result. A
+            direction that is not a unit vector counts as a miss of the first surface.
+        wavelength_nm: a number, or a tensor [N]; None takes `Lens.reference_nm`. In a lens that disperses, rays of a
+            tensor's wavelengths outside `glass.stated_nm`, or NaN, get the status of what is outside the domain.
         towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
         transmittance: whether to follow the power of unpolarised light, with the polarisation that surfaces give to it.
-        record: surfaces whose crossings are wanted.
+        record: the surfaces whose crossings are wanted.
         path: whether the points on all surfaces and the directions after them are wanted.
 
     Raises:
         InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape or a
             number outside `glass.stated_nm`, an unknown `towards`, a surface to record that the lens does not have.
-
-    A direction that is not a unit vector counts as a miss of the first surface.
-    Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
     wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     check_rays(lens, rays, wavelength_nm)
@@ -134,7 +135,7 @@ def trace(
 
 
 def _joined(parts: Sequence[Any]) -> Any:
-    """Join the results of chunks."""
+    """Join the results of several chunks."""
     first = parts[0]
     if isinstance(first, Tensor):
         return torch.cat(list(parts))
@@ -149,8 +150,8 @@ def _joined(parts: Sequence[Any]) -> Any:
 def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = "scene") -> Tensor:
     """Test whether rays pass the whole lens, bool [N]: exactly where the status of `trace` is 0.
 
-    Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
-    Arguments and errors are those of `trace`, with one wavelength.
+    Lost rays take no more work at later surfaces, which pays where most rays are lost. Arguments and errors are those
+    of `trace`, with one wavelength.
     """
     check_rays(lens, rays, wavelength_nm)
     keep_memory()
@@ -174,14 +175,14 @@ def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Toward
 
 
 def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph: bool = False) -> Callable[..., Any]:
-    """Compile a function that traces rays through a lens by torch, the prescription folded in as constants.
+    """Compile a function that traces rays through a lens with torch, with the prescription folded in as constants.
 
-    Every new number of rays compiles anew, so call it with batches of one length. Without a C++ compiler the first call
-    raises torch's own error; the eager `trace` needs none.
+    Every new number of rays compiles anew, so call the result with batches of one length. Without a C++ compiler the
+    first call raises torch's own error; `trace` itself needs none.
 
-    What the compiler may take for constant is marked here only: that imports it, which takes longer than a camera needs
-    to start. Torch keeps the machine code that it makes, and runs what it finds: by default in a folder that every user
-    of the machine can create, so that its cache is moved into the user's own.
+    What the compiler may take for constant is marked in here and not at import, because marking imports the compiler,
+    which takes longer than a camera needs to start. Torch keeps the machine code that it makes, and runs what it finds:
+    by default in a folder that every user of the machine can create. So its cache is moved into the user's own folder.
     """
     for surface in lens.surfaces if lens else ():  # read the catalogue now: compiled code cannot read files
         glass.index_of(surface, glass.LINE_D_NM)
@@ -215,12 +216,14 @@ def _path(lens: Lens, towards: Towards) -> tuple[int, range]:
 
 
 class Tracing:
-    """Rays on their way through a lens, surface by surface.
+    """Takes rays through a lens, surface by surface.
 
     Args:
-        sense: the direction of travel in which they start, +1 to the film.
-        entering: the surface that they meet first. guard: whether lost rays stay finite on the way.
-        freeze: whether lost rays are put on the axis at once, for gradients.
+        lens, rays, wavelength_nm: as for `trace`.
+        sense: the direction of travel in which the rays start, +1 towards the film.
+        entering: the surface that they meet first.
+        guard: whether lost rays stay finite on the way.
+        freeze: whether lost rays are put on the axis at once, for the sake of gradients.
     """
 
     def __init__(
@@ -229,7 +232,7 @@ class Tracing:
         self.lens, self.sense, self.freeze = lens, sense, freeze
         self.o = Tensors(guard or freeze, rays.x.dtype)
         self.wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
-        self.media = media(lens, self.wavelength_nm)  # media[k] lies before surface k as light travels to the film
+        self.media = media(lens, self.wavelength_nm)  # media[k] lies in front of surface k, seen from the scene
         self.curves = [traced_curve(s) for s in lens.surfaces]
         self.medium = self.media[0 if sense > 0 else -1]
         self.vertex: Any = 0.0
@@ -237,33 +240,34 @@ class Tracing:
         self.tests, self.rays = self._start(rays, lit, entering)
 
     def _start(self, rays: Rays, lit: Tensor | None, entering: int) -> tuple[Survival, Rays]:
-        """Return rays with optical direction cosines, and the test that their directions are unit vectors."""
+        """The rays with optical direction cosines, and the tests, which hold that directions are unit vectors."""
         o = self.o
         length2 = o.dot(rays[3:], rays[3:])
         sound = at_most((length2 - 1).abs(), UNIT_SLACK)
         if self.freeze:
-            # A NaN input must not reach the gradients of the other rays.
+            # A NaN in one ray must not reach the gradients of the others.
             sound = sound * torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
         if lit is None:
             tests = Survival(sound, st.blocked(entering, st.MISSED))
         else:
-            tests = Survival(torch.ones_like(sound) * lit, st.OUTSIDE_DOMAIN)  # of one wavelength for all rays, too
+            tests = Survival(torch.ones_like(sound) * lit, st.OUTSIDE_DOMAIN)  # also of one wavelength for all rays
             tests.require([(0.5, sound)], entering, st.MISSED)
         if self.freeze:
             rays = tests.along_axis(rays, self.sense, 0.0)
         if self.sense > 0:
-            # Light may start far away; near the lens float32 keeps points and directions consistent.
+            # Light may start far away; near the lens, float32 keeps points and directions consistent.
             rays = Rays(*nearest_approach(o, rays, 1.0), *rays[3:])
         return tests, Rays(*rays[:3], *(times(d, self.medium.n) for d in rays[3:]))
 
     def cross(self, k: int, reflected: bool = False) -> tuple[Rays, SurfaceStep, tuple[Medium, Medium]]:
         """Go on to surface k and through it, or back from it where `reflected`.
 
-        Returns the rays before it, in its vertex frame, what it does to them, and the media as they meet them.
+        Returns:
+            The rays before the surface, in its vertex frame, what it does to them, and the media as they meet them.
         """
         lens, surface = self.lens, self.lens.surfaces[k]
         vertex = lens.vertices_mm[k]
-        # In this surface's frame float32 keeps its precision.
+        # In the surface's own frame float32 keeps its precision.
         r, self.vertex = self.rays._replace(z=self.rays.z + (self.vertex - vertex)), vertex
         met_media = (self.media[k], self.media[k + 1]) if self.sense > 0 else (self.media[k + 1], self.media[k])
         crossed = cross(
@@ -273,12 +277,12 @@ class Tracing:
         for tests, reason in crossed.tests:
             self.tests.require(tests, k, reason)
         if self.curves[k].flat:
-            # A sphere's square root turns NaN and overflow into a miss; a plane would pass them.
+            # A sphere's square root makes a miss of NaN and overflow; a plane would let them pass.
             self.tests.end(radius2(self.o, crossed.met))
         self.rays, self._entering = crossed.bent.rays, None
         self.medium = met_media[0 if reflected else 1]
         self.sense = -self.sense if reflected else self.sense
-        # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
+        # A lost ray goes on along the axis, where no overflow can reach the gradients of the others.
         if self.freeze:
             self.rays = self.tests.along_axis(self.rays, self.sense, 0.0)
         return r, crossed, met_media
@@ -296,7 +300,7 @@ class Tracing:
         return r if is_number(n) and n == 1 else Rays(*r[:3], *(d / n for d in r[3:]))
 
     def leave(self) -> Rays:
-        """Return the rays in the lens frame; those that did not go on are along the axis."""
+        """Return the rays in the lens frame; those that did not go on run along the axis."""
         return self.tests.along_axis(self.in_lens_frame(), self.sense, self.vertex)
 
 
@@ -330,9 +334,10 @@ def _trace_chunk(
 
 
 def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
-    """x and y of a meeting, [N] each, mm; on the far half of a deep sphere mirrored outwards at its equator.
+    """Return x and y of a meeting, [N] each, mm, mirrored outwards at the equator on the far half of a deep sphere.
 
-    So the distance from the axis grows on beyond a deep rim, where it would fall again, and tells the half.
+    The distance from the axis then grows on beyond a deep rim, where it would fall again, and so tells the halves
+    apart.
     """
     if not is_deep(surface):
         return met.x, met.y
@@ -344,7 +349,8 @@ def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
 def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
     """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not stated.
 
-    Warn of wavelengths at which the index of a glass is not stated, but not of tensors on a GPU, which would wait.
+    Warn of wavelengths for which a glass's index is not stated; not of a tensor on a GPU, for which the host would
+    wait.
     """
     shape, dtype = rays.x.shape, rays.x.dtype
     if dtype not in (torch.float32, torch.float64):
@@ -371,10 +377,10 @@ def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
 def sound_wavelength(
     lens: Lens, wavelength_nm: Tensor | float, dtype: torch.dtype
 ) -> tuple[Tensor | float, Tensor | None]:
-    """Wavelengths in the precision of the rays, invalid ones replaced by the d line, and which are valid [N].
+    """The wavelengths in the precision of the rays, invalid ones replaced by the d line, and which are valid [N].
 
-    A NaN in an index would reach the gradients of the prescription, and float64 would spread to float32 rays halfway.
-    None where all are valid or, without dispersion, irrelevant.
+    A NaN in an index would reach the gradients of the prescription, and a float64 wavelength would turn float32 rays
+    into float64 halfway. The second result is None where all are valid or, without dispersion, irrelevant.
     """
     if not isinstance(wavelength_nm, Tensor):
         return wavelength_nm, None
@@ -390,13 +396,13 @@ Steps = Sequence[tuple[int, Action]]
 
 
 class GhostTrace(NamedTuple):
-    """The result of following a sequence.
+    """Holds the result of following a sequence of surfaces.
 
     Attributes:
         rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
         status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
-        power: [N], the share of unpolarised light that the surfaces send on and the glass does not absorb.
-        points: x, y, z of the meeting points of every step, lens frame, mm.
+        power: [N], the share of unpolarised power that the surfaces send on and the glass does not absorb.
+        points: x, y, z of the meeting points at every step, lens frame, mm.
     """
 
     rays: Rays
@@ -406,7 +412,7 @@ class GhostTrace(NamedTuple):
 
 
 def turning(count: int, reflections: Sequence[int]) -> list[tuple[int, Action]]:
-    """The steps of light from the front to the film of `count` surfaces, reflected at some of them in this order."""
+    """Return the steps of light from the front to the film of `count` surfaces, reflected at some, in this order."""
     steps: list[tuple[int, Action]] = []
     at, sense = 0, 1
     for k in reflections:
@@ -429,14 +435,14 @@ def follow(
     Args:
         lens: the prescription; every rim and the stop are tested at every crossing.
         rays: points and unit directions [N], lens frame, mm; float32 or float64.
-        steps: surfaces in the order in which they are met, "T" refracted or "R" reflected.
+        steps: the surfaces in the order in which they are met, each with "T" (refracted) or "R" (reflected).
         wavelength_nm: number or [N]; None takes `Lens.reference_nm`.
         towards: "film" for light that enters at the front, "scene" for light that enters at the rear.
         polarised: whether to follow the polarisation that each surface gives to the light, or to average it there.
 
     Raises:
-        InputError: as `trace` for rays and wavelengths; no steps, a surface that does not exist or is not the next one
-            in the direction of travel.
+        InputError: what `trace` raises for rays and wavelengths; no steps, or a surface that does not exist or is not
+            the next one in the direction of travel.
     """
     wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     check_rays(lens, rays, wavelength_nm)
@@ -454,7 +460,7 @@ def follow(
 
 
 def _check(count: int, steps: Steps, towards: Towards) -> None:
-    """Surfaces must follow one another as light meets them."""
+    """Raise InputError unless the surfaces follow one another as light meets them."""
     if not steps:
         raise InputError("sequence", "steps", "(none)", "at least one surface")
     if towards not in ("scene", "film"):

@@ -1,12 +1,14 @@
 """The shape of a surface for rays: its figure as numbers, its depth, and where an iteration along a ray starts.
 
-A conic surface of curvature c and constant K is c (x^2 + y^2 + (1 + K) z^2) - 2 z = 0; a cylinder lacks the square of
-the coordinate along which it is straight. An asphere adds A_p h^p, h the distance from the axis (from the plane of
-symmetry, for a cylinder). All arithmetic is that of `arithmetic`: the same text serves tensors, arrays and graphs.
+A conic of curvature c and constant K is the surface c (x^2 + y^2 + (1 + K) z^2) - 2 z = 0; a cylinder lacks the square
+of the coordinate along which it is straight. An asphere adds the sum of A_p h^p, with h the distance from the axis (for
+a cylinder, from its plane of symmetry). All arithmetic is that of `arithmetic`: the same text serves tensors, arrays
+and graphs.
 
 Beyond its rim a polynomial soon means nothing: a term in r^20 is 3,000 times as large at 1.5 times the rim. Where rims
-are ignored an asphere therefore follows its figures only as far as they stay close to the slope at the rim, and then
-continues with the same slope and curvature, which dies away: it becomes a cone that every ray can meet.
+are ignored, an asphere therefore follows its figures only as far as its slope stays close to that at the rim. From
+there it continues with the same slope and curvature, the curvature dies away, and it becomes a cone that every ray can
+meet.
 """
 
 from __future__ import annotations
@@ -24,17 +26,18 @@ from neurolens.optics.lens.figures import Centred, Figure, figure_of, number_of
 from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
 
-# Steps of the iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
-# count: a test of convergence would make an accelerator wait for its host at every surface.
+# How many steps the iteration takes, by how far (in rim radii) the asphere departs from the conic that it starts from.
+# The count is fixed, because with a test of convergence an accelerator would wait for its host at every surface.
 STEPS = ((3e-4, 2), (3e-3, 3), (3e-2, 4), (math.inf, 7))
-# Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its square.
+# The iteration counts as converged where its deciding step is shorter than this, in rim radii: the error left is of the
+# order of its square.
 LAST_STEP = 3e-4
-# cos^2 of the slope of the steepest conic that the iteration follows.
+# The iteration follows conics up to this steepness, as cos^2 of the slope.
 STEEPEST = 1e-7
-# How far (rad) the slope of an asphere may turn beyond its rim before it continues smoothly, and again after that.
+# How far (rad) an asphere's slope may turn beyond its rim before it continues smoothly, and again after that.
 TURN = 0.25
 FARTHEST = 1.5  # rim radii up to which figures are followed at most
-# Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
+# From this ratio of rim radius to radius of curvature on, a sphere's rim is tested by its depth.
 DEEP = 0.25
 _UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
@@ -42,19 +45,23 @@ Quadric = tuple[Any, Any, Any]
 
 
 class Curve(NamedTuple):
-    """A surface's shape, as rays meet it; lengths in mm, as numbers, 0-d tensors or values of a graph.
+    """Describes a surface's shape as rays meet it, in mm, with numbers, 0-d tensors or values of a graph.
 
     Attributes:
         curvature, stretch: c and 1 + K of the conic.
         plain: whether it is a sphere or a plane, of which only the curvature counts.
-        bent: whether along x and y.
-        terms: A_p of h^(p - 2), lowest first, in every second power where they are `even`; () without a polynomial.
-        centred: the same polynomial where its powers cancel; see `centred`.
+        bent: whether it is curved along x, and along y.
+        terms: the A_p as coefficients of h^(p - 2), lowest first, for every second power where they are `even`, else
+            for every power; () without a polynomial.
+        even: whether only even powers occur.
+        centred: the same polynomial, where its powers cancel; see `centred`.
         start: cx, cy, cz of the quadric cx x^2 + cy y^2 + cz z^2 = 2 z that the iteration starts from; None without an
-            iteration. steps: of it. last_step: how long its last step may be.
-        across: of a toroid or biconic, along the other axis: curvature and 1 + K; () of other surfaces.
+            iteration.
+        steps: how many steps the iteration takes.
+        last_step: how long its last step may be.
+        across: curvature and 1 + K of a toroid or biconic along the other axis; () for other surfaces.
         turned: whether it is a toroid.
-        beyond: where and how an asphere continues smoothly; None for one that follows its polynomial everywhere.
+        beyond: where and how an asphere continues smoothly; None where it follows its polynomial everywhere.
     """
 
     curvature: Any
@@ -73,14 +80,14 @@ class Curve(NamedTuple):
 
     @property
     def flat(self) -> bool:
-        """Whether it is a plane, known as such: a curvature that is no plain number may become another."""
+        """Whether it is known to be a plane: a curvature that is no plain number may take another value."""
         return self.plain and is_number(self.curvature) and self.curvature == 0
 
 
 class Beyond(NamedTuple):
     """The continuation of a curve beyond the height up to which its figures are followed.
 
-    With d the distance beyond the end: its slope there is slope + bend * length * (1 - exp(-d / length)).
+    At a distance d beyond that height its slope is slope + bend * length * (1 - exp(-d / length)).
     """
 
     height: float  # where the figures end
@@ -96,7 +103,7 @@ def curve_of(surface: Surface, number: Callable[[Any], Any] = float) -> Curve:
     if is_number(k) and k == 0 and not powers and not figure.axis:
         return Curve(c, plain=True)
     even = all(n % 2 == 0 for n in powers)
-    numbers = all(is_number(a) for a in powers.values())  # derivatives by coefficients are taken in powers
+    numbers = all(is_number(a) for a in powers.values())  # only then: derivatives by coefficients are taken in powers
     return Curve(
         c,
         1 + k,
@@ -110,12 +117,12 @@ def curve_of(surface: Surface, number: Callable[[Any], Any] = float) -> Curve:
 
 
 def centred(surface: Surface) -> Centred | None:
-    """Return the polynomial of a surface about the middle of its zone; None where float32 carries its powers."""
+    """Return the polynomial of a surface about the middle of its zone; None where float32 copes with its powers."""
     return surface.figure.centred(float(_extent_mm(surface)))
 
 
 def traced_curve(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Curve:
-    """Return the curve of a surface with the start of its iteration; arguments as of `curve_of`."""
+    """Return the curve of a surface with the start of its iteration; arguments are those of `curve_of`."""
     curve = curve_of(surface, number)
     if not curve.terms and not curve.across:
         return curve
@@ -125,7 +132,7 @@ def traced_curve(surface: Surface, number: Callable[[Any], Any] = lambda value: 
 
 
 def without_rim(curve: Curve) -> Curve:
-    """Return a curve whose iteration starts from the quadric of its vertex."""
+    """Return the curve with an iteration that starts from the quadric at its vertex, for lenses without rims."""
     if not curve.terms and not curve.across:
         return curve
     c, (other, _) = curve.curvature, curve.across or (0.0, 1.0)
@@ -134,7 +141,10 @@ def without_rim(curve: Curve) -> Curve:
 
 
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
-    """Return the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
+    """Return cx, cy, cz of the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface, and the steps it needs.
+
+    It is nearest inside the rim.
+    """
     figure = figure_of(surface.figure.record())  # of numbers
     (c, other, cz), steps = _fitted(number_of(surface.curvature), figure, _extent_mm(surface))
     if not figure.across:
@@ -143,7 +153,7 @@ def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
 
 
 def followed_mm(surface: Surface) -> float:
-    """Distance from the axis up to which an asphere's figures are followed where rims are ignored, at least its rim."""
+    """The distance from the axis, at least the rim's, up to which figures are followed where rims are ignored."""
     height = surface.semi_diameter_mm * np.linspace(1, FARTHEST, 51)
     with np.errstate(invalid="ignore", divide="ignore"):
         angle = np.arctan(_profile(surface, height)[0])
@@ -152,7 +162,7 @@ def followed_mm(surface: Surface) -> float:
 
 
 def _profile(surface: Surface, height: Any) -> tuple[Any, Any]:
-    """First and second derivative by the height of a surface's meridional curve (of a cylinder: across its lines)."""
+    """The first and second derivative, by height, of a surface's meridional curve (of a cylinder, across its lines)."""
     own = replace(surface, figure=_round(surface.figure))
     step = 1e-4 * height
     before, slope = (sag_and_derivatives(own, h, 0 * h)[1] for h in (height - step, height))
@@ -174,14 +184,16 @@ def _end_of(surface: Surface) -> Beyond:
 
 
 def _round(figure: Figure) -> Figure:
-    """The figure of revolution that has the curve of the radius."""
+    """Return the figure of revolution whose meridian is the curve of the radius."""
     return Figure(figure.conic, figure.asphere) if figure.axis else figure
 
 
 @lru_cache(maxsize=4096)
 def _fitted(curvature: float, figure: Figure, rim_mm: float) -> tuple[tuple[float, float, float], int]:
-    """Return the fit along the curve, across it and along z, by linear least squares: each point's error is that of
-    its height along the axis, times 2."""
+    """Fit a quadric to a figure by linear least squares, and return its three numbers and the steps it needs.
+
+    A point's error is, times 2, that of its height along the axis.
+    """
     across = figure.across
     if not math.isfinite(rim_mm):
         start = (curvature, 1 / across[0], 0.0) if across else (curvature, curvature, curvature * (1 + figure.conic))
@@ -205,9 +217,10 @@ class Depth(NamedTuple):
     """The curve of a figure at a distance h from its axis or plane of symmetry.
 
     Attributes:
-        sag: depth towards +z. slope: d sag / d h over h. turn: the change of that over h by h, of the conic alone. One
-            that is not needed for the `order` of `depth` is 0.
-        cos2: squared cosine of the conic's slope, positive where it exists; None without a conic.
+        sag: depth towards +z; 0 where `depth` was called with order 1.
+        slope: d sag / d h, divided by h.
+        turn: the derivative of `slope` by h, divided by h, of the conic alone; 0 where `order` is below 2.
+        cos2: squared cosine of the conic's slope, positive where the conic exists; None without a conic.
     """
 
     sag: Any
@@ -217,10 +230,11 @@ class Depth(NamedTuple):
 
 
 def depth(o: Arithmetic, curve: Curve, h2: Any, order: int = 2, steepest: float = STEEPEST) -> Depth:
-    """Return the depth of a curve at squared distances h2 (mm^2); held finite where its conic ends.
+    """Return the depth of a curve at squared distances h2 (mm^2); it stays finite beyond the end of its conic.
 
-    `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything. `steepest`: least squared cosine of the
-    conic's slope.
+    Args:
+        order: 0 for depth and slope, 1 for the slope alone, 2 for everything.
+        steepest: least squared cosine of the conic's slope.
     """
     if curve.beyond is None:
         return _followed(o, curve, h2, order, steepest)
@@ -253,10 +267,10 @@ def _followed(o: Arithmetic, curve: Curve, h2: Any, order: int, steepest: float)
 
 
 def polynomials(o: Arithmetic, curve: Curve, h2: Any, order: int) -> tuple[Any, Any]:
-    """sum A_p h^(p - 2) and sum p A_p h^(p - 2), by powers of h^2 or, where odd ones occur, of h, or centred ones."""
+    """Return sum A_p h^(p - 2) and sum p A_p h^(p - 2), in powers of h^2, or of h where odd ones occur, or centred."""
     if not curve.terms:
         return 0.0, 0.0
-    # The root is kept from 0, where its derivative is infinite.
+    # The root is held above 0, where its derivative is infinite.
     h, down = (h2, 2) if curve.even else (o.held_root(h2), 1)
     if curve.centred is not None:
         h, sum_ = o.fma(h, curve.centred.scale, -1.0), o.chebyshev if curve.centred.chebyshev else o.horner
@@ -266,13 +280,14 @@ def polynomials(o: Arithmetic, curve: Curve, h2: Any, order: int) -> tuple[Any, 
 
 
 def toroid(c: Any, section: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
-    """(c (a^2 + z^2) - c g^2) / 2 - z + g, which is 0 on a toroid; its gradient; its second derivative along p.
+    """Return a function that is 0 on a toroid, its gradient, and its second derivative along p.
 
-    In any arithmetic that has operators.
+    The function is (c (a^2 + z^2) - c g^2) / 2 - z + g. Any arithmetic that has operators serves.
 
     Args:
-        c: 1 / radius of rotation. section: the sag g(h), its slope over h, and the change of that over h by h.
-        at, p: point and direction: across the curve, along it, along z.
+        c: 1 / radius of rotation.
+        section: the sag g(h), its slope over h, and the derivative of that by h over h.
+        at, p: a point and a direction, each as components across the curve, along it, and along z.
     """
     (g, slope, turn), (a, h, z), (pa, ph, pz) = section, at, p
     way = 1 - g * c
@@ -284,10 +299,12 @@ def toroid(c: Any, section: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: t
 def biconic(
     along: tuple[Any, Any], across: tuple[Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any], root: Any
 ) -> tuple[Any, ...]:
-    """Sag less z of a biconic, its gradient, its second derivative along p, and what stands under the root.
+    """Return sag less z of a biconic, its gradient, its second derivative along p, and what stands under the root.
 
     Args:
-        along, across: curvature and 1 + conic. at, p: as of `toroid`. root: a square root that is held above 0.
+        along, across: curvature and 1 + conic constant of the two sections.
+        at, p: as for `toroid`.
+        root: a square root that is held above 0.
     """
     (c, k), (ca, ka), (a, h, z), (pa, ph, _) = along, across, at, p
     kc, kca = k * c * c, ka * ca * ca
@@ -295,7 +312,7 @@ def biconic(
     r = root(square)
     over = 1 / (r + 1)
     sag = (h * h * c + a * a * ca) * over
-    rh, ra = h * kc / r, a * kca / r  # derivatives of the root, negative
+    rh, ra = h * kc / r, a * kca / r  # derivatives of the root, with the sign changed
     sh, sa = (h * c * 2 + sag * rh) * over, (a * ca * 2 + sag * ra) * over
     change, rise = ph * rh + pa * ra, ph * sh + pa * sa
     bend = (ph * ph * c + pa * pa * ca + rise * change) * 2 + sag * (ph * ph * kc + pa * pa * kca + change * change) / r
@@ -310,7 +327,7 @@ def height2(o: Arithmetic, curve: Curve, x: Any, y: Any) -> Any:
 
 
 def sag(o: Arithmetic, curve: Curve, x: Any, y: Any) -> tuple[Any, Any]:
-    """Return the depth at points, and what is at least 0 where the surface exists; None where that is everywhere."""
+    """Return the depth at points, and what is at least 0 where the surface exists; None where it does everywhere."""
     h2 = height2(o, curve, x, y)
     if not curve.across:
         found = depth(o, curve, h2, order=0, steepest=TINY)
@@ -321,7 +338,7 @@ def sag(o: Arithmetic, curve: Curve, x: Any, y: Any) -> tuple[Any, Any]:
         square = 1 - (h2 * (curve.stretch * curve.curvature**2) + a2 * (stretch * c * c))
         return (h2 * curve.curvature + a2 * c) / (1 + o.held_root(square)), square
     found = depth(o, curve, h2, order=0, steepest=TINY)
-    way = 1 - c * found.sag  # to the line that the curve is turned about, over the radius there
+    way = 1 - c * found.sag  # distance to the line that the curve is turned about, over the radius there
     square = way * way - a2 * (c * c)
     z = (found.sag * (1 + way) + a2 * c) / (1 + o.held_root(square))
     return z, square if found.cos2 is None else o.least(found.cos2, square)
@@ -332,7 +349,8 @@ def sag_mm(shape: Surface, x: Any, y: Any, *, held: bool = False) -> Any:
 
     Args:
         x, y: floats, numpy arrays or torch tensors.
-        held: whether a conic goes on as a plane beyond its end, where the depth is else NaN; arrays and tensors only.
+        held: whether a conic continues as a plane beyond its end, where the depth would be NaN; arrays and tensors
+            only.
     """
     tensor = next((v for v in (x, y) if hasattr(v, "new_full")), None)
     o = NUMPY if tensor is None else import_module("neurolens.optics.trace.tensors").Tensors(False, tensor.dtype)
@@ -342,7 +360,7 @@ def sag_mm(shape: Surface, x: Any, y: Any, *, held: bool = False) -> Any:
 
 
 def sag_and_derivatives(shape: Surface, x: Any, y: Any) -> tuple[Any, Any, Any]:
-    """Depth (mm) at points x, y (numpy arrays) and its derivatives by x and y; NaN beyond the end of a conic."""
+    """Return the depth (mm) at points x, y (numpy arrays) and its derivatives by x and y; NaN beyond a conic's end."""
     figure, z = curve_of(shape), sag_mm(shape, x, y)
     if figure.across:
         _, (gx, gy, gz), *_ = crossed(NUMPY, figure, (x, y, z), (0.0, 0.0, 1.0))
@@ -354,8 +372,8 @@ def sag_and_derivatives(shape: Surface, x: Any, y: Any) -> tuple[Any, Any, Any]:
 def crossed(o: Arithmetic, curve: Curve, at: Quadric, p: Quadric) -> tuple[Any, Quadric, Any, Any]:
     """Return a function that is 0 on a toroid or biconic and grows with -z.
 
-    Returns its value at points, its gradient, its second derivative along p, and what is positive where the surface
-    exists.
+    Returns:
+        Its value at points, its gradient, its second derivative along p, and what is positive where the surface exists.
     """
     (c, stretch), swapped = curve.across, not curve.bent[1]
     (a, h, z), (pa, ph, pz) = ((v[swapped], v[not swapped], v[2]) for v in (at, p))
@@ -381,5 +399,5 @@ def is_deep(surface: Surface) -> bool:
 
 
 def rim_sine(surface: Surface) -> float:
-    """Return the rim radius over radius of curvature."""
+    """Return a surface's rim radius over its radius of curvature."""
     return abs(surface.semi_diameter_mm * surface.curvature)

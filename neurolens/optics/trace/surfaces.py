@@ -40,12 +40,12 @@ from neurolens.optics.trace.shapes import (
 
 Array = NDArray[np.float64]
 
-# A test that a ray passes where the first value is at most the second; NaN does not pass.
+# A test (low, high) is passed where low is at most high; NaN passes none.
 Test = tuple[Any, Any]
 
 
 class Rays(NamedTuple):
-    """Rays as a structure of arrays, each [N]: a point (mm) and a direction (unit, or times the index in here)."""
+    """Rays as arrays [N] of points (mm) and directions, which are unit or, in this module, times the index."""
 
     x: Any
     y: Any
@@ -56,7 +56,7 @@ class Rays(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """A refractive index with its square and the inverse of that: numbers, or [N] where dispersive."""
+    """A refractive index, its square and the inverse of the square: numbers, or [N] where dispersive."""
 
     n: Any
     n2: Any
@@ -64,15 +64,19 @@ class Medium(NamedTuple):
 
 
 AIR = Medium(1.0, 1.0, 1.0)
-_FARTHEST = 1e6  # parameter of a meeting, from the point of the ray nearest to the vertex
+_FARTHEST = 1e6  # largest parameter of a meeting along its ray, counted from the point nearest to the vertex
 
 
 class Hit(NamedTuple):
     """The intersection of rays with a surface, each [N].
 
-    `q` is n times the cosine of incidence and `q2` its square: positive where the ray meets the surface, and with
-    guards a smooth measure of how far it misses elsewhere. The ray meets the surface where it passes the `tests`.
-    `normal` is the unit normal towards +z; None for a sphere or plane, whose curvature gives it (`normal_at`).
+    Attributes:
+        x, y, z: the point.
+        q: index times cosine of incidence.
+        q2: its square; positive where the ray meets the surface, and elsewhere, with guards, a smooth measure of how
+            far the ray misses it.
+        tests: a ray meets the surface where it passes all of them.
+        normal: unit normal towards +z; None for a sphere or plane, whose curvature gives it (`normal_at`).
     """
 
     x: Any
@@ -85,9 +89,13 @@ class Hit(NamedTuple):
 
 
 class Outgoing(NamedTuple):
-    """Rays behind a surface (vertex frame), n' times their cosine there, its square, and the test for total reflection.
+    """Rays behind a surface, in its vertex frame.
 
-    The square `q2` is not positive where rays are totally reflected.
+    Attributes:
+        rays: points, and directions times the index.
+        q: n' times the cosine of refraction.
+        q2: its square, which is not positive where rays are totally reflected.
+        tests: the test for total reflection.
     """
 
     rays: Rays
@@ -97,15 +105,18 @@ class Outgoing(NamedTuple):
 
 
 def medium(n: Any) -> Medium:
-    """Return a medium of index `n`, a number or a value."""
+    """Return the medium of index `n`, a number or a value."""
     n2 = n * n
     return Medium(n, n2, 1 / n2)
 
 
 def media(lens: Lens, wavelength_nm: Any) -> list[Medium]:
-    """Media from the scene to the film; media(...)[k] lies before surface k. The same object where it does not change.
+    """Return the media from the scene to the film; that at place k lies before surface k.
 
-    `wavelength_nm` is a number or [N]; a dispersive medium has the shape of the wavelength.
+    Where the medium does not change, it is the same object.
+
+    Args:
+        wavelength_nm: number or [N]; a dispersive medium has its shape.
     """
     known: dict[Any, Medium] = {"air": AIR}
     for s in lens.media:
@@ -121,15 +132,16 @@ def _medium_key(s: Surface | prescription.Medium) -> Any:
 
 
 def nearest_approach(o: Arithmetic, r: Rays, inverse_n2: Any) -> Quadric:
-    """The point of a ray nearest to the vertex: its coordinates are small, which keeps float32 to micrometres."""
+    """Return the point of a ray nearest to the vertex: with such small coordinates float32 is good to micrometres."""
     e = times(o.dot(r[:3], r[3:]), inverse_n2)
     return o.fma(e, r.dx, r.x, -1), o.fma(e, r.dy, r.y, -1), o.fma(e, r.dz, r.z, -1)
 
 
 def meet(o: Arithmetic, r: Rays, curve: Curve, sense: int, before: Medium, entering: bool = False) -> Hit:
-    """Meet a surface at the point next to its vertex.
+    """Find where rays meet a surface, of several points the one next to its vertex.
 
-    `entering` marks the first surface met, where rays may arrive at more than 90 degrees.
+    Args:
+        entering: whether it is the first surface met, where rays may arrive at more than 90 degrees.
     """
     if curve.flat:
         return _meet_plane(o, r, sense)
@@ -157,14 +169,14 @@ def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int,
         denominator = o.fma(r.dz, sense, q)
         t = f / o.positive(denominator)
         x, y, z = (o.add_to(a, t, d) for a, d in zip(m, r[3:], strict=True))
-        # A root that is NaN fails the test of the denominator, too.
+        # A root that is NaN fails the test of the denominator too.
         return Hit(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.guard else [])])
-    # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
+    # Beyond 90 degrees the usual form is a quotient of two vanishing numbers, where the conjugate form is exact.
     forward = times(r.dz, sense)
     conjugate = times(forward - q, before.inverse_n2) / (c if is_number(c) else o.nonzero(c))
     t = o.select(forward, 0.0, conjugate, f / o.select(forward, 0.0, 1.0, forward + q))
     x, y, z = _along(o, m, t, r)
-    # A general ray may meet the far half of the sphere, where there is no glass.
+    # Any other ray may meet the far half of the sphere, where there is no glass.
     return Hit(x, y, z, q, q2, [(TINY, q2), (times(z, curvature), 1.0)])
 
 
@@ -180,14 +192,15 @@ def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, be
 
 
 def _meet_quadric(o: Arithmetic, r: Rays, m: Quadric, c: Quadric, sense: int, before: Medium) -> tuple[Any, Any, Any]:
-    """Meet cx x^2 + cy y^2 + cz z^2 = 2 z at the root next to the vertex.
+    """Find where rays meet cx x^2 + cy y^2 + cz z^2 = 2 z, at the root next to the vertex.
 
-    Returns the square of the left side's derivative along the ray, which is positive where there is a root, what the
-    parameter of the ray is divided by, and this parameter, from the ray's nearest approach `m`.
+    Returns:
+        The square of the left side's derivative along the ray, which is positive where there is a root; what the
+        parameter of the ray is divided by; and this parameter, from the ray's nearest approach `m`.
     """
     p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
     if cx is cy or (is_number(cx) and is_number(cy) and cx == cy):
-        # Rotationally symmetric: p.p = n^2 and m.p = 0 simplify the terms.
+        # For a surface of revolution, p.p = n^2 and m.p = 0 simplify the terms.
         a = o.fma(p[2] * p[2], cz - cx, times(before.n2, cx))
         b = p[2] * o.fma(m[2], cz - cx, -1.0)
         f = o.fma(o.dot(m[:2], m[:2]), cx, m[2] * o.fma(m[2], cz, -2.0))
@@ -195,14 +208,14 @@ def _meet_quadric(o: Arithmetic, r: Rays, m: Quadric, c: Quadric, sense: int, be
         a, b, f = _weighted(o, p, p, c), _weighted(o, m, p, c) - r.dz, o.fma(m[2], -2.0, _weighted(o, m, m, c))
     q2 = o.fma(a, f, b * b, -1)
     q, back = o.held_root(q2), times(b, -sense)
-    # The two forms of the same root: each divides by what is not small.
+    # Two forms of the same root: the one is taken whose divisor is not small.
     denominator = o.select(back, 0.0, a, o.fma(q, sense, -b))
     numerator = o.select(back, 0.0, o.fma(q, -sense, -b), f)
     return q2, denominator, numerator / o.nonzero(denominator)
 
 
 def _weighted(o: Arithmetic, a: Sequence[Any], b: Sequence[Any], w: Sequence[Any]) -> Any:
-    """Sum of the products of two vectors' components, each times its weight; terms of weight 0 are left out."""
+    """Return the sum of two vectors' products, each times its weight; terms of weight 0 are left out."""
     total: Any = None
     for p, q, k in zip(a, b, w, strict=True):
         if not (is_number(k) and k == 0):
@@ -215,10 +228,10 @@ def _along(o: Arithmetic, m: Quadric, t: Any, r: Rays) -> Quadric:
 
 
 def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, before: Medium) -> Hit:
-    """Iterate along the rays, from the quadric that fits the asphere best.
+    """Find where rays meet an asphere by an iteration along them, from the quadric that fits it best.
 
-    Only the last step carries the derivative (implicit function theorem), so that gradients cost no memory for
-    iterations.
+    Only the last step carries the derivative (by the implicit function theorem), so that gradients need no memory for
+    the iterations.
     """
     assert curve.start is not None
     still = Rays(*(o.fixed(v) for v in r))
@@ -232,7 +245,7 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, 
                 deciding = step
             t = t + step
         if o.guard:
-            t = o.select(o.abs(t), _FARTHEST, t, 0.0)  # rays that meet nothing, as backwards: no NaN in the normal
+            t = o.select(o.abs(t), _FARTHEST, t, 0.0)  # rays that meet nothing must give no NaN in the normal
     at = _along(o, m, o.fixed(t), r)
     step, p = _last_step(o, at, r, curve), (r.dx, r.dy, r.dz)
     x, y, z = _along(o, at, step, r)
@@ -258,10 +271,10 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, 
 
 
 def _toward(o: Arithmetic, at: Quadric, r: Rays, curve: Curve, sense: int) -> Any:
-    """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
+    """Return Euler's step along the rays towards sag(x, y) = z: Newton's step that allows for the surface's bend.
 
-    Newton's own is lost where a ray all but touches the surface, for there two meetings lie close together; the
-    parabola has both.
+    Newton's own step gets lost where a ray all but touches the surface, for two meetings lie close together there; the
+    parabola of Euler's step has both.
     """
     p, (x, y, z) = (r.dx, r.dy, r.dz), at
     if curve.across:
@@ -272,7 +285,7 @@ def _toward(o: Arithmetic, at: Quadric, r: Rays, curve: Curve, sense: int) -> An
         bent = (*map(float, curve.bent), 0.0)
         along = _weighted(o, at, p, bent)
         rate = o.fma(slope, along, -r.dz)
-        # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its slope.
+        # Second derivative of the sag along the ray, without what the polynomial adds to the change of its slope.
         bend = o.fma(along * along, turn, slope * _weighted(o, p, p, bent))
         lack = 2.0 * (sag - z)
     root = o.held_root(o.fma(bend, lack, rate * rate, -1))
@@ -280,7 +293,7 @@ def _toward(o: Arithmetic, at: Quadric, r: Rays, curve: Curve, sense: int) -> An
 
 
 def _last_step(o: Arithmetic, at: Quadric, r: Rays, curve: Curve) -> Any:
-    """Return Newton's step, which by then is Euler's."""
+    """Return Newton's step, which equals Euler's so close to the meeting."""
     if curve.across:
         value, gradient, *_ = crossed(o, curve, at, (r.dx, r.dy, r.dz))
         return -value / o.nonzero(o.dot(gradient, r[3:]))
@@ -290,7 +303,7 @@ def _last_step(o: Arithmetic, at: Quadric, r: Rays, curve: Curve) -> Any:
 
 
 def normal_at(o: Arithmetic, met: Hit, curvature: Any) -> Quadric:
-    """Return the unit normal towards +z at a meeting point; spheres and planes have it by their curvature."""
+    """Return the unit normal towards +z at a meeting point; for spheres and planes it follows from the curvature."""
     if met.normal is not None:
         return met.normal
     return met.x * -curvature, met.y * -curvature, 1.0 - met.z * curvature
@@ -299,16 +312,19 @@ def normal_at(o: Arithmetic, met: Hit, curvature: Any) -> Quadric:
 def refract(
     o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int, before: Medium, after: Medium, step: Any = None
 ) -> Outgoing:
-    """Snell's law: the tangential part of the optical direction cosines stays, the normal part follows their length.
+    """Refract rays by Snell's law: the tangential part of their directions stays, the normal part makes up the length.
 
-    `step` is n'^2 - n^2, where it is known better than from the media.
+    Directions are optical direction cosines.
+
+    Args:
+        step: n'^2 - n^2, where it is known better than from the media.
     """
     step = after.n2 - before.n2 if step is None else step
     q2 = met.q2 + step
     q = o.root(q2, o.finite)
-    # q - met.q without the rounding of both roots, which was a third of all error in float32.
+    # This is q - met.q without the rounding of both roots, which was a third of all error in float32.
     bend = step / o.positive(q + met.q)
-    # From air nothing is totally reflected.
+    # Light from air is never totally reflected.
     tests = [] if before is AIR else [(TINY, q2)]
     if met.normal is not None:
         direction = [o.fma(bend, n, p, sense) for p, n in zip(r[3:], met.normal, strict=True)]
@@ -320,13 +336,13 @@ def refract(
 
 
 def reflect(o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int) -> Rays:
-    """Return rays with the normal part of their direction turned round."""
+    """Return the rays with the normal part of their directions reversed."""
     normal = normal_at(o, met, curvature)
     return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense) for p, n in zip(r[3:], normal, strict=True)))
 
 
 def through_ideal(o: Arithmetic, r: Rays, met: Hit, power: float) -> Rays:
-    """Rays in air behind an ideal thin lens of power 1 / f: slopes change by -x / f and -y / f."""
+    """Return rays in air behind an ideal thin lens of power 1 / f: slopes change by -x / f and -y / f."""
     towards = o.abs(r.dz) * power
     dx, dy = o.fma(towards, met.x, r.dx, -1), o.fma(towards, met.y, r.dy, -1)
     scale = o.inverse_root(o.dot((dx, dy, r.dz), (dx, dy, r.dz)))
@@ -334,9 +350,12 @@ def through_ideal(o: Arithmetic, r: Rays, met: Hit, power: float) -> Rays:
 
 
 class SurfaceStep(NamedTuple):
-    """The passage of rays through a surface; the rays behind it are in its vertex frame.
+    """The passage of rays through a surface.
 
-    `bent` has the rays behind; `tests` are all tests at the surface in order, each with its reason (`base.status`).
+    Attributes:
+        met: where they meet it.
+        bent: the rays behind it, in its vertex frame.
+        tests: all tests at the surface in order, each with the reason that it stands for (`base.status`).
     """
 
     met: Hit
@@ -372,9 +391,9 @@ def cross(
 
 
 def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Hit], list[Test]]:
-    """Return the tests whether a meeting lies inside a surface's rim."""
+    """Return the function that tests whether a meeting lies inside a surface's rim."""
     if is_deep(surface):
-        # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
+        # Tested by depth: a point on the far half of the sphere may be near the axis, but there is no glass.
         most = 1 - math.sqrt(1 - rim_sine(surface) ** 2)
         return lambda met: [(times(met.z, surface.curvature), most)]
     return lambda met: [(radius2(o, met), surface.semi_diameter_mm**2)]
@@ -388,11 +407,14 @@ def radius2(o: Arithmetic, met: Hit) -> Any:
 def meet_front(
     shape: Surface | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
 ) -> tuple[Array, Array]:
-    """(x, y) where the line of each ray meets the front surface, None the plane z = 0, next to its vertex; else NaN.
+    """Return (x, y) where the line of each ray meets the front surface next to its vertex; NaN where it does not.
 
-    Rays are points (mm) and directions of either sense, float64 [N].
+    Args:
+        shape: the front surface; None is the plane z = 0.
+        x, y, z, dx, dy, dz: points (mm) and directions of either sense, float64 [N].
     """
-    # Before the lens light travels towards +z, or from the side and beyond: the sense is that of the camera ray's end.
+    # In front of the lens light travels towards +z, or comes from the side and beyond: the sense is that of the camera
+    # ray's end.
     rays = Rays(x, y, z, -dx, -dy, -dz)
     curve = Curve(0.0, plain=True) if shape is None else without_rim(curve_of(shape))
     with np.errstate(all="ignore"):
@@ -413,12 +435,16 @@ def front_rays(
     index: Sequence[float] | None = None,
     wavelength_nm: Array | float = math.nan,
 ) -> tuple[Array, Array]:
-    """Return the scene rays as models have them, and the solid angle per area of their direction vectors [N].
+    """Return scene rays in the form that models use, and the solid angle per area of their direction vectors [N].
 
-    Rows [4, N]: x and y (mm) on the front surface, and the direction vector, theta (dx, dy) / |(dx, dy)| with theta
-    from -z; of first-order models, which have no shape, the slope. Arguments as of `meet_front`, unit directions away
-    from the lens. `index`: where direction vectors are those inside the front glass, its index as a power series in
-    1 / lambda^2 (1/um^2).
+    The form is [4, N]: x and y (mm) on the front surface, and the direction vector theta (dx, dy) / |(dx, dy)|, where
+    theta is the angle to -z. First-order models, which have no shape, have the slope in its place.
+
+    Args:
+        shape, x, y, z: as for `meet_front`.
+        dx, dy, dz: unit directions away from the lens.
+        index: given where direction vectors are those inside the front glass: its index as a power series in 1 /
+            lambda^2 (1/um^2).
     """
     x, y = meet_front(shape, x, y, z, dx, dy, dz)
     with np.errstate(all="ignore"):
@@ -435,9 +461,9 @@ def front_rays(
 
 
 def entered(shape: Surface, x: Array, y: Array, d: Array, index: Array) -> tuple[Array, Array]:
-    """Return the unit directions [3, N] inside the front glass of rays that leave it at (x, y) along d [3, N].
+    """Return the unit directions [3, N], inside the front glass, of rays that leave it at (x, y) along d [3, N].
 
-    Also the solid angle of a bundle of them outside over that inside, n^2 cos(inside) / cos(outside) [N].
+    Also return the solid angle of a bundle of them outside over that inside, n^2 cos(inside) / cos(outside) [N].
     """
     _, zx, zy = sag_and_derivatives(shape, x, y)
     normal = np.stack([zx, zy, np.full_like(zx, -1.0)]) / np.sqrt(1 + zx * zx + zy * zy)

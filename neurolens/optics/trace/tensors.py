@@ -1,7 +1,8 @@
 """Torch's arithmetic for the surface step, and the tests that rays pass on their way.
 
-Eager torch moves memory; these forms make few passes over it. Comparisons that give truth values cost several times as
-much as those that give 1.0 and 0.0, and so do selections by them, so that tests are numbers here.
+Eager torch spends its time on moving memory, and these forms make few passes over it. Comparisons that give truth
+values cost several times as much as those that give 1.0 and 0.0, and so do selections by them: so tests are numbers
+here.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from neurolens.base import status as st
 from neurolens.optics.trace.arithmetic import TINY, Arithmetic, is_number, times
 from neurolens.optics.trace.surfaces import Rays, Test
 
-# Steps of an iteration after the one that decides convergence: float64 takes some, and both precisions decide alike.
+# Steps that an iteration takes after the one that decides convergence. Float64 takes some more; which rays converge is
+# decided alike in both precisions.
 POLISH = {torch.float32: 0, torch.float64: 2}
 
 
@@ -26,7 +28,8 @@ class Tensors(Arithmetic):
     """The arithmetic of torch tensors.
 
     Args:
-        guard: whether lost rays stay finite on the way. dtype: of the rays.
+        guard: whether lost rays stay finite on the way.
+        dtype: of the rays.
     """
 
     def __init__(self, guard: bool, dtype: torch.dtype) -> None:
@@ -52,7 +55,7 @@ class Tensors(Arithmetic):
     def dot(self, a: Sequence[Any], b: Sequence[Any]) -> Tensor:
         total = a[0] * b[0]
         for p, q in zip(a[1:], b[1:], strict=True):
-            total.addcmul_(p, q)  # in place: a third less memory to move
+            total.addcmul_(p, q)  # in place, which moves a third less memory
         return total
 
     def root(self, square: Tensor, finite: bool = False) -> Tensor:
@@ -60,7 +63,7 @@ class Tensors(Arithmetic):
             return torch.sqrt(torch.where(square > 0, square, 1.0))
         if torch.compiler.is_compiling():
             return torch.sqrt(square)
-        # The mathematics library behind torch.sqrt takes 20 times as long for negative numbers, which lost rays have.
+        # The library behind torch.sqrt takes 20 times as long for negative numbers, which lost rays have.
         return square * torch.rsqrt(square)
 
     def held_root(self, square: Tensor, least: float = TINY) -> Tensor:
@@ -95,14 +98,14 @@ class Tensors(Arithmetic):
 
 
 class Survival:
-    """The tests that rays pass, in the order in which they meet them; the first that fails decides a ray's status.
+    """Keeps the tests that rays pass, in the order in which they meet them; the first that fails is a ray's status.
 
-    A ray goes on until it misses a surface or is totally reflected. One that a rim stops goes on, too, since surrogates
-    are fitted to its crossings.
+    A ray goes on until it misses a surface or is totally reflected. A ray that a rim stops goes on too, because
+    surrogates are fitted to its crossings.
     """
 
     def __init__(self, sound: Tensor, otherwise: int) -> None:
-        """Start with the rays that are `sound` [N], 1.0 or 0.0; the others have the status `otherwise`."""
+        """Start with the rays that are `sound` [N], 1.0 or 0.0; the others get the status `otherwise`."""
         self.passed, self._goes_on, self._count = sound.clone(), sound.clone(), sound.clone()
         self._meanings = [otherwise]
 
@@ -114,19 +117,19 @@ class Survival:
             self._count.add_(self.passed)
             self._meanings.append(st.blocked(surface, reason))
             if reason != st.RIM:
-                self._goes_on = self._goes_on * passed  # a new one: gradients may need the old
+                self._goes_on = self._goes_on * passed  # a new tensor, for gradients may need the old one
 
     def end(self, value: Tensor) -> None:
         """End rays whose `value` [N] is not finite, whatever their status."""
         self._goes_on = self._goes_on * at_most(value, torch.finfo(value.dtype).max)
 
     def only(self, value: Tensor, otherwise: Any) -> Tensor:
-        """`value` [N] of the rays that go on, `otherwise` for the others, even where it is NaN."""
+        """Return `value` [N] for the rays that go on, and `otherwise` for the others, even where `value` is NaN."""
         kept = value.nan_to_num(0.0, 0.0, 0.0) * self._goes_on
         return kept if is_number(otherwise) and otherwise == 0 else kept + (1 - self._goes_on) * otherwise
 
     def along_axis(self, r: Rays, sense: int, z: Any) -> Rays:
-        """Return the rays that go on; the others replaced by rays along the axis from z."""
+        """Return the rays, those that do not go on replaced by rays along the axis that start at z."""
         on_axis = (0.0, 0.0, z, 0.0, 0.0, float(sense))
         return Rays(*(self.only(c, a) for a, c in zip(on_axis, r, strict=True)))
 
@@ -136,7 +139,7 @@ class Survival:
 
 
 def at_most(low: Any, high: Any) -> Tensor:
-    """1.0 where low <= high, else 0.0, [N]; one of the two may be a number."""
+    """Return 1.0 where low <= high, else 0.0, [N]; one of the two may be a number."""
     if isinstance(low, Tensor):
         low = low.detach()
         return torch.le(low, high.detach() if isinstance(high, Tensor) else high, out=torch.empty_like(low))
@@ -145,5 +148,5 @@ def at_most(low: Any, high: Any) -> Tensor:
 
 @lru_cache(maxsize=256)
 def _table(meanings: tuple[int, ...], device: torch.device) -> Tensor:
-    """Cached: transferring it with every chunk would make the host wait for an accelerator."""
+    """Cache the table on its device: to transfer it for every chunk would make the host wait for an accelerator."""
     return torch.tensor(meanings, dtype=torch.int32, device=device)

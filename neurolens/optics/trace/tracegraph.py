@@ -1,6 +1,6 @@
-"""The exact lens as a graph, from which C is written: the best that tracing can do, with which surrogates are compared.
+"""The exact lens as a graph, from which C is written: the best that tracing can do, for comparison with surrogates.
 
-The surfaces are those of the tracer (`surfaces`), and so is the power that arrives (`transmission`).
+Its surfaces are those of the tracer (`surfaces`), and so is the power that arrives (`transmission`).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from neurolens.optics.trace.transmission import Passage, Shares, times_film
 TRANSMITTANCE = (
     "Transmittance: of unpolarised light, with the polarisation that surfaces give to it, coatings and absorption."
 )
-_DEGREE, _FIT = 8, 1e-9  # of the series of sine and cosine, and how close they are
-_WIDEST_MM = 1e15  # of a stop: its square is finite in float32
+_DEGREE, _FIT = 8, 1e-9  # degrees that the series of sine and cosine may have, and how close they are
+_WIDEST_MM = 1e15  # widest radius of a stop, whose square is still finite in float32
 _HALVINGS = 12  # of a phase, at most: films of 500 waves
 
 
@@ -59,23 +59,23 @@ def exact_graph(
     tests: list[tuple[Test, int]] = []  # in the order in which rays meet them, with their codes
     at_stop, crossings = rays[0:2], list[Value]()
     d = rays[2] - rays[0], rays[3] - rays[1], pupil_z_mm - film_z
-    # Directions are multiplied by the index of the medium, see `surfaces`.
+    # Directions are multiplied by the medium's index, see `surfaces`.
     scale = times(1.0 / o.dot(d, d).sqrt(), mediums[-1].n)
     r = Rays(rays[0], rays[1], film_z, *(c * scale for c in d))
 
     def opening(met: Hit) -> list[Test]:
-        """Return the test of the stop, whose radius is a number of the call; none where only the ray is wanted."""
+        """Return the test of the stop, whose radius is a number of the call; no test where only the ray is wanted."""
         return [] if stop_square is None else [(radius2(o, met), stop_square)]
 
     last = len(lens.surfaces) - 1
     moving = {i for state in lens.configurations for i, _ in state.thickness_mm}
     for k in range(last, -1, -1):
         surface, before, after = lens.surfaces[k], mediums[k + 1], mediums[k]
-        # Gaps as the lens has them: those that are equal stay so in every state of a zoom.
+        # Gaps as they are in the lens: gaps that are equal stay equal in every state of a zoom.
         gap = float(surface.thickness_mm) if k < last else -float(lens.vertices_mm[k])
-        # A gap that moves may happen to equal another number in one state alone: its label keeps the nodes apart.
+        # In a single state, a gap that moves may happen to equal another number: its label keeps the nodes apart.
         step = g.constant(gap, *([f"gap {k}"] if k in moving else []))
-        # Behind a plane z is the number 0, and a sum of two numbers would lose its label.
+        # Behind a plane z is the number 0; added to it, the gap would lose its label.
         r = r._replace(z=step if r.z.node.kind == "constant" else r.z + step)
         rim = opening if surface.stop or not whole else None
         met, bent, found = cross(o, surface, traced_curve(surface, float), r, -1, before, after, rim=rim)
@@ -91,14 +91,15 @@ def exact_graph(
     g.outputs["scene_ray"] = g.concat(*(g.value(v) for v in (*r[:3], *directions)))
     if power is not None:
         through = g.value(power.arrived(r.x))
-        if through.node.kind == "constant":  # no surface takes light: still a number a ray
+        if through.node.kind == "constant":  # no surface takes light, but the power is still a number for each ray
             through = g.select(rays[0] <= rays[0], through, 0.0)
         g.outputs |= {"transmittance": through, "stop_xy_mm": at_stop}
     pairs, codes = zip(*tests, strict=True) if tests else ((), ())
     status = g.first_failure([(g.value(a), g.value(b)) for a, b in pairs], codes)
     if stop_radius is not None:
         low, high = light_limits(lens, wavelength_nm)
-        # The stop decides once for all rays of a call: no wavelength is at most -1.
+        # The stop decides once for all rays of a call: where it has no radius, no wavelength passes, for none is at
+        # most -1.
         high_or_none = g.select(stop_radius.between(0.0, _WIDEST_MM), high, -1.0)
         inside = (g.constant(low) <= rays[4]) & (rays[4] <= high_or_none)
         status = g.select(inside, status, float(st.OUTSIDE_DOMAIN))
@@ -109,9 +110,9 @@ def exact_graph(
 
 
 def light_limits(lens: Lens, wavelength_nm: tuple[float, float]) -> tuple[float, float]:
-    """Wavelengths that a lens takes as a graph for a range: those of the range at which a glass of it is stated.
+    """Return the wavelengths that a lens takes as a graph for a range: those of it for which some glass is stated.
 
-    Any for a lens without dispersion.
+    A lens without dispersion takes any wavelength.
     """
     if not lens.dispersive:
         return ANY_WAVELENGTH_NM

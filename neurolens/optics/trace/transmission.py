@@ -1,11 +1,12 @@
 """The power of unpolarised light that arrives: transmission or reflection at surfaces, absorption in glass.
 
-Each surface polarises the light that the next one meets, whose plane of incidence may be another. So Stokes parameters
-are followed: at each surface they are turned into its plane of incidence, and the surface acts on s and p. Angles stand
-only in the cosine and sine of twice the turn, which are products of normals and directions. Sources: Born and Wolf,
-Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polarized Light and Optical Systems, chapter 6.
+Each surface polarises the light that the next one meets, and the next plane of incidence may be another. So Stokes
+parameters are followed: at each surface they are turned into its plane of incidence, where the surface acts on s and p.
+Angles enter only as the cosine and sine of twice the turn, which are products of normals and directions. Sources: Born
+and Wolf, Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polarized Light and Optical Systems, chapter
+6.
 
-`Light`, `Shares` and the functions on them compute with tensors and with values of a graph alike.
+`Light`, `Shares` and the functions on them compute with tensors and with the values of a graph alike.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ from neurolens.optics.trace.surfaces import Hit, Medium, Rays, nearest_approach,
 
 Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
 
-# Added to the square of a turn's cosine: at exactly normal incidence, where there is no plane, nothing is turned. Below
-# it as (n cos)^2 behind a stack, light counts as totally reflected: float32 products of such cosines underflow.
+# Added to the square of a turn's cosine, so that nothing is turned at exactly normal incidence, where there is no
+# plane. Light whose (n cos)^2 behind a stack is below it counts as totally reflected, for float32 products of such
+# cosines underflow.
 FLOOR = 1e-30
 
 
 class Light(NamedTuple):
-    """Stokes parameters of light that was unpolarised and of power 1, about the plane of incidence of a surface.
+    """Stokes parameters, about the plane of incidence of a surface, of light that was unpolarised and of power 1.
 
     Attributes:
-        power: of both polarisations together, which is the transmittance so far.
+        power: that of both polarisations together, which is the transmittance so far.
         excess: power of s, polarised across the plane of incidence, less that of p, polarised in it.
         diagonal, circular: real and imaginary part of 2 E_s times the conjugate of E_p; None while they are 0.
     """
@@ -40,11 +42,12 @@ class Light(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """The shares of s and p that a surface sends on; all but the last two are to be multiplied by `above / below`.
+    """The shares of s and p that a surface sends on; all but the last two are to be scaled by `above / below`.
 
     Attributes:
-        mean, half: mean of the shares of power of s and p that go on, and half of their difference.
-        real, imaginary: of the amplitude of s times the conjugate of that of p; None for 0.
+        mean, half: mean of the shares of s and p power that go on, and half of their difference.
+        real, imaginary: real and imaginary part of the amplitude of s times the conjugate of that of p; None for 0.
+        above, below: the factor that the other fields have in common, as a fraction.
     """
 
     mean: Any
@@ -71,8 +74,9 @@ def pass_surface(light: Light | None, turn: tuple[Any, Any] | None, shares: Shar
     """Return the light behind a surface that transmits or reflects it.
 
     Args:
-        light: from the last surface that did anything to it; None before the first, where it is unpolarised.
-        turn: from that surface's plane of incidence into this one's, as `turned`; None before the first surface.
+        light: from the last surface that changed it; None before the first, where it is unpolarised.
+        turn: from that surface's plane of incidence into this one's, as `turned` gives it; None before the first
+            surface.
     """
     mean, half, real, imaginary, above, below = shares
     if light is None or turn is None:
@@ -99,32 +103,36 @@ def pass_surface(light: Light | None, turn: tuple[Any, Any] | None, shares: Shar
 
 
 def turned(last: Vector, normal: Vector, cosines: Any, across: Any) -> tuple[Any, Any]:
-    """Return the turn from one plane of incidence into the next: its cosine and sine, both times the same size.
+    """Return the turn from one plane of incidence into the next: its cosine and sine, both times the same factor.
 
-    The direction d lies in both planes; across them are s = d x n and s' = d x n', with s s' = n n' - (d n)(d n') and
-    s x s' = d det(d, n, n').
+    The direction d lies in both planes. Across them are s = d x n and s' = d x n', with s s' = n n' - (d n)(d n') and s
+    x s' = d det(d, n, n').
 
     Args:
-        last, normal: unit normals of the two surfaces. cosines: (d n)(d n'). across: det(d, n, n'), see `crossed`.
+        last, normal: unit normals n and n' of the two surfaces.
+        cosines: (d n)(d n').
+        across: det(d, n, n'), see `crossed`.
     """
     return _plus(_plus(last[0] * normal[0], last[1], normal[1]), last[2], normal[2]) - cosines, across
 
 
 def crossed(d: Vector, a: Vector, b: Vector) -> Any:
-    """det(d, a, b)."""
+    """Return det(d, a, b)."""
     return d[0] * (a[1] * b[2] - a[2] * b[1]) + d[1] * (a[2] * b[0] - a[0] * b[2]) + d[2] * (a[0] * b[1] - a[1] * b[0])
 
 
 def turned_spheres(
     o: Arithmetic, near: Vector, d: Vector, medium: Medium, curvatures: tuple[Any, Any], gap_mm: Any, skew: Any
 ) -> tuple[Any, Any]:
-    """`turned` of two spheres with vertices on the axis, so far apart, times the square of the index.
+    """Return `turned` for two spheres with vertices on the axis, `gap_mm` apart, times the square of the index.
 
-    Their normals are (0, 0, 1) - c P for points P from the vertex, and the part of P along the ray drops out: with the
-    ray's point nearest to the second vertex, `near`, only terms remain that are small where angles are.
+    The normal of a sphere of curvature c at the point P from its vertex is (0, 0, 1) - c P, and the part of P along the
+    ray drops out. With `near`, the ray's point nearest to the second vertex, only terms remain that are small where
+    angles are.
 
     Args:
-        d: direction times the index. skew: x dy - y dx of any point of the ray.
+        d: direction times the index.
+        skew: x dy - y dx of any point of the ray.
     """
     first, second = curvatures
     ratio = 1.0 - first * gap_mm
@@ -134,26 +142,27 @@ def turned_spheres(
 
 
 def _plus(total: Any, a: Any, b: Any) -> Any:
-    """total + a b, of tensors in one pass over memory."""
+    """Return total + a b, for tensors in one pass over memory."""
     return total.addcmul(a, b) if hasattr(total, "addcmul") else total + a * b
 
 
 class Passage:
-    """The power of rays while they are traced; absorption follows Beer and Lambert's law.
+    """Follows the power of rays while they are traced; absorption follows Beer and Lambert's law.
 
-    `polarised`: whether the polarisation is followed that each surface gives to the light, or averaged at each surface.
+    Args:
+        polarised: whether to follow the polarisation that each surface gives to the light, or to average it there.
     """
 
     def __init__(self, o: Arithmetic, lens: Lens, wavelength_nm: Any, polarised: bool = True) -> None:
         self._o, self.lens, self.wavelength_nm, self._polarised = o, lens, wavelength_nm, polarised
         self._light: Light | None = None
         self._depth: Any = None
-        self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
+        self._last: tuple[int, Vector, Any] | None = None  # the last surface, its normal, and n cos behind it
         self._skew: Any = None
 
     def absorption(self, k: int) -> Any:
         """Return the Napierian absorption (1/mm) of the medium before surface k; None where there is none."""
-        # What the medium in front of the lens absorbs is a matter of the scene.
+        # Absorption in the medium in front of the lens belongs to the scene.
         return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
 
     def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
@@ -207,32 +216,32 @@ class Passage:
         return turned([times(c, before.n2) for c in other], normal, q * met.q, times(across, before.n))
 
     def _skewness(self, r: Rays) -> Any:
-        """Return x dy - y dx, with directions times the index, which surfaces round about the axis leave as it is."""
+        """X dy - y dx with directions times the index; surfaces that are round about the axis do not change it."""
         if self._skew is None:
             self._skew = r.x * r.dy - r.y * r.dx
         return self._skew
 
     def arrived(self, like: Any) -> Any:
-        """Return the power of all rays, in the form of a value."""
+        """Return the power of all rays, in the form that a value has."""
         power = self._o.like(like, 1.0) if self._light is None else self._light.power
         return power if self._depth is None else power * self.transmitted(self._depth)
 
 
 def path_mm(o: Arithmetic, r: Rays, met: Hit, before: Medium) -> Any:
-    """Length of the path from a ray's point to its meeting, mm; negative where the meeting lies behind it."""
+    """Return the length (mm) of the path from a ray's point to its meeting; negative where the meeting lies behind."""
     along = o.fma(met.z - r.z, r.dz, o.fma(met.y - r.y, r.dy, (met.x - r.x) * r.dx))
     return times(along, times(before.n, before.inverse_n2))
 
 
 def times_film(s: tuple[Any, ...], p: tuple[Any, ...], film: tuple[Any, Any, Any], index2: Any) -> Any:
-    """The matrices of s and p times those of a film: of its phase cos, sin / q and q sin; tensors or values of a graph.
+    """Return the matrices of s and p times those of a film, given as cos, sin / q and q sin of its phase.
 
-    q is index times cosine in the film, `index2` its index squared.
+    Tensors and values of a graph serve alike. Here q is index times cosine in the film, and `index2` its index squared.
     """
     c, e, f = film
     return _times(s, (c, e, f, c)), _times(p, (c, index2 * e, f / index2, c))
 
 
 def _times(m: tuple[Any, ...], k: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the product of two matrices [[a, -i b], [-i c, d]] given as (a, b, c, d)."""
+    """Return the product of two matrices [[a, -i b], [-i c, d]], each given as (a, b, c, d)."""
     return (m[0] * k[0] - m[1] * k[2], m[0] * k[1] + m[1] * k[3], m[2] * k[0] + m[3] * k[2], m[3] * k[3] - m[2] * k[1])

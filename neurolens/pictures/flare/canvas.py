@@ -119,7 +119,7 @@ class Smear(NamedTuple):
 
     @property
     def coarse(self) -> int:
-        """How many pixels wide the pixels may be with which the smeared picture is drawn."""
+        """Return how many times as wide the pixels may be in which the smeared picture is drawn."""
         (a, b, c, d), weights = self.sides, np.array(self.weights or ((1.0,),))
         parts, steps = max(weights.shape), (np.abs(np.diff(weights, axis=axis)).max(initial=0) for axis in (0, 1))
         # The light may jump between cells, not between their parts; a patch of even light only fades.
@@ -128,11 +128,13 @@ class Smear(NamedTuple):
         return 1 << max(0, math.floor(math.log2(wide / cells / _FINE)))
 
     def kernel(self, most: int, coarse: int = 1) -> Floats:
-        """The kernel [2 H + 1, 2 W + 1] about the middle of the light; what lies beyond `most` pixels is cut off.
+        """Return the smear as a kernel [2 H + 1, 2 W + 1] about the middle of its light.
 
-        coarse: the width of the kernel's pixels.
+        Its sum is 1, less the light beyond `most` pixels, which is cut off.
 
-        Its sum is 1, less the light that is cut off.
+        Args:
+            most: H and W are at most this.
+            coarse: the width of the kernel's pixels, in pixels of the picture.
         """
         sides = np.array(self.sides).reshape(2, 2) / coarse
         area = abs(float(np.linalg.det(sides)))

@@ -126,8 +126,7 @@ class LightGroup:
         raise NotImplementedError
 
     def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
-        """The density [N] per solid angle of `sample` for a direction that hits lights [N]; 0 for lights without
-        size."""
+        """Return the density [N] per solid angle with which `sample` hits lights [N]; 0 for lights without size."""
         return np.zeros_like(distance)
 
 

@@ -1,7 +1,7 @@
-"""Cameras that may show a scene, each with its error against the exact lens and, where it matters, its cost.
+"""Cameras that may show a scene, each with its error against the exact lens and, where that matters, its cost.
 
-They are pinholes, thin and thick lenses, the exact lens, models that ship, and polynomials fitted to one shot of a lens
-alone: its film, stop, focus and light.
+They are pinholes, thin and thick lenses, the exact lens, models that ship, and polynomials that are fitted only to one
+shot of a lens: its film, stop, focus and light.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from neurolens.studies.plan.footprints import Footprints
 from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
-Cost = Callable[[], tuple[Timing, float]]  # of a ray, and noise
+Cost = Callable[[], tuple[Timing, float]]  # of a ray; with it the noise
 EXACT = "exact"
 OURS = ("render", "c")  # targets that run compiled C
 IDEAL = ("pinhole", "thin", "thick")
-_MAPPED = " + ST map"  # after the name of an ideal camera
+_MAPPED = " + ST map"  # follows the name of an ideal camera
 FITTED = "fitted for this shot"
-_CLOSE = 1.3  # times the operations of the smallest model that holds, up to which others of its form are timed
-_MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
+_CLOSE = 1.3  # models of one form are timed up to so many times the operations of the smallest that holds
+_MOST_OVERSCAN = 4.0  # the most overscan of a plane picture that is warped afterwards
 
 
 @dataclass(frozen=True)
@@ -66,16 +66,16 @@ class Choice:
 
     Attributes:
         camera: the text that `--camera` or `export` takes.
-        error_px, light_error: at the counted percentile; inf where it has no light that the lens has.
+        error_px, light_error: at the counted percentile; inf where it lacks light that the lens has.
         cost: what the camera takes on a path, in the plan's unit, times `noise`; inf where nobody asked for it.
-        noise: how many times the paths it needs for equal error, see `costs`.
+        noise: how many times as many paths it needs for an equal error, see `costs`.
         how: what else it needs, or how it was made.
         within: whether it meets the budget of its plan.
-        settings: of a model that was fitted for the shot.
-        spread: how many times as long as the least the median of its timed calls took (1 where cost is counted).
+        settings: those of a model that was fitted for the shot.
+        spread: the median of its timed calls over the least (1 where cost is counted).
         disperses: whether its picture depends on the wavelength.
-        seconds: of one thread, of the whole picture to the noise of the exact lens (10^9 operations where no time is
-            known), by the least of the camera's timed calls; by their median the picture takes `more` than that.
+        seconds: on one thread, for the whole picture to the noise of the exact lens, by the least of the camera's timed
+            calls (10^9 operations where no time is known). `more`: how much longer it is by their median.
         camera_seconds: the camera's share of them.
     """
 
@@ -96,15 +96,15 @@ class Choice:
 
     @property
     def noisy(self) -> bool:
-        """Whether the timing spreads too far to tell it from one that is a little shorter: see `records.noisy`."""
+        """Whether its timing spreads too far to tell it from one that is a little shorter: see `records.noisy`."""
         return noisy({"min": 1.0, "median": self.spread})
 
     def meets(self, budget_px: float) -> bool:
-        """Whether it may be used."""
+        """Return whether it meets a budget of error."""
         return self.error_px <= budget_px and self.light_error <= LIGHT
 
     def whole(self, work: Work, denoised: bool = False) -> float:
-        """The cost of a path, times the noise of its picture unless that is taken out later."""
+        """Return the cost of a path, times the noise of its picture unless that is removed later."""
         return self.cost + work.rest[self.disperses] * (1.0 if denoised else self.noise)
 
 
@@ -112,14 +112,14 @@ def candidates(
     probed: Probe, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
     folder: Path | None = None, explain: bool = False, report: Report | None = None, work: Work = ALONE,
 ) -> tuple[Choice, ...]:  # fmt: skip
-    """Cameras with error and cost, enough to decide for each of some budgets; arguments as for `studies.plan.plan`.
+    """Try cameras until each of some budgets can be decided, with error and cost; arguments as for `studies.plan.plan`.
 
-    `work`: of the paths of the target.
+    `work` is that of the target's paths.
     """
     say = report or (lambda done, left=None: None)
     say(0.2)
     trial = Trial(probed, target, tuple(budgets_px), explain, work)
-    with warnings.catch_warnings():  # a film beyond the end of a model's range: its error counts
+    with warnings.catch_warnings():  # of a film beyond the end of a model's range, which shows as error
         warnings.simplefilter("ignore", NeurolensWarning)
         tried = [*_ideal(trial), *_exact(trial), *_shipped(trial, models)]
         fitted = [] if folder is None else _fitted(trial, folder, tried, lambda done, left=None: say(0.2 + 0.6 * done))
@@ -128,12 +128,12 @@ def candidates(
 
 @dataclass(frozen=True)
 class _Judged:
-    """A camera with its errors, and the function that gives the cost of a ray and its noise.
+    """A camera with its errors, and the function that gives a ray's cost and noise.
 
     Attributes:
-        form: of models, "ols" or another method.
-        size: operations of a ray. Where both are given, a model of more size is taken to cost no less than one of the
-            same form.
+        form: for models, "ols" or another method.
+        size: operations of a ray. Where form and size are given, a larger model is assumed to cost no less than a
+            smaller one of the same form.
     """
 
     choice: Choice
@@ -144,8 +144,7 @@ class _Judged:
 
 @dataclass(frozen=True)
 class Trial:
-    """The scene, target and budgets that cameras are tried for, whether all are to have their cost, and the work of a
-    path."""
+    """What cameras are tried for: scene, target, budgets, whether all need a cost (`explain`), and a path's work."""
 
     probed: Probe
     target: Target
@@ -160,14 +159,14 @@ class Trial:
 
     @property
     def by_size(self) -> bool:
-        """Whether costs rise with size; shaders of models have pupils and noise of their own."""
+        """Whether costs rise with size; shaders of models have pupils, and so noise, of their own."""
         return self.target != "osl" and not self.explain
 
     def judged(
         self, name: str, spec: str, seen: Footprints, cost: Cost, how: str = "", form: str = "", size: int = 0,
         beside: prints.Array | float = 0.0, disperses: bool = False,
     ) -> _Judged:  # fmt: skip
-        """A camera's error against the exact footprints, its cost not known yet; `beside`: light outside the lens's."""
+        """A camera's error against the exact footprints, without its cost; `beside` is light outside the lens's."""
         probed = self.probed
         apart = prints.distance_mm(probed.wanted, seen, self.share) / probed.asked.pixel_mm
         light = np.abs(seen.light / np.maximum(probed.wanted.light, 1e-30) - 1) + beside
@@ -179,7 +178,7 @@ class Trial:
         return _Judged(choice, cost, form, size)
 
     def costed(self, judged: _Judged) -> Choice:
-        """A camera with its cost."""
+        """Return a camera with its cost."""
         choice, (timing, weights) = judged.choice, judged.cost()
         times = weights * self.work.noise[choice.disperses]
         return replace(
@@ -187,16 +186,16 @@ class Trial:
             cost=timing["min"] * (1.0 if self.probed.asked.denoised else times),
             noise=times,
             spread=timing["median"] / timing["min"] if timing["min"] else 1.0,
-            # A shader that does not focus so near shows nothing.
+            # A shader that cannot focus so near shows nothing.
             error_px=choice.error_px if math.isfinite(times) else math.inf,
         )
 
     def timed(self, camera: Camera, seen: Footprints) -> tuple[Timing, float]:
-        """The cost of a ray of a camera that runs here, by the clock, and the noise of its weights."""
+        """Return the cost of a ray of a camera that runs here, by the clock, and the noise of its weights."""
         return ns_a_ray(camera, self.probed.places), noise(seen.weight, self.share)
 
     def counted(self, cost: float, seen: Footprints) -> tuple[Timing, float]:
-        """A cost that is no measurement, and so has no spread."""
+        """Return a cost that is counted, and so has no spread."""
         return {"min": cost, "median": cost}, noise(seen.weight, self.share)
 
     def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
@@ -206,19 +205,19 @@ class Trial:
         return timing, area * times
 
     def shader(self, file: str | Path) -> tuple[Timing, float]:
-        """The cost of the shader of a model or a lens."""
+        """Return the cost of the shader of a model or a lens."""
         asked = self.probed.asked
-        state = asked.zoom if str(file) == self.probed.lens.path else None  # a model is of one state
+        state = asked.zoom if str(file) == self.probed.lens.path else None  # a model has one state
         lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
         ns, times = shader_cost(lens, self.probed.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
         return {"min": ns, "median": ns}, times
 
 
 def camera_of(probed: Probe, choice: Choice) -> Camera:
-    """The camera of a choice, in our renderer; with the maps of its picture, where it needs them.
+    """Return the camera of a choice in our renderer, with the maps of its picture where it needs them.
 
     Raises:
-        InputError, ModelError: as the cameras.
+        InputError, ModelError: as the camera's own class.
     """
     kind, path = split_kind(choice.camera)
     if choice.name == EXACT:
@@ -232,18 +231,18 @@ def camera_of(probed: Probe, choice: Choice) -> Camera:
 
 
 def _ideal(trial: Trial) -> Iterator[_Judged]:
-    """Pinhole, thin and thick lens, as they are and with their picture warped afterwards, where the target has them.
+    """Yield pinhole, thin and thick lens, as they are and, where the target has that, with their picture warped later.
 
     In C and GLSL they are their own source.
     """
     probed, shot = trial.probed, trial.probed.asked.shot
     for name in {"onnx": (), "osl": IDEAL[:2]}.get(trial.target, IDEAL):
         spec = f"{name}:{probed.lens.path}"
-        with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
+        with suppress(InputError):  # a lens with cylinders has no thick lens; maps lack half a sphere, or a dark film
             camera = as_c(ideal_as(f"{name}:", probed.exact.lens, shot))
             seen = prints.footprints(camera, probed.places)
             yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
-            # In our renderer the thick lens stands in the thin one's place.
+            # In our renderer the thick lens takes the place of the thin one.
             if "distortion" in probed.asked.afterwards or (name == "thin" and trial.target in OURS):
                 continue
             maps = Warped(camera, probed.exact, probed.asked.shot.focus_m)
@@ -254,8 +253,10 @@ def _ideal(trial: Trial) -> Iterator[_Judged]:
 
 
 def _exact(trial: Trial) -> Iterator[_Judged]:
-    """The exact lens, which has no error with all of its dispersion: as C where that runs, and as code where its
-    surfaces have a form in it."""
+    """Yield the exact lens, which has no error with all of its dispersion.
+
+    It is taken as C where that runs, and as code where its surfaces have a form in that.
+    """
     probed, target = trial.probed, trial.target
     shown = with_dispersion(probed.exact, probed.asked.shot)
     seen = probed.seen if shown is probed.exact else prints.footprints(shown, probed.places)
@@ -265,18 +266,18 @@ def _exact(trial: Trial) -> Iterator[_Judged]:
         "glsl": lambda: trial.counted(glsl_operations(exact), probed.seen),
     }.get(target, lambda: trial.timed(shown, seen))
     if target in ("render", "osl", "glsl") or (target == "c" and compiled):
-        with suppress(InputError):  # a shader that is too large
+        with suppress(InputError):  # the shader may be too large
             yield trial.judged(EXACT, str(path), seen, cost, disperses=shown.dispersive)
 
 
 def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = ()) -> Iterator[_Judged]:
-    """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form, or its
-    form is one of `without`.
+    """Yield a model in the form that the target runs.
 
-    Errors are of onnxruntime: compilers take seconds, and C and shaders give the same rays. They are measured within
-    the outline of the exact lens's pupil, from the same points of it: rows of samples leave out the rim of what fills
-    an outline, and two outlines of one lens would differ by a percent of light and 0.2% of the blur. Light that a model
-    lets pass outside it counts as its light's error.
+    There is none where its domain is not the shot's, it has no such form, or its form is one of `without`. Errors are
+    those of onnxruntime: compilers take seconds, and C and shaders give the same rays. They are measured within the
+    outline of the exact lens's pupil, from the same points of it. Each camera's own outline would do less well: rows of
+    samples do not reach an outline's rim, so that two outlines of one lens would differ by a percent of light and 0.2%
+    of the blur. Light that a model passes outside the exact outline counts as an error of light.
     """
     target = trial.target
     compiled = target in OURS and has_compiler()
@@ -303,14 +304,14 @@ def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = (
 
 
 def _operations(model: OnnxLens) -> int:
-    """The number of float operations that a ray of a model costs; 0 for networks that only onnxruntime runs."""
+    """Count the float operations of a ray of a model; 0 for networks that only onnxruntime runs."""
     with suppress(InputError):
         return sum(lower(model.graph()).count().values())
     return 0
 
 
 def _shipped(trial: Trial, files: Sequence[Path]) -> list[_Judged]:
-    """Models that are there; those of one form from the smallest on, up to one that holds the least budget."""
+    """Judge the models that exist: of each form from the smallest up to the first that meets the smallest budget."""
     judged: list[_Judged] = []
     for file in sorted(files, key=lambda f: f.stat().st_size if f.is_file() else 0):
         done = {j.form for j in judged if trial.by_size and j.choice.meets(min(trial.budgets_px))}
@@ -319,8 +320,10 @@ def _shipped(trial: Trial, files: Sequence[Path]) -> list[_Judged]:
 
 
 def _costed(trial: Trial, tried: Sequence[_Judged]) -> Iterator[Choice]:
-    """Cameras with their cost where it matters: those that hold a budget, and of models of one form the smallest and
-    those that are about as small."""
+    """Yield cameras with their cost where it matters.
+
+    It matters for those that meet a budget; of models of one form, for the smallest and those of about its size.
+    """
     asked = {id(j) for j in tried} if trial.explain else set[int]()
     for budget_px in trial.budgets_px:
         holds = [j for j in tried if j.choice.meets(budget_px)]
@@ -332,26 +335,27 @@ def _costed(trial: Trial, tried: Sequence[_Judged]) -> Iterator[Choice]:
         yield trial.costed(j) if id(j) in asked else j.choice
 
 
-TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
-# Gates that alone block a smaller share of the rays go: they darken no pixel by a thousandth.
+TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of polynomials that are fitted for a shot
+# Gates that alone block a smaller share of the rays are left out: they darken no pixel by a thousandth.
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=5e-4)
-_FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
-_MOVED_TERMS = 16, 22  # from so many on, planes are searched: once, for the second number
+# for lenses with cylinders: more candidates take ten times as long, for the same errors
+_FIT_MIRROR = replace(_FIT, degree=5)
+_MOVED_TERMS = 16, 22  # with the first number of terms or more, planes are searched: once, for the second number
 PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 
 
 def shot_domain(probed: Probe) -> DomainChoice:
-    """The domain of a probe as the choice of an experiment."""
+    """Return the domain of a probe as an experiment states it."""
     return DomainChoice(probed.domain.film_radius_mm, probed.domain.focus_m, probed.asked.shot.wavelength_nm)
 
 
 def shot_terms(probed: Probe) -> list[int]:
-    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
+    """Return the sizes of polynomials that are tried for a shot; with cylinders they count terms of x and of y."""
     return [n for n in TERMS if n >= (4 if probed.lens.anamorphic else 2)]
 
 
 def shot_fits(probed: Probe, folder: Path) -> Callable[[int], tuple[Path, ModelSettings]]:
-    """A function that fits a polynomial of so many terms to a shot alone.
+    """Return a function that fits a polynomial of so many terms to one shot alone.
 
     It returns the model's file, in the folder, and its settings.
     """
@@ -360,7 +364,7 @@ def shot_fits(probed: Probe, folder: Path) -> Callable[[int], tuple[Path, ModelS
     folder.mkdir(parents=True, exist_ok=True)
 
     @cache
-    def moved() -> Prepared:  # the planes of one size: a search takes a second, and others of its kind agree on them
+    def moved() -> Prepared:  # planes for one size: a search takes a second, and other sizes agree on them
         return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
 
     def fit(terms: int) -> tuple[Path, ModelSettings]:
@@ -368,19 +372,19 @@ def shot_fits(probed: Probe, folder: Path) -> Callable[[int], tuple[Path, ModelS
         file = folder / f"{probed.lens.lens_id}.{settings.label}.onnx"
         planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
         export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
-        return file, replace(settings, planes=planes)  # as a training from scratch has it
+        return file, replace(settings, planes=planes)  # as settings from which a training finds the same
 
     return fit
 
 
 def _fitted(trial: Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:
-    """Polynomials fitted for the shot alone: the smallest that holds each budget, and those on the way to it.
+    """Fit polynomials for the shot alone: the smallest that meets each budget, and those tried on the way to it.
 
-    Nothing is fitted where a pinhole or an ideal lens, which costs less, holds a budget, unless all are asked for.
+    Nothing is fitted where a pinhole or an ideal lens, which costs less, meets a budget, unless all are asked for.
     """
     probed = trial.probed
     easy = [j.choice for j in tried if j.choice.name.startswith(IDEAL) and not trial.explain]
-    # Nothing that is fitted has no error.
+    # No fitted model has an error of 0.
     asked = [b for b in trial.budgets_px if (b > 0 or trial.explain) and not any(c.meets(b) for c in easy)]
     if not asked:
         return []

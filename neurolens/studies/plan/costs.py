@@ -1,9 +1,10 @@
 """The cost of a camera in its target: nanoseconds or operations of a path, times the noise of its picture.
 
-That is proportional to the seconds to equal error. A pixel is the mean of n samples w L of weights and radiances, which
-are independent; with a and b their squared relative deviations its relative variance is ((1 + a)(1 + b) - 1) / n. Where
-radiances vary much, that is where samples are many, it goes with 1 + a = mean(w^2) / mean(w)^2: so many times the rays
-of a camera of even weights have its error. Weights that are 1 with probability p and else 0 need 1 / p times the rays.
+Their product is proportional to the seconds to equal error. A pixel is the mean of n samples w L of weights and
+radiances, which are independent. With a and b the squared relative deviations of these, its relative variance is ((1 +
+a)(1 + b) - 1) / n. Where radiances vary much, which is where samples are many, it is proportional to 1 + a = mean(w^2)
+/ mean(w)^2: so many times the rays of a camera of even weights give its error. Weights that are 1 with probability p
+and else 0 need 1 / p times the rays.
 
 In our renderer a camera that disperses has more noise than that, and its paths take longer: both are measured for the
 scene, by strips of its picture through the exact lens and through a thin one (`work_of`).
@@ -34,30 +35,32 @@ from neurolens.pictures.render.world import shared_worlds
 from neurolens.studies.plan.footprints import Array, Places
 
 UNIT = {"render": "ns", "c": "ns", "onnx": "ns", "osl": "ns", "glsl": "operations"}
-# Of a camera ray in Cycles under a white sky, experiments/results/osl_speed.md: Blender's own cameras; any shader, each
-# of its operations, and what each division and root takes besides. Fitted to the least times of the six cameras of
-# lenses there, on quiet cores: within 3.5%.
+# Of a camera ray in Cycles under a white sky, experiments/results/osl_speed.md: Blender's own cameras; for a shader a
+# base, each of its operations, and what a division or a root takes besides. Fitted to the least times of the six lenses
+# there, on quiet cores: within 3.5%.
 CYCLES_NS: Mapping[str, float] = {"pinhole": 114.4, "thin": 140.9}
 SHADER_NS = 90.66
 _STEP_NS, _DEAR_NS, _DEAR = 0.2295, 2.772, ("div", "sqrt")
-# Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
+# Of GLSL as anybody would write it: a direction with its length, a point of a disc by concentric squares, the plane in
+# focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
-# Of a picture, to measure its paths: most strips, least rows of one (where cameras disperse, rows beside a strip have
-# light in it and are rendered, too), paths of all, of the picture's at most one in `_PART`, samples of a pixel at most.
-# What thin lenses and those that disperse gain by more samples differs: noise is compared at the scene's own number.
+# To measure the paths of a picture: the most strips; the fewest rows of one (where cameras disperse, rows beside a
+# strip have light in it and are rendered, too); paths of all strips, and the part of the picture's paths that these may
+# be; samples of a pixel, at most. Thin lenses and those that disperse gain differently by more samples: noise is
+# compared at the scene's own number.
 _STRIPS, _ROWS, _STRIP_PATHS, _PART, _SAMPLES = 6, 4, 400_000, 400, 16
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
-_MOST_DARK = 0.05  # of the places
+_MOST_DARK = 0.05  # share of the places that may be dark
 
 
 @dataclass(frozen=True)
 class Work:
-    """The parts of the cost of a path that all cameras of a kind share; each pair is without and with dispersion.
+    """What all cameras of a kind share in the cost of a path; each pair is without and with dispersion.
 
     Attributes:
-        rest: cost of a path besides a ray of the camera, the hero's; 0 where the camera alone counts.
-        noise: variance at equal samples and equal weights, over that of cameras that do not disperse.
+        rest: cost of a path without the hero's camera ray; 0 where the camera alone counts.
+        noise: variance at equal samples and equal weights, relative to cameras that do not disperse.
     """
 
     rest: tuple[float, float] = (0.0, 0.0)
@@ -68,9 +71,9 @@ ALONE = Work()  # where the camera alone counts
 
 
 def noise(weight: Array, share: Array) -> float:
-    """The factor of rays that a camera with weights [N, W, P] needs, by the share of each wavelength: mean over places.
+    """Return how many times as many rays a camera with weights [N, W, P] needs, averaged over places.
 
-    inf where more than 5% of the places get no light.
+    `share` is that of each wavelength. It is inf where more than 5% of the places get no light.
     """
     mean, square = ((w.mean(-1) * share).sum(-1) for w in (weight, weight**2))
     lit = mean > 0
@@ -78,7 +81,7 @@ def noise(weight: Array, share: Array) -> float:
 
 
 def ns_a_ray(camera: Camera, places: Places) -> Timing:
-    """Nanoseconds of the processor for a ray: least and median of some calls on one thread."""
+    """Return the processor's nanoseconds for a ray: least and median of some calls on one thread."""
     rays = int(getattr(camera, "rays_a_call", RAYS_A_CALL))
     rng = np.random.default_rng(1)
     rows = rng.integers(0, places.film_mm.shape[1], rays)
@@ -93,7 +96,7 @@ def ns_a_ray(camera: Camera, places: Places) -> Timing:
 
 
 def small(scene: Scene, across: int) -> tuple[int, int]:
-    """Width and height of the scene's picture, no wider than `across`."""
+    """Return width and height of the scene's picture, no wider than `across`."""
     shot = scene.settings.camera
     width = min(across, shot.width)
     return width, max(round(width * shot.film_mm[1] / shot.film_mm[0]), 1)
@@ -103,8 +106,8 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
     """Measure the work of a path of our renderer, and what dispersion does to its noise.
 
     Args:
-        plain, colours: cameras of the same lens, without and with its dispersion. weights: theirs at the places, as
-            for `noise`.
+        plain, colours: cameras of the same lens, without and with its dispersion. weights: those of both at the places,
+            as for `noise`.
     """
     shot = scene.settings.camera
     samples = min(shot.samples, _SAMPLES)
@@ -113,13 +116,14 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
     rest, variance = [], []
     for camera, weight in zip((plain, colours), weights, strict=True):
         with shared_worlds():
-            _strip(scene, camera, 0, (0, 1), samples)  # what is fitted or compiled once is no part of a path
+            _strip(scene, camera, 0, (0, 1), samples)  # fits and compilations, done once, are no part of a path
             some = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
         ns = np.array([[seconds for _, seconds in row] for row in some]).min(axis=0).mean()
         rest.append(max(float(ns) - ns_a_ray(camera, places)["min"], 0.0))
         one, two = (np.concatenate([picture for picture, _ in row]) for row in some)
-        apart = np.square(one - two).mean(axis=-1)  # twice the variance
-        most = np.percentile(apart, 100 * (1 - _MOST_DARK))  # the rarest lights are left to chance
+        apart = np.square(one - two).mean(axis=-1)  # is twice the variance
+        # brighter differences, from the rarest lights, are left to chance
+        most = np.percentile(apart, 100 * (1 - _MOST_DARK))
         mean = max(float(one.mean()), 1e-30)
         variance.append(float(np.minimum(apart, most).mean()) / mean**2 / noise(weight, places.share))
     ratio = variance[1] / variance[0] if variance[0] > 0 and math.isfinite(variance[1]) else 1.0
@@ -127,7 +131,7 @@ def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weight
 
 
 def strips_of(scene: Scene, paths: int, samples: int) -> list[tuple[int, int]]:
-    """The first row of each of some strips of a picture, and the one after its last: for so many paths in all."""
+    """Return first row and the one after the last of strips of a picture that have `paths` paths in all."""
     shot = scene.settings.camera
     rows = max(paths // (samples * shot.width), 1)
     count = min(max(rows // _ROWS, 1), _STRIPS)
@@ -137,7 +141,7 @@ def strips_of(scene: Scene, paths: int, samples: int) -> list[tuple[int, int]]:
 
 
 def _strip(scene: Scene, camera: Camera, seed: int, rows: tuple[int, int], samples: int) -> tuple[Array, float]:
-    """Rows of a picture, and the nanoseconds of a path: of the processor, for other work would count by the clock."""
+    """Render rows of a picture; also return a path's nanoseconds of the processor (a clock counts other work)."""
     shot = scene.settings.camera
     grid = PixelGrid(shot.width, shot.height, camera.film_mm)
     job = Job(scene, camera, grid, samples, seed, shot.max_depth, scene.settings.film, rows)
@@ -151,14 +155,14 @@ def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:
     """Count the operations of a ray of `neurolens export --whole-camera --to glsl`; a fused multiply-add counts as one.
 
     Raises:
-        InputError: a lens or model that has no such form.
+        InputError: the lens or model has no such form.
     """
     graph = camera.lens_graph()
     return sum(camera_program(camera.film, graph, own_table=False).count().values())
 
 
 def cycles_ns(program: Program) -> float:
-    """Nanoseconds of a ray of a shader in Cycles, by its operations."""
+    """Return the nanoseconds of a ray of a shader in Cycles, from its operations."""
     kinds = program.count()
     return SHADER_NS + _STEP_NS * sum(kinds.values()) + _DEAR_NS * sum(kinds.get(k, 0) for k in _DEAR)
 
@@ -166,16 +170,16 @@ def cycles_ns(program: Program) -> float:
 def shader_cost(
     lens: OslLens, places: Places, film_mm: tuple[float, float], f_number: float, focus_m: float
 ) -> tuple[float, float]:
-    """Nanoseconds of a ray of a shader in Cycles by its operations, and its noise in luminance.
+    """Return the nanoseconds of a shader's ray in Cycles, from its operations, and the noise of its luminance.
 
-    The noise is that of the shader's own throughput at the places: of its pupil, and of wavelengths drawn evenly.
+    The noise is that of the shader's own throughput at the places: from its pupil, and from wavelengths drawn evenly.
     """
     program = osl_program(lens, {"count": 0.0})
     ns = cycles_ns(program)
     points, rays = places.film_mm.shape[1], _SIDE * _SIDE
     steps, rng = (np.arange(_SIDE) + 0.5) / _SIDE, np.random.default_rng(1)
     first, second = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
-    # Low bits of the first number tell the wavelength within a part of the spectrum.
+    # The low bits of the first number choose the wavelength within a part of the spectrum.
     low = (rng.permuted(np.tile(np.arange(rays), (points, 1)), axis=1) + 0.5) / rays
     raster = 0.5 - places.film_mm / np.array(film_mm)[:, None]
     half = math.pi / 3

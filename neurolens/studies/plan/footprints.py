@@ -1,13 +1,13 @@
-"""Footprints: the places on the film that a camera's rays of a film point stand for; their parts, and how two differ.
+"""Footprints of film points: the places on the film that a camera's rays stand for, their parts, and how two differ.
 
-The rays of a film point meet the plane across its chief ray at the distance of what it shows. Taken back to the film by
-the first-order map of the exact camera there, the points where they meet it are its footprint, in mm on the film: the
-picture of a point, seen the other way. Any camera of the contract has one, so that all are held against the exact lens
-by the same rule, fisheyes too.
+The rays of a film point meet the plane across its chief ray at the distance of what it shows. The first-order map of
+the exact camera takes these points back to the film, where they are its footprint, in mm: the picture of a point, seen
+the other way. Any camera of the contract has one, so that all, fisheyes too, are held against the exact lens by the
+same rule.
 
-Footprints differ by the sliced Wasserstein distance of order 2 (Bonneel et al. 2015), scaled so that a shift by d is d:
-the least RMS way on which light moves to turn one into the other, over lines through the film. It needs no pairing of
-rays, and holds what a picture shows: place, size and shape of the blur, and of each wavelength by itself.
+Footprints differ by the sliced Wasserstein distance of order 2 (Bonneel et al. 2015), scaled so that a shift by d is d.
+It is the least RMS way by which light must move to turn one into the other, over lines through the film. It needs no
+pairing of rays, and holds what a picture shows: place, size and shape of the blur, and of each wavelength by itself.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ _Real = TypeVar("_Real", bound=np.floating[Any])
 
 _LINES = 8  # directions of the sliced distance
 _QUANTILES = 64
-_BESIDE, _BESIDE_POINTS = 0.005, 24  # of a pupil's radius, outside its outline; points there
-_STEP = 1e-3  # of the film's width: step of the first-order map
+# how far outside the pupil's outline light is looked for, in pupil radii; points there
+_BESIDE, _BESIDE_POINTS = 0.005, 24
+_STEP = 1e-3  # step of the first-order map, as a share of the film's width
 EFFECTS = (
     "distortion", "defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
     "longitudinal colour", "lateral colour",
 )  # fmt: skip
-AFTERWARDS = ("distortion", "defocus")  # what compositing may do to a picture
+AFTERWARDS = ("distortion", "defocus")  # what compositing may do to a picture later
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,8 @@ class Places:
     Attributes:
         film_mm: [2, N], lens frame. distance_m: [N] along the chief rays, inf allowed.
         origin_m, direction: [3, N] of the exact camera's chief rays, camera frame. across: [2, 3, N] unit vectors
-            across them. to_film: [2, 2, N] from slopes against the chief ray to mm on the film.
-        wavelength_nm: [W]. share: [W] of the light, of sum 1.
+            across these. to_film: [2, 2, N] from slopes against the chief ray to mm on the film.
+        wavelength_nm: [W]. share: [W] of the light, with the sum 1.
     """
 
     film_mm: Array
@@ -57,7 +58,7 @@ class Places:
     share: Array
 
     def at(self, index: NDArray[np.intp]) -> Places:
-        """Some of the places."""
+        """Return some of the places, by number."""
         each = ("film_mm", "distance_m", "origin_m", "direction", "across", "to_film")
         return replace(self, **{name: getattr(self, name)[..., index] for name in each})
 
@@ -67,8 +68,8 @@ class Footprints:
     """Rays of N places, W wavelengths and P pupil samples.
 
     Attributes:
-        place_mm: [2, N, W, P] on the film, from the place's own film point. pupil_mm: [2, N, W, P] across the chief
-            ray at its origin, on the side of the scene. weight: [N, W, P]; 0 where a ray did not pass.
+        place_mm: [2, N, W, P] on the film, from the place's own film point. pupil_mm: [2, N, W, P] where rays cross the
+            plane of the chief ray's origin, on the side of the scene. weight: [N, W, P]; 0 where a ray did not pass.
     """
 
     place_mm: Array
@@ -77,26 +78,26 @@ class Footprints:
 
     @property
     def light(self) -> Array:
-        """[N] film value of white surroundings, mean over wavelengths."""
+        """The film value [N] of white surroundings, averaged over wavelengths."""
         return self.weight.mean((1, 2))
 
     @cached_property
     def quantiles(self) -> list[Array]:
-        """[N, W, Q] mm at equal steps of the light along each of some lines through the film."""
+        """Places [N, W, Q] in mm at equal steps of the light, along each of some lines through the film."""
         x, y = self.place_mm
         return [_quantiles(np.cos(t) * x + np.sin(t) * y, self.weight) for t in np.arange(_LINES) * (np.pi / _LINES)]
 
 
 def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Array, share: Array) -> Places:
-    """Places of film points [2, N] that show something at depths [N] along the axis; points without light are left out.
+    """Make places of film points [2, N] that show something at depths [N] along the axis; dark points are left out.
 
-    Depths become distances along the chief ray of the exact camera, in the middle of the wavelengths.
+    Depths become distances along the exact camera's chief ray at the middle wavelength.
     """
     middle = float((wavelength_nm * share).sum())
     origin, direction, lit = _chief(exact, film_mm, middle)
     lit &= (depth_m > 0) | np.isinf(depth_m)
     film_mm, depth_m, origin, direction = film_mm[:, lit], depth_m[lit], origin[:, lit], direction[:, lit]
-    with np.errstate(all="ignore"):  # a ray of a fisheye across the axis meets no depth: it shows something distant
+    with np.errstate(all="ignore"):  # a fisheye's ray across the axis meets no depth, and shows something distant
         distance = (depth_m + origin[2]) / np.maximum(-direction[2], 0.0)
     distance = np.where(np.isfinite(distance) & (distance > 0), distance, np.inf)
     helper = np.where(np.abs(direction[0]) < 0.9, *np.eye(3)[:2, :, None])
@@ -115,7 +116,7 @@ def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Arra
 
 
 def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
-    """Footprints of a camera at places, by `samples` by `samples` stratified points of its pupil."""
+    """Trace the footprints of a camera at places, by `samples` by `samples` stratified points of its pupil."""
     steps = (np.arange(samples) + 0.5) / samples
     rays, shape = _sampled(camera, places, np.stack(np.meshgrid(steps, steps)).reshape(2, -1))
     points = shape[0]
@@ -130,16 +131,17 @@ def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
 
 
 def light_beside(camera: Camera, places: Places) -> Array:
-    """Light [N] within half a percent of a pupil's radius outside its outline, if all is as that distance away."""
+    """Return the light [N] within half a percent of a pupil's radius outside its outline, from its density there."""
     angle = 2 * np.pi * (np.arange(_BESIDE_POINTS) + 0.5) / _BESIDE_POINTS
     edge = np.stack([np.cos(angle), np.sin(angle)])
-    square = 0.5 + 0.5 * (1 + _BESIDE) * edge / np.abs(edge).max(0)  # outlines go on beyond the edge of the square
+    # the outline is continued beyond the edge of the square
+    square = 0.5 + 0.5 * (1 + _BESIDE) * edge / np.abs(edge).max(0)
     rays, shape = _sampled(camera, places, square)
     return np.asarray(2 * _BESIDE * rays.weight.astype(np.float64).reshape(shape).mean((1, 2)))
 
 
 def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Collection[str]) -> Footprints:
-    """The exact camera's footprints without what `AFTERWARDS` makes of the picture later.
+    """Return the exact camera's footprints without the effects that `AFTERWARDS` adds to the picture later.
 
     Without distortion they lie where a thin lens's do; without defocus they are points.
     """
@@ -153,9 +155,9 @@ def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Colle
 
 
 def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
-    """Sliced Wasserstein distance [N] between footprints of the same places, RMS over wavelengths by share, mm.
+    """Return the sliced Wasserstein distance [N] between footprints of the same places, RMS over wavelengths, in mm.
 
-    NaN where one of the two has light and the other none.
+    It is NaN where one has light and the other has none.
     """
     total = np.zeros(a.weight.shape[:2])
     for of_a, of_b in zip(a.quantiles, b.quantiles, strict=True):
@@ -164,11 +166,11 @@ def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
 
 
 def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, Array]:
-    """Parts of the exact camera's footprints, `EFFECTS` by name, [N] RMS mm on the film.
+    """Return the parts of the exact camera's footprints, `EFFECTS` by name, [N] RMS mm on the film.
 
-    A thin lens framed as the lens has the defocus of each depth. What the exact footprint has besides is expanded in
-    the pupil point: by degree, each part orthogonal to those below it over the light that passes (as Zernike's are over
-    a disc: coma with the tilt that balances it, spherical aberration with its best focus).
+    A thin lens framed as the lens has the defocus of each depth. What else the exact footprint has is expanded in the
+    pupil point by degree. Each part is orthogonal to those below it over the light that passes, as Zernike's
+    polynomials are over a disc: coma has the tilt that balances it, spherical aberration its best focus.
     """
     (centre, by_wave), (ideal, ideal_by_wave) = centroids(exact, share), centroids(thin, share)
     (linear, parts), (plain, _) = _expanded(exact, by_wave), _expanded(thin, ideal_by_wave)
@@ -196,7 +198,7 @@ def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, A
 
 
 def blur_mm(prints: Footprints, share: Array) -> Array:
-    """RMS diameter [N] of footprints: twice the RMS distance from their centroid, all wavelengths together, mm."""
+    """The RMS diameter [N] of footprints in mm: twice the RMS distance from their centroid, over all wavelengths."""
     centre, _ = centroids(prints, share)
     weight = prints.weight * share[:, None]
     away = ((prints.place_mm - centre[:, :, None, None]) ** 2).sum(0)
@@ -204,7 +206,7 @@ def blur_mm(prints: Footprints, share: Array) -> Array:
 
 
 def _sampled(camera: Camera, places: Places, pupil: Array) -> tuple[CameraRays, tuple[int, int, int]]:
-    """Rays of N places, W wavelengths and points [2, P] of the square that fills the pupil, and (N, W, P)."""
+    """Trace rays of N places, W wavelengths and points [2, P] of the pupil's square; also return (N, W, P)."""
     shape = places.film_mm.shape[1], len(places.wavelength_nm), pupil.shape[1]
     film = np.broadcast_to(places.film_mm[:, :, None, None], (2, *shape)).reshape(2, -1)
     square = np.broadcast_to(pupil[:, None, None, :], (2, *shape)).reshape(2, -1)
@@ -226,21 +228,21 @@ def _meet(places: Places, origin: Array, direction: Array) -> Array:
     base, along, near = places.origin_m[..., *new], places.direction[..., *new], 1 / places.distance_m[..., *new]
     rate, from_base = (direction * along).sum(0), origin - base
     with np.errstate(all="ignore"):
-        # Everything over the distance, so that the plane may lie at infinity.
+        # All is divided by the distance, so that the plane may lie at infinity.
         step = (1 - near * (from_base * along).sum(0)) / rate
         meet = np.where(rate > 1e-3, near * from_base + step * direction, np.nan)
     return np.asarray((places.across[..., *new] * meet).sum(1))
 
 
 def centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
-    """Centroid over all light [2, N], and of each wavelength [2, N, W]."""
+    """Return the centroid of all light [2, N], and that of each wavelength [2, N, W]."""
     light = np.maximum(prints.weight.sum(2), 1e-300)
     by_wave = (prints.place_mm * prints.weight).sum(3) / light
     return (by_wave * share).sum(2), by_wave
 
 
 def _quantiles(value: Array, weight: Array) -> Array:
-    """Values [N, W, Q] at equal steps of the weight of samples [N, W, P]; NaN without weight."""
+    """Return values [N, W, Q] at equal steps of the weight of samples [N, W, P]; NaN without weight."""
     order = np.argsort(value, axis=-1)
     value, weight = np.take_along_axis(value, order, -1), np.take_along_axis(weight, order, -1)
     total = weight.sum(-1, keepdims=True)
@@ -256,14 +258,14 @@ def _quantiles(value: Array, weight: Array) -> Array:
 
 
 def _pupil_size(prints: Footprints) -> Array:
-    """RMS pupil coordinate [N] along one axis, mm: what a matrix per mm of pupil is multiplied by."""
+    """Return the RMS pupil coordinate [N] along one axis (mm), by which a matrix per mm of pupil is multiplied."""
     weight = prints.weight / np.maximum(prints.weight.sum(2, keepdims=True), 1e-300)
     mean = (prints.pupil_mm * weight).sum(3, keepdims=True)
     return np.asarray(np.sqrt((((prints.pupil_mm - mean) ** 2) * weight).sum((0, 3)).mean(1) / 2))
 
 
 def _expanded(prints: Footprints, centre: Array) -> tuple[Array, Array]:
-    """Linear parts [2, 2, N, W] in mm per mm of pupil, and mean squares [3, N, W] of degrees 2, 3 and what is left."""
+    """Return linear parts [2, 2, N, W], mm per mm of pupil, and mean squares [3, N, W] of degrees 2, 3 and the rest."""
     size = np.maximum(_pupil_size(prints), 1e-12)[:, None, None]
     x, y = prints.pupil_mm / size
     total = np.maximum(prints.weight.sum(2, keepdims=True), 1e-300)
@@ -283,12 +285,14 @@ def _expanded(prints: Footprints, centre: Array) -> tuple[Array, Array]:
 
 
 def upright(film: NDArray[_Real]) -> NDArray[_Real]:
-    """Rows by rising y and columns by rising x of the film (lens frame) as a picture shows them, turned by 180 degrees:
-    its top left is at +x, -y."""
+    """Turn rows by rising y and columns by rising x of the film (lens frame) by 180 degrees, as a picture shows them.
+
+    The top left of the picture is at +x, -y.
+    """
     return film[:, ::-1]
 
 
 def cell_centres(film_mm: tuple[float, float], shape: tuple[int, int]) -> tuple[Array, Array]:
-    """x and y in mm of the centres of equal cells of the film, rows and columns as in `shape`."""
+    """Return x and y in mm of the centres of equal cells of the film; `shape` is rows and columns."""
     x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(shape[::-1], film_mm, strict=True))
     return x, y

@@ -1,19 +1,19 @@
-"""The camera for a scene by a budget of error or time; and the trade of error against time.
+"""Plans the camera for a scene by a budget of error or time, and shows the trade of error against time.
 
-A camera's error is the distance of its footprints from the exact lens's in pixels, and of its light, at the places of a
-scene that a `probe` finds; both count where they are largest but for 5% of the picture. Its cost is the time of a path
-in the target named, times the noise of its picture: see `costs`. In C and onnxruntime it is measured here, with one
-thread; for shaders it is counted. The cheapest camera within the budget is chosen; those that take about as long are
+A camera's error is how far its footprints are from the exact lens's in pixels, and how far its light is, at the places
+of a scene that a `probe` finds; both are counted at the 95th percentile over the picture. Its cost is the time of a
+path in the target, times the noise of its picture: see `costs`. In C and onnxruntime it is measured here, on one
+thread; for shaders it is counted. The cheapest camera within the budget is chosen. Those that take about as long are
 alike, and the exact lens is taken where it is one of them.
 
-Seconds are of one thread's processor and of the whole picture at the scene's own size, to the noise that the exact lens
-has with the scene's samples. What a path takes besides its camera, and how dispersion adds to noise, is measured by
-strips of the picture in our renderer; in other targets the camera alone counts, in Cycles under a white sky. There
-cameras count as alike up to `pages.SAVING`, for what else a path takes is not known.
+Seconds are those of one thread's processor, for the whole picture at the scene's own size, to the noise that the exact
+lens has with the scene's samples. What a path takes besides its camera, and how dispersion adds to noise, is measured
+on strips of the picture in our renderer. In other targets the camera alone counts, in Cycles under a white sky; there
+cameras are alike up to `pages.SAVING`, because what else a path takes is not known.
 
-A plan should take at most a tenth of its picture. So it renders strips in proportion to the picture, tries no model
-where none could save enough, and looks for the light that the lens adds, which takes seconds, where a tenth of the
-picture has room for it.
+A plan should take at most a tenth of its picture's time. So it renders strips in proportion to the picture, tries no
+model where none could save enough, and looks for the light that the lens adds, which takes seconds, only where a tenth
+of the picture's time has room for that.
 """
 
 from __future__ import annotations
@@ -49,23 +49,24 @@ from neurolens.studies.plots import CHOSEN, error_scale, family_colour, log_norm
 from neurolens.studies.scenes import Image, flip_map
 
 _SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
-_ACROSS, _SAMPLES = 240, 16  # of pictures
-_SHOWN = 8  # most of them, beside the exact lens
-ALIKE = 1.2  # times the least cost of a whole picture: costs are no more accurate
-_BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for where every camera is asked for
-SHARE = 0.1  # of the time of its picture that a plan should take at most
-_WHOLE_S = 20.0  # CPU seconds of a plan with the light that the lens adds, at most, whatever the picture
+_ACROSS, _SAMPLES = 240, 16  # width and samples of pictures
+_SHOWN = 8  # the most pictures, besides the exact lens's
+ALIKE = 1.2  # whose pictures take up to so many times the least: costs are no more accurate
+_BUDGETS = (1.0, 0.25, 0.05)  # for which polynomials are fitted where every camera is asked for
+SHARE = 0.1  # the most that a plan should take of its picture's time
+_WHOLE_S = 20.0  # the most CPU seconds of a plan with the light that the lens adds, whatever the picture
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A scene's needs, the effects in falling order of worth, every camera tried by rising cost, the one to use.
+    """A scene's needs, its effects by falling worth, every camera tried by rising cost, and the one to use.
 
     Attributes:
-        budget_s: seconds of a plan for those, whose `budget_px` is then the error of the best camera.
+        budget_s: the seconds the picture may take, or None where an error was asked for. Where given, `budget_px` is
+            the error of the best camera that keeps to them.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
         work: what a path takes besides its camera, in the same unit; none where the camera alone counts.
-        alike: names of the cameras within the budget that take about as long as the cheapest, the best among them.
+        alike: names of the cameras within the budget that take about as long as the cheapest; the best is one of them.
     """
 
     asked: SceneNeeds
@@ -83,7 +84,7 @@ class Plan:
 
     @property
     def what(self) -> str:
-        """What takes the seconds of its cameras."""
+        """What the seconds of its cameras are spent on, in words."""
         return "whole picture" if any(self.work.rest) else "camera"
 
     @property
@@ -93,7 +94,7 @@ class Plan:
 
     @property
     def half(self) -> Choice | None:
-        """The best camera for half of the seconds that the picture of the chosen one takes."""
+        """The best camera for half of the seconds that the chosen one's picture takes."""
         return None if self.best is None else best_within(self.choices, self.best.seconds / 2)
 
     @property
@@ -102,7 +103,7 @@ class Plan:
         return "s" if self.unit == "ns" else "10^9 operations"
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: all fields but `probed`."""
+        """Return all fields but `probed`, JSON-able."""
         fields = asdict(replace(self, probed=None))  # type: ignore[arg-type]
         del fields["probed"]
         shot = fields["asked"].pop("shot")
@@ -110,8 +111,11 @@ class Plan:
         return fields
 
     def to_toml(self, lens: Lens, folder: Path) -> str:
-        """The text of a file in a folder that `render` and `export` take for the best camera, and `train` as the
-        experiment that fits it, where it is a model of the shot. Paths in it are relative to the folder."""
+        """The text of a file in a folder, from which other commands go on; paths in it are relative to the folder.
+
+        `render` and `export` take it for the best camera. `train` takes it as the experiment that fits that camera,
+        where this is a model of the shot.
+        """
         best = self.best
         assert best is not None
         kind, path = split_kind(best.camera)
@@ -129,8 +133,9 @@ def plan(
     models: Sequence[Path] = (), folder: Path | None = None, explain: bool = False, report: Report | None = None,
     **look: Any,
 ) -> Plan:  # fmt: skip
-    """The cheapest camera for a scene whose error stays within a budget, or the exact lens where that one saves too
-    little to tell; or the most faithful camera for a time. In our renderer the whole picture counts.
+    """Find the cheapest camera for a scene within a budget of error, or the most faithful one for a time.
+
+    Where the cheapest camera saves too little to tell, it is the exact lens. In our renderer the whole picture counts.
 
     Args:
         lens: as its file has it. budget_px: error of place and blur in pixels of the scene's picture.
@@ -138,12 +143,12 @@ def plan(
         target: what runs the camera: our renderer with all it has, compiled C, onnxruntime, Blender's Cycles (osl), or
             a renderer in GLSL.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
-        explain: whether cameras beyond the budget are compiled and timed, too, and the light that the lens adds is
-            looked for, whatever that takes; else their cost is infinite.
-        look: further arguments of `probe`: zoom, dispersion, and what is made of the picture later.
+        explain: whether cameras beyond the budget are compiled and timed, too (else their cost is infinite), and the
+            light that the lens adds is looked for, however long that takes.
+        look: further arguments of `probe`: zoom, dispersion, and what happens to the picture later.
 
     Raises:
-        InputError: a budget that is negative or no number; seconds for a target whose time is not known; a part of the
+        InputError: a budget is negative or no number; seconds for a target whose time is not known; part of the
             dispersion for a target other than our renderer; as `probe`.
     """
     if not budget_px >= 0:
@@ -162,10 +167,10 @@ def plan(
 
 
 def work_for(scene: Scene, probed: Probe, target: Target) -> Work:
-    """The work of a path: in our renderer by strips of the picture, in other targets that of the camera alone.
+    """Measure the work of a path: in our renderer on strips of the picture; in other targets the camera alone counts.
 
     Raises:
-        InputError: a part of the dispersion for another target.
+        InputError: part of the dispersion for another target.
     """
     shot = probed.asked.shot
     if target != "render":
@@ -179,14 +184,14 @@ def work_for(scene: Scene, probed: Probe, target: Target) -> Work:
 
 
 def exact_suffices(probed: Probe, work: Work) -> bool:
-    """Whether not even a model that costs nothing would save enough, so that nothing needs to be fitted."""
+    """Return whether even a model that costs nothing would save too little, so that nothing needs to be fitted."""
     rest = work.rest[probed.exact.dispersive]
     exact = ns_a_ray(probed.exact, probed.places)["min"] if rest else math.inf
     return recommended((0.0,), float, exact, rest, ALIKE) == exact
 
 
 def _alike(work: Work) -> float:
-    """The factor up to which costs count as the same."""
+    """Return the factor up to which costs count as the same."""
     return ALIKE if any(work.rest) else SAVING
 
 
@@ -194,10 +199,10 @@ def decided(
     probed: Probe, tried: Sequence[Choice], budget_px: float, target: Target, work: Work | None = None,
     budget_s: float | None = None, explain: bool = True,
 ) -> Plan:  # fmt: skip
-    """The plan for a budget, from candidates that serve it.
+    """Decide the plan for a budget, from candidates that serve it.
 
     Args:
-        work: of a path; None chooses the cheapest camera, whatever it saves. explain: see `plan`.
+        work: that of a path; with None the cheapest camera is chosen, whatever it saves. explain: see `plan`.
     """
     known, ranked = work or ALONE, in_seconds(probed, tried, work or ALONE)
     alike: tuple[str, ...] = ()
@@ -219,7 +224,7 @@ def decided(
 
 
 def in_seconds(probed: Probe, tried: Sequence[Choice], work: Work) -> list[Choice]:
-    """Cameras by rising seconds, to the noise that the exact lens has with the scene's samples."""
+    """Return cameras by rising seconds, to the noise that the exact lens has with the scene's samples."""
     denoised, shot = probed.asked.denoised, probed.scene.settings.camera
     exact = noise(probed.seen.weight, probed.places.share) * work.noise[probed.exact.dispersive]
     paths = 1e-9 * shot.width * shot.height * shot.samples / (1.0 if denoised else exact)
@@ -234,7 +239,7 @@ def in_seconds(probed: Probe, tried: Sequence[Choice], work: Work) -> list[Choic
 
 @dataclass(frozen=True)
 class CameraPicture:
-    """A camera's small picture [H, W, 3], linear, and its FLIP from the exact lens's of the same random numbers."""
+    """A camera's small picture [H, W, 3], linear, and its FLIP from the exact lens's with the same random numbers."""
 
     choice: Choice
     rgb: FloatArray
@@ -247,22 +252,24 @@ class CameraPicture:
 
 
 def front(choices: Sequence[Choice]) -> list[Choice]:
-    """The cameras of right light that no other betters in error and seconds."""
+    """Return the cameras with the right light that no other betters in error and seconds."""
     bright = [c for c in choices if c.light_error <= LIGHT and math.isfinite(c.seconds)]
     return [bright[i] for i in pareto_front([(c.seconds, c.error_px) for c in bright])]
 
 
 def best_within(choices: Sequence[Choice], seconds: float) -> Choice | None:
-    """The most faithful camera whose picture takes no longer."""
+    """Return the most faithful camera whose picture takes no longer than `seconds`."""
     affordable = (c for c in front(choices) if c.seconds <= seconds)
     return min(affordable, key=lambda c: (c.error_px, c.seconds), default=None)
 
 
 def pictures(plan: Plan, samples: int, report: Report) -> tuple[FloatArray, list[CameraPicture]]:
-    """The exact lens's small picture, and those of some cameras that no other betters, the chosen one among them: equal
-    samples, the same random numbers."""
+    """Render the exact lens's small picture, and those of cameras that no other betters, also the chosen one's.
+
+    All have equal samples and the same random numbers.
+    """
     scene, some = plan.probed.scene, spread(plan.front, plan.best)
-    film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
+    film = replace(scene.settings.film, wavelengths="one")  # so that all cameras share their random numbers
     width, height = small(scene, _ACROSS)
     drawn = partial(render, scene, width=width, height=height, samples=samples, film=film)
     exact = drawn(plan.probed.exact).rgb
@@ -276,7 +283,7 @@ def pictures(plan: Plan, samples: int, report: Report) -> tuple[FloatArray, list
 
 
 def spread(choices: Sequence[Choice], chosen: Choice | None, most: int = _SHOWN) -> list[Choice]:
-    """At most so many of a front, evenly, and the chosen one among them, even where it is not on the front."""
+    """Choose at most `most` of a front, evenly, and the chosen camera with them, even where it is not on the front."""
     if chosen is not None and chosen not in choices:
         choices = sorted([*choices, chosen], key=lambda c: c.seconds)
     if len(choices) <= most:
@@ -289,9 +296,9 @@ def spread(choices: Sequence[Choice], chosen: Choice | None, most: int = _SHOWN)
 
 
 _MAPS_A_ROW = 4
-# Light that an effect takes is dark, light that it adds is orange; none is white.
+# Light that an effect takes is drawn dark, light that it adds orange, and none white.
 _SIGNED = ("#10183a", "#4d6796", "#c9d1de", "#ffffff", "#f6cfae", "#e58a45", CHOSEN)
-# By unit of effects: what a value is multiplied by, the sign after it, and the labels of bars and of maps.
+# By unit of effects: a factor on values, the sign after them, and the labels of bars and of maps.
 _DRAWN = {
     "px": (1.0, " px", "worth (pixels); grey: left out", "pixels"),
     "relative": (100.0, "%", "worth (% of the light); grey: left out", "% of the light\n(dark: taken)"),
@@ -299,7 +306,7 @@ _DRAWN = {
 
 
 def plot_effects(plan: Plan, path: Path, title: str) -> None:
-    """Draw effects as bars beside the budget, and maps of those that a camera needs, one scale for each unit."""
+    """Draw effects as bars beside the budget, and maps of those that a camera needs, on one scale for each unit."""
     asked, shown = plan.asked, [e for e in plan.effects if math.isfinite(e.worth)]
     needed = [e.name for e in shown if e.needed]
     known = plan.probed.camera_maps
@@ -329,7 +336,7 @@ def _bars(axes: Any, effects: Sequence[Effect], unit: str, budget: float) -> Non
 
 
 def _maps(figure: Any, maps: Mapping[str, tuple[str, Any]], film_mm: tuple[float, float]) -> None:
-    """Maps of effects, upright, with a bar of colours for each unit."""
+    """Draw maps of effects, upright, with a colour bar for each unit."""
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
     rows, across = -(-len(maps) // _MAPS_A_ROW), min(len(maps), _MAPS_A_ROW)
@@ -357,8 +364,10 @@ def _maps(figure: Any, maps: Mapping[str, tuple[str, Any]], film_mm: tuple[float
 
 
 def _cameras(axes: Any, plan: Plan) -> None:
-    """Errors of cameras over their least time, with their median: within the budget in colour, the chosen one with a
-    ring. From a noisy time a line leads to the median of its repeats."""
+    """Draw errors of cameras over their least time: those within the budget in colour, the chosen one with a ring.
+
+    From a noisy time a line leads to the median of its repeats.
+    """
     timed = [c for c in plan.choices if 0 < c.seconds < float("inf") and c.error_px < float("inf")]
     points = [(c.seconds, max(c.error_px, 1e-4)) for c in timed]
     axes.scatter(*np.reshape(points, (-1, 2)).T, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
@@ -367,7 +376,8 @@ def _cameras(axes: Any, plan: Plan) -> None:
         axes.scatter(*point, **ring)
     noisy_lines(axes, [(y, x, x + c.more) for (x, y), c in zip(points, timed, strict=True) if c.noisy])
     axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
-    place_labels(axes, points, [c.name.rpartition(".")[2] or c.name for c in timed])  # a model without its lens
+    # models without the name of their lens
+    place_labels(axes, points, [c.name.rpartition(".")[2] or c.name for c in timed])
     if plan.budget_px > 0:
         axes.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
     if any(axes.get_legend_handles_labels()):
@@ -376,7 +386,7 @@ def _cameras(axes: Any, plan: Plan) -> None:
 
 
 def plot_trade(plan: Plan, path: Path, title: str) -> None:
-    """Error of every camera against its seconds, with the front of those that no other betters."""
+    """Draw the error of every camera against its seconds, with the front of those that no other betters."""
     best = plan.front
     subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
     with drawing(path, 8.5, 5.0, title, subtitle) as figure:

@@ -1,12 +1,12 @@
-"""A scene as a lens sees it: the places in view, the lens's footprints there, and what each of its effects is worth.
+"""A scene as a lens sees it: places in view, the lens's footprints there, and the worth of each of its effects.
 
-A probe sends the chief rays of a grid of film points into the scene: what they meet, and how far off, are the places at
-which cameras are held against the exact lens (`footprints`), in the scene's own light. An effect's worth is its part of
-the exact footprints in pixels, or the light that it adds or takes relative to the picture, where it is largest but for
-5% of the picture.
+A probe sends the chief rays of a grid of film points into the scene. What they meet, and how far off, are the places at
+which cameras are held against the exact lens (`footprints`), in the scene's own light. An effect is worth its part of
+the exact footprints in pixels, or the light that it adds or takes relative to the picture; both are counted at the 95th
+percentile over the picture.
 
-A small picture with few samples shows where the scene is bright. The lens's ghosts, glare and stars of the scene's own
-lights, drawn on as few pixels, are set against it.
+A small picture with few samples shows where the scene is bright. The lens's ghosts, glare and stars from the scene's
+own lights, drawn on as few pixels, are set against it.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ from neurolens.studies.plan.footprints import AFTERWARDS, Array, Footprints, Pla
 from neurolens.studies.scenes import seen_depths_m
 
 ACROSS = 48  # pixels of the small picture along its longer side
-BLACK = 0.01  # of the picture's mean: relative to less than that nothing counts
+BLACK = 0.01  # of the picture's mean: darker values do not count in ratios
 STRAY = {"ghosts": "flare", "glare": "glare", "starburst": "star-bursts"}  # layers, and their names in a plan
-_SAMPLES = 32  # of its pixels: together a tenth of a second
+_SAMPLES = 32  # samples of a pixel: all pixels together take a tenth of a second
 _MOST_LIGHTS = 8
-_STARS = 2  # lights whose stars are drawn, the brightest in view: a second each
-_HIGHLIGHT = 4.0  # times the picture's mean: what shines or mirrors what does
-_NEAR_DEG = 2.0  # between a highlight and a light that it is the image of
-_WAVES, _CELL_PX, _PHOTONS = 3, 2.0, 1 << 18  # photons of all lights together
-_TAIL = 1e-3  # of the light, that its range leaves out at either end
+_STARS = 2  # lights whose stars are drawn, the brightest in view; each takes a second
+_HIGHLIGHT = 4.0  # times the picture's mean: what is brighter shines, or mirrors what shines
+_NEAR_DEG = 2.0  # within which a highlight is the image of a light
+_WAVES, _CELL_PX, _PHOTONS = 3, 2.0, 1 << 18  # wavelengths and cells of ghosts; photons of all lights together
+_TAIL = 1e-3  # share of the light that its range leaves out at either end
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Overview:
 
     Attributes:
         rgb: [H, W, 3] linear sRGB.
-        range_nm: the range of all but the last of its light by the eye.
-        wavelength_nm, share: [W] of that, of sum 1.
+        range_nm: the range of nearly all of its light, as the eye weighs it.
+        wavelength_nm, share: [W] of that range; shares have the sum 1.
     """
 
     rgb: Array
@@ -77,7 +77,7 @@ class Overview:
 
     @property
     def floor(self) -> float:
-        """Radiance below which the picture is black."""
+        """The radiance below which the picture counts as black."""
         return max(BLACK * float(self.rgb.mean()), 1e-30)
 
 
@@ -89,16 +89,16 @@ def overview(scene: Scene, camera: Camera) -> Overview:
 
 
 def small_raster(film_mm: tuple[float, float], across: int = ACROSS) -> tuple[int, int]:
-    """Width and height in pixels of a picture with so many along its longer side."""
+    """Return width and height in pixels of a picture with `across` pixels along its longer side."""
     width, height = (max(round(across * side / max(film_mm)), 1) for side in film_mm)
     return width, height
 
 
 def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[tuple[float, float], Array, Array]:
-    """Range and wavelengths in nm and their shares of a picture's light, as the eye weighs it: see `spectrum_seen`.
+    """Return range, wavelengths (nm) and their shares of a picture's light as the eye weighs it: see `spectrum_seen`.
 
-    Equal parts of the range that holds all but the last of it are each one wavelength, their centroid: a narrow line
-    is one.
+    The range holds nearly all of the light. Each of its equal parts is one wavelength, its centroid, so that a narrow
+    line is one.
     """
     low, high = scene.settings.camera.wavelength_nm
     if not camera.dispersive and getattr(camera, "achromatic", False):
@@ -110,8 +110,10 @@ def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[tuple[float, flo
 
 
 def spectrum_seen(scene: Scene, rgb: Array) -> tuple[Array, Array]:
-    """Wavelengths in nm and their light as the eye weighs it: of the scene's lights, tinted so that its picture has the
-    mean colour [3]."""
+    """Return wavelengths (nm) and their light as the eye weighs it.
+
+    It is that of the scene's lights, tinted so that the picture has the mean colour [3].
+    """
     low, high = scene.settings.camera.wavelength_nm
     nm, light = expected_light(scene)
     spectral = SpectralRange(low, high, len(nm))
@@ -123,7 +125,7 @@ def spectrum_seen(scene: Scene, rgb: Array) -> tuple[Array, Array]:
 
 
 def parts_of(nm: Array, seen: Array, first: int, last: int, count: int) -> tuple[Array, Array]:
-    """Centroids of equal parts of a spectrum from one index to another, and their shares; dark parts left out."""
+    """Return the centroids of equal parts of a spectrum between two indices, and their shares, without dark parts."""
     edges = np.linspace(nm[first], nm[last], count + 1)
     part = np.clip(np.searchsorted(edges, nm, side="right") - 1, 0, count - 1)
     share = np.bincount(part, seen, count)
@@ -132,13 +134,13 @@ def parts_of(nm: Array, seen: Array, first: int, last: int, count: int) -> tuple
 
 
 def stray_light(scene: Scene, camera: Any, seen: Overview) -> dict[str, Array]:
-    """Light that the lens adds, relative to the small picture, [H, W] by name of `STRAY`; the most of its colours.
+    """Return the light that the lens adds, relative to the small picture, [H, W] by name of `STRAY`.
 
-    The lights are those of the scene, in view or not, and highlights of the picture that are not their images. What
-    mirrors or shines beyond the picture's edge is not known.
+    It is that of the colour with most. The lights are those of the scene, in view or not, and highlights of the picture
+    that are not their images. What mirrors or shines beyond the picture's edge is not known.
 
     Raises:
-        InputError: no compiler, or a lens whose flare is not known (cylinders).
+        InputError: there is no compiler, or the lens's flare is not known (cylinders).
     """
     lens: Lens = camera.lens
     assert lens.film_z_mm is not None
@@ -163,25 +165,25 @@ def stray_light(scene: Scene, camera: Any, seen: Overview) -> dict[str, Array]:
 
 
 def _highlights(camera: Any, seen: Overview, known: list[Light]) -> list[Light]:
-    """Bright regions of the picture that are not where a known light is."""
+    """Find bright regions of the picture that are not where a known light is."""
     threshold = _HIGHLIGHT * float(seen.rgb.mean())
     if not threshold > 0 or not (seen.rgb.max(-1) >= threshold).any():
         return []
     focus = float(camera.settings.get("focus_m") or math.inf)
-    middle = float((seen.wavelength_nm * seen.share).sum())  # one tells where they are
+    middle = float((seen.wavelength_nm * seen.share).sum())  # one wavelength tells where they are
     field = field_of(camera, focus, "equidistant", spectrum=(np.array([middle]), np.ones(1)))
     found = highlights(seen.rgb.astype(np.float32), field, camera.film_mm, threshold, _MOST_LIGHTS)
     near = math.cos(math.radians(_NEAR_DEG + 45 / ACROSS))
     return [a for a in found.lights if all(float(a.towards @ b.towards) < near for b in known)]
 
 
-COUNTED = 95.0  # percentile over the picture that a budget is held against
+COUNTED = 95.0  # percentile over the picture at which a budget is counted
 Maps = dict[str, tuple[Literal["px", "relative"], Array]]
-LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
-_FOCUS_SPARE = 0.25  # of a pixel of blur: how far a model may place its film from the lens's
-_FIELDS = 17  # from the axis to the edge of the film, at which vignetting is traced
+LIGHT = 0.01  # relative error of light that a plan allows beside its budget of error
+_FOCUS_SPARE = 0.25  # of a pixel of blur: how far a model may place its film from the lens's film
+_FIELDS = 17  # fields from the axis to the edge of the film at which vignetting is traced
 _ACROSS = 16  # points of the probe along the longer side
-# The step of compositing that makes an effect: a blur by depth makes all blur.
+# The step of compositing that makes an effect; a blur by depth makes all blur.
 _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vignetting": "distortion"} | dict.fromkeys(
     ("defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
      "longitudinal colour", "diffraction"), "defocus",
@@ -190,16 +192,16 @@ _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vigne
 
 @dataclass(frozen=True)
 class SceneNeeds:
-    """The properties of a scene and of its shot that a camera must serve.
+    """What a camera must serve in a scene and its shot.
 
     Attributes:
-        shot: for the lens at its zoom; the f-number is no wider than the lens opens. pixel_mm: pitch.
+        shot: of the lens at its zoom, with an f-number no wider than the lens opens. pixel_mm: pitch.
         nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
         distant: share of the picture that shows things without a distance. dark: share that the lens leaves dark.
         light_nm: range of all but 0.2% of the scene's light, as the eye weighs it.
-        filter_px: side of the pixel filter, a box.
-        afterwards: effects that compositing makes, of `footprints.AFTERWARDS`.
-        denoised: whether noise is taken out, so that cameras are not charged for it.
+        filter_px: side of the pixel filter, which is a box.
+        afterwards: which of `footprints.AFTERWARDS` compositing makes.
+        denoised: whether noise is removed later, so that cameras are not charged for it.
         zoom: state of the lens.
     """
 
@@ -223,13 +225,13 @@ class SceneNeeds:
 
 @dataclass(frozen=True)
 class Effect:
-    """The worth of an effect of the lens in a picture.
+    """What an effect of the lens is worth in a picture.
 
     Attributes:
-        worth: at the counted percentile, in pixels (RMS distance by which it moves light) or, `relative`, as a share of
-            the light; inf where it is not known.
+        worth: at the counted percentile, in pixels (RMS distance by which it moves light) or, where `relative`, as a
+            share of the light; inf where it is not known.
         median: over the picture. over: share of the picture where it is beyond the budget.
-        needed: whether a camera needs it. why: the reason where it does not, or where its worth is not known.
+        needed: whether a camera needs it. why: the reason where it does not, or where the worth is not known.
     """
 
     name: str
@@ -243,11 +245,11 @@ class Effect:
 
 @dataclass(frozen=True)
 class Probe:
-    """A scene's places as the exact lens sees them: its camera, its footprints there, and those of a thin lens.
+    """A scene's places as the exact lens sees them, with its camera, its footprints there, and a thin lens's.
 
     Attributes:
-        scene, lens, domain: the lens stopped and focused, and the domain of models of this shot.
-        places: those with light, of `shape` rows and columns over the film.
+        scene, lens, domain: the lens is stopped down and focused; the domain is that of models of this shot.
+        places: those with light, among `shape` rows and columns over the film.
         seen, thin_seen: footprints of the exact camera and of a thin lens.
         wanted: the footprints that a camera should have: `seen` without the effects that are made afterwards.
     """
@@ -266,7 +268,7 @@ class Probe:
 
     @cached_property
     def exact_field(self) -> Field:
-        """The field of the exact camera, for maps of its picture; it takes seconds.
+        """The field of the exact camera, for maps of its picture; making it takes seconds.
 
         Raises:
             InputError: as `field_of`.
@@ -275,19 +277,19 @@ class Probe:
 
     @cached_property
     def camera_maps(self) -> Maps:
-        """`effect_maps`, made once."""
+        """The maps of `effect_maps`, made once."""
         return effect_maps(self)
 
     @cached_property
     def maps(self) -> Maps:
-        """The same, and those of the light that the lens adds, on more pixels; without that where it is not known."""
+        """The same with maps of the light that the lens adds, on more pixels; without these where it is not known."""
         with suppress(InputError):
             added = stray_light(self.scene, self.exact, self.overview)
             return self.camera_maps | {k: ("relative", v) for k, v in added.items()}
         return self.camera_maps
 
     def on_film(self, value: Array) -> Array:
-        """Values [N] of places as a picture [rows, columns], as prints show it: upright; NaN where none is."""
+        """Values [N] of places as a picture [rows, columns], upright as prints are; NaN where there is no place."""
         film = np.full(self.shape, np.nan)
         at = self.places.film_mm / np.array(self.asked.shot.film_mm)[:, None] + 0.5
         column, row = (np.minimum((at[k] * n).astype(int), n - 1) for k, n in enumerate(self.shape[::-1]))
@@ -302,13 +304,13 @@ def probe(
     """Look through the exact lens at a scene.
 
     Args:
-        across: places along the longer side. afterwards: effects that compositing makes, of `footprints.AFTERWARDS`:
+        across: places along the longer side. afterwards: which of `footprints.AFTERWARDS` compositing makes:
             distortion, where the ST map corrects the picture's light, too, and defocus. denoised: see `SceneNeeds`.
         zoom: state of the lens by name or focal length; None leaves it as it is.
-        dispersion: that cameras are to have; the exact lens that they are held against has all of it.
+        dispersion: what cameras are to have; the exact lens that they are held against has all of it.
 
     Raises:
-        InputError: a scene's camera that the lens cannot be; a picture that the lens leaves dark; other names; an
+        InputError: the scene's camera is none that the lens can be; the lens leaves the picture dark; other names; an
             unknown state.
     """
     if not set(afterwards) <= set(AFTERWARDS):
@@ -341,15 +343,15 @@ def probe(
 
 
 def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
-    """The domain of models of the shot: its film, stop and wavelengths, and a quarter of a pixel of defocus beyond it.
+    """The domain of models of the shot: its film, stop and wavelengths, and a quarter of a pixel of defocus more.
 
-    Models have their own focus. A lens that goes no nearer has no room beyond it.
+    The room is for models' own focus. A lens that focuses no nearer has none on that side.
     """
     shot, plain = scene.settings.camera, lens.with_aperture(None)
     film = shot.film_mm
     stopped = set_lens(plain, f_number=f_number, focus_m=shot.focus_m)
     radius = min(math.hypot(*film) / 2, image_radius_mm(lens)[0])
-    move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, 1/mm
+    move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, in 1/mm
     vergence = 1e-3 / shot.focus_m
     ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
     options: dict[str, Any] = {"film_radius_mm": radius, "wavelength_nm": shot.wavelength_nm}
@@ -361,13 +363,12 @@ def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
 def effect_maps(probed: Probe) -> Maps:
     """Unit and map [H, W] of each effect over the picture, upright; NaN where the lens is dark. See `effects_mm`.
 
-    Light has a sign: the share of it that an effect adds, below 0 where the effect makes the picture darker. Vignetting
-    is what the rims take of the light through the stop (`passed_share`). Natural fall-off is the light that would
-    remain without rims, relative to the axis: cos^4, and how the pupil grows or shrinks with the field.
-
-    An Airy disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times
-    the f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and
-    an aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
+    Light has a sign: it is the share that an effect adds, below 0 where the picture gets darker. Vignetting is what the
+    rims take of the light through the stop (`passed_share`). Natural fall-off is the light that would remain without
+    rims, relative to the axis: cos^4, and how the pupil grows or shrinks with the field. An Airy disc has no RMS
+    radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times the f-number (Born and
+    Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass, its coatings, and an aperture that
+    changes with the wavelength: RMS over wavelengths of the light there, relative to its mean.
     """
     pixel, share = probed.asked.pixel_mm, probed.places.share
     parts = {k: v / pixel for k, v in prints.effects_mm(probed.seen, probed.thin_seen, share).items()}
@@ -388,7 +389,7 @@ def effect_maps(probed: Probe) -> Maps:
 
 
 def passed_share(probed: Probe) -> Array:
-    """[N] share of the light through the stop that no rim takes, by exact tracing (`optics.analysis.field_curves`).
+    """Return the share [N] of the light through the stop that no rim takes, by exact tracing (`field_curves`).
 
     It is traced from the axis outwards; beyond the last field with a chief ray its share is kept. An anamorphic lens is
     traced along x and along y, and the two shares are multiplied, as if its rims were slits.
@@ -397,7 +398,7 @@ def passed_share(probed: Probe) -> Array:
     def along(axis: Literal["x", "y"], height_mm: Array) -> Array:
         try:
             data = illumination(Fields(probed.lens, probed.asked.shot.focus_m, axis), fields=_FIELDS)
-        except InputError:  # no chief rays: what the rims take is then part of the natural fall-off
+        except InputError:  # no chief rays: the natural fall-off then includes what the rims take
             return np.ones_like(height_mm)
         known = np.isfinite(data.passed)
         order = np.argsort(data.height_mm[known])
@@ -408,7 +409,7 @@ def passed_share(probed: Probe) -> Array:
 
 
 def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
-    """The effects with their worth in this picture, the largest first; `stray`: with the light that the lens adds."""
+    """Return effects with their worth in this picture, largest first; `stray` adds the light that the lens adds."""
     effects = []
     for name, (unit, value) in (probed.maps if stray else probed.camera_maps).items():
         budget = budget_px if unit == "px" else LIGHT
@@ -424,10 +425,10 @@ def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Eff
 
 
 def exact_camera(lens: Lens, shot: Shot, bounds: PupilBounds) -> ExactCamera:
-    """The exact camera."""
+    """Make the exact camera."""
     return ExactCamera(lens, shot, bounds=bounds)
 
 
 def _grid(film_mm: tuple[float, float], shape: tuple[int, int]) -> Array:
-    """Centres of equal cells of the film, [2, N] mm, row after row."""
+    """Return the centres of equal cells of the film, [2, N] mm, row after row."""
     return np.stack(np.meshgrid(*cell_centres(film_mm, shape))).reshape(2, -1)

@@ -60,8 +60,8 @@ def see(kind: Kind, frame: Any, size: tuple[float, ...], normalized: bool, eye: 
 def see_faces(corners: Any, radiance: Any, eye: Any) -> tuple[Seen, Any]:
     """See triangles [N, 3, 3] of radiances [N, 3] as an ellipse of their middle and moments; also their irradiance [3].
 
-    They shine on both sides. The triangles that turn one side to the eye are seen: the outer side where both look
-    equally large.
+    Each shines on both sides. A closed surface is seen by its near half: so only the triangles that turn their outer
+    side to the eye count, or those that turn their inner side to it where these cover clearly more of its view.
     """
     middles, areas = corners.mean(1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     far = np.linalg.norm(middles - eye, axis=1).clip(1e-9)
