@@ -4,6 +4,7 @@ import math
 import os
 import signal
 import threading
+import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -114,8 +115,16 @@ def cooke() -> Lens:
     return set_lens(read_lens(Path(__file__).parents[3] / "lenses" / "cooke_triplet_50.toml"), focus_m=math.inf)
 
 
-def interrupted_after(seconds: float, words: list[str]) -> int:
-    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+def interrupted_after(seconds: float, words: list[str], made: Path | None = None) -> int:
+    """The exit code of a command that is interrupted so long after its start, or once this file is there."""
+
+    def interrupt() -> None:
+        while made is not None and not made.exists() and threading.main_thread().is_alive():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    timer = threading.Timer(seconds, interrupt)
+    timer.daemon = True
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
     timer.start()
     try:
@@ -167,7 +176,8 @@ def test_photons_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatch: 
 def test_frames_end_when_asked_and_are_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a.exr"
     assert main([*COOKE, "--light", "5,3", "--frames", "1:1", "-o", str(out)]) == 0
-    assert interrupted_after(1.5, [*COOKE, "--light", "5,3", "--frames", "1:2000", "-o", str(out)]) == 130
+    words = [*COOKE, "--light", "5,3", "--frames", "1:2000", "-o", str(out)]
+    assert interrupted_after(0.0, words, tmp_path / "a.0003.png") == 130
     assert "goes on" in capsys.readouterr().err
     files = sorted(tmp_path.glob("*.exr"))
     assert [file.name for file in files] == [f"a.{k + 1:04d}.exr" for k in range(len(files))]
