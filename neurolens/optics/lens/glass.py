@@ -128,8 +128,9 @@ class Glass:
 
     @property
     def V_d(self) -> float:
-        """The Abbe number (n_d - 1) / (n_F - n_C)."""
-        return (self.n_d - 1.0) / (self.index(LINE_F_NM) - self.index(LINE_C_NM))
+        """The Abbe number (n_d - 1) / (n_F - n_C), infinite without dispersion."""
+        spread = self.index(LINE_F_NM) - self.index(LINE_C_NM)
+        return (self.n_d - 1.0) / spread if spread else math.inf
 
     def covers(self, wavelength_nm: float) -> bool:
         """Test whether the source states the formula for this wavelength."""

@@ -48,7 +48,7 @@ def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> No
             ("radius_mm", abs(s.radius_mm), 1e-6, math.inf, ""),
             ("thickness_mm", abs(s.thickness_mm), 0.0, 1e6, ""),
             ("diameter_mm", s.diameter_mm, 1e-6, 1e6, ""),
-            ("V_d", 100.0 if s.V_d is None else s.V_d, 1.0, 1e4, ""),
+            ("V_d", 100.0 if s.V_d in (None, math.inf) else s.V_d, 1.0, 1e4, ""),
             *s.figure.bounds(rim),
             ("absorption_per_mm", s.absorption_per_mm, 0.0, 1e6, ""),
         )

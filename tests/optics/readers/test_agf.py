@@ -10,6 +10,7 @@ from command_line import failure, run_json
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lens import glass as catalogue
 from neurolens.optics.lens.glass import index_at, index_of
+from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.readers.glasses import more_glasses, read_agf
 from neurolens.optics.readers.lensfile import read_lens
 
@@ -97,3 +98,17 @@ def test_a_lens_is_traced_with_its_own_catalogue_or_by_its_figures(
     with pytest.warns(NeurolensWarning, match=r"surface 0, glass: glass XY1 is not in the catalogue.*Cauchy"):
         front = read_lens(lens).surfaces[0]
     assert (front.glass, front.material) == (None, "XY1") and index_of(front, 450.0) == index_at(1.62, 36.4, 450.0)
+
+
+def test_a_lens_of_a_glass_without_dispersion_has_one_focal_length(tmp_path: Path) -> None:
+    """A plano-convex lens, f = r / (n - 1) in every colour."""
+    rows = "{ radius_mm = 50, thickness_mm = 2, diameter_mm = 12, n_d = 1.5, glass = 'FLAT', stop = true }"
+    rows += ", { radius_mm = inf, thickness_mm = 98, diameter_mm = 12 }"
+    file, made = tmp_path / "flat.toml", agf(tmp_path, entry("FLAT", 2, (1.25, 0, 0, 0, 0, 0), 1.5))
+    head = "schema = 1\nname = 'flat'\nf_number = 8\nimage_radius_mm = 9\nrims = 'source'\nsource = 'x'\n"
+    file.write_text(f"{head}surfaces = [{rows}]\n")
+    with more_glasses([made]):
+        lens = read_lens(file)
+        assert math.isinf(catalogue.find("FLAT").V_d)
+        for nm in (400.0, 700.0):
+            assert first_order(lens, wavelength_nm=nm).efl_mm == pytest.approx(100, rel=1e-12)
