@@ -1,7 +1,8 @@
-"""The library's index: of each lens its row of `neurolens lens list`, with its character, which take 2 CPU s a lens.
+"""The library's index: of each lens its row of `neurolens lens list`, with its character, which take 2 CPU s a lens,
+and its section as a small picture.
 
-Lenses whose files have not changed keep their rows, unless --restart is given, as after changes of the code. Writes
-lenses/index.jsonl, a line a lens.
+Lenses whose files have not changed keep their rows and pictures, unless --restart is given, as after changes of the
+code. Writes lenses/index.jsonl, a line a lens, and lenses/thumbnails/NAME.svg.
 """
 
 from __future__ import annotations
@@ -12,10 +13,13 @@ import math
 from typing import Any
 
 from experiments import lab
+from experiments.library_pages import section_of
 from neurolens.base.files import atomic_write_text, library, sha256_of
-from neurolens.cli.lens import INDEX, kept_row, read_index
+from neurolens.base.find import INDEX, read_index
+from neurolens.cli.lens import kept_row
+from neurolens.optics.analysis.layout import thumbnail
 from neurolens.optics.readers.any_format import lens_files
-from neurolens.studies.describe import library_row
+from neurolens.studies.describe import library_row, read_quietly
 
 OPTIONS = (lab.AGAIN, lab.QUIET)
 
@@ -34,7 +38,11 @@ def run(args: argparse.Namespace) -> None:
     folder, kept = library() / "lenses", {} if args.restart else read_index()
     lines = []
     for file in lab.counted(lens_files(folder), "lenses", args.quiet):
-        row = kept_row(file, kept) or rounded(library_row(file, characters=True))
+        picture, row = folder / "thumbnails" / f"{file.stem}.svg", kept_row(file, kept)
+        if row is None or not picture.is_file():
+            picture.parent.mkdir(exist_ok=True)
+            atomic_write_text(picture, thumbnail(section_of(read_quietly(file))))
+        row = row or rounded(library_row(file, characters=True))
         row = {key: value for key, value in row.items() if key not in ("lens", "file")}
         lines.append(json.dumps({"file": file.name, "sha256": sha256_of(file), "row": row}, ensure_ascii=False))
     atomic_write_text(folder / INDEX, "\n".join(lines) + "\n")

@@ -100,7 +100,7 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
         return {"lens": file.stem, "page": None, "fault": str(error)}
 
 
-def _section(lens: Lens) -> Any:
+def section_of(lens: Lens) -> Any:
     """The layout of a lens focused at infinity, with rays; an anamorphic one in y-z."""
     from neurolens.optics.analysis.fields import Scene
     from neurolens.optics.analysis.layout import layout_profile
@@ -162,7 +162,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
         more["discs"] = "discs.png"
         with atomic_path(folder / "discs.png") as part:
             part.write_bytes(discs)
-    return {**{k: row[k] for k in keys}, **more, "layout": thumbnail(_section(lens))}
+    return {**{k: row[k] for k in keys}, **more, "layout": thumbnail(section_of(lens))}
 
 
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:

@@ -7,12 +7,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurolens.front import Answer, Camera, Lens, find, fit, load, rays
+    from neurolens.front import Answer, Camera, Lens, fit, load, rays
 
     def _run(*given: Any, **named: Any) -> Answer: ...
 
     lens, camera = Lens.make, Camera.make
-    analyse = bokeh = defocus = export = flare = plan = projection = render = stmap = train = verify = _run
+    analyse = bokeh = defocus = export = find = flare = plan = projection = render = stmap = train = verify = _run
 
 __version__ = "0.1.0"
 # What pip calls this project. `neurolens` on PyPI is another one, with the same folder and command.

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from neurolens.base import lensname
 from neurolens.base.errors import InputError, installed, one_line
-from neurolens.base.files import TemporaryFolder, library
+from neurolens.base.files import TemporaryFolder
 from neurolens.base.progress import Progress
 from neurolens.base.settings import setting_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens
@@ -76,7 +76,7 @@ class Call:
 def of(name: str) -> Call:
     """The function of the front that has this name; its docstring has the parameters and an example."""
     example = f"Example::\n\n    >>> import neurolens as nl\n    >>> {EXAMPLES[name]}\n"
-    others: dict[str, Callable[..., Any]] = {"find": find, "load": load, "fit": fit, "rays": rays}
+    others: dict[str, Callable[..., Any]] = {"load": load, "fit": fit, "rays": rays}
     if (own := others.get(name)) is not None:
         return Call(
             name, _rays if name == "rays" else own, f"{inspect.getdoc(own)}\n\n{example}", inspect.signature(own)
@@ -311,11 +311,6 @@ class Model(OnnxLens):
     def export(self, to: str, output: str | Path, **options: Any) -> Answer:
         """Write it in another form, "c", "glsl", "osl" and more: `nl.export`."""
         return run_command(command("export"), self, to=to, output=output, **options)
-
-
-def find(words: str) -> list[str]:
-    """The names of lenses that ship and hold each of the words, the shortest first; `nl.lens` takes each."""
-    return lensname.of_words(words, [file.stem for file in sorted((library() / "lenses").glob("*.toml"))])
 
 
 def load(model: str | os.PathLike[str]) -> Model:

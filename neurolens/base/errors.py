@@ -79,6 +79,15 @@ class AssumedWarning(NeurolensWarning):
     """Something that a file does not say, or says wrongly, was assumed: what is read from it is doubtful."""
 
 
+class Note(NeurolensWarning):
+    """What was taken or assumed where nothing was said: no reason to worry."""
+
+
+def note(text: str) -> None:
+    """Say on stderr what was taken or assumed, a `Note`."""
+    warnings.warn(text, Note, stacklevel=2)
+
+
 def warn(text: str) -> None:
     """Warn with a NeurolensWarning, which the command line prints to stderr."""
     warnings.warn(text, NeurolensWarning, stacklevel=2)

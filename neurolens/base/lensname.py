@@ -1,6 +1,7 @@
 """Arguments that name a lens: a lens or a model that ships, a file of either, or a camera made from one.
 
 laikin_double_gauss_50              a lens of lenses/, or a model of models/, by its name
+helios 44, "nikkor z 58"            words of one lens of lenses/: `neurolens.base.find`
 FILE.toml, FILE.zmx, ...            a lens file of any format that `neurolens.optics.readers.any_format` reads
 MODEL.onnx                          an exported model
 plan.toml                           a file of `neurolens plan`: the camera that it names
@@ -15,13 +16,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, note
 from neurolens.base.files import library
+from neurolens.base.find import Found, find
 from neurolens.base.tomlfile import read_toml, suggestion
 
 _FUSED = "fused:"
@@ -73,13 +75,14 @@ def maker_of(designer: str) -> str:
 
 
 def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> Named:
-    """Find what an argument names: first a file, then a name that ships, then the folder of a run.
+    """Find what an argument names: first a file, then a name that ships, then the folder of a run, then words of one
+    lens of the library, of which a `Note` says what was taken.
 
     Args:
         models: whether a model is accepted. cameras: whether kinds of cameras and files of `neurolens plan` are.
 
     Raises:
-        InputError: there is no such file or name; the message offers the nearest name.
+        InputError: there is no such file or name, and the nearest is offered; or words name several lenses.
     """
     if cameras and text in IDEAL:
         return Named(str(text), None)
@@ -87,18 +90,23 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
     places = (("lenses", ".toml"), ("models", ".onnx")) if models else (("lenses", ".toml"),)
     ships = [library() / folder / f"{word}{suffix}" for folder, suffix in places if Path(word).name == word]
     path = next((file for file in (Path(word), *ships) if file.is_file()), Path(word))
-    if (is_model(path) and (not models or kind in IDEAL_OF)) or not path.exists():
-        expected = _FORMATS + (", a model (.onnx)" if models else "") + " or a name that ships (neurolens lens list)"
+    found = find(word) if not path.exists() and _is_words(word) else Found((), None)
+    if found.chosen:
+        path = library() / "lenses" / f"{found.chosen.lens}.toml"
+        note("; ".join([f"{word!r} is {found.chosen.name}, {found.chosen.lens}", *found.notes]))
+    elif (is_model(path) and (not models or kind in IDEAL_OF)) or not path.exists():
+        asked = "camera" if cameras else "lens"
+        if found.hits:
+            named = [f"{entry.lens} ({entry.name})" for entry in found.hits[:_NEAR]]
+            raise InputError(word, asked, f"({len(found.hits)} lenses)", f"words of one lens: {', '.join(named)} ...")
+        expected = _FORMATS + (", a model (.onnx)" if models else "") + " or a name that ships (neurolens find WORDS)"
         if cameras:
             expected += f", with {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
         ours = [file.stem for folder, suffix in places for file in sorted((library() / folder).glob(f"*{suffix}"))]
-        known = [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())]
-        near = suggestion(word, known)
-        if not near and (alike := of_words(word, [name for name in ours if "." not in name])[:_NEAR]):
-            near = f"; did you mean {' or '.join(map(repr, alike))}?"
-        raise InputError(
-            word, "camera" if cameras else "lens", "(a model)" if path.exists() else "(missing)", expected + near
-        )
+        near = suggestion(word, [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())])
+        if not near and found.near:
+            near = f"; did you mean {' or '.join(repr(entry.lens) for entry in found.near)}?"
+        raise InputError(word, asked, "(a model)" if path.exists() else "(missing)", expected + near)
     if cameras and path.suffix.lower() == ".toml" and (planned := _planned(path)):
         own, file = split_kind(planned)
         return Named(kind or own, Path(os.path.normpath(path.parent / file)))
@@ -106,10 +114,10 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
     return Named(kind, Path(os.path.relpath(path)) if here else path)
 
 
-def of_words(text: str, known: Sequence[str]) -> list[str]:
-    """Return the known names that hold each word, shortest first: "RF 50mm f/1.2" finds canon_rf_50mm_f1_2_l_usm."""
-    words = re.findall(r"[^\W_]+", text.lower().replace("f/", "f"))
-    return sorted((name for name in known if words and all(word in name for word in words)), key=len)
+def _is_words(text: str) -> bool:
+    """Whether a text may be words of a lens, not a path or the name of a file; f/1.2 and 50/1.2 have a stroke."""
+    bare = re.sub(r"(?<=\b[fFtT])/|(?<=\d)/(?=[\d.])", " ", text)
+    return not re.search(r"[/\\]|\.[^\W\d][\w-]*$", bare)
 
 
 def _planned(path: Path) -> str | None:

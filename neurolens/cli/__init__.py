@@ -18,7 +18,16 @@ from importlib import import_module
 from typing import Any
 
 import neurolens
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, missing, one_line, printable, reason
+from neurolens.base.errors import (
+    InputError,
+    NeurolensError,
+    NeurolensWarning,
+    Note,
+    missing,
+    one_line,
+    printable,
+    reason,
+)
 from neurolens.base.tasks import handled
 from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
@@ -28,6 +37,7 @@ _RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--trade")}  # nam
 # The commands by the titles of the help: the module and the class of each, and its line.
 _COMMANDS = {
     "lenses": {
+        "find": ("find.Find", "lenses of the library by what photographers call them"),
         "lens": ("lens.Lens", "first-order data, field and layout of a lens file"),
         "analyse": ("analyse.Analyse", "spots, MTF, distortion and more of a lens file"),
         "verify": ("photographs.Verify", "hold a lens file against photographs of the product"),
@@ -78,7 +88,7 @@ Help of a command: neurolens COMMAND --help"""
 # What `neurolens` alone prints: what to type first, for each of the three ways in.
 _FIRST = """\
 A first picture:      neurolens demo
-To find a lens:       neurolens lens list
+To find a lens:       neurolens find nikkor 50 1.2
 To light or comp:     neurolens handover laikin_double_gauss_50 --film 36x20.25 --width 3840 --focus 2 -o shot/
 To do research:       neurolens analyse laikin_double_gauss_50 -o gauss
 To write a renderer:  neurolens export laikin_double_gauss_50.ols-36 --to c -o gauss.h
@@ -141,9 +151,10 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None =
     try:
         with handled(interrupt):
             _check_words(words)
-            args = (build() if build else build_parser(words[0] if words else "")).parse_args(words)
-            with _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(getattr(args, "glass", ())):
-                code: int = args.run(args)
+            with _plain_warnings(quiet="--quiet" in words):
+                args = (build() if build else build_parser(words[0] if words else "")).parse_args(words)
+                with more_glasses(getattr(args, "glass", ())):
+                    code: int = args.run(args)
         sys.stdout.flush()
         return code
     except (Exception, KeyboardInterrupt) as error:
@@ -220,7 +231,7 @@ def _plain_warnings(quiet: bool) -> Iterator[None]:
             if issubclass(category, NeurolensWarning):
                 text = one_line(str(message), 3000)
                 if not quiet and text not in said:
-                    print(f"neurolens: warning: {text}", file=sys.stderr)
+                    print(f"neurolens: {'' if category is Note else 'warning: '}{text}", file=sys.stderr)
                 said.add(text)
             else:
                 usual(message, category, *place, **more)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from dataclasses import asdict, dataclass, replace
@@ -12,15 +11,11 @@ from typing import Any, Literal
 
 from neurolens.base.errors import one_line, warned
 from neurolens.base.files import library, sha256_of
+from neurolens.base.find import CHARACTER, read_index
 from neurolens.base.lensname import resolve
 from neurolens.base.settings import changed, setting
 from neurolens.cli import arguments as cli
 
-INDEX = "index.jsonl"  # in lenses/: a line a lens, {file, sha256, row}, by `python -m experiments lens-index`
-CHARACTER = {  # keys of --sort: the figure of `studies.describe`, and its heading; strongest first
-    "cats-eye": ("cats_eye", "cat's eye"), "swirl": ("swirl", "swirl"), "bubbles": ("bubble", "bubbles"),
-    "softness": ("softness_um", "soft um"), "flare": ("flare", "flare"),
-}  # fmt: skip
 _SORTS = {"maker": "maker", "focal-length": "efl_mm", "speed": "f_number", "year": "year"}
 _Sort = Literal["maker", "focal-length", "speed", "year", "cats-eye", "swirl", "bubbles", "softness", "flare"]
 
@@ -299,13 +294,6 @@ def _surface_words(row: dict[str, Any]) -> str:
         f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
     ]
     return ", ".join(word for word in words if word)
-
-
-def read_index() -> dict[str, dict[str, Any]]:
-    """The entries of the library's index by file; none without an index."""
-    file = library() / "lenses" / INDEX
-    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else ()
-    return {entry["file"]: entry for entry in map(json.loads, lines)}
 
 
 def kept_row(file: Path, index: dict[str, dict[str, Any]]) -> dict[str, Any] | None:

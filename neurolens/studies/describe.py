@@ -228,8 +228,8 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
 
     Returns: name, believed_to_be, maker, year, efl_mm and efl_x_mm computed (the latter only for an anamorphic lens),
     stated_efl_mm, back_focus_mm, f_number of the stop, half_field_deg as stated, image_radius_mm as stated,
-    refractions, aspheres, cylinders, states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks "read"),
-    doubts, and checks: a list of {state, quantity, computed, stated, doubt}.
+    refractions, aspheres, cylinders, states (zoom or focus), match (how surely photographs are of this product), rims,
+    verdict ("ok" or "doubtful"; without checks "read"), doubts, and checks: a list of {state, quantity, computed, stated, doubt}.
     """
     data, cylinders = first_order(lens), sum(s.figure.axis is not None for s in lens.surfaces)
     return {
@@ -241,6 +241,7 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
         "aspheres": sum(s.figure.aspheric for s in lens.surfaces),
         "cylinders": cylinders,
         "states": len(lens.configurations),
+        "match": dict(lens.measured).get("match"),
         "verdict": "read" if checks is None else verdict(checks),
         "doubts": doubts(checks or []),
         "checks": [asdict(c) for c in checks or []],

@@ -15,6 +15,7 @@ from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
+from neurolens.base.find import INDEX
 from neurolens.cli import lens as lens_list
 from neurolens.cli import main
 from neurolens.optics.analysis.fields import Scene
@@ -230,7 +231,7 @@ def test_a_changed_file_is_not_the_index_s(tmp_path: Path, monkeypatch: pytest.M
     file = tmp_path / "lenses" / "a.toml"
     file.write_text("name = 1\n")
     entry = {"file": "a.toml", "sha256": sha256_of(file), "row": {"efl_mm": 5.0}}
-    (tmp_path / "lenses" / lens_list.INDEX).write_text(json.dumps(entry) + "\n")
+    (tmp_path / "lenses" / INDEX).write_text(json.dumps(entry) + "\n")
     monkeypatch.setattr(lens_list, "library", lambda: tmp_path)
     index = lens_list.read_index()
     assert lens_list.kept_row(file, index) == {"lens": "a", "file": str(file), "efl_mm": 5.0}

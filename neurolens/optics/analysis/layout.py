@@ -253,8 +253,9 @@ def thumbnail(layout: Layout) -> str:
     def path(points: Array, look: str, close: str = "") -> str:
         x = np.clip(scale * (points[:, 0] - left), -9 * _WIDTH, 9 * _WIDTH)
         y = np.clip(height / 2 - scale * points[:, 1], -9 * _WIDTH, 9 * _WIDTH)
-        moves = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
-        return f"<path d='M{moves}{close}' {look}/>"
+        (start, *ends) = np.round(np.stack([x, y], axis=1), 1)
+        steps = " ".join(f"{a:g} {b:g}" for a, b in np.round(np.diff([start, *ends], axis=0), 1) + 0.0)
+        return f"<path d='M{start[0]:g} {start[1]:g}l{steps}{close}' {look}/>"
 
     parts = []
     for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False):
