@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
+from neurolens.base.find import CHARACTER, Entry, entries, said_of, words_of
 from neurolens.base.lensname import lens_id_of
 from neurolens.cli.arguments import Reporting, lens, output_path
-from neurolens.cli.lens import CHARACTER
 
 if TYPE_CHECKING:
     from neurolens.optics.lens.prescription import Lens
@@ -208,6 +208,14 @@ def _lessen(picture: Path) -> None:
         small.save(part, optimize=True)
 
 
+def words_of_row(record: Mapping[str, Any]) -> str:
+    """The words by which the page's search finds a lens: those of `neurolens find`, and its nicknames."""
+    known = {entry.lens: entry for entry in entries()}
+    entry = known.get(record["lens"]) or Entry.of(record["lens"], record)
+    nicknames = words_of(" ".join(said_of(entry)))
+    return " ".join(sorted({*entry.words, *nicknames}))
+
+
 def _model_columns() -> tuple[Any, ...]:
     from neurolens.studies.pages import Column
 
@@ -234,5 +242,5 @@ def _index(records: Sequence[Mapping[str, Any]]) -> str:
         *(Column(heading, f"character.{figure}") for figure, heading in CHARACTER.values()),
     )  # fmt: skip
     missing = {"fault": "", "designer": "", "layout": "", "discs": "", "doubts": ()}
-    rows = [{"name": r["lens"], **missing, **r} for r in records]
+    rows = [{"name": r["lens"], **missing, **r, "words": words_of_row(r)} for r in records]
     return html("library.html", title="Lenses", records=rows, columns=columns)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,10 @@ def test_a_lens_that_is_not_there_gives_the_nearest(rest: str) -> None:
     assert not find("sumilux 35").hits and "summilux" in find("sumilux 35").near[0].lens
 
 
-@pytest.mark.parametrize("nothing", ["", " ", "?!", "lens", "xyzzy qwrtz", "\0", "\ud800", "鏡頭", "9" * 400, "f/", "-"])
+NOTHING = ["", " ", "?!", "lens", "xyzzy qwrtz", "\0", "\ud800", "鏡頭", "9" * 400, "f/", "-"]
+
+
+@pytest.mark.parametrize("nothing", NOTHING)
 def test_what_names_nothing_finds_nothing(nothing: str) -> None:
     found = find(nothing)
     assert (list(found.hits), found.chosen, list(found.near)) == ([], None, [])
@@ -139,7 +143,7 @@ def test_files_and_paths_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     shutil.copy(LENSES / "cooke_triplet_50.toml", "petzval")
     assert resolve("petzval").file == Path("petzval")
-    for path in ("lenses/petzval", "./biotar", "../petzval", "petzval.zmx", "biotar\\x", "laikin_double_gauss_50.ols-99"):
+    for path in ("lenses/petzval", "./biotar", "../petzval", "petzval.zmx", "biotar\\x", "laikin.ols-99"):
         with pytest.raises(InputError, match="missing"):
             resolve(path)
 
@@ -177,3 +181,30 @@ def test_five_hundred_lenses_take_no_time(tmp_path: Path, monkeypatch: pytest.Mo
     began = time.process_time()
     assert find("sumilux 50mm").near
     assert time.process_time() - began < 0.5
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the page's script")
+def test_the_search_of_the_index_page_finds_the_same(tmp_path: Path) -> None:
+    from experiments.library_pages import words_of_row
+
+    queries = ["nikkor 50 1.2", "helios 44", "Angénieux", "F1.2 50mm", "canon rf", "70-200mm", "summilux 35", "1950s"]
+    rows = [{"lens": entry.lens, "words": words_of_row({"lens": entry.lens})} for entry in entries()]
+    script = LENSES.parent / "neurolens" / "templates" / "table.js"
+    (tmp_path / "page.js").write_text(f"""
+      const input = {{addEventListener() {{}}}}, kind = {{checked: true, value: 'all', addEventListener() {{}}}};
+      const rows = {json.dumps(rows)}.map(r => ({{textContent: '', dataset: {{kinds: 'all', words: r.words}}, r}}));
+      const table = {{tBodies: [{{rows}}], tHead: {{rows: [{{cells: []}}]}}}}, found = {{}};
+      globalThis.document = {{
+        querySelector: () => table, querySelectorAll: () => [kind],
+        getElementById: id => id === 'words' ? input : {{}},
+      }};
+      for (const query of {json.dumps(queries)}) {{
+        input.value = query;
+        eval({json.dumps(script.read_text())});
+        found[query] = rows.filter(r => !r.hidden).map(r => r.r.lens);
+      }}
+      console.log(JSON.stringify(found));""")
+    out = subprocess.run(["node", str(tmp_path / "page.js")], capture_output=True, text=True, check=True).stdout
+    assert {q: sorted(names) for q, names in json.loads(out).items()} == {
+        query: sorted(entry.lens for entry in find(query).hits) for query in queries
+    }

@@ -113,7 +113,7 @@ def test_mistakes_that_only_a_call_can_make_are_one_line() -> None:
         (lambda: nl.stmap(MODEL, MODEL), "camera, each once"),
         (lambda: nl.stmap(MODEL, camera=MODEL), "camera, each once"),
         (lambda: nl.stmap(MODEL, lateral_colour="yes"), "--lateral-colour"),
-        (lambda: nl.lens("laikin_double_gaus_50"), "did you mean 'laikin_double_gauss_50'?"),
+        (lambda: nl.lens("laikin_duble_gauss_50"), "did you mean 'laikin_double_gauss_50'?"),
         (lambda: nl.lens(GAUSS, focus_m=0.1), "four focal lengths"),
         (lambda: nl.load(GAUSS), "an exported model (.onnx)"),
         (lambda: nl.verify(nl.lens(GAUSS, f_number=4)), "f_number: got (unknown key)"),

@@ -127,8 +127,8 @@ class Found:
 def find(text: str) -> Found:
     """The lenses of the library that have all words of a query; where it names a character, the strongest first.
 
-    Of lenses that agree equally well products come before designs, and those of whose name the query leaves out less. One is chosen
-    where it agrees better than all others, or where its whole name is said.
+    Of lenses that agree equally well products come before designs, and those of whose name the query leaves out less.
+    One is chosen where it agrees better than all others, or where its whole name is said.
     """
     words, notes = _translated(text)
     sorts = [word for word in words if word in CHARACTER]

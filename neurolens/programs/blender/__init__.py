@@ -26,6 +26,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, fcntl, place_inside, read_bytes, safe_name
+from neurolens.base.find import entries, said_of
 from neurolens.base.lensname import year_of
 from neurolens.base.tomlfile import parse_json
 
@@ -89,6 +90,7 @@ class PackedLens:
             "id": self.lens_id,
             **{name: getattr(self, name) for name in same},
             "year": year_of(self.source),
+            "said": [s for e in entries() if e.lens == self.lens_id.partition("-")[0] for s in said_of(e)],
             "picture": None if self.picture is None else self._picture(),
             "bokeh": None if self.bokeh is None else self._picture(".bokeh"),
             "variants": [{k: v for k, v in variant.items() if k != "osl"} for variant in variants],

@@ -103,6 +103,14 @@ def everything(scene: Any) -> dict[str, Any]:
     return found
 
 
+def test_the_search_chooses_a_lens_by_name_maker_or_nickname(scene: Any) -> None:
+    panel = sys.modules[f"{MODULE}.panel"]
+    (row,) = [row for row in panel.LIBRARY.found if row[0] == "gauss"]
+    assert row[1].startswith("Angenieux: Lens gauss (49.6 mm f/1.8, 1955)")
+    assert bpy.ops.neurolens.find(lens="phone") == {"FINISHED"}
+    assert scene.camera.data.neurolens.lens == "phone"
+
+
 def test_zip_is_one_that_blender_accepts_and_shows(installed: Path) -> None:
     script = Path(sys.modules["bl_pkg"].__file__).parent / "cli" / "blender_ext.py"
     done = subprocess.run([sys.executable, script, "validate", installed], capture_output=True, text=True)

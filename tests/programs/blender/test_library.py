@@ -130,6 +130,13 @@ def entry(**changed: Any) -> str:
     return json.dumps({"schema": 1, "lenses": [facts]})
 
 
+def test_facts_hold_what_people_call_a_lens(tmp_path: Path) -> None:
+    (tmp_path / "shaders").mkdir()
+    facts = dataclasses.replace(lens(), lens_id="merte_biotar_100").facts()
+    assert "helios 44" in facts["said"] and lens().facts()["said"] == []
+    assert "helios 44" in library.lens_of(tmp_path, facts).said
+
+
 BAD_ZIPS: dict[str, Any] = {
     "empty": b"",
     "damaged at the start": b"PK",

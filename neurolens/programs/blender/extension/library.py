@@ -104,6 +104,7 @@ class LensFacts:
     maker: str = ""
     character: dict[str, float] = dataclasses.field(default_factory=dict)
     bokeh: Path | None = None
+    said: str = ""  # nicknames
 
     @property
     def line(self) -> str:
@@ -193,6 +194,7 @@ def lens_of(folder: Path, entry: dict[str, Any]) -> LensFacts:
         maker=str(entry.get("maker") or ""),
         character={k: float(v) for k, v in (entry.get("character") or {}).items() if k in CHARACTER and v is not None},
         bokeh=bokeh or None,
+        said=", ".join(map(str, entry.get("said") or ())),
     )
 
 

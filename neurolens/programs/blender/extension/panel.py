@@ -33,6 +33,7 @@ class Library:
         self.wrong: list[str] = []
         # kept, because Blender does not hold the texts of menus
         self.items: dict[str, list[tuple[str, str, str, int, int]]] = {}
+        self.found: list[tuple[str, str, str, int, int]] = []  # with the words that its search finds
         self.bokeh: dict[str, int] = {}
         self.pictures: Any = None
 
@@ -57,6 +58,11 @@ class Library:
                 (lens.lens_id, lens.entry(order), lens.source, shown[lens.lens_id], lens.number)
                 for lens in facts.ordered(self.lenses.values(), order)
             ]
+
+        self.found = [
+            (lens.lens_id, " ".join((lens.entry("maker"), lens.said)), lens.source, icons[name], lens.number)
+            for name, lens in self.lenses.items()
+        ]
 
     def _icon(self, name: str, picture: Path | None) -> int:
         """Return the number of a picture, which Blender reads when it is first shown; 0 without one."""
@@ -190,6 +196,22 @@ class NEUROLENS_OT_apply(_Operator):
         props.busy = False
 
 
+class NEUROLENS_OT_find(_Operator):
+    """Find a lens by words of its name, its maker, its focal length or a nickname"""
+
+    bl_idname = "neurolens.find"
+    bl_label = "Find a Lens"
+    bl_property = "lens"  # that Blender's search fills in
+    __annotations__ = {"lens": bpy.props.EnumProperty(name="Lens", items=lambda _props, _context: LIBRARY.found)}
+
+    def invoke(self, context: Any, _event: Any) -> set[str]:
+        context.window_manager.invoke_search_popup(self)
+        return {"FINISHED"}
+
+    def act(self, context: Any, found: Any, props: Any) -> None:
+        props.lens = self.lens
+
+
 class NEUROLENS_OT_take_back(_Operator):
     """Take the lens off this camera: everything that it changed is as it was"""
 
@@ -249,6 +271,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             layout.label(text=line, icon="ERROR")
         props = camera.neurolens
         layout.prop(props, "order")
+        layout.operator("neurolens.find", icon="VIEWZOOM")
         layout.template_icon_view(props, "lens", show_labels=True, scale=6.0)
         layout.prop(props, "lens", text="")
         try:
@@ -346,6 +369,6 @@ def _wrapped(layout: Any, text: str, icon: str) -> None:
 
 
 CLASSES = (
-    CameraSettings, NEUROLENS_OT_apply, NEUROLENS_OT_take_back, NEUROLENS_OT_needs, NEUROLENS_OT_reload,
-    NEUROLENS_PT_lens,
+    CameraSettings, NEUROLENS_OT_apply, NEUROLENS_OT_find, NEUROLENS_OT_take_back, NEUROLENS_OT_needs,
+    NEUROLENS_OT_reload, NEUROLENS_PT_lens,
 )  # fmt: skip
