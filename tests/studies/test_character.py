@@ -233,6 +233,7 @@ def test_a_changed_file_is_not_the_index_s(tmp_path: Path, monkeypatch: pytest.M
     entry = {"file": "a.toml", "sha256": sha256_of(file), "row": {"efl_mm": 5.0}}
     (tmp_path / "lenses" / INDEX).write_text(json.dumps(entry) + "\n")
     monkeypatch.setattr(lens_list, "library", lambda: tmp_path)
+    monkeypatch.setattr("neurolens.base.find.library", lambda: tmp_path)
     index = lens_list.read_index()
     assert lens_list.kept_row(file, index) == {"lens": "a", "file": str(file), "efl_mm": 5.0}
     (tmp_path / "a.toml").write_text("name = 1\n")
