@@ -1,8 +1,9 @@
 """Cameras made of others: without a part of what their lens does, or an ideal one whose picture is warped afterwards.
 
-A lens that disperses moves its picture with the wavelength (lateral colour) and blurs it differently (longitudinal
-colour, and the colours of other aberrations). `ReducedDispersion` follows the rays of one wavelength. With "lateral",
-polynomials in film point and wavelength still move the picture of every other one, as an ST map a wavelength would.
+A lens that disperses moves its picture with the wavelength (lateral colour), and blurs it in another way at each
+(longitudinal colour, and the colours of other aberrations). `ReducedDispersion` follows the rays of one wavelength.
+With "lateral", polynomials in film point and wavelength still move the picture of every other one, as an ST map for
+each wavelength would.
 
 `Vignetted`: the film value of white surroundings is V(f) at a film point f, 1 on the axis. It is the product of
 
