@@ -373,9 +373,8 @@ class Warped:
         focus_m: from the film to the plane that the maps are of.
         tables: whether to make tables of both fields, which takes seconds, or that of the camera, made before; without
             tables, film points are traced.
-            without them film points are traced.
 
-    InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.
+    Raises:
         InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.
     """
 

@@ -43,8 +43,7 @@ def write_lens(
     zoom: str | None = None,
     progress: Progress | None = None,
 ) -> Written:
-    """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and, for a range,
-    zoom.
+    """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and any zoom range.
 
     Args:
         file: the lens file.
