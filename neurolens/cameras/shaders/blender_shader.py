@@ -66,7 +66,7 @@ class Shader:
 
 
 def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False) -> Shader:
-    """Write the shader of a model (.onnx) or of a lens file.
+    """The shader of a model (.onnx) or of a lens file.
 
     Args:
         file: the model or lens file.
@@ -108,10 +108,8 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
 
 
 def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
-    """Return the id of a model (.onnx) or lens file, the lens as a shader has it, and lines that describe it.
-
-    Arguments and errors are those of `shader_of`.
-    """
+    """The id of a model (.onnx) or lens file, the lens as a shader has it, and lines that describe it. Arguments and
+    errors are those of `shader_of`."""
     return _of_model(file, zoom, report) if is_model(file) else exact_lens(file, zoom, report)
 
 
@@ -127,7 +125,7 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
 
 
 def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
-    """Return a lens with every surface traced: its id, the lens as a shader has it, and lines that describe it.
+    """A lens with every surface traced: its id, the lens as a shader has it, and lines that describe it.
 
     It focuses by its groups where its file tells how they move, else by its film, to ten focal lengths.
 
