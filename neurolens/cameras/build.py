@@ -1,4 +1,4 @@
-"""A camera from what a command line names: `neurolens.base.lensname` lists the kinds."""
+"""Makes a camera of what a command line names; `neurolens.base.lensname` lists the kinds."""
 
 from __future__ import annotations
 
@@ -28,14 +28,15 @@ _FOCAL_MM, _FISHEYE_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
 
 
 def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) -> Camera:
-    """The camera that `spec` names, set for a shot.
+    """Make the camera that `spec` names, set for a shot.
 
     Args:
         spec: as `resolve` takes it.
         progress: shows what takes long, see `ExactCamera`.
 
     Raises:
-        InputError: an unknown kind of camera, a missing file, a setting that this kind does not have or cannot reach.
+        InputError: an unknown kind of camera, a missing file, or a setting that this kind does not have or cannot
+            reach.
         ModelError: a model that cannot be trusted.
     """
     camera = with_dispersion(as_c(_camera(str(spec), shot, progress)), shot)
@@ -43,14 +44,14 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
 
 
 def as_c(camera: Camera) -> Camera:
-    """An ideal lens as C where the machine has a compiler; other cameras as they are."""
+    """Return an ideal lens run as C where the machine has a compiler, and any other camera as it is."""
     with suppress(InputError):
         return camera.compiled() if isinstance(camera, ThickLens) and has_compiler() else camera
     return camera
 
 
 def with_dispersion(camera: Camera, shot: Shot) -> Camera:
-    """The camera with the part of its dispersion that the shot keeps."""
+    """Return the camera with the part of its dispersion that the shot keeps."""
     return camera if shot.dispersion == "full" else ReducedDispersion(camera, shot.dispersion, shot.wavelength_nm)
 
 
@@ -110,14 +111,15 @@ def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
 
 
 def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
-    """One of `IDEAL_OF`, framed as a lens that stands ready for the shot, with its entrance pupil.
+    """Return one of `IDEAL_OF`, framed as a lens that stands ready for the shot, with that lens's entrance pupil.
 
-    Chief rays of a film point meet the plane in focus where the lens's do, to first order. A film in best focus is not
-    in the paraxial image: then the ideal lenses' focal lengths differ from the lens's by a few thousandths. Of
-    a lens with cylinders, thin lens and hole are those of the y-z plane.
+    Chief rays of a film point meet the plane in focus where the lens's do, to first order. Since a film in best focus
+    is not in the paraxial image, the ideal lens's focal length may differ from the lens's by a few thousandths. For a
+    lens with cylinders, the thin lens and the hole are those of the y-z plane.
 
     Raises:
-        InputError: a thick lens of one with cylinders, which has two focal lengths; as the cameras.
+        InputError: a thick lens is asked of a lens with cylinders, which has two focal lengths; and what the cameras
+            raise.
     """
     from neurolens.optics.lens.paraxial import first_order, framing_mm
 
@@ -166,7 +168,7 @@ def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
 
 
 def _doubts(lens: Lens) -> list[str]:
-    """What a check of the lens against its source doubts; none without torch, which traces its chief rays."""
+    """Return what a check of the lens against its source doubts; nothing without torch, which traces its chief rays."""
     if find_spec("torch") is None:
         return []
     from neurolens.optics.setting.check import check_lens, doubts
@@ -175,7 +177,7 @@ def _doubts(lens: Lens) -> list[str]:
 
 
 def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
-    """A sentence on a film that is larger than the picture of the lens, where the size of that is known."""
+    """Return a sentence if the film is larger than the picture of the lens, where the picture's size is known."""
     from neurolens.optics.setting.pupils import image_radius_mm
 
     if lens.image_radius_mm is None and (lens.half_field_deg is None or lens.half_field_deg >= 60):

@@ -1,6 +1,7 @@
 """Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
 
-The graph of a camera is written here, once: that of its lens between the pupil and the weights (`whole_camera`).
+`whole_camera` writes the graph of a camera, once for all that run it: the graph of its lens stands between those of the
+pupil and the weights.
 """
 
 from __future__ import annotations
@@ -25,32 +26,33 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
+# How far a direction's squared length may be from 1: a poor network may decode none, and then there is no ray.
 UNIT_SLACK = 1e-3
-# Areas below (mm^2) are none: the outline at the end of the light.
+# Areas (mm^2) below this count as none: the outline at the end of the light.
 _NO_AREA = 1e-30
-# Outputs of a lens's graph with derivatives by the film point.
+# Outputs of a lens's graph with derivatives by the film point, in its x and its y.
 D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
 METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
-_HAIR = 1e-18  # mm; keeps the axis and the middle of a disc finite
+_HAIR = 1e-18  # mm; added so that the axis and the middle of a disc stay finite
 _AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
 @lru_cache(maxsize=16)
 def pupil_graph(segments: int, wavelengths: int) -> Graph:
-    """The pupil point of a film point, of a point of the unit square and a wavelength, and its area, as a graph.
+    """Write the graph from film point, point of the unit square and wavelength to a pupil point and its area.
 
-    The square's concentric squares become concentric copies of the polygon, as for Shirley and Chiu's disk (1997):
-    neighbours stay neighbours, and inside each triangle between centre and edge areas stay in proportion.
+    Concentric squares in the unit square become concentric copies of the polygon, as in Shirley and Chiu's map to the
+    disk (1997): neighbours stay neighbours, and inside each triangle between centre and edge areas stay in proportion.
 
     Args:
-        segments: K, of the upper half of a polygon. wavelengths: of the outline, 1 or 2.
+        segments: K, of the upper half of a polygon.
+        wavelengths: of the outline, 1 or 2.
 
-    Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call the table `outline` (`PupilOutline.table`),
-    `per_radius` (1 / the last film radius), `last_row`, and of two wavelengths `wave_first`, `wave_scale`: the share of
-    the second is (1 / wavelength^2 - first) scale.
-    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but negative or NaN where nothing passes;
-    points mean nothing there.
+    Inputs are `film_mm`, `square` [2] and `wavelength_nm`; for a whole call, the table `outline`
+    (`PupilOutline.table`), `per_radius` (1 / the last film radius), `last_row`, and for two wavelengths `wave_first`
+    and `wave_scale`: the share of the second is (1 / wavelength^2 - first) scale. Outputs are `pupil_mm` [2], and
+    `area_mm2`, which is that of `PupilOutline.sample`, but negative or NaN where nothing passes; there the point means
+    nothing.
     """
     g = Graph()
     film, square, wavelength = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
@@ -63,7 +65,7 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     a, b = g.split(square - 0.5, (1, 1))
     height = b.abs()
     size = a.abs().maximum(height)
-    # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
+    # The place along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has none.
     per_size = 1.0 / size.maximum(1e-30)
     along = (2.0 - a * per_size * (2.0 - height * per_size)) * (segments / 4)
     edge = along.floor()
@@ -74,12 +76,12 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
         weights = g.concat(weights, share, share * step)
     vertex, side, centre = g.split(g.lookup(g.table("outline", 10 * wavelengths), cell, weights), (2, 2, 1))
     products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
-    area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # none beyond the end
+    area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # no area beyond the end
     sign = (b * 1e30).clip(-1.0, 1.0)
     x, y = g.split(vertex + side * (along - edge), (1, 1))
     size = size * 2.0
     x, y = x * size, y * (size * sign)
-    # Turned to the azimuth of the film point; on the axis that is 0, and does not move with the film point.
+    # Turned to the film point's azimuth; on the axis that is 0, and does not move with the film point.
     turn = g.select(g.constant(_HAIR) <= radius, film * (1.0 / radius.maximum(_HAIR)), g.constant([1.0, 0.0]))
     pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
     g.outputs = {"pupil_mm": pupil, "area_mm2": area}
@@ -88,14 +90,15 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
 
 @lru_cache(maxsize=16)
 def status_graph(aperture: Aperture | None = None, stopped: int = 0, unit: bool = False) -> Graph:
-    """The status of rays: those that pass the lens must have a unit direction and cross the stop within its shape.
+    """Write the graph of the status: rays that pass the lens must have a unit direction and pass the stop's shape.
 
     Args:
-        aperture: shape of the stop's opening, tested on the crossing `stop_xy_mm`; None: the round one of the lens.
-        stopped: status of rays that the shape stops. unit: directions are known to be of unit length, and not tested.
+        aperture: shape of the stop's opening, tested on the crossing `stop_xy_mm`; None is the lens's round one.
+        stopped: the status of rays that the shape stops.
+        unit: whether directions are known to be of unit length, and need no test.
 
-    Inputs: `scene_ray` [6], `lens_status`; for an aperture `stop_xy_mm` [2], of the call `stop_radius_mm`, of a mask
-    the table `mask`. Output: `status`.
+    Inputs are `scene_ray` [6] and `lens_status`; for an aperture `stop_xy_mm` [2] and, for a whole call,
+    `stop_radius_mm`; for a mask also the table `mask`. The output is `status`.
     """
     g = Graph()
     ray, status = g.input("scene_ray", 6), g.input("lens_status")
@@ -114,18 +117,18 @@ def status_graph(aperture: Aperture | None = None, stopped: int = 0, unit: bool 
 def weight_graph(
     derivatives: tuple[str, ...] = (), aperture: Aperture | None = None, stopped: int = 0, unit: bool = False
 ) -> Graph:
-    """Weighted rays in the camera's frame, of rays of a lens.
+    """Write the graph that turns rays of a lens into weighted rays in the camera's frame.
 
-    w = T A cos^4 / Z^2 over the exposure on the axis; see `cameras.contract`. Film points that nothing reaches (area 0
-    or NaN) are outside the domain; what does not pass weighs nothing, and is no ray.
+    The weight w is T A cos^4 / Z^2 over the exposure on the axis; see `cameras.contract`. Film points that nothing
+    reaches (area 0 or NaN) are outside the domain. What does not pass weighs nothing and has no ray.
 
     Args:
-        derivatives: names of derivatives of `scene_ray`, inputs and outputs, too.
+        derivatives: names of derivatives of `scene_ray`, which become inputs and outputs too.
         aperture, stopped, unit: see `status_graph`.
 
-    Inputs: `film_mm`, `pupil_mm` [2], `area_mm2`, `scene_ray` [6] (mm, lens frame), `transmittance`, `lens_status`, and
-    derivatives [6] of the ray; of the call `film_z_mm`, `per_distance` (1 / Z), `scale` (1 / (Z^2 exposure)).
-    Outputs: `ray` [6] (metres, camera frame), `weight`, `status`, and derivatives of the ray.
+    Inputs are `film_mm`, `pupil_mm` [2], `area_mm2`, `scene_ray` [6] (mm, lens frame), `transmittance`, `lens_status`,
+    and derivatives [6] of the ray; for a whole call `film_z_mm`, `per_distance` (1 / Z) and `scale` (1 / (Z^2
+    exposure)). Outputs are `ray` [6] (metres, camera frame), `weight`, `status`, and derivatives of the ray.
     """
     g = Graph()
     film, pupil, area, ray = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2"), g.input("scene_ray", 6)
@@ -144,7 +147,7 @@ def weight_graph(
 
 
 def unit_disc(square: Value) -> Value:
-    """The point [2] of the unit disc of a point of the unit square, evenly (Shirley and Chiu 1997)."""
+    """Map a point of the unit square evenly to a point [2] of the unit disc (Shirley and Chiu 1997)."""
     g = square.graph
     a, b = g.split(square * 2.0 - 1.0, (1, 1))
     flat = b * b <= a * a
@@ -157,7 +160,7 @@ def unit_disc(square: Value) -> Value:
 
 
 def concentric_disk(square: NDArray[Any]) -> NDArray[Any]:
-    """`unit_disc` of points [2, N], which keeps areas and neighbours."""
+    """Map points [2, N] as `unit_disc` does, which keeps areas and neighbours."""
     g = Graph()
     g.outputs["disc"] = unit_disc(g.input("square", 2))
     found: NDArray[Any] = evaluate(g, {"square": square})["disc"]
@@ -165,7 +168,7 @@ def concentric_disk(square: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(function: Callable[[Array], Array]) -> Array:
-    """The polynomial of a function of squares of angles up to pi / 4, in units of that, to float32's last bit."""
+    """Fit a function of squares of angles up to pi / 4, in units of that, by a polynomial, to float32's last bit."""
     fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
     return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
 
@@ -175,12 +178,12 @@ _SIN = _series(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))
 
 
 class LensGraph(NamedTuple):
-    """The graph of a lens with what its camera's graph takes from it.
+    """The graph of a lens, with what its camera's graph takes from it.
 
     Attributes:
-        graph: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
-            `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2], and any derivatives of `scene_ray`.
-        stop_radius_mm: of its round stop.
+        graph: its inputs are `rays` [5] (film point, pupil point and wavelength), `film_z_mm` and `stop_radius_mm`; its
+            outputs `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2], and any derivatives of `scene_ray`.
+        stop_radius_mm: radius of the lens's round stop.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
         stopped: status of rays that the shape blocks.
         unit: whether directions are sure to be of unit length.
@@ -194,14 +197,14 @@ class LensGraph(NamedTuple):
 
     @property
     def blades(self) -> Aperture | None:
-        """The opening where it is no mask: a mask's table is too large for compiled loops."""
+        """The opening, unless it is a mask, whose table is too large for compiled loops."""
         return None if self.aperture is None or self.aperture.mask is not None else self.aperture
 
 
 def lens_inside(g: Graph, lens: LensGraph, rays: Value, mask_too: bool) -> tuple[dict[str, Value], Aperture | None]:
-    """The outputs of a lens's graph for rays [5] of another graph, and the shape of the stop for that graph to test.
+    """Put the graph of a lens, for rays [5], into another graph; return its outputs and the shape of the stop to test.
 
-    Where the caller is to test a mask, `stop_xy_mm` is an output of the graph.
+    Where the caller has to test a mask, `stop_xy_mm` becomes an output of the other graph.
     """
     aperture = lens.aperture if mask_too else lens.blades
     wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
@@ -212,18 +215,18 @@ def lens_inside(g: Graph, lens: LensGraph, rays: Value, mask_too: bool) -> tuple
 
 
 def unrounded(status: Value) -> Value:
-    """The status of a lens's graph before it is made an integer, for more tests."""
+    """Return the status of a lens's graph before it becomes an integer, so that tests can be added to it."""
     return status.graph.inputs_of(status.number)[0] if status.node.kind == "whole" else status
 
 
 def whole_camera(
     film: LensFilm, lens: LensGraph, also: Sequence[str] = (), mask_too: bool = False
 ) -> tuple[Graph, dict[str, float]]:
-    """The graph of a camera with the graph of its lens inside, and its numbers of the call.
+    """Write the graph of a camera, with the graph of its lens inside, and return it with its numbers of the call.
 
-    Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`, derivatives of the ray that the
-    lens's graph has, and those of `also`, of the pupil's graph or the lens's. A mask in the stop is tested in the graph
-    with `mask_too`; else `stop_xy_mm` is an output, for the caller to test it.
+    Inputs are those of `pupil_graph` and `weight_graph`. Outputs are those of `weight_graph`, the derivatives of the
+    ray that the lens's graph has, and those named in `also`, of the pupil's graph or the lens's. With `mask_too` the
+    graph tests a mask in the stop; else `stop_xy_mm` is an output, and the caller tests it.
     """
     g = Graph()
     pupil = g.inline(film.outline.graph, {})
@@ -237,9 +240,9 @@ def whole_camera(
 
 
 def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
-    """Rays of the outputs of `weight_graph`, [R, N] each; those that do not pass look ahead.
+    """Return the outputs of `weight_graph`, [R, N] each, as camera rays; those that do not pass look straight ahead.
 
-    Derivatives by the film point stand together, `d_film` [6, 2, N].
+    The derivatives by the film point are one input, `d_film` [6, 2, N].
     """
     ray, moves = found["ray"], found.get("d_film")
     lost = np.flatnonzero(found["status"][0] != st.PASSED)

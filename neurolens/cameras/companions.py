@@ -1,9 +1,9 @@
 """Companion wavelengths of camera rays: where on film and pupil another wavelength takes the same scene ray.
 
-A path that carries several wavelengths follows the scene ray of one, the hero. At a companion wavelength the same scene
-ray belongs to another film point, some microns away, and to another pupil point. Polynomials of low order give both
-shifts and the ratio of their light. Whether a companion passes the lens is certain inside the pupil; near the pupil's
-edge the lens's own graph decides.
+A path that carries several wavelengths follows the scene ray of one of them, the hero. At a companion wavelength the
+same scene ray belongs to another film point, some microns away, and to another pupil point. Polynomials of low order
+give both shifts and the ratio of their light. Whether a companion passes the lens is certain inside the pupil; near the
+pupil's edge the lens's own graph decides.
 """
 
 from __future__ import annotations
@@ -27,31 +27,32 @@ Array = NDArray[np.float64]
 Degrees = tuple[int, int, int]
 Pair = tuple[float, float]
 
-# Degrees in film and pupil point of the terms without a wavelength, linear in the wavelengths, and quadratic; the
-# higher ones serve where the lower do not keep film points within `_WORST_MM`.
+# Degrees in film and pupil point: of the terms without a wavelength, of those linear in the wavelengths, and of the
+# quadratic ones. The second set serves where the first does not keep film points within `_WORST_MM`.
 _DEGREES = ((5, 3, 1), (7, 3, 1))
-_LIGHT_DEGREE, _TINT = 4, 8  # of the ratio of light: in film and pupil point, and in the wavelength alone
-_STEPS, _CLOSE = 5, 1e-4  # of Newton's method; how well a shift must keep the scene ray, mm
-_FAR_MM = 50.0  # from the lens, where an error of a direction counts as an error of the position
-_FEWEST = 500  # rays, to fit to
-_WORST_MM, _WORST = 5e-4, 0.05  # RMS error of the film point, alone and of the shifts, one of which must do
-_BEYOND = 1.5  # the farthest shift over that of the rays of the fit, and the edge of the pupil over where they are lost
-_SURELY = 0.02  # the share of the rays, next to the edge, that are traced in any case
+_LIGHT_DEGREE, _TINT = 4, 8  # degrees of the ratio of light: in film and pupil point, and in the wavelength alone
+_STEPS, _CLOSE = 5, 1e-4  # steps of Newton's method, and how closely (mm) a shift must keep the scene ray
+_FAR_MM = 50.0  # distance from the lens at which an error of direction counts as one of position
+_FEWEST = 500  # rays that a fit needs
+_WORST_MM, _WORST = 5e-4, 0.05  # RMS error of the film point, in mm or as a share of the shifts: one must do
+_BEYOND = 1.5  # the farthest shift over the fitted rays', and the pupil's edge over where they are lost
+_SURELY = 0.02  # share of the rays, next to the edge, that are traced in any case
 
 
 class Shift(NamedTuple):
-    """The shift from the film and pupil point of the hero to those of a companion.
+    """The shift from a hero's film and pupil points to those of a companion.
 
     Attributes:
-        of_hero: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`; what all companions share: outputs `film_shift` and
-            `pupil_shift` [6], `tint`.
-        graph: inputs those and the outputs of `of_hero`, and `companion_nm`; outputs `film_there`, `pupil_there` [2],
-            the points in mm of the same scene ray at the companion wavelength, `ratio` of its light to the hero's, and
-            `known`, 0 beyond the film or the reach.
+        of_hero: the part that all companions share; inputs `film_mm`, `pupil_mm` [2] and `wavelength_nm`, outputs
+            `film_shift` and `pupil_shift` [6], and `tint`.
+        graph: takes these inputs, the outputs of `of_hero` and `companion_nm`, and gives `film_there` and `pupil_there`
+            [2], the points (mm) of the same scene ray at the companion wavelength; the `ratio` of its light to the
+            hero's; and `known`, which is 0 beyond the film or the reach.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
-        edge: a companion passes if the hero does, and crosses the pupil farther inside than the first number (mm), than
-            the second times d and than the third times -d. d is the difference of 1 / wavelength^2 (um) to the hero's,
-            negative on the far side of the pupil's middle: dispersion moves rays to one side.
+        edge: three numbers. A companion passes if the hero passes and crosses the pupil farther inside it than the
+            first number (mm), than the second times d, and than the third times -d. Here d is by how much its 1 /
+            wavelength^2 (um) exceeds the hero's, with the sign changed on the far side of the pupil's middle, for
+            dispersion moves rays to one side.
     """
 
     of_hero: Graph
@@ -63,13 +64,14 @@ class Shift(NamedTuple):
 def fit_shift(
     lens: Graph, samples: Mapping[str, Array], margin: Array, companion_nm: Array, film_mm: tuple[float, float]
 ) -> Shift | None:
-    """Fit the shift of a lens; None if too few rays pass, or the error on held-out rays is too large.
+    """Fit the shift of a lens; return None if too few rays pass, or if the error on held-out rays is too large.
 
     Args:
         lens: the graph of the lens (`cameragraph.LensGraph`).
         samples: its inputs for rays that cover film, pupil and wavelengths; half of them measure the error.
-        margin: [N] how far inside the pupil these rays pass, as in `lanes_graph`.
-        companion_nm: [N] wavelengths of the companions. film_mm: width and height of the film.
+        margin: [N], how far inside the pupil these rays pass, as in `lanes_graph`.
+        companion_nm: [N], wavelengths of the companions.
+        film_mm: width and height of the film.
     """
     found = _solved(lens, samples, companion_nm)
     if found.kept.sum() < _FEWEST:
@@ -96,8 +98,12 @@ def fit_shift(
 
 
 def _terms(columns: Array, values: Array, degrees: Degrees) -> tuple[Array, Array, float]:
-    """Fit the values [5, N] of `_Solved` by variables [6, N]: weights [5, M] of the monomials, coefficients of the
-    light by wavelength, and the RMS error of the film point on the half of the rays that were not fitted."""
+    """Fit the values [5, N] of `_Solved` by polynomials of variables [6, N].
+
+    Returns:
+        The weights [5, M] of the monomials, the coefficients of the light by wavelength, and the RMS error of the film
+        point on the half of the rays that were not fitted.
+    """
     exponents, parity = _monomials(degrees)
     products = np.stack([np.prod(columns.T**powers, axis=1) for powers in exponents]) * (columns[5] - columns[4])
     tints = np.stack([columns[5] ** k - columns[4] ** k for k in range(1, _TINT + 1)])
@@ -118,7 +124,7 @@ def _terms(columns: Array, values: Array, degrees: Degrees) -> tuple[Array, Arra
 def _shift_graphs(
     degrees: Degrees, weights: Array, tint: Array, scale: Array, waves: Pair, *limits_mm: Pair
 ) -> tuple[Graph, Graph]:
-    """The graphs of `Shift`, for what `_terms` finds in variables so scaled, the reach and the film."""
+    """Write the graphs of `Shift` from what `_terms` finds in scaled variables, the reach, and the film's size."""
     exponents, of_hero, g = _monomials(degrees)[0], Graph(), Graph()
 
     def variable(g: Graph, name: str) -> Value:
@@ -148,13 +154,12 @@ def _shift_graphs(
 
 
 def lanes_graph(shift: Shift, companions: int) -> Graph:
-    """The graph of all wavelengths of a ray, as if the lens let pass every companion.
+    """Write the graph of all wavelengths of a ray, as if the lens let every companion pass.
 
-    Inputs: those of `Shift.of_hero`, `companion_nm` [companions], and of the hero's ray `square` [2], `area_mm2` and
-    `weight`.
-    Outputs: `light` [companions], the weights that they would have alone, 0 where they are not `known`; `places`, the
-    film points of all wavelengths, the hero's where there is no light; `sure` [companions], above 0 where a companion
-    passes if the hero does.
+    Inputs are those of `Shift.of_hero`, `companion_nm` [companions], and the hero ray's `square` [2], `area_mm2` and
+    `weight`. Outputs are `light` [companions], the weights that they would have alone, 0 where they are not `known`;
+    `places`, the film points of all wavelengths, the hero's where there is no light; and `sure` [companions], which is
+    above 0 where a companion passes if the hero does.
     """
     g = Graph()
     film, light, weight = g.input("film_mm", 2), g.input("companion_nm", companions), g.input("weight")
@@ -179,11 +184,10 @@ def lanes_graph(shift: Shift, companions: int) -> Graph:
 
 
 def companion_graph(lens: LensGraph, shift: Shift, mask_too: bool) -> Graph:
-    """The graph that says whether companions pass: from a ray's film and pupil point and two wavelengths.
+    """Write the graph that tells whether companions pass, from a ray's film and pupil point and two wavelengths.
 
-    Inputs: those of `Shift.of_hero`, `companion_nm`, and those of the lens for a whole call; with `mask_too` the table
-    of a mask.
-    Outputs: `status`; without `mask_too` also `stop_xy_mm` of a lens with a mask.
+    Inputs are those of `Shift.of_hero`, `companion_nm`, and those of the lens for a whole call; with `mask_too` also
+    the table of a mask. Outputs are `status`, and without `mask_too`, for a lens with a mask, `stop_xy_mm`.
     """
     g = Graph()
     of_hero = {k: v for k, v in shift.of_hero.outputs.items() if k != "tint"}
@@ -198,10 +202,10 @@ def companion_graph(lens: LensGraph, shift: Shift, mask_too: bool) -> Graph:
 
 @cache
 def _monomials(degrees: Degrees) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Exponents [M, 6] of film x, y, pupil x, y, hero and companion; and [M] 0 where odd in x alone, 1 where odd in y
-    alone, as shifts are, 2 where odd in neither, as light is.
+    """Return exponents [M, 6] of film x, y, pupil x, y, hero and companion, and a number for the symmetry of each term.
 
-    Lenses with two planes of symmetry have no others, round or with cylinders.
+    The number [M] is 0 for a term odd in x alone and 1 for one odd in y alone, as shifts are, and 2 for one odd in
+    neither, as light is. A lens with two planes of symmetry, round or with cylinders, has no other terms.
     """
     found, parity = [], []
     for *point, hero, other in product(*[range(degrees[0] + 1)] * 4, *[range(len(degrees))] * 2):
@@ -214,8 +218,13 @@ def _monomials(degrees: Degrees) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 class _Solved(NamedTuple):
-    """Shifts [4, N] of film and pupil points and the logarithm of the ratio of light, `values` [5, N]; [N] whether they
-    are solutions (`kept`), and whether the companion passes."""
+    """Holds solved shifts.
+
+    Attributes:
+        values: [5, N], the shifts of film and pupil points [4, N] and the logarithm of the ratio of light.
+        kept: [N], whether they are solutions.
+        passed: [N], whether the companion passes.
+    """
 
     values: Array
     kept: NDArray[np.bool_]

@@ -1,6 +1,6 @@
 """The exact lens as a camera, run as its graph: every ray passes through every surface.
 
-The outline of the light that passes the lens is searched by the same graph, in onnxruntime.
+The same graph, in onnxruntime, serves the search for the outline of the light that passes the lens.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from neurolens.optics.trace.tracegraph import exact_graph, light_limits
 
 
 class ExactRun(LensRun):
-    """The graph of a lens that `set_lens` has placed, for light through points of a plane."""
+    """Runs the graph of a lens that `set_lens` has placed, for light through points of a plane."""
 
     def __init__(self, lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float]) -> None:
         super().__init__(Path(lens.path))
         self.stop_index, self._graph = lens.stop_index, exact_graph(lens, pupil_z_mm, wavelength_nm)
 
     def graph(self, form: Form = SCALARS) -> Graph:
-        """The graph, which has one form."""
+        """Return the graph, which is the same in every form."""
         return self._graph
 
 
@@ -104,7 +104,7 @@ class ExactCamera(LensCamera):
 
     @property
     def front(self) -> Surface:
-        """The first surface."""
+        """The first surface of the lens."""
         return self.lens.surfaces[0]
 
     def _traced_back(
@@ -114,7 +114,7 @@ class ExactCamera(LensCamera):
 
         from neurolens.optics.trace.rays import trace
 
-        # Light starts a millimetre before the surface, so that it lies ahead; rays that are not finite miss it.
+        # Light starts a millimetre in front of the surface, which then lies ahead; rays that are not finite miss it.
         rays = np.nan_to_num(np.concatenate([position + direction, -direction]), posinf=0, neginf=0)
         with torch.no_grad():
             *light, wavelength = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in (*rays, wavelength_nm))
@@ -122,21 +122,25 @@ class ExactCamera(LensCamera):
         assert done.transmittance is not None
         x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
         film = np.stack([x, y]) + (self.film.film_z_mm - z) / dz * np.stack([dx, dy])
-        # As the lens's graph has it: of no other light than that of the camera.
+        # The lens's graph takes light of the camera's range alone; so does this.
         low, high = light_limits(self.lens, self._range_nm)
         inside = (low <= wavelength_nm) & (wavelength_nm <= high)
         return film, through, np.where(inside, done.status.numpy(), st.OUTSIDE_DOMAIN).astype(np.int32)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
-        """The graph of the lens with its stop."""
+        """Return the graph of the lens with its stop."""
         scene = self.film.scene
         return LensGraph(scene.lens.graph(form), scene.stop_radius_mm, scene.aperture, scene.stopped)
 
     def path_by_height(
         self, surfaces: list[int], film_mm: NDArray[Any], pupil_mm: NDArray[Any], wavelength_nm: NDArray[Any]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rays of film points [2, N] through pupil points [2, N]: optical direction cosines at the film [2, N]; of each
-        surface the distance from the axis and the path that a surface higher by 1 would add [surfaces, 2, N]."""
+        """Trace rays of film points [2, N] through pupil points [2, N] for the effect of uneven surfaces.
+
+        Returns:
+            Optical direction cosines at the film [2, N]; and for each surface, [surfaces, 2, N], the distance of the
+            ray from the axis and by how much its path grows if the surface is higher by 1.
+        """
         import torch
 
         from neurolens.optics.trace.aiming import without_rims
@@ -148,7 +152,7 @@ class ExactCamera(LensCamera):
         way = np.stack([*(pupil_mm - film_mm), outline.pupil_z_mm - film_z])
         way /= np.sqrt((way**2).sum(axis=0))
         start = Rays(*map(torch.from_numpy, (*film_mm.astype(np.float64), film_z, *way)))
-        path = [start, *trace(lens, start, waves, path=True).path]  # from the film: surface k is number -1 - k
+        path = [start, *trace(lens, start, waves, path=True).path]  # seen from the film: surface k is number -1 - k
         radius = [path[-1 - k].x.hypot(path[-1 - k].y).numpy() for k in surfaces]
         added = [index[k + 1] * path[-2 - k].dz.numpy() - index[k] * path[-1 - k].dz.numpy() for k in surfaces]
         return index[-1] * way[:2], np.stack([radius, added], 1)
@@ -156,15 +160,16 @@ class ExactCamera(LensCamera):
     def _outline(
         self, scene: LensScene, pupil_z_mm: float, bounds: PupilBounds | None, progress: Progress | None
     ) -> PupilOutline | None:
-        """The outline of what passes the lens with a round stop; that of an earlier run where it is kept."""
+        """The outline of what passes the lens with a round stop, from the cache where an earlier run has kept it."""
         lens, planes, light = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm), self._light_nm
-        # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
+        # A lens with cylinders takes a search at many azimuths, for one outline that fits none closely: so it is
+        # coarser.
         detail, rows, points = (COARSE, 13, 48) if self.lens.anamorphic else (FINE, 17, 128)
 
         def passes(film: FloatArray, pupil: FloatArray, nm: float) -> NDArray[np.bool_]:
             if not self.lens.anamorphic:
                 return lens.passes(film, pupil, nm)
-            # Most of many azimuths are dark: as arrays, for lost rays are then left out.
+            # At most azimuths most points are dark. Traced as arrays, lost rays take no more work.
             radius, x, y = (c.astype(np.float64) for c in (film[0], *pupil))
             film_z = np.full_like(radius, scene.film_z_mm)
             return passes_at_any_azimuth(self.lens, radius, film_z, x, y, pupil_z_mm, nm, self.film_mm)
@@ -205,7 +210,7 @@ def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float |
 
 
 def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) -> dict[str, Any]:
-    """The settings of an exact camera that describe lens and film, for a lens that `set_lens` has placed."""
+    """Return the part of an exact camera's settings that describes lens and film, for a lens placed by `set_lens`."""
     nominal = None if lens.infinity_mm else float(first_order(lens).efl_mm)
     return {
         "camera": "exact",
@@ -216,14 +221,15 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
     }
 
 
-_KEPT = 256  # outlines in the cache, of 100 kB or less
+_KEPT = 256  # outlines in the cache, of 100 kB or less each
 
 
 def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[float, ...], *settings: Any) -> str:
-    """A name for all that the search for an outline reads.
+    """Return a name for all that the search for an outline depends on.
 
     Args:
-        lens: focused. wavelength_nm, shares: the range, and the shares of it at which rays are traced.
+        lens: focused.
+        wavelength_nm, shares: the range, and the shares of it at which rays are traced.
         settings: whatever else rules the search, as JSON takes it.
     """
     waves = {lens.reference_nm, *wavelength_nm, *(wavelength_between(wavelength_nm, share) for share in shares)}
@@ -244,7 +250,7 @@ def _code() -> list[str]:
 
 
 def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOutline | None:
-    """The outline of a key: from the cache, else what `search` finds, which takes seconds."""
+    """Return the outline of a key, from the cache, or else what `search` finds, which takes seconds."""
 
     def searched() -> dict[str, Any]:
         outline = search()

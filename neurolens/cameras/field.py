@@ -1,15 +1,15 @@
 """The field of a camera: the undistorted place of every point of its picture, the way back, and the light there.
 
 Picture points are mm on the film as the picture is looked at: x right, y up, origin at its centre. What a point of the
-picture shows is the centroid of the light that arrives there: the mean, over pupil and wavelengths and by weight, of
-where its rays meet the object. It is what a picture shows as the place of a thing, whatever the stop, also where the
-focus is not perfect; the ray through the stop's centre differs from it by the coma.
+picture shows is the centroid of the light that arrives there: the mean of where its rays meet the object, over pupil
+and wavelengths and by weight. That is where a picture shows a thing, whatever the stop, and also where the focus is not
+perfect; the ray through the stop's centre differs from it by the coma.
 
-The object is a plane across the axis for the rectilinear projection, a sphere about the entrance pupil for the others,
-at the distance in focus unless another is asked for. Undistorted places are those of an ideal camera: a point at the
-lens's paraxial entrance pupil, whose picture has the lens's paraxial size on the axis (chief rays; of a lens with
-cylinders, in each of its meridians). A point nearer or farther than the object is seen from elsewhere than the
-entrance pupil's centre, for that moves with the field: `shown_at` says where the picture has it instead.
+The object is a plane across the axis for the rectilinear projection, and a sphere about the entrance pupil for the
+others, at the distance in focus unless another is asked for. Undistorted places are those in the picture of an ideal
+camera: a point at the lens's paraxial entrance pupil, whose picture on the axis has the lens's paraxial size (by chief
+rays; for a lens with cylinders, in each of its meridians). The lens itself sees from a point that moves with the field.
+So it shows a point nearer or farther than the object at another place, which `shown_at` gives.
 """
 
 from __future__ import annotations
@@ -31,44 +31,54 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 RECTILINEAR = "rectilinear"
-WIDEST_DEG = 85.0  # field that is laid on a plane: there a picture is 11 focal lengths from the axis
+WIDEST_DEG = 85.0  # field that can be laid on a plane: a picture is then 11 focal lengths from the axis
 
 _PUPIL = 6, 24  # rings of pupil samples, and samples of a ring
-_RAYS = 1 << 17  # at once
-_ROUND, _OTHER = (513, 1), (97, 64)  # radii and azimuths of the tables
-BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
-_FINER = 64, 4  # rings (and azimuths) of the map back over those of the map there, of round cameras and of others
+_RAYS = 1 << 17  # rays at once
+_ROUND, _OTHER = (513, 1), (97, 64)  # radii and azimuths of the tables, for round cameras and others
+BEYOND = 1.02  # radius of the film's corner over that of the light that is allowed, for lenses are engraved so
+_FINER = 64, 4  # rings of the map back for each of the map there; of cameras that are not round, also azimuths
 _EDGE = 16  # points on each side of the film
 _SPREAD = 61, 41  # points over a film
-_TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
+# shares of the radius and azimuths that are tried; unevenness of a round one
+_TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6
 _HALVINGS = 24
-DIM = 2e-3  # of the light on the axis, nine stops below it: from there on places go straight on
-_STEPS = 6  # of Newton's method
-_SMALL = 0.004  # of the radius: where the size on the axis is measured, of cameras that do not know it
+DIM = 2e-3  # share of the light on the axis, nine stops below: from there on places continue straight
+_STEPS = 6  # steps of Newton's method
+_SMALL = 0.004  # share of the radius at which the size on the axis is measured, for cameras that do not know it
 
 
 class Frame(NamedTuple):
-    """The ideal camera that a picture is compared with: size on the film of a slope of 1, along x and y, mm; distance
-    of its point before the film in each meridian, mm."""
+    """The ideal camera that a picture is compared with.
+
+    Attributes:
+        reach_mm: the size on the film of a slope of 1, along x and along y.
+        pupil_mm: how far in front of the film its point lies, in each meridian.
+    """
 
     reach_mm: tuple[float, float]
     pupil_mm: tuple[float, float]
 
 
 class Light(NamedTuple):
-    """The light of picture points [N]: its undistorted place (x + i y, mm), its amount over that on the axis, and the
-    angle of its mean ray to the axis (rad)."""
+    """The light of picture points, [N] each.
+
+    Attributes:
+        place: the undistorted place, x + i y in mm.
+        light: the amount of light over that on the axis.
+        angle: of the mean ray to the axis, rad.
+    """
 
     place: Complex
     light: Array
     angle: Array
 
 
-Spectrum = tuple[Array, Array]  # wavelengths in nm and weights
+Spectrum = tuple[Array, Array]  # wavelengths in nm, and their weights
 
 
 def spectrum_of(camera: Any, light_nm: tuple[float, float] = LIGHT_NM, only_nm: float | None = None) -> Spectrum:
-    """One wavelength, or those of a range by the eye's sensitivity, within what the camera takes."""
+    """Return one wavelength, or those of a range weighted by the eye's sensitivity, of those that the camera takes."""
     low, high = camera.wavelength_nm or light_nm
     if only_nm is not None:
         if camera.wavelength_nm is not None and not low <= only_nm <= high:
@@ -80,7 +90,7 @@ def spectrum_of(camera: Any, light_nm: tuple[float, float] = LIGHT_NM, only_nm: 
 
 
 def frame_of(camera: Any) -> Frame:
-    """The ideal camera of any camera, by its first-order data; of models of lenses with cylinders, x by their rays."""
+    """Return the ideal camera for any camera, by its first-order data (by rays, for x in models with cylinders)."""
     state, lens = camera.settings["lens_state"], getattr(camera, "lens", None)
     y = state["pinhole_focal_length_mm"], state["entrance_pupil_offset_mm"]
     if None in y:
@@ -100,7 +110,7 @@ def frame_of(camera: Any) -> Frame:
 
 
 def _measured(camera: Any) -> Frame:
-    """The frame of a camera without first-order data: its rays close to the axis meet two planes, in both meridians."""
+    """Measure the ideal camera of one without first-order data, by where rays close to the axis meet two planes."""
     height = _SMALL * math.hypot(*camera.film_mm) / 2
     points = np.asarray(height * np.array([1, 1j, -1, -1j, 2, 2j, -2, -2j]), np.complex128)
     near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
@@ -109,7 +119,7 @@ def _measured(camera: Any) -> Frame:
         z = traced_light(camera, points, spectrum_of(camera), origin, RECTILINEAR, distance / 1000, (1, 1)).place
         x, y = z.real * distance / height, z.imag * distance / height
         once, twice = np.array([x[0] - x[2], y[1] - y[3]]) / 2, np.array([x[4] - x[6], y[5] - y[7]]) / 4
-        sizes.append((4 * once - twice) / 3)  # the error goes with the square
+        sizes.append((4 * once - twice) / 3)  # the error grows with the square
     growth = [(b - a) / (far - near) for a, b in zip(*sizes, strict=True)]  # per mm: 1 / reach
     pupil = [near - a / g for a, g in zip(sizes[0], growth, strict=True)]
     return Frame((float(1 / growth[0]), float(1 / growth[1])), (float(pupil[0]), float(pupil[1])))
@@ -119,10 +129,10 @@ def traced_light(
     camera: Any, point: Complex, spectrum: Spectrum, frame: Frame, target: str, distance_m: float,
     pupil: tuple[int, int] = _PUPIL,
 ) -> Light:  # fmt: skip
-    """The light of picture points [N]; see the module.
+    """Trace the light of picture points [N]; see the module.
 
     Args:
-        distance_m: from the film to the object on the axis, inf allowed.
+        distance_m: from the film to the object on the axis; inf is allowed.
         pupil: see `_pupil_samples`.
     """
     (waves, weights), (square, shares) = spectrum, _pupil_samples(*pupil)
@@ -148,15 +158,15 @@ def traced_light(
 
 
 def _pupil_samples(rings: int, around: int) -> tuple[Array, Array]:
-    """Points [2, N] of the unit square and their weights, which integrate what is smooth over a pupil.
+    """Return points [2, N] of the unit square and weights that integrate what is smooth over a pupil.
 
-    All cameras map concentric squares to concentric copies of the pupil: rings by Gauss, equal steps around. One sample
-    is the centre.
+    All cameras map concentric squares to concentric copies of the pupil, so the points lie on rings by Gauss's rule, in
+    equal steps around. One more sample is the centre.
     """
     if around == 1:
         return np.full((2, 1), 0.5), np.ones(1)
     node, weight = np.polynomial.legendre.leggauss(rings)
-    size = np.sqrt((1 + node) / 2)  # the area of a square goes with its square
+    size = np.sqrt((1 + node) / 2)  # the area of a square grows with its square
     turn = (np.arange(around) + 0.5) * (8 / around)  # along the edge of the square from +x, which is 8 long
     from_x = 4 - np.abs(4 - turn)
     a, b = np.clip(2 - from_x, -1, 1), np.sign(4 - turn) * np.clip(np.minimum(from_x, 4 - from_x), 0, 1)
@@ -165,7 +175,7 @@ def _pupil_samples(rings: int, around: int) -> tuple[Array, Array]:
 
 
 def _on_object(origin: Array, way: Array, frame: Frame, target: str, distance_m: float) -> Array:
-    """Directions [3, ...] from the ideal camera's point to where rays (camera frame, m) meet the object; z forward."""
+    """Directions [3, ...] from the ideal camera's point to where rays (camera frame, m) meet the object; z ahead."""
     flip, pupil = np.array([1.0, 1.0, -1.0])[:, None, None], 1e-3 * np.array(frame.pupil_mm)
     with np.errstate(all="ignore"):
         if target == RECTILINEAR:
@@ -173,7 +183,7 @@ def _on_object(origin: Array, way: Array, frame: Frame, target: str, distance_m:
             if math.isinf(distance_m):
                 return np.concatenate([slope, np.ones_like(slope[:1])])
             place = origin[:2] + slope * (distance_m + origin[2])
-            # Each meridian is seen from its own pupil: a direction of which z is 1.
+            # Each meridian is seen from its own pupil, so the direction is scaled to z = 1.
             return np.concatenate([place / (distance_m - pupil)[:, None, None], np.ones_like(slope[:1])])
         if math.isinf(distance_m):
             return way * flip
@@ -186,7 +196,7 @@ def _on_object(origin: Array, way: Array, frame: Frame, target: str, distance_m:
 
 
 def _undistorted(direction: Array, frame: Frame, target: str) -> Complex:
-    """Undistorted places x + i y [N], mm, of directions [3, N]."""
+    """Return the undistorted places x + i y [N], in mm, of directions [3, N]."""
     side = np.hypot(direction[0], direction[1])
     angle = np.arctan2(side, direction[2])
     with np.errstate(all="ignore"):
@@ -197,7 +207,7 @@ def _undistorted(direction: Array, frame: Frame, target: str) -> Complex:
 
 
 def _directions(place: Complex, frame: Frame, target: str) -> Array:
-    """Unit vectors [3, N] of undistorted places."""
+    """Return the unit vectors [3, N] of undistorted places."""
     place = place.real / frame.reach_mm[0] + 1j * (place.imag / frame.reach_mm[1])
     rho = np.abs(place)
     angle = np.arctan(rho) if target == RECTILINEAR else PROJECTIONS[target].angle(rho)
@@ -206,7 +216,7 @@ def _directions(place: Complex, frame: Frame, target: str) -> Array:
 
 
 def is_round(camera: Any) -> bool:
-    """Test whether points at some azimuths, none of which is another's mirror image, have the same places and light."""
+    """Test whether a camera is round: places and light agree at azimuths of which none is another's mirror image."""
     corner = math.hypot(*camera.film_mm) / 2
     angle = np.arange(_AZIMUTHS) * 0.83
     turn = np.exp(1j * np.tile(angle, len(_TRIED)))
@@ -214,20 +224,20 @@ def is_round(camera: Any) -> bool:
     traced = traced_light(camera, points, spectrum_of(camera), Frame((1, 1), (0, 0)), "equidistant", math.inf)
     place = (traced.place / turn).reshape(len(_TRIED), -1)
     light = traced.light.reshape(place.shape) > 0
-    lit = light.all(1)  # a row that is dark in part is not round, one that is dark says nothing
+    lit = light.all(1)  # a row that is dark in part is not round; one that is all dark tells nothing
     uneven = np.abs(place[lit] - place[lit].mean(1, keepdims=True))
     return bool((lit | ~light.any(1)).all() and (uneven <= _UNEVEN * np.abs(place[lit])).all())
 
 
 @dataclass(frozen=True)
 class Polar:
-    """A map of the plane to itself near the identity, on rings: of each point its ratio to where it goes.
+    """A map of the plane to itself, near the identity, given on rings by the ratio of where a point goes to the point.
 
     Attributes:
-        end: radius of the last ring, mm; beyond it the map goes on straight along the radius.
+        end: radius of the last ring, mm; beyond it the map continues straight along the radius.
         ratio: [R, A] complex, at equal steps of radius (from 0) and azimuth (from +x); A is 1 where the map is round.
         slope: [A] complex, derivative along the radius at the last ring.
-        shift: what is added everywhere, of cameras that are not round.
+        shift: what is added everywhere, for cameras that are not round.
     """
 
     end: float
@@ -237,18 +247,18 @@ class Polar:
 
     @classmethod
     def of(cls, end: float, place: Complex) -> Polar:
-        """Make it from where the points of the rings go, [R, A]; the first ring is the centre."""
+        """Make the map of where the points of the rings go, [R, A]; the first ring is the centre."""
         rings, turn = place.shape[0], turns(place.shape[1])
-        shift = complex(place[0].mean()) if len(turn) > 1 else 0j  # of a round camera it is rounding
+        shift = complex(place[0].mean()) if len(turn) > 1 else 0j  # of a round camera it is only rounding
         radius = np.linspace(0, end, rings)[:, None]
         ratio = np.ones_like(place)
         ratio[1:] = (place[1:] - shift) / (radius[1:] * turn)
-        ratio[0] = (4 * ratio[1] - ratio[2]) / 3  # even about the centre
+        ratio[0] = (4 * ratio[1] - ratio[2]) / 3  # ratios are even about the centre
         a, b, c = place[-1], place[-2], place[-3]
         return cls(end, ratio, (3 * a - 4 * b + c) / (2 * radius[1] * turn), shift)
 
     def __call__(self, point: Complex) -> Complex:
-        """The points to which the map takes points."""
+        """Return where the map takes points."""
         radius = np.abs(point)
         inner = np.minimum(radius, self.end)
         turn = point / np.where(radius > 0, radius, 1.0)
@@ -259,13 +269,13 @@ class Polar:
 
 
 def turns(azimuths: int) -> Complex:
-    """Unit vectors to equally spaced azimuths, [A]."""
+    """Return the unit vectors [A] to equally spaced azimuths."""
     found: Complex = np.exp(2j * math.pi * np.arange(azimuths) / azimuths)
     return found
 
 
 def on_rings(table: NDArray[Any], end: float, point: Complex) -> NDArray[Any]:
-    """A table [R, A] on rings from the centre to `end` at points, by cubics; those beyond as on the last ring."""
+    """Interpolate a table [R, A] on rings from the centre to `end`, by cubics; beyond, take the last ring's values."""
     rings, azimuths = table.shape
     place = np.minimum(np.abs(point), end) * ((rings - 1) / end)
     row = np.clip(place.astype(np.intp) - 1, 0, rings - 4)
@@ -280,23 +290,23 @@ def on_rings(table: NDArray[Any], end: float, point: Complex) -> NDArray[Any]:
 
 
 def _lagrange(t: Array) -> list[Array]:
-    """Weights of four values at 0, 1, 2 and 3."""
+    """Return the weights of four values at 0, 1, 2 and 3."""
     a, b, c = t - 1, t - 2, t - 3
     return [-a * b * c / 6, t * b * c / 2, -t * a * c / 2, t * a * b / 6]
 
 
 @dataclass(frozen=True)
 class Field:
-    """A camera's picture and its undistorted one.
+    """Holds both maps between a camera's picture and its undistorted picture, and the light.
 
     Attributes:
-        ideal, picture: undistorted place of a picture point and back, both x + i y in mm.
-        frame, target: see the module.
+        ideal, picture: undistorted place of a picture point, and the way back, both x + i y in mm.
+        frame, target: the ideal camera and the projection; see the module.
         end_mm: radius of the tables: the film's corner, or where the light ends.
-        field_deg: widest angle to the axis of light that arrives within it.
+        field_deg: widest angle to the axis of light that arrives within that radius.
         light: [R, A] on the rings of `ideal`, over that on the axis.
         distance_m: from the film to the object.
-        spectrum: wavelengths in nm and weights.
+        spectrum: wavelengths in nm and their weights.
     """
 
     ideal: Polar
@@ -311,7 +321,7 @@ class Field:
 
     @property
     def round(self) -> bool:
-        """Whether it is the same at all azimuths."""
+        """Whether the field is the same at all azimuths."""
         return self.light.shape[1] == 1
 
     def lit(self, point: Complex) -> NDArray[np.bool_]:
@@ -321,16 +331,16 @@ class Field:
         return self.relative_light(point) > 0
 
     def relative_light(self, point: Complex) -> Array:
-        """Light at picture points over that on the axis; 0 beyond the end of light."""
+        """Return the light at picture points over that on the axis; 0 beyond the end of the light."""
         value = np.maximum(on_rings(self.light, self.end_mm, point), 0.0)
         return np.where(np.abs(point) <= self.end_mm * (1 + 1e-9), value, 0.0)
 
     def directions(self, point: Complex) -> Array:
-        """Unit vectors [3, N] (z towards the scene) of picture points, from the ideal camera's point."""
+        """Return the unit vectors [3, N] (z towards the scene) of picture points, from the ideal camera's point."""
         return _directions(self.ideal(point), self.frame, self.target)
 
     def point(self, direction: Array) -> Complex:
-        """Picture points of directions [3, N], those back again: NaN where the ideal camera sees nothing."""
+        """The picture points of directions [3, N], as `directions` gives them; NaN where the ideal camera sees none."""
         behind = direction[2] <= 0 if self.target == RECTILINEAR else direction[2] < -1 + 1e-9
         with np.errstate(all="ignore"):
             return self.picture(np.where(behind, np.nan, _undistorted(direction, self.frame, self.target)))
@@ -340,17 +350,18 @@ def field_of(
     camera: Any, focus_m: float, target: str = RECTILINEAR, *,
     frame: Frame | None = None, spectrum: Spectrum | None = None, distance_m: float | None = None,
 ) -> Field:  # fmt: skip
-    """Trace a camera's field.
+    """Trace a camera's field and tabulate it.
 
     Args:
-        camera: any of this package; its stop and focus are those in use.
+        camera: any camera of this package; its stop and focus are those in use.
         focus_m: distance from the film to what is in focus.
-        frame: the ideal camera, found where it is not given. spectrum: see `spectrum_of`.
-        distance_m: to the object, if not that in focus.
+        frame: the ideal camera; found where it is not given.
+        spectrum: see `spectrum_of`.
+        distance_m: to the object, where that is not in focus.
 
     Raises:
-        InputError: an object nearer than the entrance pupil; a field beyond `WIDEST_DEG`, or a picture that is dark in
-            the corners, for a plane; a picture that folds.
+        InputError: an object nearer than the entrance pupil; a field beyond `WIDEST_DEG`, or dark corners, for a plane;
+            a picture that folds.
     """
     frame, spectrum = frame or frame_of(camera), spectrum or spectrum_of(camera)
     distance = focus_m if distance_m is None else distance_m
@@ -372,7 +383,7 @@ def field_of(
     widest = math.degrees(float(np.where(found.light > 0, found.angle, 0.0).max()))
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
-    # At the very rim few samples of the pupil are lit, and their mean steps to and fro: that is no fold.
+    # At the very rim few samples of the pupil are lit, so that their mean steps to and fro: that is no fold.
     place = np.where(found.light < DIM * found.light[0], np.nan, place)
     place = _filled(place.reshape(rings, azimuths))
     rising = (np.diff(np.abs(place - place[:1]), axis=0) > 0).all(1)
@@ -385,34 +396,34 @@ def field_of(
 
 
 def shown_at(camera: Any, field: Field, point: Complex, distance_m: float) -> Complex:
-    """Where the field, of one centre, has what picture points [N] show at this distance from the film; NaN: dark."""
+    """Return where a field, of one centre, has what picture points [N] show at this distance; NaN where it is dark."""
     seen = traced_light(camera, point, field.spectrum, field.frame, field.target, distance_m)
     found: Complex = np.where(seen.light > 0, field.picture(seen.place), np.nan)
     return found
 
 
 def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
-    """Points from the axis, without it, to the film's corner, or where the light ends, mm."""
+    """Return points along x, from next to the axis to the radius of the film's corner or the end of the light, mm."""
     return np.linspace(0, min(field.end_mm, math.hypot(*film_mm) / 2), count)[1:].astype(np.complex128)
 
 
 def diagonal_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
-    """The same points on the way to a corner, where also a picture that is not round has them."""
+    """Return the same points on the way to a corner, where a picture that is not round has them too."""
     return film_points(field, film_mm, count) * (complex(*film_mm) / math.hypot(*film_mm))
 
 
 def lit_points(field: Field, film_mm: tuple[float, float], count: tuple[int, int] = _SPREAD) -> Complex:
-    """Points spread over a film that light reaches, mm."""
+    """Return points spread over the part of a film that light reaches, mm."""
     x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, n) * side for n, side in zip(count, film_mm, strict=True)))
     points = np.asarray(x + 1j * y, np.complex128).reshape(-1)
     return points[field.lit(points)]
 
 
 def centroids_m(camera: Any, field: Field, point: Complex, distance_m: float) -> Array:
-    """Places [3, N] of the light of picture points on a sphere about the entrance pupil, which is their origin.
+    """Return the places [3, N] of the light of picture points on a sphere about the entrance pupil, their origin.
 
-    Frame: x right, y up, z towards the scene. The sphere cuts the axis at this distance from the film; unit directions
-    at infinity; NaN where the picture is dark.
+    The frame is x right, y up, z towards the scene. The sphere cuts the axis at this distance from the film; for
+    infinity unit directions are returned. Where the picture is dark they are NaN.
     """
     traced = traced_light(camera, point, field.spectrum, field.frame, "equidistant", distance_m)
     radius = 1.0 if math.isinf(distance_m) else distance_m - 1e-3 * float(np.mean(field.frame.pupil_mm))
@@ -420,13 +431,13 @@ def centroids_m(camera: Any, field: Field, point: Complex, distance_m: float) ->
 
 
 def film_edge(film_mm: tuple[float, float]) -> Complex:
-    """Points round the edge of a film, mm."""
+    """Return points round the edge of a film, mm."""
     line, (x, y) = np.linspace(-1, 1, _EDGE), np.array(film_mm) / 2
     return np.concatenate([x * line + 1j * y, x * line - 1j * y, x + 1j * y * line, -x + 1j * y * line])
 
 
 def end_of_light(lit: Callable[[float], bool], corner: float) -> float:
-    """Radius up to which a picture is lit, at most that of the corner."""
+    """Return the radius up to which a picture is lit, at most that of the corner."""
     steps = np.linspace(0, corner, 33)
     dark = next((k for k, r in enumerate(steps) if not lit(float(r))), None)
     if dark is None:
@@ -438,7 +449,7 @@ def end_of_light(lit: Callable[[float], bool], corner: float) -> float:
 
 
 def _check_plane(camera: Any, widest_deg: float, bright: bool, end_mm: float) -> None:
-    """Refuse what cannot be laid on a plane."""
+    """Raise InputError for a field that cannot be laid on a plane."""
     other = "--projection equidistant, or a smaller film"
     if widest_deg > WIDEST_DEG:
         raise InputError(camera.name, "field", f"({widest_deg:.4g} degrees from the axis)",
@@ -451,7 +462,7 @@ def _check_plane(camera: Any, widest_deg: float, bright: bool, end_mm: float) ->
 
 
 def _filled(place: Complex) -> Complex:
-    """Places [R, A], of each azimuth those beyond the end of light straight on."""
+    """Continue places [R, A] straight, at each azimuth, beyond the end of the light."""
     for k in range(place.shape[1]):
         dark = np.flatnonzero(~np.isfinite(place[:, k]))
         if dark.size and dark[0] > 1:
@@ -464,7 +475,7 @@ def _filled(place: Complex) -> Complex:
 
 
 def _inverted(forward: Polar) -> Polar:
-    """The map back, by Newton's method from rings to where they come from."""
+    """Return the map back, by Newton's method from rings to where they come from."""
     rings, azimuths = forward.ratio.shape
     finer = _FINER[azimuths > 1]
     rings, azimuths = finer * (rings - 1) + 1, finer * azimuths if azimuths > 1 else 1

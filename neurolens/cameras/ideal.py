@@ -1,16 +1,16 @@
 """Ideal lenses: the thick lens with principal planes and pupils of a real one, and the thin lens, where all are one.
 
-The thick lens is that of Kolb, Mitchell and Hanrahan 1995, "A Realistic Camera Model for Computer Graphics": a ray of a
-film point through the exit pupil goes on from the rear principal plane H' at the same height on the front one H,
-towards the object point conjugate to the film point. Perfect focus on one plane, no aberration and no rims; but where
-the film's picture is, how large, and how its light falls off (cos^4 about the exit pupil) are the real lens's to first
-order.
+The thick lens is that of Kolb, Mitchell and Hanrahan 1995, "A Realistic Camera Model for Computer Graphics". A ray of a
+film point through the exit pupil meets the rear principal plane H', and continues at the same height from the front one
+H, towards the object point conjugate to the film point. So focus is perfect on one plane, and there are no aberrations
+and no rims. But where the film's picture is, how large, and how its light falls off (cos^4 about the exit pupil) are
+the real lens's, to first order.
 
-Cameras that are a point, the pinhole and fisheye projections to compare lenses with, have one ray a film point and
-everything in focus. With r = f rho(theta) on the film, a small hole of area A gives E = L A c dOmega / dA_film (what
-enters arrives), c being the hole's foreshortening. Projections that end at 90 degrees have a flat hole, c = cos(theta),
-as the pinhole; those that see beyond have one that turns with the ray, c = 1, as the entrance pupils of real fisheyes
-nearly do. Relative to the axis E is then
+The pinhole and the fisheye projections, to compare lenses with, are cameras that are a point: they have one ray for
+each film point and everything in focus. With r = f rho(theta) on the film, a small hole of area A gives E = L A c
+dOmega / dA_film (what enters arrives), where c is the hole's foreshortening. Projections that end at 90 degrees have a
+flat hole, c = cos(theta), as the pinhole has. Those that see beyond have a hole that turns with the ray, c = 1, as the
+entrance pupils of real fisheyes nearly do. Relative to the axis E is then
 
     rectilinear     rho = tan(theta)           cos^4(theta)       (the pinhole)
     orthographic    rho = sin(theta)           1                  flat hole, to 90 degrees
@@ -52,7 +52,7 @@ from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.paraxial import film_z_of_planes_mm
 from neurolens.optics.lens.shot import check_film
 
-_QUADRATURE = 256  # points a side
+_QUADRATURE = 256  # points a side of the square
 
 
 class ThickLens:
@@ -60,13 +60,14 @@ class ThickLens:
 
     Args:
         focal_length_mm: focal length.
-        f_number: focal length over diameter of the entrance pupil; it does not change with focus.
+        f_number: focal length over the diameter of the entrance pupil; it does not change with focus.
         focus_m: distance from film to the object in focus, or infinity.
         film_mm: width and height of the film.
         principal_z_mm: front and rear principal planes H and H'.
-        entrance_pupil_z_mm: None puts both pupils on the principal planes. The exit pupil is its image, at infinity for
-            an entrance pupil in the front focal plane.
-        film_at_mm: film plane; None follows from `focus_m`. Given, it rules, and `focus_m` is what the settings say.
+        entrance_pupil_z_mm: None puts both pupils on the principal planes. The exit pupil is the image of the entrance
+            pupil, at infinity for one in the front focal plane.
+        film_at_mm: film plane; None follows from `focus_m`. If given, it decides, and `focus_m` is only written to the
+            settings.
         aperture: shape of the opening; None is round.
         name: for reports.
 
@@ -79,7 +80,7 @@ class ThickLens:
     achromatic = True
     wavelength_nm: tuple[float, float] | None = None
     rays_a_call = MANY_RAYS_A_CALL
-    _part = 1.0  # of the exposure on the axis, that a shape lets through
+    _part = 1.0  # part of the exposure on the axis that a shape lets through
 
     def __init__(
         self,
@@ -105,8 +106,9 @@ class ThickLens:
         self.film_z_mm = film_z_of_planes_mm(f, front, rear, self.focus_m) if film_at_mm is None else float(film_at_mm)
         self.image_distance_mm = positive("film_at_mm behind H'", self.film_z_mm - rear)
         self.radius_mm = f / (2 * self.f_number)
-        # Newton's distances from the focal points: x of the entrance pupil, x' = s' - f of the film. The exit pupil is
-        # at -f^2 / x and f / x times as large: seen from the film, its slopes are (f e - x F) / (x x' + f^2).
+        # Newton's distances from the focal points: x of the entrance pupil, x' = s' - f of the film. The exit pupil
+        # lies at -f^2 / x and is f / x times as large: seen from the film F, a point e of it has the slopes (f e - x F)
+        # / (x x' + f^2).
         self._x = self.pupil_z_mm - (front - f)
         self._seen = self._x * (self.image_distance_mm - f) + f * f
         if abs(self._seen) < 1e-6 * f * f:
@@ -132,15 +134,15 @@ class ThickLens:
             self._part = float(self.sample(np.zeros_like(square), square, wavelength).weight.mean(dtype=np.float64))
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
+        """Return rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
         given = {"film_mm": film_mm, "square": pupil, "wavelength_nm": wavelength_nm[None]}
-        with np.errstate(all="ignore"):  # of points that are not sound
+        with np.errstate(all="ignore"):  # points that are not sound give NaN
             return camera_rays(self._run({k: np.ascontiguousarray(v, np.float32) for k, v in given.items()}))
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Sample rays as `sample` does, with their differentials; the origins move on the front principal plane."""
         rays = self.sample(film_mm, pupil, wavelength_nm)
-        rise = 1 - self._x * self.image_distance_mm / self._seen  # of the height by the film point
+        rise = 1 - self._x * self.image_distance_mm / self._seen  # of the height, by the film point
         slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
         slope[0, 0] = slope[1, 1] = -1 / self.image_distance_mm - self._per_depth * rise
         turns = towards(rays.direction / -rays.direction[2], slope, rays.origin_m).direction
@@ -149,20 +151,20 @@ class ThickLens:
         return replace(rays, differentials=RayDifferentials(moves, turns))
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays from exit pupil to film."""
+        """Return cos^4 of the angles between the axis and the rays from exit pupil to film."""
         slope = self._slopes(film_mm, concentric_disk(pupil) * np.float32(self.radius_mm))
         return np.square(1.0 / (1.0 + np.einsum("in,in->n", slope, slope))).astype(np.float32)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m through points of the entrance pupil chosen by `pupil`."""
+        """Return film points for scene points [3, N] in m, through points of the entrance pupil chosen by `pupil`."""
         entrance = concentric_disk(pupil).astype(np.float64) * self.radius_mm
         with np.errstate(all="ignore"):
             point = 1e3 * point_m.astype(np.float64)
             depth = self.pupil_z_mm - self.film_z_mm - point[2]
-            slope = (point[:2] - entrance) / depth  # forwards, per unit of depth
+            slope = (point[:2] - entrance) / depth  # forwards, for each unit of depth
             height = entrance + slope * (self.pupil_z_mm - self.front_z_mm)
             film = -self.image_distance_mm * (slope + height * self._per_depth)
-            # The weight of `sample`, times mm^2 of film for each m^2 of a plane square to the ray.
+            # This is the weight of `sample`, times the mm^2 of film for each m^2 of a plane square to the ray.
             tangent2 = (self._slopes(film, entrance) ** 2).sum(0)
             scale = self.image_distance_mm * (1 + self._per_depth * (self.pupil_z_mm - self.front_z_mm)) / depth
             weight = 1e6 * self._exposure / self._part / (1 + tangent2) ** 2 * scale**2
@@ -172,10 +174,10 @@ class ThickLens:
         return arrived(film, 1e-3 * np.concatenate([height, plane]), point_m, weight, status, wavelength_nm)
 
     def compiled(self) -> Self:
-        """The same camera run as C, but for a mask in its stop, whose table is too large.
+        """Return the same camera run as C, except with a mask in its stop, whose table is too large for that.
 
         Raises:
-            InputError: no C compiler, or one that fails.
+            InputError: there is no C compiler, or it fails.
         """
         from neurolens.cameras.lenscamera import CompiledProgram
 
@@ -191,7 +193,7 @@ class ThickLens:
 
     @property
     def _numbers(self) -> dict[str, float]:
-        """The inputs of the call of `ideal_graph`."""
+        """Return the inputs of `ideal_graph` for a whole call."""
         return {
             "radius_mm": self.radius_mm,
             "spread": self.focal_length_mm / self._seen,
@@ -204,11 +206,11 @@ class ThickLens:
         }
 
     def _slopes(self, film_mm: NDArray[Any], entrance_mm: NDArray[Any]) -> NDArray[Any]:
-        """Slopes [2, N] of the film-side rays of film points towards the images of points of the entrance pupil."""
+        """Return the slopes [2, N] of rays from film points towards the images of points of the entrance pupil."""
         return entrance_mm * (self.focal_length_mm / self._seen) - film_mm * (self._x / self._seen)
 
     def _stopped(self, opening_mm: NDArray[Any], status: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The status, of those that pass outside the shape, at points [2, N] of the opening, the rim's."""
+        """Return the status; rays at points [2, N] of the opening that lie outside its shape get the rim's."""
         if self.aperture is None:
             return status
         inside = self.aperture.inside(opening_mm[0], opening_mm[1], self.radius_mm)
@@ -217,9 +219,9 @@ class ThickLens:
 
 @lru_cache(maxsize=16)
 def ideal_graph(aperture: Aperture | None = None) -> Graph:
-    """The rays of an ideal lens as a graph, whose numbers are inputs of the call (`ThickLens._numbers`).
+    """Write the rays of an ideal lens as a graph, whose numbers are inputs of the call (`ThickLens._numbers`).
 
-    Inputs and outputs are those of `cameragraph.whole_camera`.
+    Its other inputs and its outputs are those of `cameragraph.whole_camera`.
     """
     g = Graph()
     film, square, light = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
@@ -297,11 +299,15 @@ Function = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Projection:
-    """A projection of focal length 1.
+    """A projection of focal length 1, in theta, the angle to the axis (rad), and rho, the distance on the film.
 
     Attributes:
-        angle, slope: theta in rad and d theta / d rho of rho. radius: rho of theta. falloff: E / E(axis) of theta.
-        end: of rho; nothing is seen from there on. flat: whether the hole is flat.
+        angle: theta of rho.
+        slope: d theta / d rho of rho.
+        radius: rho of theta.
+        falloff: E / E(axis) of theta.
+        end: the rho from which on nothing is seen.
+        flat: whether the hole is flat.
     """
 
     angle: Function
@@ -340,17 +346,18 @@ _RECTILINEAR = Projection(
 
 
 class Fisheye:
-    """A hole at distance `focal_length_mm` from the film whose picture obeys a fisheye projection.
+    """A hole at the distance `focal_length_mm` from the film whose picture obeys a fisheye projection.
 
     Args:
         projection: one of `PROJECTIONS`.
         focal_length_mm: focal length of the projection.
         film_mm: width and height of the film.
         field_deg: full field of view, beyond which the film is dark; None sees as far as the projection goes.
-        f_number: nominal, as the pinhole's.
+        f_number: a nominal one, as the pinhole's.
 
     Raises:
-        InputError: an unknown projection, a length, field or f-number not above 0, a field that it does not see.
+        InputError: an unknown projection, a length, field or f-number not above 0, or a field that the projection
+            cannot see.
     """
 
     dispersive = False
@@ -386,7 +393,7 @@ class Fisheye:
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays through the hole for film points [2, N] in mm; pupil and wavelength change nothing."""
+        """Return rays through the hole for film points [2, N] in mm; pupil and wavelength change nothing."""
         rho, towards, lit = self._place(film_mm)
         theta = self.projection.angle(rho)
         lit &= theta <= np.float32(self.widest_rad)
@@ -404,7 +411,7 @@ class Fisheye:
         rays = self.sample(film_mm, pupil, wavelength_nm)
         rho, towards, _ = self._place(film_mm)
         theta = self.projection.angle(rho)
-        along = self.projection.slope(rho)  # of theta; across the radius directions turn by sin(theta) / rho
+        along = self.projection.slope(rho)  # of theta; across the radius, directions turn by sin(theta) / rho
         across = np.where(rho > 0, np.sin(theta) / np.where(rho > 0, rho, 1), np.float32(1))
         radial = np.cos(theta) * along - across
         moves = np.zeros((3, 2, film_mm.shape[1]), np.float32)
@@ -416,28 +423,28 @@ class Fisheye:
         return replace(rays, differentials=RayDifferentials(np.zeros_like(moves), moves))
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """The whole weight: the projection's own law."""
+        """Return the whole weight, for it is the projection's own law."""
         return self.sample(film_mm, pupil, wavelength_nm).weight
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m through the hole; pupil and wavelength change nothing."""
+        """Return film points for scene points [3, N] in m through the hole; pupil and wavelength change nothing."""
         origin = np.array([[0.0], [0.0], [-1e-3 * self.focal_length_mm]]) + np.zeros((1, point_m.shape[1]))
         with np.errstate(all="ignore"):
             way = point_m - origin
             side, squared = np.hypot(way[0], way[1]), np.einsum("in,in->n", way, way)
             theta = np.arctan2(side, -way[2])
             film = -self.focal_length_mm * self.projection.radius(theta) * way[:2] / np.where(side > 0, side, 1)
-            # A' / E0 of a small hole is the square of its distance from the film, where it faces the ray.
+            # For a small hole A' / E0 is its squared distance from the film, where it faces the ray.
             weight = self.focal_length_mm**2 / squared * (np.cos(theta) if self.projection.flat else 1)
         beyond = (theta > self.widest_rad) | (self.projection.flat & (way[2] >= 0))
         out = np.where(beyond, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
-        # Straight behind, the projection has no direction to lay the point in.
+        # Straight behind, the projection has no direction in which to lay the point.
         lit = ~beyond & (self.projection.radius(theta) < self.projection.end) & (theta < math.pi)
         status = np.where(lit, st.PASSED, out).astype(np.int32)
         return arrived(film, origin, point_m, weight, status, wavelength_nm)
 
     def _place(self, film_mm: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """rho [N] and the unit vectors [2, N] from the axis to film points, and which lie within the projection."""
+        """Return rho [N], the unit vectors [2, N] from the axis to film points, and which lie within the projection."""
         scaled = film_mm * np.float32(1 / self.focal_length_mm)
         with np.errstate(over="ignore", invalid="ignore"):
             rho = np.hypot(scaled[0], scaled[1])
@@ -471,7 +478,7 @@ class Pinhole(Fisheye):
         self._set(focal_length_mm, film_mm, f_number)
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays through the hole, without the angles that the other projections need."""
+        """Return rays through the hole, without the angles that the other projections need."""
         count = film_mm.shape[1]
         direction = np.empty((3, count), np.float32)
         np.divide(film_mm, np.float32(-self.focal_length_mm), out=direction[:2])
@@ -486,10 +493,10 @@ class Pinhole(Fisheye):
 
 
 def check_field(projection: str, field_deg: float | None) -> float:
-    """Half of a full field of view, in rad: at most what the projection sees, which None takes.
+    """Return half of a full field of view, in rad; None takes all that the projection sees.
 
     Raises:
-        InputError: a field that is not above 0, or beyond the projection.
+        InputError: a field that is not above 0, or that the projection does not see.
     """
     widest = 180.0 if PROJECTIONS[projection].flat else 360.0
     if field_deg is None:

@@ -1,11 +1,7 @@
 """The camera class of lenses, exact or modelled: everything between the random numbers and the weighted ray.
 
-A camera is one graph, that of its lens between the pupil and the weights (`cameragraph.whole_camera`). Two runtimes
-give the same rays to rounding:
-
-    "c"            the graph compiled by the system's C compiler when the camera is made (1 to 10 s, kept for the next
-                   time, see `graph.compiler`); it runs in float32 on the thread that calls it, and forks share it
-    "onnxruntime"  the graph written as ONNX, where there is no compiler, or the graph is too large for one
+A camera is one graph, with that of its lens between the pupil and the weights (`cameragraph.whole_camera`). Two
+runtimes give the same rays, to rounding:
 """
 
 from __future__ import annotations
@@ -58,17 +54,20 @@ from neurolens.optics.trace.shapes import sag_and_derivatives
 
 Array = NDArray[np.float64]
 
-_ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, not a cylinder
-# Points a side of the quadrature of the exposure on the axis.
+_ROUND = 0.02  # the squeeze of a model may differ from 1 by this error without a cylinder
+# Points on each side of the square over which the exposure on the axis is integrated.
 _QUADRATURE = 256
 
 
 @dataclass(frozen=True)
 class LensScene:
-    """A lens at one focus and stop: film points [2, N] mm, pupil points [2, N] mm and wavelengths [N] nm to scene rays.
+    """A lens at one focus and stop; takes film points, pupil points [2, N] (mm) and wavelengths [N] (nm) to scene rays.
 
     Attributes:
-        lens: which knows a round stop. aperture: the shape of another opening.
+        lens: a lens with a round stop.
+        film_z_mm: the film plane.
+        stop_radius_mm: radius of the stop.
+        aperture: the shape of the opening, where it is not round.
     """
 
     lens: LensRun
@@ -82,7 +81,7 @@ class LensScene:
         return out._replace(status=self.status_of(out))
 
     def status_of(self, rays: LensRays | InverseRays) -> NDArray[np.int32]:
-        """Status [N] of rays of the lens with that of the stop's shape; see `status_graph`."""
+        """Return the status [N] of rays of the lens, with that of the stop's shape; see `status_graph`."""
         given = {"scene_ray": rays.scene_ray, "lens_status": rays.status[None].astype(np.float32)}
         if self.aperture is not None:
             given |= {"stop_xy_mm": rays.stop_xy_mm, "stop_radius_mm": np.array([[self.stop_radius_mm]], np.float32)}
@@ -91,11 +90,11 @@ class LensScene:
 
     @property
     def stopped(self) -> int:
-        """Status of rays that the stop's shape blocks."""
+        """The status of rays that the stop's shape blocks."""
         return st.blocked(self.lens.stop_index, st.RIM)
 
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Test whether rays pass at one wavelength; bool [N]. Behind a round stop only the status is computed."""
+        """Test whether rays pass at one wavelength, bool [N]; for a round stop only the status is computed."""
         waves = np.full(film.shape[1], wavelength_nm, np.float32)
         if self.aperture is not None:
             return self(film, pupil, waves).status == st.PASSED
@@ -103,7 +102,7 @@ class LensScene:
         return self.lens.status(rays, self.film_z_mm, self.stop_radius_mm) == st.PASSED
 
     def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
+        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points, bool [N]."""
         passed = np.zeros(film.shape[1], bool)
         for azimuth in chain(*GROUPS):
             left = np.flatnonzero(~passed)
@@ -114,16 +113,17 @@ class LensScene:
         return passed
 
     def axial_transmittance(self, wavelength_nm: tuple[float, float]) -> float | None:
-        """Transmittance of the axial ray at the wavelength nearest to the d line; None where the stop blocks it."""
+        """The transmittance of the axial ray at the wavelength nearest the d line; None where the stop blocks it."""
         axis = np.zeros((2, 1), np.float32)
         out = self(axis, axis, np.clip([LINE_D_NM], *wavelength_nm).astype(np.float32))
         through = float(out.transmittance[0])
         return through if out.status[0] == st.PASSED and 0 < through <= 1 else None
 
     def squeeze(self, height_mm: float, wavelength_nm: tuple[float, float]) -> float | None:
-        """Squeeze of a lens known by its rays alone: one that leaves parallel to the axis at height h slopes h / f.
+        """Return the squeeze of a lens known by its rays alone.
 
-        Rays count whether they pass or not.
+        A ray that leaves it parallel to the axis at height h has the slope h / f on the film's side, which tells f in
+        each meridian. Rays count whether they pass or not.
         """
         h = height_mm
         film = np.array([[h, -h, 0, 0], [0, 0, h, -h]], np.float32)
@@ -137,12 +137,12 @@ class LensScene:
 
 
 class LensFilm:
-    """Film and pupil of a lens at one focus and stop.
+    """The film and pupil of a lens at one focus and stop.
 
     Args:
         outline: the pupil of every film radius; None where no ray passes.
-        wavelength_nm: range of the wavelengths used.
-        scene: the lens; its film is this one.
+        wavelength_nm: range of the wavelengths in use.
+        scene: the lens, set for this film.
 
     Raises:
         InputError: no ray passes from the film's centre.
@@ -158,18 +158,18 @@ class LensFilm:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The inputs of the call of `cameragraph.weight_graph`."""
+        """Return the inputs of `cameragraph.weight_graph` for a whole call."""
         scale = 1 / (self.distance_mm**2 * self.exposure)
         return {"per_distance": 1 / self.distance_mm, "scale": scale, "film_z_mm": self.film_z_mm}
 
     def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
+        """Return cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
         slope = (self.outline.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
         cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
         return cos4
 
     def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
-        """Integral of T cos over solid angle at the film's centre, mean over the wavelengths."""
+        """Return the integral of T cos over solid angle at the film's centre, as a mean over the wavelengths."""
         square, wavelength = stratified(_QUADRATURE, wavelength_nm)
         film = np.zeros_like(square)
         pupil, area = self.outline.sample(film, square, wavelength)
@@ -184,16 +184,17 @@ class LensFilm:
         return exposure
 
 
-# What a camera computes: rays, with differentials, with companions, or whether companions pass (`companion_graph`).
+# What a camera computes: rays, rays with differentials, rays with companions, or whether companions pass
+# (`companion_graph`).
 Kind = Literal["rays", "differentials", "hero", "companion"]
-# Film points, pupil squares [2, N] and wavelengths [1, N] by name to what `camera_rays` takes.
+# Takes film points, pupil squares [2, N] and wavelengths [1, N], by name, to what `camera_rays` takes.
 GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 
-# The most steps of a camera that are compiled. The largest camera of a model that ships has 2900; gcc 12 takes 48 s for
-# 7100, and its time grows faster than their number.
+# Cameras of more steps are not compiled. The largest camera of a model that ships has 2900; gcc 12 takes 48 s for 7100,
+# and its time grows faster than their number.
 MAX_STEPS = 12_000
-_SAMPLES = 4096  # rays that low-order derivatives are fitted to
-_EDGE_RAYS = 2**16  # rays that look for where light crosses the front surface
+_SAMPLES = 4096  # rays that derivatives of low order are fitted to
+_EDGE_RAYS = 2**16  # rays that find where light crosses the front surface
 
 
 class LensCamera:
@@ -221,28 +222,28 @@ class LensCamera:
     differentials_error: float | None = None
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
-        """The graph of the lens with its stop."""
+        """Return the graph of the lens with its stop."""
         raise NotImplementedError
 
     @property
     def rays_a_call(self) -> int:
-        """The rays with which a call is fastest."""
+        """The number of rays with which a call is fastest."""
         return MANY_RAYS_A_CALL if self.runtime == "c" else RAYS_A_CALL
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        """Return rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
         return self._sampled(film_mm, pupil, wavelength_nm, False)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `sample` does, and give their differentials, too."""
+        """Sample rays as `sample` does, and give their differentials too."""
         return self._sampled(film_mm, pupil, wavelength_nm, True)
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
+        """Return cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
         return self.film.natural(film_mm, pupil, wavelength_nm)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m, through points of the front surface that `pupil` chooses."""
+        """Return film points for scene points [3, N] in m, through points of the front surface that `pupil` chooses."""
         shape, up = self.front, np.array([[0.0], [0.0], [self.film.film_z_mm]])
         with np.errstate(all="ignore"):
             point = 1e3 * point_m.astype(np.float64) + up
@@ -251,7 +252,7 @@ class LensCamera:
             position = np.stack([x, y, z])
             way = point - position
             direction = way / np.sqrt((way * way).sum(0))
-            # dA cos = dx dy (d . n) / |n_z|, with the outward normal along (sx, sy, -1).
+            # dA cos is dx dy (d . n) / |n_z|, where the outward normal is along (sx, sy, -1).
             facing = sx * direction[0] + sy * direction[1] - direction[2]
             film, through, status = self._traced_back(position, direction, wavelength_nm)
             origin = 1e-3 * (position - up)
@@ -262,18 +263,18 @@ class LensCamera:
 
     @property
     def front(self) -> Surface | None:
-        """The surface at which light of scene points is aimed; None is the plane z = 0."""
+        """The surface at which light from scene points is aimed; None is the plane z = 0."""
         raise NotImplementedError
 
     def _traced_back(
         self, position: Array, direction: Array, wavelength_nm: FloatArray
     ) -> tuple[Array, FloatArray, NDArray[np.int32]]:
-        """Film points [2, N], transmittance and status of light that comes from `direction` to points of the front."""
+        """Return film points [2, N], transmittance and status of light from `direction` to points of the front."""
         raise NotImplementedError
 
     @cached_property
     def _front_discs(self) -> FrontDiscs:
-        """Where the film's light crosses the front, by rays at the edges of the pupil, half of them from the film's."""
+        """Where the film's light crosses the front, by rays at the pupil's edge, half of them from the film's edge."""
         rng, ray = np.random.default_rng(0), np.arange(_EDGE_RAYS)
         film = (rng.random((2, _EDGE_RAYS)) - 0.5) * np.array(self.film_mm)[:, None]
         film[:, ::2] *= 0.5 / np.abs(film[:, ::2] / np.array(self.film_mm)[:, None]).max(0)
@@ -285,7 +286,7 @@ class LensCamera:
         return FrontDiscs.of(found.scene_ray[:, found.status == st.PASSED].astype(np.float64), self.front)
 
     def compiled(self) -> Self:
-        """The same camera run as C; its film and pupil are not searched again. Raises InputError: no C compiler."""
+        """The same camera run as C, without a new search for its outline; raises InputError without a compiler."""
         other = copy(self)
         other.start("c")
         return other
@@ -293,10 +294,10 @@ class LensCamera:
     def start(self, runtime: Runtime | None, progress: Progress | None = None) -> None:
         """Choose what runs the camera; None takes C where the machine has a compiler that takes it, else onnxruntime.
 
-        `progress`: says what is compiled, which is done at once, and how long it took.
+        `progress` shows what is compiled, which is done at once, and how long it took.
 
         Raises:
-            InputError: C was asked for, and there is no compiler, or one that fails.
+            InputError: C is asked for, and there is no compiler, or it fails.
         """
         self.runtime, self._runs = runtime or ("c" if has_compiler() else "onnxruntime"), {}
         self._asked, self._told = runtime is not None, (progress or Progress(quiet=True)).note
@@ -305,7 +306,7 @@ class LensCamera:
         self.settings = self.settings | {"runtime": self.runtime}
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract.
+        """Rays as `sample` does, for wavelengths [W, N] in nm, the first of which is the hero's; see the contract.
 
         Raises:
             InputError: the camera cannot place companions (`companion_reach_mm`).
@@ -351,7 +352,7 @@ class LensCamera:
         return film, square
 
     def _run(self, kind: Kind, companions: int = 0) -> GraphRun:
-        """The camera's graph in its runtime, made when it is first needed; onnxruntime's in each process."""
+        """Return the camera's graph in its runtime, made when first needed; onnxruntime's is made in each process."""
         key = 0 if self.runtime == "c" else os.getpid(), kind, companions
         if key not in self._runs:
             self._runs[key] = self._made(kind, companions)
@@ -396,11 +397,11 @@ class LensCamera:
 
     @cached_property
     def _sure(self) -> float:
-        """The `sure` of `lanes_graph` from which companions need no ray; none where a shape in the stop has edges."""
+        """The `sure` (`lanes_graph`) above which companions need no ray; none where the stop's shape has edges."""
         return 0.0 if self.lens_graph().aperture is None else math.inf
 
     def _of_the_lens(self) -> dict[str, float]:
-        """The inputs of the lens's graph for a whole call."""
+        """Return the inputs of the lens's graph for a whole call."""
         return {"film_z_mm": self.film.film_z_mm, "stop_radius_mm": self.lens_graph().stop_radius_mm}
 
     def _in_onnxruntime(self, whole: Graph, numbers: dict[str, float], lens: LensGraph) -> GraphRun:
@@ -425,7 +426,7 @@ class LensCamera:
         return run
 
     def _with_moves(self, graph: Graph) -> Graph:
-        """The lens's graph with the derivatives of its rays by the film point."""
+        """Return the lens's graph with the derivatives of its rays by the film point."""
         if self.runtime != "c":
             return with_film_derivatives(graph)
         fitted = with_low_order_derivatives(graph, self._film_samples()[0])
@@ -433,7 +434,7 @@ class LensCamera:
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
     def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
-        """Inputs of the lens's graph for rays all over film, pupil and light, and their margins as in `lanes_graph`."""
+        """Inputs of the lens's graph for rays all over film, pupil and light, and their margins (`lanes_graph`)."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))
@@ -448,7 +449,7 @@ class LensCamera:
 def _compiled(
     graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph, told: Callable[[str], None]
 ) -> GraphRun:
-    """A graph of the camera as a compiled function; a mask in the stop is tested on the rays that come back."""
+    """Compile a graph of the camera to a function, which tests a mask in the stop on the rays that come back."""
     run = CompiledProgram.of(graph, numbers, padded(film.outline.table, 5), told)
     mask = lens.aperture if lens.blades is None else None
     if mask is None:
@@ -470,17 +471,20 @@ def _compiled(
 
 
 def padded(table: FloatArray, columns: int) -> FloatArray:
-    """A table as compiled code takes it: each group of so many columns in whole registers."""
+    """Lay out a table as compiled code takes it, with each group of so many columns filling whole registers."""
     groups = table.reshape(len(table), -1, columns)
     return np.ascontiguousarray(np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(columns) - columns))))
 
 
 class CompiledProgram:
-    """A camera's program as a compiled function.
+    """Runs a camera's program as a compiled function.
 
     Args:
-        rows: of each result, of which the program has them one by one. numbers: of the call. table: of the outline.
-        told: as of `load_compiled`.
+        program: what is compiled.
+        rows: how many rows each result has, which the program gives one by one.
+        numbers: inputs of a whole call.
+        table: of the outline.
+        told: as for `load_compiled`.
     """
 
     def __init__(
@@ -501,12 +505,12 @@ class CompiledProgram:
     def of(
         cls, graph: Graph, numbers: dict[str, float], table: FloatArray, told: Callable[[str], None] | None = None
     ) -> CompiledProgram:
-        """That of a graph."""
+        """Compile the program of a graph."""
         rows = {name: value.rows for name, value in graph.outputs.items()}
         return cls(lower(graph).in_order_of_need(), rows, numbers, table, told)
 
     def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
-        """The results [R, N] for inputs [R, N]; of a camera the input of `camera_rays`."""
+        """Return the results [R, N] for inputs [R, N]; those of a camera are the input of `camera_rays`."""
         count = next(iter(rays.values())).shape[1]
         found: dict[str, NDArray[Any]] = {
             name: np.empty((rows, count), kind) for name, (rows, kind) in self._rows.items() if name not in D_FILM

@@ -1,4 +1,4 @@
-"""Exported lens models as cameras, with onnxruntime and numpy alone."""
+"""Exported lens models as cameras, which run with onnxruntime and numpy alone."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
-_NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
+_NOMINAL = 1.02  # engraved f-numbers are rounded: this factor wider than the widest stop still means the widest stop
 
 
 class OnnxCamera(LensCamera):
@@ -46,17 +46,17 @@ class OnnxCamera(LensCamera):
     Args:
         model: see `load_model`.
         shot: the settings of the camera. Film beyond the model's film radius stays dark. An f-number up to 2% below the
-            model's widest stop means that (an engraved f/1.8 may be 1.83). A zoom of None leaves the model in its
-            state. Focusing moves the groups of a model that knows them, in every mode; the film then stands where the
-            model's rays from the axis make the least spot, or with "paraxial" in the paraxial image.
-        outline: of the pupil of the lens itself, to hold the model against it; None searches the model's own.
-        progress: as of `LensCamera.start`.
+            model's widest stop means that stop (an engraved f/1.8 may be 1.83). A zoom of None leaves the model in its
+            state. Focusing moves the groups of a model that knows them, whatever the mode; the film then stands where
+            the model's rays from the axis make the least spot, or with "paraxial" in the paraxial image.
+        outline: of the pupil of the lens itself, to compare the model with it; None searches the model's own.
+        progress: as for `LensCamera.start`.
 
     Raises:
-        InputError: a focus, stop or zoom position outside the model's domain; no C compiler where one is needed.
+        InputError: a focus, stop or zoom position outside the model's domain, or no C compiler where one is needed.
 
     Warns:
-        NeurolensWarning: best focus lies beyond the film positions of a model, which has its film at their end then.
+        NeurolensWarning: best focus lies beyond the film positions of the model; its film is then at the end of them.
     """
 
     def __init__(
@@ -77,9 +77,10 @@ class OnnxCamera(LensCamera):
         self.film_mm = shot.film_mm
         low, high = (float(v) for v in domain["wavelength_nm"])
         self.dispersive = low < high
-        # A model for one wavelength of a dispersive lens knows that wavelength only; without dispersion any will do.
+        # A model for one wavelength of a dispersive lens knows that wavelength only; without dispersion, any wavelength
+        # will do.
         self.wavelength_nm = (low, high) if lens["dispersive"] else None
-        # Glass takes more of some wavelengths than of others: exposure is for those that the light has.
+        # Glass absorbs some wavelengths more than others, so that the exposure is that of the light in use.
         self._light_nm = used = common_light((low, high), shot.wavelength_nm)
         stop = _stop_radius(model, shot)
         paraxial, (near, far) = _paraxial_film_z(model, shot.focus_m), domain["film_z_mm"]
@@ -115,10 +116,11 @@ class OnnxCamera(LensCamera):
         self.start(shot.runtime, progress)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
-        """The graph of the model in the camera's state, with its stop."""
+        """Return the graph of the model in the camera's state, with its stop."""
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
-        # Series decode unit directions, and their range is tested; to test the length is eight passes in onnxruntime.
+        # Series decode unit directions, whose range is tested; to test the length, too, takes eight passes in
+        # onnxruntime.
         unit = form is ONNX and self.model.fitted.direction == "angle"
         return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stopped, unit)
 
@@ -130,7 +132,7 @@ class OnnxCamera(LensCamera):
     def _traced_back(
         self, position: NDArray[np.float64], direction: NDArray[np.float64], wavelength_nm: FloatArray
     ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
-        """By the model's inverse map of scene rays; what it does not find is NO_SOLUTION."""
+        """Find film points by the model's inverse map of scene rays; where it finds none, the status is NO_SOLUTION."""
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
         out = self._inverse.from_scene(position, direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
@@ -147,23 +149,22 @@ class ModelScene(LensScene):
     lens: OnnxLens
 
 
-_RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, since the stop's edge falls between two
-_WIDER = 1.3  # their disc over the axial pupil at the stop in use
-_STEPS = 4  # towards the film points from which rays go to the object
-_SHIFT = 1e-3  # of the film radius, for differences
-_SQUEEZED = 0.05  # of the film radius: height of the rays that tell a squeeze
-_BLUR_MM = 0.002  # growth of a spot that is worth a warning
+_RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, because the stop's edge falls between two
+_WIDER = 1.3  # radius of their disc over that of the axial pupil at the stop in use
+_STEPS = 4  # steps towards the film points whose rays meet the object
+_SHIFT = 1e-3  # step of differences, as a share of the film radius
+_SQUEEZED = 0.05  # height of the rays that tell a squeeze, as a share of the film radius
+_BLUR_MM = 0.002  # a spot that grows by this much is worth a warning
 
 
 def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> float:
-    """Film plane of least RMS spot for the axial point `focus_m` metres from it, by the model's own rays.
+    """Find the film plane of least RMS spot for the axial point `focus_m` metres from it, by the model's own rays.
 
-    Spot and colours are those of `focusing.best_focus_z_mm`, whose rays come from the object. Here the film point of
-    each pupil point is searched from which a ray goes to the object, by Newton's method. The plane may lie outside the
-    domain.
+    Spot and colours are those of `focusing.best_focus_z_mm`, whose rays come from the object. Here, Newton's method
+    finds for each pupil point the film point whose ray meets the object. The plane may lie outside the domain.
 
     Args:
-        scene: its film in the paraxial image, or near it.
+        scene: the model, with its film in the paraxial image or near it.
 
     Raises:
         InputError: no ray passes.
@@ -174,15 +175,15 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
 def best_focus_of_stops_mm(
     scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float], stops_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """`best_focus_z_mm` at stop radii up to the scene's: of one set of rays, those that each lets through."""
+    """Return `best_focus_z_mm` at stop radii up to the scene's, from one set of rays."""
     spot = _axial_spot(scene, focus_m, wavelength_nm)
     found = scene.lens.rays(*spot.rays, scene.film_z_mm, scene.stop_radius_mm)
     radius = np.where(spot.passed, np.hypot(*found.stop_xy_mm), np.inf)
-    edge_mm = scene.stop_radius_mm * _WIDER / _RINGS  # from ring to ring: those at the edge count in part
+    edge_mm = scene.stop_radius_mm * _WIDER / _RINGS  # from ring to ring: rays at a stop's edge count in part
     share = ((stops_mm[:, None] - radius) / edge_mm + 0.5).clip(0, 1)
     along, across = np.where(spot.passed, spot.moments, 0.0) @ share.T
     shift = -along / across
-    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    # The object keeps its distance from the film: where the film moves, the image moves by the square of its scale.
     whole = spot.best_mm - scene.film_z_mm
     lens = scene.lens.card["lens"]
     scale = 0.0 if math.isinf(focus_m) else (scene.film_z_mm - lens["infinity_film_z_mm"]) / lens["efl_mm"]
@@ -191,7 +192,14 @@ def best_focus_of_stops_mm(
 
 
 class _Spot(NamedTuple):
-    """Best film of rays [N] of an axial point; film and pupil points [2, N], wavelengths; moments [2, N]; who pass."""
+    """The best film of rays of an axial point, with the rays.
+
+    Attributes:
+        best_mm: the film plane.
+        rays: film points and pupil points [2, N], and wavelengths [N].
+        moments: [2, N], whose sums over rays tell the best film.
+        passed: [N], whether rays pass.
+    """
 
     best_mm: float
     rays: tuple[FloatArray, FloatArray, FloatArray]
@@ -204,14 +212,14 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
     colours, weights = paraxial.colours(wavelength_nm)
     reach = float(domain["film_radius_mm"])
     round_ = scene.aperture is None and scene.squeeze(_SQUEEZED * reach, wavelength_nm) == 1.0
-    spokes = 1 if round_ else _SPOKES  # of a round lens one stands for all
+    spokes = 1 if round_ else _SPOKES  # one spoke of a round lens stands for all
     shape = len(colours), _RINGS, spokes
     pupil = np.tile(_axial_pupil(domain, scene.stop_radius_mm, spokes), len(colours))
     nanometres = np.repeat(colours, _RINGS * spokes).astype(np.float32)
     film, best, shift = np.zeros_like(pupil), scene.film_z_mm, _SHIFT * reach
 
     def miss(film: FloatArray, object_z_mm: float) -> tuple[FloatArray, FloatArray, NDArray[np.int32]]:
-        """The miss distance of rays at the object, their place in the entrance pupil, and their status."""
+        """Return by how much rays miss the object, their place in the entrance pupil, and their status."""
         out = scene(film.astype(np.float32), pupil.astype(np.float32), nanometres)
         place, way = out.scene_ray[:3].astype(np.float64), out.scene_ray[3:].astype(np.float64)
         with np.errstate(all="ignore"):
@@ -229,10 +237,10 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
             step = np.stack([wrong[0] * dy[1] - wrong[1] * dy[0], wrong[1] * dx[0] - wrong[0] * dx[1]])
             film = film - step / (dx[0] * dy[1] - dx[1] * dy[0])
             slope = (pupil - film) / (domain["pupil_z_mm"] - scene.film_z_mm)
-            # Equal areas of the entrance pupil count alike: a cell's area there.
+            # Equal areas of the entrance pupil count alike, so a ray's weight is the area of its cell there.
             cell = seen.reshape(2, *shape)
             out, turn = np.gradient(cell, axis=2), np.roll(cell, -1, 3) - np.roll(cell, 1, 3)
-            if round_:  # its neighbours are the spoke turned
+            if round_:  # its neighbours are the same spoke, turned
                 turn = cell[::-1] * np.array([-1.0, 1.0])[:, None, None, None]
             weight = weights[:, None, None] * np.abs(out[0] * turn[1] - out[1] * turn[0])
             moments = weight.reshape(-1) * np.stack([(film * slope).sum(0), (slope**2).sum(0)])
@@ -246,7 +254,7 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
 
 
 def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilOutline | None:
-    """The pupil of a model with a round stop; one for all azimuths of a lens with cylinders, which fits none."""
+    """Search the outline of a model with a round stop; with cylinders, one for all azimuths that fits none well."""
     domain = scene.lens.card["domain"]
     bounds = PupilTable.of(domain["bounds"])
     if scene.squeeze(_SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
@@ -255,7 +263,7 @@ def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilO
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:
-    """The table `lens_state` of the settings, by the first-order data of the card."""
+    """Return the table `lens_state` of the settings, by the first-order data of the card."""
     model, film_z = scene.lens, scene.film_z_mm
     lens, radius = model.card["lens"], model.card["domain"]["film_radius_mm"]
     efl, front_efl = lens["efl_mm"], lens["efl_mm"] * paraxial.index_ratio(lens)
@@ -275,7 +283,7 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
 
 
 def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float, spokes: int) -> FloatArray:
-    """Pupil points [2, rings * spokes] about all that pass from the film's centre through a stop."""
+    """Return pupil points [2, rings * spokes] about all that pass from the film's centre through a stop."""
     ring, spoke = (np.arange(_RINGS) + 0.5) / _RINGS, 2 * np.pi * (np.arange(spokes) + 0.5) / spokes
     low, high, half = (abs(domain["bounds"][name][0]) for name in ("low_mm", "high_mm", "half_mm"))
     reach = _WIDER * max(low, high, half) * min(1.0, stop_radius_mm / domain["stop_radius_mm"])
@@ -283,12 +291,12 @@ def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float, spokes: int) -> 
 
 
 def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
-    """The film in the paraxial image of a focus within the model's domain, whose films may lie beside it."""
+    """Return the film in the paraxial image of a focus within the model's domain, whose films may lie next to it."""
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
         return float(lens["film_z_mm"])  # its groups have moved
     z = paraxial.film_z_of_card_mm(lens, focus_m)
-    # A domain may hold the film of best focus alone: a millimetre from the paraxial one, of a singlet.
+    # A domain may hold the film of best focus alone, which for a singlet is a millimetre from the paraxial one.
     least, most = sorted(float(v) for v in model.card["domain"]["focus_m"])
     if not (near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK or least <= focus_m <= most):
         raise InputError(model.path, "focus_m", focus_m, f"a focus within the model's domain, {_limits(model)}")
@@ -296,7 +304,7 @@ def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
 
 
 def _film_z(model: OnnxLens, best_mm: float, offset_mm: float, f_number: float) -> float:
-    """The film position wanted, or the end of the model's domain that is nearest to it."""
+    """Return the film position asked for, or the end of the model's domain nearest to it."""
     near, far = model.card["domain"]["film_z_mm"]
     z = best_mm + offset_mm
     if offset_mm and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:

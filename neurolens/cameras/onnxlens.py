@@ -1,6 +1,6 @@
-"""Exported lens models, run by onnxruntime: rays in, rays out, numpy arrays.
+"""Exported lens models, run by onnxruntime on numpy arrays: rays in, rays out.
 
-What runs is the graph that is built from the coefficients in a file, never the nodes in it.
+What runs is a graph that is built from the coefficients in a file, never the nodes stored in it.
 """
 
 from __future__ import annotations
@@ -30,15 +30,19 @@ from neurolens.models.model import LensModel
 def open_session(
     path: Path, data: bytes, inputs: dict[str, tuple[Any, ...]], outputs: dict[str, tuple[Any, ...]]
 ) -> Any:
-    """A session of onnxruntime on the CPU.
+    """Open a session of onnxruntime on the CPU.
+
+    Args:
+        path: of the file, for errors.
+        data: the model's bytes.
+        inputs, outputs: those expected: by name the type and then the dimensions, None for the number of rays.
 
     Raises:
-        ModelError: onnxruntime cannot load the bytes, or inputs or outputs are others than those expected: by name the
-            type, then the dimensions, None for the number of rays.
+        ModelError: onnxruntime cannot load the bytes, or has other inputs or outputs than those expected.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # batches fit a core's cache
-    options.log_severity_level = 4  # what goes wrong is raised, not printed
+    options.log_severity_level = 4  # errors are raised, so printing them would repeat them
     try:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
         inside = [_shapes(session.get_inputs()), _shapes(session.get_outputs())]
@@ -51,7 +55,7 @@ def open_session(
 
 
 def _shapes(tensors: Any) -> dict[str, tuple[Any, ...]]:
-    """Type and dimensions by name; a dimension that has a name is None. A name that is no UTF-8 raises an error."""
+    """Type and dimensions by name, None for a dimension that has a name; a name that is no UTF-8 raises an error."""
     return {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in tensors}
 
 
@@ -63,18 +67,22 @@ def run_batches(
     call: Mapping[str, Any],
     batch: int,
 ) -> list[NDArray[Any]]:
-    """The outputs for any number of rays, which are the last axis of all of them.
+    """Run any number of rays, which are the last axis of all arrays, and return the outputs.
 
     Args:
-        rays: inputs [K, N]. call: the other inputs, the same for all rays.
-        batch: rays a call of onnxruntime, at most.
+        path: of the model, for errors.
+        session: see `open_session`.
+        outputs: names of those wanted.
+        rays: inputs [K, N].
+        call: the other inputs, which are the same for all rays.
+        batch: the most rays for one call of onnxruntime.
 
     Raises:
-        ModelError: onnxruntime cannot run the model `path`.
+        ModelError: onnxruntime cannot run the model.
     """
     count = next(iter(rays.values())).shape[1]
     numbers = {name: np.atleast_1d(np.asarray(value, np.float32)) for name, value in call.items()}
-    # Calls of about the same size: few rays cost nearly as much as many.
+    # Calls get about equal sizes, because few rays cost nearly as much as many.
     ends = np.linspace(0, count, max(1, -(-count // batch)) + 1).astype(int)
     parts = []
     for start, end in zip(ends[:-1], ends[1:], strict=True):
@@ -88,7 +96,7 @@ def run_batches(
 
 
 def _padded(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same columns [R, N] and further ones of zeros where N would make onnxruntime slow.
+    """Return the same columns [R, N], followed by zeros where N would make onnxruntime slow.
 
     Rows a power of two apart share cache lines, which makes matrix products a third slower.
     """
@@ -111,16 +119,19 @@ OUTPUTS = {
     "stop_xy_mm": ("tensor(float)", 2, None),
     "status": ("tensor(int32)", None),
 }
-# Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
+# Rays for a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
 BATCH = 16384
 MAX_RAYS = 2**27
 
 
 class LensRays(NamedTuple):
-    """The answer of a model for N rays; lens frame, mm. Rays are valid where status is 0.
+    """A model's answer for N rays, in the lens frame and mm; valid where the status is 0.
 
-    scene_ray [6, N] float32 (x, y, z, unit direction), transmittance [N], stop_xy_mm [2, N] (crossing with the stop),
-    status [N] int32 (see `neurolens.base.status`).
+    Attributes:
+        scene_ray: [6, N] float32: x, y, z and the unit direction.
+        transmittance: [N].
+        stop_xy_mm: [2, N], the crossing with the stop.
+        status: [N] int32, see `neurolens.base.status`.
     """
 
     scene_ray: FloatArray
@@ -130,31 +141,31 @@ class LensRays(NamedTuple):
 
 
 class LensRun:
-    """The graph of a lens, exact or modelled, run by onnxruntime: rays through points of its pupil.
+    """Runs the graph of a lens, exact or modelled, in onnxruntime, for rays through points of its pupil.
 
     Attributes:
-        path: of the file of the lens, for messages.
-        stop_index: the surface at its stop.
+        path: of the lens's file, for messages.
+        stop_index: the surface at the stop.
     """
 
     stop_index: int
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._sessions: dict[tuple[Any, ...], Any] = {}  # by process and outputs; opened when they are needed
+        self._sessions: dict[tuple[Any, ...], Any] = {}  # by process and outputs; opened when needed
 
     def graph(self, form: Form = SCALARS) -> Graph:
-        """The graph of the lens; inputs and outputs as `models.assemble` says."""
+        """Return the graph of the lens, with inputs and outputs as `models.assemble` has them."""
         raise NotImplementedError
 
     def run(self, rays: FloatArray, film_z_mm: ArrayLike, stop_radius_mm: float) -> LensRays:
-        """The scene rays of columns [5, N] as of `ray_columns`."""
+        """Return the scene rays of columns [5, N] as `ray_columns` makes them."""
         call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
         names = tuple(OUTPUTS)
         return LensRays(*run_batches(self.path, self._session(names), names, {"rays": rays}, call, BATCH))
 
     def status(self, rays: FloatArray, film_z_mm: float, stop_radius_mm: float) -> NDArray[np.int32]:
-        """`run(...).status` alone, in less time: nothing else is computed."""
+        """Return `run(...).status` alone, which takes less time, since nothing else is computed."""
         call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
         names = ("status",)
         found: NDArray[np.int32] = run_batches(self.path, self._session(names), names, {"rays": rays}, call, BATCH)[0]
@@ -171,12 +182,12 @@ class LensRun:
 
 
 class OnnxLens(LensRun):
-    """An exported model, loaded and checked. Make it with `load_model`.
+    """An exported model, loaded and checked; make it with `load_model`.
 
     Attributes:
         file: what the file says.
         card: see `neurolens.models.card`; its lens and domain are those of `state`.
-        axes: what the model's state is made of (zoom in mm, focus in 1/m); none for a model of one state.
+        axes: what the model's state consists of (zoom in mm, focus in 1/m); empty for a model of one state.
         state: a number for every axis.
     """
 
@@ -187,10 +198,10 @@ class OnnxLens(LensRun):
         self._graphs: dict[Form, Graph] = {}
 
     def at(self, *state: float) -> Self:
-        """The same model in another state, its card with the lens and the domain there.
+        """Return the same model in another state; its card then has the lens and the domain of that state.
 
         Raises:
-            InputError: another number of values than axes, or one out of range.
+            InputError: a number of values other than that of the axes, or a value out of range.
         """
         if not self.axes and not state:
             return self
@@ -204,12 +215,12 @@ class OnnxLens(LensRun):
         return self.file.at(self.state)
 
     def graph(self, form: Form = SCALARS) -> Graph:
-        """The graph of the model in its state; inputs and outputs as `models.assemble` says."""
+        """Return the graph of the model in its state, with inputs and outputs as `models.assemble` has them."""
         if form not in self._graphs:
             self._graphs[form] = model_graph(self.fitted, form)
         return self._graphs[form]
 
-    @np.errstate(over="ignore")  # numbers that float32 does not hold are outside the domain
+    @np.errstate(over="ignore")  # numbers too large for float32 are outside the domain
     def rays(
         self,
         film_xy_mm: ArrayLike,
@@ -219,20 +230,20 @@ class OnnxLens(LensRun):
         stop_radius_mm: float | None = None,
         state: float | Sequence[float] | None = None,
     ) -> LensRays:
-        """Scene-side rays of camera rays.
+        """Trace camera rays to the scene side.
 
         Args:
-            film_xy_mm, pupil_xy_mm: [2, N], lens frame, on the film plane and on the plane domain.pupil_z_mm.
+            film_xy_mm, pupil_xy_mm: [2, N], lens frame, on the film plane and on the plane `domain.pupil_z_mm`.
             wavelength_nm: [N], or one number.
-            film_z_mm: film plane; None takes the paraxial image of the farthest focus. An array [N] costs
-                a call for each distinct value.
+            film_z_mm: film plane; None takes the paraxial image of the farthest focus. An array [N] costs a call for
+                each distinct value.
             stop_radius_mm: None takes the widest stop.
-            state: of a model of many states, a number for every axis; None takes `self.state`, at first the first end
-                of every axis. Out of range, every ray is outside the domain.
+            state: a number for every axis of a model of many states; None takes `self.state`, which starts with the
+                first end of every axis. For a state out of range, every ray is outside the domain.
 
         Raises:
-            InputError: arrays of other shapes, or another number of states than axes. Rays outside the domain are no
-                error: their status says so.
+            InputError: arrays of other shapes, or a number of states other than that of the axes. Rays outside the
+                domain are no error: their status tells.
         """
         if state is not None:
             values = state_numbers(self.axes, state)
@@ -261,10 +272,11 @@ def load_model(path: str | Path, lens: str | None = None) -> OnnxLens:
     """Load an exported model and check it.
 
     Args:
+        path: the model's file.
         lens: SHA-256 of the prescription (`Lens.sha256`) that the model must stand for; None takes any.
 
     Raises:
-        ModelError: as `read_model`; a file of another lens.
+        ModelError: as `read_model` raises it, and for a model of another lens.
     """
     file = read_model(path)
     known = str(file.card["lens"]["sha256"])
@@ -277,10 +289,10 @@ def load_model(path: str | Path, lens: str | None = None) -> OnnxLens:
 
 
 def ray_columns(where: str, points: Mapping[str, ArrayLike], wavelength_nm: ArrayLike) -> FloatArray:
-    """Arrays [2, N] of points, by name, and wavelengths [N] or one for all, below each other.
+    """Stack arrays [2, N] of points, by name, and wavelengths, [N] or one for all.
 
     Raises:
-        InputError: other shapes; more than `MAX_RAYS`.
+        InputError: other shapes, or more than `MAX_RAYS` rays.
     """
     try:
         given = [np.asarray(v, np.float32) for v in (*points.values(), wavelength_nm)]

@@ -5,8 +5,8 @@ the stop and of the rims that vignette. A polygon about a centre inside it, inte
 region so closely that nearly every ray sent through it passes. The arcs move with the wavelength, by 2% of the pupil
 over the visible range in a double Gauss, and so do the polygons.
 
-They are searched from nothing but whether rays pass, which the exact tracer and an exported model both tell, at any
-focus and stop: all rows of the outline at once, ray by ray from a centre outwards.
+The search needs nothing but a test whether rays pass, which the exact tracer and an exported model both have, at any
+focus and stop. It goes outwards from a centre, ray by ray, for all rows of the outline at once.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ from neurolens.models.card import pupil_rows
 class PupilOutline:
     """Polygons on the pupil plane that hold the passing rays of film points, by film radius and wavelength.
 
-    For a film point at radius r along +x the polygon has its centre at (centre, 0) and is symmetric about the x axis;
-    `x`, `y` are the vertices of its upper half relative to the centre, from +x to -x. Film radii grow by less and
-    less: row i of R lies at (1 - (1 - i / (R - 1))^2) of the last radius, for near the end of the light the region
-    shrinks as the root of the distance to it, which then is linear from row to row.
+    For a film point at radius r along +x, the polygon has its centre at (centre, 0) and is symmetric about the x axis;
+    `x` and `y` are the vertices of its upper half relative to the centre, from +x to -x. Film radii grow by less and
+    less: row i of R lies at (1 - (1 - i / (R - 1))^2) of the last radius. For near the end of the light the region
+    shrinks as the root of the distance to that end, which is then linear from row to row.
 
     Attributes:
-        pupil_z_mm: the plane.
-        film_radius_mm: radius of the last row: beyond it no ray passes. The first row is the axis.
-        wavelength_nm: the W wavelengths of `x` and `y`, one or two; between two, vertices go with 1 / wavelength^2.
-        centre: [R] mm.
-        x, y: [W, R, K + 1] mm; y is 0 at both ends.
+        pupil_z_mm: the pupil plane.
+        film_radius_mm: radius of the last row, beyond which no ray passes; the first row is the axis.
+        wavelength_nm: the W wavelengths of `x` and `y`, one or two; between two, vertices move linearly with 1 /
+            wavelength^2.
+        centre: [R], mm.
+        x, y: [W, R, K + 1], mm; y is 0 at both ends.
     """
 
     pupil_z_mm: float
@@ -54,16 +55,17 @@ class PupilOutline:
     def sample(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Points that fill the polygons of film points evenly, by `graph`.
+        """Return points that fill the polygons of film points evenly, by `graph`.
 
         Args:
             film_mm: [2, N].
             square: [2, N] in [0, 1).
             wavelength_nm: [N].
 
-        Returns the points [2, N] in mm, and for each the area [N] in mm^2 of pupil plane per area of the square, 0
-        where nothing passes: the inverse of its probability density. It varies little over a polygon, whose area is
-        its mean.
+            Returns:
+                The points [2, N] in mm, and for each the area [N], in mm^2 of pupil plane for each unit of area of the
+                square; 0 where nothing passes. It is the inverse of the point's probability density. Over a polygon it
+                varies little, and its mean is the polygon's area.
         """
         given = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None], "outline": self.table}
         given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
@@ -72,7 +74,7 @@ class PupilOutline:
         return found["pupil_mm"], np.where(area > 0, area, np.float32(0))
 
     def on_plane(self, pupil_z_mm: float, film_z_mm: float) -> PupilOutline:
-        """The same rays on another plane, those of the film at a place."""
+        """Return the outline of the same rays on another plane, with their film at a given place."""
         scale = np.float32((pupil_z_mm - film_z_mm) / (self.pupil_z_mm - film_z_mm))
         film = self.radii(np.arange(self.centre.size, dtype=np.float64)).astype(np.float32)
         centre = film + (self.centre - film) * scale
@@ -84,12 +86,12 @@ class PupilOutline:
         return pupil_graph(self.x.shape[2] - 1, len(self.x))
 
     def radii(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Film radii in mm of (fractional) rows."""
+        """Return the film radii in mm of (fractional) rows."""
         return self.film_radius_mm * (1 - (1 - place / (self.centre.size - 1)) ** 2)
 
     @cached_property
     def numbers(self) -> dict[str, float]:
-        """The inputs of the call of `pupil_graph`."""
+        """Return the inputs of `pupil_graph` for a whole call."""
         waves = [w**-2 for w in self.wavelength_nm]
         numbers = {"per_radius": 1 / self.film_radius_mm, "last_row": float(self.centre.size - 1)}
         if len(self.x) > 1:
@@ -98,11 +100,11 @@ class PupilOutline:
 
     @cached_property
     def table(self) -> FloatArray:
-        """The table of `pupil_graph`, [R * (K + 1), 10 W]; each column is contiguous.
+        """Return the table of `pupil_graph`, [R * (K + 1), 10 W], with contiguous columns.
 
-        Groups of columns (weights 1, step, share, share step): first vertex and edge (x, y, dx, dy) at a row, and
-        centre; their steps to the next row; and of two wavelengths the change of both from the first to the second.
-        The last cell of a row is its end, which belongs to the last edge.
+        Columns stand in groups, whose weights are 1, step, share, and share times step: first vertex and edge (x, y,
+        dx, dy) and centre at a row; their steps to the next row; and for two wavelengths the change of both from the
+        first to the second. The last cell of a row is its end, which belongs to the last edge.
         """
         edges = [np.diff(c, append=2 * c[..., -1:] - c[..., -2:-1]) for c in (self.x, self.y)]
         centre = np.broadcast_to(self.centre[:, None], self.x.shape)
@@ -113,7 +115,7 @@ class PupilOutline:
 
 
 def wavelength_between(wavelength_nm: tuple[float, ...], share: float) -> float:
-    """The wavelength in nm at a share of the way from the first to the last, in 1 / wavelength^2."""
+    """Return the wavelength in nm at a share of the way from the first to the last, in 1 / wavelength^2."""
     first, last = wavelength_nm[0], wavelength_nm[-1]
     if share in (0, 1):  # no rounding may leave the range
         return last if share else first
@@ -122,14 +124,14 @@ def wavelength_between(wavelength_nm: tuple[float, ...], share: float) -> float:
 
 # ---- the search ----
 
-# Halvings that place the end of the light; lattice on a box that looks for light.
+# Halvings that place the end of the light, and the lattice on a box that looks for light.
 _END_HALVINGS = 10
 _COARSE_LATTICE = (40, 20)
 
-# Whether light of a wavelength in nm passes from film points [2, N] through pupil points [2, N], both mm: bool [N].
+# Tells whether light of a wavelength in nm passes from film points through pupil points, [2, N] in mm each: bool [N].
 Passes = Callable[[FloatArray, FloatArray, float], NDArray[np.bool_]]
 Float64Array = NDArray[np.float64]
-# Whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
+# Tells whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
 PassTest = Callable[[Float64Array, Float64Array], NDArray[np.bool_]]
 
 
@@ -140,9 +142,9 @@ class PupilTable:
     For a film point at radius r along +x, passing rays lie within low <= u <= high along +x and |v| <= half across.
 
     Attributes:
-        pupil_z_mm: the plane.
+        pupil_z_mm: the pupil plane.
         film_radius_mm: radius of the last row; the first row is the axis.
-        rows: [3, R]: low, high, half; low > high where nothing passes.
+        rows: [3, R], low, high and half; low > high where nothing passes.
     """
 
     pupil_z_mm: float
@@ -151,12 +153,12 @@ class PupilTable:
 
     @staticmethod
     def of(bounds: Mapping[str, Any]) -> PupilTable:
-        """Make it of the fields of `PupilBounds`, in which a model's card holds them."""
+        """Make the table of the fields of `PupilBounds`, as a model's card holds them."""
         return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), pupil_rows(bounds))
 
 
 def tightened(table: PupilTable, passing: PassTest, lattice: tuple[int, int] = (96, 48)) -> PupilTable:
-    """The same rows with boxes cut to what passes now, for example through a closed stop."""
+    """Return the same rows with boxes cut to what passes now, for example through a stop that is closed down."""
     last = table.rows.shape[1] - 1
     place = np.minimum(np.arange(last + 1), last * (1 - 1e-6))
     found = _lattice(_boxes(table, place), table.film_radius_mm * place / last, passing, lattice)
@@ -164,9 +166,15 @@ def tightened(table: PupilTable, passing: PassTest, lattice: tuple[int, int] = (
 
 
 class SearchFrame(NamedTuple):
-    """For each row [R]: film radius, centre of the polygon, half widths along and across [2, R], and farthest reach.
+    """Describes where to search in each row [R].
 
-    Directions and the reach are those of a frame in which the region is about as wide as it is high.
+    The frame is stretched so that the region is about as wide as it is high.
+
+    Attributes:
+        radius: film radius.
+        centre: of the polygon.
+        stretch: [2, R], half widths along and across.
+        reach: the farthest distance in the stretched frame.
     """
 
     radius: Float64Array
@@ -176,7 +184,7 @@ class SearchFrame(NamedTuple):
 
 
 def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
-    """A test whether rays pass at any of the wavelengths."""
+    """Return a test whether rays pass at any of the wavelengths."""
 
     def passing(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
         film = np.zeros(points.shape, np.float32)
@@ -192,11 +200,11 @@ def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
 
 
 def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
-    """The largest film radius, within those of the table, from which a ray is found to pass."""
+    """Return the largest film radius, within those of the table, from which a ray is found to pass."""
     last = table.rows.shape[1] - 1
 
     def light(boxes: Float64Array, place: Float64Array) -> Float64Array:
-        """Boxes [3, M] about what passes at fractional rows within boxes."""
+        """Return boxes [3, M] about what passes at fractional rows within boxes."""
         return _lattice(boxes, table.film_radius_mm * place / last, passing).boxes
 
     rows = np.minimum(np.arange(last + 1), last * (1 - 1e-6))
@@ -208,14 +216,14 @@ def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
     dark = rows[some[-1] + 1 : some[-1] + 2]
     for _ in range(_END_HALVINGS if dark.size else 0):
         middle = (lit + dark) / 2
-        # What is left of the pupil mostly lies in what was left before: a lattice there finds smaller regions.
+        # What is left of the pupil mostly lies within what was left before, where a lattice finds smaller regions.
         found = next((f for b in (box, _boxes(table, middle)) if (f := light(b, middle))[0] <= f[1]), None)
         lit, dark, box = (lit, middle, box) if found is None else (middle, dark, found)
     return float(table.film_radius_mm * lit[0] / last) if lit[0] > 0 else None
 
 
 def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
-    """[3, M] low, high and half width that hold what passes at fractional rows of the table."""
+    """Return low, high and half width [3, M] of boxes that hold what passes at fractional rows of the table."""
     low, high, half = table.rows.astype(np.float64)
     empty = low > high
     low, high = np.where(empty, np.inf, low), np.where(empty, -np.inf, high)
@@ -225,13 +233,13 @@ def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
 
 
 class _Found(NamedTuple):
-    """What passes of lattices: boxes [3, M] about it, a step wider (low > high where nothing passes); mean along x."""
+    """What passes of lattices: boxes [3, M] about it, a step wider (low > high if nothing does); its mean along x."""
 
     boxes: Float64Array
     centre: Float64Array
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of empty boxes, and of those near the end of float32, nothing passes
+@np.errstate(over="ignore", invalid="ignore")  # nothing passes of empty boxes, nor of those near float32's end
 def _lattice(
     boxes: Float64Array, radius: Float64Array, passing: PassTest, size: tuple[int, int] = _COARSE_LATTICE
 ) -> _Found:
@@ -250,10 +258,10 @@ def _lattice(
 
 
 def frame_of(table: PupilTable, radius: Float64Array, passing: PassTest) -> SearchFrame:
-    """Centroid and extent of what passes at each film radius, from a lattice."""
+    """Return the centroid and extent of what passes at each film radius, from a lattice."""
     place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
     boxes, centre = _lattice(_boxes(table, place), radius, passing)
-    # A row whose lattice misses a small region takes what its neighbours have.
+    # A row whose lattice misses a small region takes over what its neighbours have.
     rows, found = np.arange(radius.size), boxes[0] <= boxes[1]
     centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, *boxes))
     centre[radius == 0] = 0.0  # the axis has no azimuth: pupil points must not jump as a film point passes it
@@ -262,28 +270,32 @@ def frame_of(table: PupilTable, radius: Float64Array, passing: PassTest) -> Sear
     return SearchFrame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))
 
 
-_DIRECTIONS = 33  # in which the first outline is sought
-# Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
-# multiples of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
+_DIRECTIONS = 33  # directions in which the first outline is sought
+# Where the interpolated outline is checked: between rows, along an edge, and between the two wavelengths; at which
+# multiples of it; and how far beyond what was found vertices are pushed, which is a hair, against rounding.
 _BETWEEN_ROWS, _ALONG_EDGE = (0.0, 0.5), (0.0, 0.3, 0.5, 0.7)
 _CHECKS, _CHECK_HALVINGS = (1.0, 1.002, 1.01, 1.03, 1.07, 1.15, 1.35), 5
 _HAIR = 2e-5
-# Where one wavelength's region is less than this share of both together, one outline serves both. Half-planes that do
-# not hold the centroid of a convex region cut off less (Gruenbaum 1960: 1 - 1/e), so that the centre lies inside all.
+# Where the region of one wavelength is less than this share of both together, one outline serves both. A half-plane
+# that does not hold the centroid of a convex region cuts off less than 1 - 1/e of it (Gruenbaum 1960), so the centre
+# lies inside all regions.
 _APART = 0.65
-# So it does where a wavelength between reaches so many times farther than the ends of the spectrum let expect.
+# One outline serves both, too, where a wavelength between reaches this much farther than the ends of the spectrum let
+# expect.
 _BULGE = 1.04
 
 
 class Detail(NamedTuple):
-    """The fineness of the search for an outline.
+    """How finely an outline is searched.
 
     Attributes:
-        rows: film radii. segments: edges of the upper half of a polygon.
+        rows: film radii.
+        segments: edges of the upper half of a polygon.
         wavelengths: shares of the way from the shortest to the longest, in 1 / wavelength^2, the ends among them.
-        steps, coarse, fine: steps outwards, and halvings of the one that crosses the boundary, of two searches.
-        reach: how many times farther than the first search found the second looks.
-        tighten: lattice on each box, along and across, for the table may be much wider than what passes.
+        steps: how many steps outwards each of the two searches takes.
+        coarse, fine: how often the first and the second search halve the step that crosses the boundary.
+        reach: how many times as far as the first search found the second looks.
+        tighten: lattice on each box, along and across, because the table may be much wider than what passes.
     """
 
     rows: int = 65
@@ -297,8 +309,8 @@ class Detail(NamedTuple):
 
 
 FINE = Detail()
-# For a lens with cylinders: each test takes tracing at many azimuths, and no outline fits all of them.
-# What is left out errs towards outlines too wide: halvings end outside what passes.
+# For a lens with cylinders: each test takes tracing at many azimuths, and no outline fits all of them. What is saved
+# errs towards outlines that are too wide, for halvings end outside what passes.
 COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, (48, 24))
 
 
@@ -309,17 +321,17 @@ def outline_of(
     detail: Detail = FINE,
     report: Callable[[float], object] = lambda share: None,
 ) -> PupilOutline | None:
-    """The outline of what passes, or None where nothing does.
+    """Search the outline of what passes; return None where nothing does.
+
+    The polygons hold every point found to pass at the rows, between them and between vertices, even where the region is
+    not convex or the outline bends: their vertices are pushed out until they do.
 
     Args:
-        table: boxes that hold what passes, wider is slower but no harm.
-        passes: the lens at one focus and stop.
+        table: boxes that hold what passes; wider ones take longer, but do no harm.
+        passes: tests the lens at one focus and stop.
         wavelength_nm: shortest and longest wavelength; equal ones give an outline for one.
-        detail: how closely.
+        detail: how finely to search.
         report: takes the share of the search that is done.
-
-    The polygons hold every point found to pass at the rows, between them and between vertices, even where the region
-    is not convex or the outline bends: their vertices are pushed out until they do.
     """
     ends = tuple(sorted(set(wavelength_nm)))
     wavelengths_nm = sorted({wavelength_between(ends, share) for share in detail.wavelengths})
@@ -356,9 +368,9 @@ def outline_of(
 def _boundary(
     passing: PassTest, frame: SearchFrame, angles: Float64Array, reach: Float64Array, steps: int, halvings: int
 ) -> Float64Array:
-    """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame.
+    """Return the distance [R, D] from the centre to the last passing point in each direction, in the stretched frame.
 
-    Looked for within `reach` [R, D], in so many steps and halvings of one.
+    It is searched within `reach` [R, D], by so many steps and halvings of the last.
     """
     direction = np.stack([np.cos(angles), np.sin(angles)]) * frame.stretch[:, :, None]
     tried = np.linspace(0, 1, steps + 1)[:, None] * reach.ravel()
@@ -369,7 +381,7 @@ def _boundary(
 def _flat(
     radius: Float64Array, centre: Float64Array, direction: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Film radius [M], origin [2, M] and direction [2, M] of every direction [2, R, D] from the centres of rows."""
+    """Film radius [M], origin [2, M] and direction [2, M] of all directions [2, R, D] from the centres of rows."""
     count = direction.shape[2]
     origin = np.stack([np.repeat(centre, count), np.zeros(centre.size * count)])
     return np.repeat(radius, count), origin, direction.reshape(2, -1)
@@ -383,15 +395,15 @@ def _farthest(
     steps: Float64Array,
     halvings: int,
 ) -> Float64Array:
-    """The largest t [M] at which origin + t direction passes, to the last halving and never less.
+    """Return the largest t [M] at which origin + t direction passes, to the last halving and never less.
 
     Args:
-        passing: whether rays pass.
-        radius, origin, direction: [M], [2, M], [2, M] mm.
-        steps: [S, M] rising values of t. All are tried, so that a region with a dent is held whole. Where none
-            passes, the first is the answer.
+        passing: the test whether rays pass.
+        radius, origin, direction: [M], [2, M], [2, M], mm.
+        steps: [S, M], rising values of t. All are tried, so that a region with a dent is held whole. Where none passes,
+            the first is the answer.
     """
-    # All in one test: tracing few rays at a time costs more than tracing many.
+    # All are tested together, because tracing few rays at a time costs more than tracing many.
     passed = passing(np.broadcast_to(radius, steps.shape), origin[:, None] + steps * direction[:, None])
     last = len(steps) - 1 - np.argmax(passed[::-1], axis=0)
     found = np.flatnonzero(passed.any(0))
@@ -408,7 +420,7 @@ def _farthest(
 
 
 def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) -> Float64Array:
-    """Angles [R, segments + 1] between which the outline given by its distance at `angles` encloses equal areas."""
+    """Return angles [R, segments + 1] between which the outline, given by its distance at `angles`, has equal areas."""
     wedges = distance[:, 1:] * distance[:, :-1] + 1e-9
     area = np.concatenate([np.zeros((len(angles), 1)), np.cumsum(wedges, axis=1)], axis=1)
     wanted = np.linspace(0, 1, segments + 1)
@@ -416,9 +428,9 @@ def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) ->
 
 
 def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array:
-    """Distances at the ends of the spectrum, of those [W, R, D] at shares of it; joined where they part.
+    """Return distances at the ends of the spectrum from those [W, R, D] at shares of it, joined where they differ much.
 
-    At the edge of the light lateral colour leaves some wavelengths dark before others.
+    At the edge of the light, lateral colour leaves some wavelengths dark before others.
     """
     if len(distance) == 1:
         return distance
@@ -433,7 +445,7 @@ def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array
 def _pushed_out(
     outline: PupilOutline, passes: Passes, shares: tuple[float, ...], report: Callable[[float], object]
 ) -> PupilOutline:
-    """The outline with its vertices moved outwards until it holds what passes between them, in all three ways."""
+    """Return the outline with its vertices moved outwards until it holds what passes in between, in all three ways."""
     needed = np.ones(outline.x.shape)
     both = len(outline.wavelength_nm) > 1
     for done, share in enumerate(shares if both else (0.0,)):
@@ -453,8 +465,10 @@ def _pushed_out(
 def _excess(
     outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], passing: PassTest
 ) -> list[tuple[float, Float64Array]]:
-    """The reach of passing rays, as a share of the outline, between rows and vertices: each place's part of the
-    step between rows, and the shares [rows, edges]."""
+    """Return how far passing rays reach between rows and vertices, as shares [rows, edges] of the outline.
+
+    Each comes with its place's part of the step between rows.
+    """
 
     def between(c: Float64Array, step: float) -> Float64Array:
         return (1 - step) * c[:-1] + step * c[1:] if step else c

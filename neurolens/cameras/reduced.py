@@ -1,17 +1,19 @@
 """Cameras made of others: without a part of what their lens does, or an ideal one whose picture is warped afterwards.
 
-A lens that disperses moves its picture with the wavelength (lateral colour) and blurs it differently (longitudinal
-colour, and the colours of other aberrations). `ReducedDispersion` follows the rays of one wavelength. With "lateral",
-polynomials in film point and wavelength still move the picture of every other one, as an ST map a wavelength would.
+A lens that disperses moves its picture with the wavelength (lateral colour), and blurs it in another way at each
+(longitudinal colour, and the colours of other aberrations). `ReducedDispersion` follows the rays of one wavelength.
+With "lateral", polynomials in film point and wavelength still move the picture of every other one, as an ST map for
+each wavelength would.
 
-`Vignetted`: the film value of white surroundings is V(f) at a film point f, 1 on the axis. It is the product of
+`Vignetted`: the film value of white surroundings is V(f) at a film point f, and 1 on the axis. It is the product of two
+factors, each taken over its value on the axis:
 
-- natural N(f) = <T cos^4> / <T>: cos^4 of the film-side angle to the axis, mean over the light that passes: the chief
-  ray's, as the stop closes; of a fisheye projection its own law;
-- optical O(f) = <T> A: effective aperture, the area through which light passes, times its transmittance,
+- natural, N(f) = <T cos^4> / <T>: cos^4 of the film-side angle to the axis, as a mean over the light that passes, which
+  tends to the chief ray's as the stop closes; a fisheye projection has its own law instead;
+- optical, O(f) = <T> A: the effective aperture, which is the area through which light passes, times its transmittance.
 
-each over its value on the axis. For the four white cards of Steinert 2009, 5.2, every ray of a film point is weighed by
-the same factor, so that blur keeps its shape:
+Four white cards show the parts (Steinert 2009, 5.2). For each, all rays of a film point are weighed by the same factor,
+so that blur keeps its shape:
 
     both: 1     natural: N / V     optical: O / V     none: 1 / V
 
@@ -55,10 +57,10 @@ from neurolens.optics.lens.shot import Dispersion, Vignetting
 Array = NDArray[np.float64]
 
 _FARTHEST_M = 1e4
-_DEGREE, _ORDERS = 7, 3  # of the shift's polynomial, in the film point and in the wavelength
-_POINTS, _SIDE, _WAVES = 192, 8, 7  # of the fit: film points, pupil samples a side, wavelengths
-_BEYOND = 1.5  # the farthest companion over that of the points of the fit
-_STEP = 1e-3  # of the film's width: a step of the film point, to know how what it shows moves
+_DEGREE, _ORDERS = 7, 3  # degrees of the shift's polynomial, in the film point and in the wavelength
+_POINTS, _SIDE, _WAVES = 192, 8, 7  # what the fit uses: film points, pupil samples a side, wavelengths
+_BEYOND = 1.5  # how far beyond the fitted points' shifts the farthest companion may lie
+_STEP = 1e-3  # share of the film's width: a step of the film point that tells how what it shows moves
 _SIDE_OF_AXIS = 64  # pupil samples a side, for the light on the axis
 
 
@@ -70,13 +72,16 @@ def film_shift(
     reference_nm: float,
     step_mm: tuple[float, float],
 ) -> Array:
-    """The way [2, F] in mm from film points to those that show the same at another wavelength; NaN where none does.
+    """Return the way [2, F] in mm from film points to those that show the same at another wavelength; NaN if none do.
 
     What a film point shows is the mean of where its rays meet the object in focus, over the rays that pass.
 
     Args:
-        film_mm: [2, F]. square: [2, F, P] pupil samples. step_mm: by which film points move along x and y to tell how
-            what they show moves; towards the middle, so that no point leaves the film.
+        film_mm: [2, F].
+        square: [2, F, P], pupil samples.
+        wavelength_nm, reference_nm: the other wavelength, and that of the film points.
+        step_mm: by how much film points move along x and y, to tell how what they show moves; the steps lead towards
+            the middle, so that no point leaves the film.
     """
     count, pupils = square.shape[1:]
     focus = camera.settings.get("focus_m")
@@ -116,15 +121,17 @@ class ReducedDispersion:
     wavelength.
 
     Args:
-        camera: of our contract. dispersion: "lateral" or "off".
-        wavelength_nm: range of the light; the rays are those of the d line, or of the nearest wavelength in it.
+        camera: any that keeps the contract.
+        dispersion: "lateral" or "off".
+        wavelength_nm: range of the light; the rays are those of the d line, or of the wavelength in the range nearest
+            to it.
 
     Attributes:
-        lateral: whether the picture moves with the wavelength; its companions may then be shared between pixels, as an
-            ST map that is read between pixels does.
+        lateral: whether the picture moves with the wavelength. Companions may then be shared between pixels, as in an
+            ST map that is read between pixels.
 
     Raises:
-        InputError: "lateral" of a camera that shows nothing.
+        InputError: "lateral" is asked of a camera that shows nothing.
     """
 
     def __init__(self, camera: Any, dispersion: Dispersion, wavelength_nm: tuple[float, float] = LIGHT_NM) -> None:
@@ -143,17 +150,17 @@ class ReducedDispersion:
             self._fit(light)
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """The camera's rays at the one wavelength, of the film points that show what these show at theirs."""
+        """Return the camera's rays at the one wavelength, of the film points that show what these show at theirs."""
         base = self._base(film_mm, wavelength_nm)
         return self._tinted(self.camera.sample(base, pupil, self._reference(film_mm)), wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `sample` does, and give their differentials, too."""
+        """Sample rays as `sample` does, and give their differentials too."""
         base = self._base(film_mm, wavelength_nm)
         return self._tinted(self.camera.sample_differentials(base, pupil, self._reference(film_mm)), wavelength_nm)
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract."""
+        """Rays as `sample` does, for wavelengths [W, N] in nm, the first of which is the hero's; see the contract."""
         base = self._base(film_mm, wavelength_nm[0])
         plain = self.camera.sample(base, pupil, self._reference(film_mm))
         rays = self._tinted(plain, wavelength_nm[0])
@@ -165,27 +172,27 @@ class ReducedDispersion:
         return SpectralRays(rays, np.where(passed, share, 0).astype(np.float32), places)
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """The part of the weights that is the camera's own natural fall-off."""
+        """Return the part of the weights that is the camera's own natural fall-off."""
         return np.asarray(self.camera.natural(self._base(film_mm, wavelength_nm), pupil, self._reference(film_mm)))
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """The camera's film points at the one wavelength, moved to where these wavelengths are shown."""
+        """Return the camera's film points at the one wavelength, moved to where these wavelengths are shown."""
         found = self._tinted(self.camera.to_film(point_m, pupil, self._reference(point_m)), wavelength_nm)
         shift = self._shifts(found.film_mm, wavelength_nm[None])[0]
         return replace(found, film_mm=found.film_mm + shift * (found.weight > 0))
 
     def _reference(self, rays: FloatArray) -> FloatArray:
-        """The one wavelength, as often as there are rays [R, N]."""
+        """Return the one wavelength, as often as there are rays [R, N]."""
         return np.full(rays.shape[1], self._nm, np.float32)
 
     def _exposure(self, nm: float) -> float:
-        """The mean weight of the rays of the film's middle at a wavelength."""
+        """Return the mean weight, at a wavelength, of the rays of the film's middle."""
         square, _ = stratified(_SIDE_OF_AXIS, (nm, nm))
         middle, light = np.zeros_like(square), np.full(square.shape[1], nm, np.float32)
         return float(self.camera.sample(middle, square, light).weight.mean(dtype=np.float64))
 
     def tints(self, wavelength_nm: FloatArray) -> FloatArray:
-        """The light of wavelengths on the axis over that of the one wavelength."""
+        """Return the light of wavelengths, on the axis, over that of the one wavelength."""
         return np.interp(np.nan_to_num(wavelength_nm), self._lit_nm, self._tint).astype(np.float32)
 
     def _tinted(self, rays: Any, wavelength_nm: FloatArray) -> Any:
@@ -194,8 +201,9 @@ class ReducedDispersion:
         return replace(rays, weight=rays.weight * self.tints(wavelength_nm) * light, status=status)
 
     def _base(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """The film points that show at the one wavelength what these show at theirs."""
-        # The shift changes by a thousandth of itself on its own length: it is not evaluated again at the base.
+        """Return the film points that show at the one wavelength what these show at theirs."""
+        # Over its own length the shift changes by a thousandth of itself, so it is not evaluated again at the other
+        # end.
         return film_mm - self._shifts(film_mm, wavelength_nm[None])[0] if self.lateral else film_mm
 
     def _shifts(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
@@ -204,7 +212,7 @@ class ReducedDispersion:
         if not self.lateral:
             return shift
         bound = np.array(self.film_mm, np.float32)[:, None]
-        at = np.clip(film_mm / bound, -1, 1)  # beyond the film polynomials are anything
+        at = np.clip(film_mm / bound, -1, 1)  # beyond the film the polynomials mean nothing
         parts = (self._terms @ _monomials(at)).reshape(2, _ORDERS, -1) * at[:, None]
         wave = self._wave(wavelength_nm)[:, None]
         for order in range(_ORDERS)[::-1]:
@@ -213,7 +221,7 @@ class ReducedDispersion:
         return shift
 
     def _wave(self, wavelength_nm: Any) -> Any:
-        """The variable of the wavelengths, 0 at the one of the rays."""
+        """Return the variable that stands for wavelengths, 0 at the one of the rays."""
         with np.errstate(divide="ignore"):  # what is no light has no rays
             wave = np.square(1000 / wavelength_nm) - (1000 / self._nm) ** 2
         return np.clip(np.nan_to_num(wave), -10, 10).astype(np.float32)
@@ -246,7 +254,7 @@ class ReducedDispersion:
 
 
 def _monomials(at: Array) -> Array:
-    """Products [M, N] of even powers of x and of y, of points [2, N]."""
+    """Return the products [M, N] of even powers of x and of y, for points [2, N]."""
     half = _DEGREE // 2 + 1
     square = at * at
     powers = np.cumprod([np.ones_like(square), *[square] * (half - 1)], axis=0)
@@ -255,9 +263,10 @@ def _monomials(at: Array) -> Array:
 
 VIGNETTINGS: tuple[str, ...] = get_args(Vignetting)
 
-# Rings, azimuths and samples a side of the tables, of round cameras and of others.
+# Rings, azimuths, and samples a side of the tables, for round cameras and for others.
 _ROUND, _OTHER = (129, 1, 64), (33, 36, 24)
-# Where roundness is tried, at azimuths of which none is the mirror image of another; of the largest value.
+# Where roundness is tried: radii, and azimuths of which none is another's mirror image; and how far values of a round
+# camera may differ, as a share of the largest.
 _TRIED, _AROUND, _UNEVEN = (0.5, 0.8, 0.95), np.exp(0.83j * np.arange(7)), 0.01
 _BATCH = 1 << 17
 
@@ -266,7 +275,7 @@ class Vignetted:
     """A camera with its vignetting switched off, in part or as a whole; see the module.
 
     Args:
-        camera: with `natural`, as all of this package have.
+        camera: one with `natural`, as all of this package have.
         vignetting: the part that is kept.
         wavelength_nm: range of the light, over which the means are taken.
 
@@ -294,42 +303,42 @@ class Vignetted:
         value, optical = (m.reshape(rings, azimuths) for m in means)
         optical /= optical[0].mean()
         natural = np.where(optical > 0, value / np.where(optical > 0, optical, 1) / value[0].mean(), np.nan)
-        for row in range(1, rings):  # where it is dark, as where light was last
+        for row in range(1, rings):  # where it is dark, the value is that where light was last
             natural[row] = np.where(np.isnan(natural[row]), natural[row - 1], natural[row])
         self._cards = {"natural": natural, "optical": optical, "none": np.ones_like(value), "both": value}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """The camera's rays, weighed anew."""
+        """Return the camera's rays, weighed anew."""
         return self._weighed(self.camera.sample(film_mm, pupil, wavelength_nm), film_mm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `sample` does, and give their differentials, too."""
+        """Sample rays as `sample` does, and give their differentials too."""
         return self._weighed(self.camera.sample_differentials(film_mm, pupil, wavelength_nm), film_mm)
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """The camera's rays of several wavelengths, weighed anew at the film point of each."""
+        """Return the camera's rays of several wavelengths, each weighed anew at its own film point."""
         found = self.camera.sample_spectrum(film_mm, pupil, wavelength_nm)
         passed = found.weight > 0
         factor = np.stack([self._factors(p, film) for p, film in zip(passed, found.film_mm, strict=True)])
-        # Wavelengths share a ray in proportion to their factors, as to the densities with which they would draw it.
-        # In equal shares a companion at the end of the light would have an unbounded weight.
+        # Wavelengths share a ray in proportion to their factors, as if those were the densities with which they would
+        # draw it. In equal shares, a companion at the end of the light would have an unbounded weight.
         share = passed.sum(axis=0) * factor[0] / np.maximum(factor.sum(axis=0), 1e-30)
         return replace(found, weight=(found.weight * factor * share).astype(np.float32))
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """The bound of the camera inside; None if it cannot place companions."""
+        """The bound of the camera inside; None if that cannot place companions."""
         return getattr(self.camera, "companion_reach_mm", None)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """The camera's film points, weighed anew."""
+        """Return the camera's film points, weighed anew."""
         return self._weighed(found := self.camera.to_film(point_m, pupil, wavelength_nm), found.film_mm)
 
     def _weighed(self, rays: Any, film_mm: FloatArray) -> Any:
         return replace(rays, weight=(rays.weight * self._factors(rays.weight > 0, film_mm)).astype(np.float32))
 
     def _factors(self, passed: NDArray[np.bool_], film_mm: FloatArray) -> Array:
-        """Factors of the weights of rays; 0 where none passes or the table is dark."""
+        """Return the factors of the weights of rays; 0 where none passes or the table is dark."""
         x, y = np.nan_to_num(film_mm.astype(np.float64), posinf=1e9, neginf=-1e9)
         radius = np.hypot(x, y)
         place = 1 - np.sqrt(1 - np.minimum(radius / self._end, 1))  # rings are equal steps of it
@@ -340,7 +349,7 @@ class Vignetted:
 
 
 def _means(camera: Any, light_nm: tuple[float, float], point: Complex, side: int) -> tuple[Array, Array]:
-    """V and <T> A at film points [M]: one wavelength a sample."""
+    """Return V and <T> A at film points [M], with one wavelength for each sample."""
     square, wavelength = stratified(side, light_nm)
     count, film = square.shape[1], np.stack([point.real, point.imag]).astype(np.float32)
     value, optical = np.zeros(point.size), np.zeros(point.size)
@@ -359,9 +368,11 @@ class Warped:
     """An ideal camera whose picture is warped by ST maps of a lens's plane field, and has the lens's light.
 
     Args:
-        flat: pinhole, thin or thick lens, of the same film. camera: to be shown. focus_m: from the film to the plane
-            that the maps are of. tables: of both fields, which take seconds, or that of the camera, made before;
-            without them film points are traced.
+        flat: pinhole, thin or thick lens, with the same film.
+        camera: the one to be shown.
+        focus_m: from the film to the plane that the maps are of.
+        tables: whether to make tables of both fields, which takes seconds, or that of the camera, made before; without
+            tables, film points are traced.
 
     Raises:
         InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.
@@ -377,7 +388,8 @@ class Warped:
         self._fields: dict[int, Field] = {}
         self._axis = {id(c): self._traced(c, np.zeros(1, complex))[1][0] for c in (flat, camera)}
         near, own, frame = 1e-3 / focus_m, self._frames[id(flat)], self._frames[id(camera)]
-        # Sizes of things in focus, of the one over the other: 1, but for the other meridian of cylinders.
+        # Sizes of things in focus, of the one over the other: 1, except in the second meridian of a lens with
+        # cylinders.
         self._size = [
             (1 - near * before) / reach * own_reach / (1 - near * own_before)
             for before, reach, own_before, own_reach in zip(
@@ -389,7 +401,7 @@ class Warped:
             expected = "a film within the image circle, and a narrower field"
             raise InputError(camera.name, "film_mm", self.film_mm, expected)
         before = self._before(ideal)
-        # Beyond the edge of the film, too, which the lens's distortion moves farther out than points within it.
+        # The picture reaches beyond the film's edge, too, which distortion moves farther out than points within it.
         sides = 2 * BEYOND**2 * np.array([np.abs(before.real).max(), np.abs(before.imag).max()]) / self.film_mm
         self.area = float(np.maximum(sides, 1.0).prod())  # of the picture before it is warped, over that of the film
         if tables:
@@ -399,7 +411,7 @@ class Warped:
             self._fields = {id(camera): shown, id(flat): field_of(wide, focus_m)}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays of film points [2, N] in mm, as of the ideal camera."""
+        """Return rays for film points [2, N] in mm, as the ideal camera has them."""
         each, back = -(film_mm[0] + 1j * film_mm[1]).astype(np.complex128), np.arange(film_mm.shape[1])
         if not self._fields:
             each, back = np.unique(each, return_inverse=True)
@@ -412,7 +424,7 @@ class Warped:
         return replace(rays, weight=rays.weight * light[back].astype(np.float32))
 
     def _place_and_light(self, camera: Camera, point: Complex) -> tuple[Complex, Array]:
-        """Undistorted places of picture points, and light over that on the axis."""
+        """Return the undistorted places of picture points, and their light over that on the axis."""
         if field := self._fields.get(id(camera)):
             return field.ideal(point), field.relative_light(point)
         ideal, light = self._traced(camera, point)
@@ -424,5 +436,5 @@ class Warped:
         return traced.place, traced.light
 
     def _before(self, ideal: Complex) -> Complex:
-        """Places in the ideal camera's picture, mm."""
+        """Return places in the ideal camera's picture, mm."""
         return np.asarray(self._size[0] * ideal.real + 1j * (self._size[1] * ideal.imag))

@@ -18,9 +18,9 @@ from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.trace.shapes import sag_mm
 from neurolens.optics.trace.surfaces import meet_front
 
-_BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
-_ANGLES, _LEVELS, _ROOM = 24, 5, 1.01  # see `FrontDiscs`; by which its discs are widened
-LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
+_BEYOND = 1.02  # largest diagonal of a film over its image circle: 36x24 on 43.2 mm is engraved so
+_ANGLES, _LEVELS, _ROOM = 24, 5, 1.01  # intervals and levels of `FrontDiscs`, and by how much its discs are widened
+LEAST_COS2 = 1e-30  # the square of the tangent beyond it comes near the end of float32
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
 
 
@@ -28,13 +28,15 @@ _AHEAD = np.array([[0], [0], [-1]], np.float32)
 class FrontDiscs:
     """Discs on a lens's front surface at which light from the scene is aimed, by its angle to the axis.
 
-    Light of a direction that reaches the film crosses a part of the front surface that moves with that angle. What
-    comes from a scene point has directions as far apart as the front is wide as seen from there.
+    Light that reaches the film from one direction crosses a part of the front surface, which moves with the angle. The
+    directions of light from a scene point spread by as much as the front is wide, seen from there.
 
     Attributes:
-        width_rad: of the equal intervals of the angle, from 0. discs: [L, B, 2] of each interval with the 2^l next on
-            either side, centre along the azimuth of the direction and radius (mm).
-        far_mm: radius of all light, about the axis. reach_mm: from the vertex to its farthest point on the surface.
+        width_rad: width of the equal intervals of the angle, which start at 0.
+        discs: [L, B, 2], for each interval together with the 2^l next on either side: the disc's centre along the
+            azimuth of the direction, and its radius (mm).
+        far_mm: radius of a disc about the axis for all light.
+        reach_mm: distance from the vertex to its farthest point on the surface.
     """
 
     width_rad: float
@@ -59,11 +61,12 @@ class FrontDiscs:
         return FrontDiscs(float(width), discs * [1.0, _ROOM], _ROOM * far, _ROOM * math.hypot(far, depth))
 
     def aim(self, point_mm: NDArray[np.float64], square: FloatArray) -> tuple[NDArray[np.float64], ...]:
-        """x, y (mm) and the area (mm^2) per unit of the square, [N] each, for scene points [3, N] (mm, lens frame)."""
+        """X, y (mm), and the area (mm^2) for the whole square, [N] each, for scene points [3, N] (mm, lens frame)."""
         point_mm = np.where(np.isfinite(point_mm).all(0), point_mm, 0.0)
         side, distance = np.hypot(point_mm[0], point_mm[1]), np.sqrt((point_mm**2).sum(0))
         angle = np.arctan2(side, -point_mm[2])
-        # Directions from the surface differ from that of the vertex by no more than this, and their azimuths.
+        # Directions from points of the surface, and their azimuths, differ from those at the vertex by no more than
+        # this.
         apart = np.arcsin(np.minimum(self.reach_mm / np.maximum(distance, 1e-9), 1))
         turn = np.sin(apart) / np.maximum(np.sin(angle), 1e-12)
         turn = np.where((turn < 1) & (apart < np.pi / 2), math.sqrt(2) * turn, 2.0)  # at least the chord of that angle
@@ -79,10 +82,10 @@ class FrontDiscs:
 
 
 def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Points [2, side^2] of the unit square and wavelengths [side^2] in nm for quadratures; always the same.
+    """Return points [2, side^2] of the unit square and wavelengths [side^2] in nm for quadratures; always the same.
 
-    At random in their cells: midpoints would all lie inside the edge of a pupil's outline, beyond which a thousandth of
-    the rays is blocked.
+    Points lie at random in their cells, because midpoints would all lie inside the edge of a pupil's outline, near
+    which a thousandth of the rays is blocked.
     """
     rng, count = np.random.default_rng(0), side * side
     cell = np.stack(np.meshgrid(np.arange(side), np.arange(side))).reshape(2, -1)
@@ -92,13 +95,14 @@ def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArra
 
 
 def is_light(wavelength_nm: FloatArray) -> NDArray[np.bool_]:
-    """Test which wavelengths [N] are finite and above 0: other rays are outside the domain of every camera."""
+    """Test which wavelengths [N] are finite and above 0; other rays are outside the domain of every camera."""
     return (wavelength_nm > 0) & (wavelength_nm < np.inf)
 
 
 def sound(rays: CameraRays, cos2: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-    """The rays, those of no film point, or of one too far out for float32, or of no pupil point or wavelength, dark,
-    straight ahead.
+    """Return the rays, with those that have no valid film point, pupil point or wavelength dark and straight ahead.
+
+    A film point too far out for float32 is not valid either.
 
     Args:
         cos2: [N], a squared cosine of each ray, which is NaN or near 0 for film points that are not sound.
@@ -125,7 +129,7 @@ def arrived(
     status: NDArray[np.int32],
     wavelength_nm: FloatArray,
 ) -> FilmPoints:
-    """Film points [2, N] with what leads to them; dark, and finite, where the status or a number forbids them."""
+    """Return film points [2, N] with what leads to them, dark and finite where the status or a number forbids them."""
     way = point_m - origin_m
     with np.errstate(all="ignore"):
         direction = (way / np.sqrt(np.einsum("in,in->n", way, way))).astype(np.float32)
@@ -143,19 +147,19 @@ def arrived(
 
 
 def ahead(depth: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Status of scene points at depths [N] before a lens: those beside or behind it miss it, NaN is outside."""
+    """The status of scene points at depths [N] before a lens: those next to it or behind miss it, NaN is outside."""
     behind = np.where(depth <= 0, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
     return np.where(depth > 0, st.PASSED, behind).astype(np.int32)
 
 
 def common_light(known_nm: tuple[float, float], light_nm: tuple[float, float]) -> tuple[float, float]:
-    """The part of a range of light that a lens knows; where they have none in common, its own end that is nearest."""
+    """The part of a range of light that a lens knows, or where there is none, the end of its own that is nearest."""
     low, high = known_nm
     return min(max(low, light_nm[0]), high), max(min(high, light_nm[1]), low)
 
 
 def beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, then: str) -> list[str]:
-    """A sentence on a film that is larger than the image circle, if it is."""
+    """Return a sentence if a film is larger than the image circle."""
     circle, diagonal = 2 * radius_mm, math.hypot(*film_mm)
     if diagonal <= _BEYOND * circle:
         return []
@@ -170,10 +174,10 @@ def refuse(camera: str, field: str, value: object, expected: str) -> None:
 
 
 def positive(field: str, value: float, *, infinite: bool = False) -> float:
-    """`value` as a float above 0, finite unless `infinite` is allowed.
+    """Return `value` as a float above 0, finite unless `infinite` is allowed.
 
     Raises:
-        InputError: names the field otherwise.
+        InputError: names the field, for any other value.
     """
     expected = "a number above 0" if infinite else "a finite number above 0"
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
@@ -193,13 +197,13 @@ def lens_state(
     transmittance: float | None = 1.0,
     squeeze: float | None = 1.0,
 ) -> dict[str, Any]:
-    """The table `lens_state` of a camera's settings, None where a number is not defined.
+    """Return the table `lens_state` of a camera's settings; None where a number is not defined.
 
     Args:
         nominal_mm: focal length at infinity, None where nothing is engraved.
         efl_mm, pinhole_mm: as in the module.
-        entrance_pupil_mm: from the film towards the scene.
-        f_number: focal length over the entrance pupil's diameter, as it is.
+        entrance_pupil_mm: distance from the film towards the scene.
+        f_number: focal length over the entrance pupil's diameter in this state.
         transmittance: of the axial ray, 0 to 1.
         squeeze: as in the module.
     """
@@ -220,6 +224,6 @@ def lens_state(
 def ideal_state(
     efl_mm: float, f_number: float, pinhole_mm: float, entrance_pupil_mm: float | None = None
 ) -> dict[str, Any]:
-    """The table of an ideal lens: nothing is engraved, all light passes; the pupil is where the pinhole would be."""
+    """Return the table of an ideal lens: nothing engraved, all light passes, the pupil where the pinhole would be."""
     pupil = pinhole_mm if entrance_pupil_mm is None else entrance_pupil_mm
     return lens_state(nominal_mm=None, efl_mm=efl_mm, pinhole_mm=pinhole_mm, entrance_pupil_mm=pupil, f_number=f_number)

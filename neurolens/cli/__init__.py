@@ -33,8 +33,8 @@ from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
-_RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--trade")}  # names that commands had still work
-# The commands by the titles of the help: the module and the class of each, and its line.
+_RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--trade")}  # names that commands had, which still work
+# The commands under the titles of the help: module and class of each, and its line in the help.
 _COMMANDS = {
     "lenses": {
         "find": ("find.Find", "lenses of the library by what photographers call them"),
@@ -96,7 +96,7 @@ All commands:         neurolens --help    (in Python: import neurolens as nl; he
 
 
 def build_parser(first: str | None = None) -> Parser:
-    """The whole command line; of a command line with such a first word, only that command is imported."""
+    """Return the whole command line; where its first word is known, only that command is imported."""
     parser = Parser(
         prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,
         formatter_class=partial(Help, indent_increment=4),
@@ -123,14 +123,14 @@ def _class_at(place: str) -> type[Command]:
 
 
 def command(name: str) -> type[Command]:
-    """The class of a command by its name."""
+    """Return the class of a command by its name."""
     return _class_at({k: place for commands in _COMMANDS.values() for k, (place, _) in commands.items()}[name])
 
 
 def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None = None) -> int:
-    """Run one command and return its exit code; a wrong command line exits with code 2 as argparse does.
+    """Run one command and return its exit code; a wrong command line exits with code 2, as argparse does.
 
-    `build` makes another parser; its errors and interrupts are reported like the command's.
+    `build` makes another parser than the usual one, whose errors and interrupts are reported in the same way.
     """
     _open_streams()
     if not hasattr(neurolens, "DISTRIBUTION"):  # its files are written over ours where both are installed
@@ -167,11 +167,11 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None =
 
 
 def _open_streams() -> None:
-    """Let any text be written to stdout and stderr, and open those that the caller has closed, on the null device.
+    """Let any text be written to stdout and stderr, and open those that the caller has closed on the null device.
 
-    Else the next file that is opened, a picture to write, would be what programs print to.
+    If they stayed closed, programs would print into the next file that is opened, such as a picture to write.
     """
-    while (number := os.open(os.devnull, os.O_RDWR)) < 3:  # the lowest that is free
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:  # the lowest number that is free
         os.set_inheritable(number, True)
     os.close(number)
     for name in ("stdout", "stderr"):
@@ -191,11 +191,11 @@ def _check_words(words: Sequence[str]) -> None:
 
 
 def _failed(error: Exception) -> int:
-    """Report an error in a line, and return the exit code."""
+    """Report an error in one line, and return the exit code."""
     if isinstance(error, NeurolensError):
         return _fail(str(error))
     if isinstance(error, BrokenPipeError):
-        # The reader (head, less) has exited; avoid a second error when the interpreter flushes stdout.
+        # The reader (head, less) has exited: avoid a second error when the interpreter flushes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     if isinstance(error, OSError) or missing(error):
@@ -204,7 +204,7 @@ def _failed(error: Exception) -> int:
 
 
 def _fault(error: Exception) -> int:
-    """Report what no command expects: no memory, or a fault of neurolens itself."""
+    """Report what no command expects: lack of memory, or a fault of neurolens itself."""
     if os.environ.get(_TRACEBACK):
         import traceback
 

@@ -31,7 +31,7 @@ _BULK = {  # left out of the JSON unless asked for: a number per ray or a pixel
 
 
 class Analysis(NamedTuple):
-    """Computes a result of a scene, draws it (result, path, title, subtitle), and tells its figures as a table."""
+    """How a result of a scene is computed, drawn (result, path, title, subtitle), and told as a table."""
 
     compute: Callable[..., Any]
     draw: Callable[..., None]
@@ -137,13 +137,13 @@ examples:
         return self.answer({**head, "edge": edge.to_dict(), **shown, **more}, text)
 
     def _scene(self) -> tuple[Scene, list[str]]:
-        """The lens with its object in its state, and warnings."""
+        """Return the lens with its object in its state, and warnings."""
         from neurolens.optics.analysis.fields import Scene
         from neurolens.optics.lens.glass import check_light
         from neurolens.optics.readers.any_format import read_any
         from neurolens.studies.describe import file_doubts, rim_doubts
 
-        with warned(self.file) as notes:  # glasses that contradict the catalogue, constant indices
+        with warned(self.file) as notes:  # such as glasses that contradict the catalogue, or constant indices
             tabled = read_any(self.file)
         lens = self.state.set_lens(tabled)
         scene = Scene(lens, self.state.focus_of(tabled, lens), self.axis)
@@ -179,7 +179,7 @@ examples:
 
 
 def analysis_of(what: str) -> Analysis:
-    """The analysis of a name; torch and matplotlib are imported here, not when the command line starts."""
+    """Return the analysis of a name; torch and matplotlib are imported here, not when the command line starts."""
     from neurolens.optics.analysis import plots
     from neurolens.optics.analysis.field_curves import colour, curvature, distortion, illumination, seidel
     from neurolens.optics.analysis.layout import layout_profile, lens_layout
@@ -200,8 +200,8 @@ def analysis_of(what: str) -> Analysis:
     }[what]
 
 
-_ROWS = 6  # of tables over the field
-_WRAP = 90  # characters a line that the narrowest picture has room for
+_ROWS = 6  # rows of tables over the field
+_WRAP = 90  # characters of a line that the narrowest picture has room for
 _MTF_PER_MM = (10, 20, 30, 40, 50)
 
 
@@ -312,7 +312,7 @@ def _psf_text(data: dict[str, Any]) -> str:
 
 
 def _each(form: Callable[..., Any], *values: Iterable[Any]) -> list[Any]:
-    """`form` of each value, or of those of several lists at one place."""
+    """Apply `form` to each value, or to the values of several lists that stand at one place."""
     return [form(*those) for those in zip(*values, strict=True)]
 
 
@@ -331,13 +331,13 @@ def _nanometres(data: dict[str, Any]) -> list[str]:
 
 
 def _some(count: int, rows: int = _ROWS) -> list[int]:
-    """About so many of the indices below `count`, evenly spread, both ends among them."""
+    """Return about so many of the indices below `count`, evenly spread, with both ends among them."""
     steps = min(rows, count) - 1
     return [round(k * (count - 1) / steps) for k in range(steps + 1)] if steps > 0 else [0] * count
 
 
 def _digits(spread: float) -> int:
-    """Decimal places, from 1 to 3, of which two samplings that differ by `spread` differ by one of the last at most."""
+    """Return decimal places, 1 to 3: two samplings that differ by `spread` differ by at most 1 in the last place."""
     return 3 if spread <= 1e-3 else max(1, math.floor(-math.log10(spread)))
 
 
@@ -350,9 +350,9 @@ def _percent(value: float, spread: float = 0.0) -> str:
 
 
 def _three(value: float, spread: float = 0.0) -> str:
-    """Three digits, or fewer: two samplings that differ by `spread` of the value differ by one of the last at most."""
+    """Write three digits, or fewer: samplings that differ by `spread` of the value differ by at most 1 in the last."""
     if not 1e-6 <= abs(value) < math.inf:
-        return cli.number(0.0 if abs(value) < 1e-6 else value)  # rounding errors of a zero are 0
+        return cli.number(0.0 if abs(value) < 1e-6 else value)  # a zero may come with rounding errors
     units = math.ceil(math.log10(max(spread * abs(value), 1e-300)))
     digits = max(min(math.floor(math.log10(abs(value))) - units + 1, 3), 1)
     return cli.number(float(f"{value:.{digits}g}"))

@@ -54,7 +54,7 @@ _SUFFIXES = {
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
-    """Help whose texts are shown as they are written: line breaks stay, and % is a percent sign."""
+    """Shows texts of help as they are written: line breaks stay, and % is a percent sign."""
 
     def _expand_help(self, action: argparse.Action) -> str:
         return self._get_help_string(action) or ""
@@ -65,19 +65,19 @@ class Parser(argparse.ArgumentParser):
 
     Attributes:
         intermixed: whether options may stand before and between the arguments of a list.
-        renamed: words at the start of a command line, and the words that replaced them.
+        renamed: words at the start of a command line, and the words that have replaced them.
     """
 
     def __init__(self, **options: Any) -> None:
         options.setdefault("formatter_class", Help)
-        # An abbreviation can become ambiguous when an option is added.
+        # Abbreviations are refused, because one may become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
-        self._negative_number_matcher = re.compile(r"-\.?\d")  # no option: -12,3 is a value, as -12 is
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # numbers are no options: -12,3 is a value, as -12 is
         self.intermixed = False
         self.renamed: Mapping[str, Sequence[str]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse as argparse does; old names of commands work; an intermixed one reports unknown arguments itself."""
+        """Parse as argparse does, with old names of commands; an intermixed parser reports unknown arguments itself."""
         args = sys.argv[1:] if args is None else list(args)
         args = [*self.renamed.get(args[0], args[:1]), *args[1:]] if args else args
         args = self._sizes(args)
@@ -93,7 +93,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def _sizes(self, args: list[str]) -> list[str]:
-        """The words of a command line, with "--width 3840x2160" as width and height."""
+        """Return the words of a command line, with "--width 3840x2160" turned into width and height."""
         for at, word in enumerate(args):
             words = word if word.startswith("--width=") else " ".join(args[at : at + 2])
             found = re.fullmatch(r"--width[= ](\d+) ?x ?(\d+)", words, re.IGNORECASE)
@@ -112,14 +112,15 @@ class Parser(argparse.ArgumentParser):
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A command: its fields are arguments and options (`base.settings`), its docstring is the text of its help.
+    """A command: its fields are arguments and options (`base.settings`), and its docstring is the text of its help.
 
-    Paths to write are checked before it runs, by the placeholder of their option: OUT.exr is a file of this kind in a
-    folder that exists, FOLDER and DIR are folders, which are made, other words the start of a file's name.
+    Paths to write are checked before it runs, by the placeholder of their option. OUT.exr is a file of this kind in a
+    folder that exists; FOLDER and DIR are folders, which are made; other words are the start of a file's name.
 
     Attributes:
-        called: the command as errors name it. epilog: the end of the help.
-        kept: what an interrupted command leaves (see also `keeps`).
+        called: the command as errors name it.
+        epilog: the end of the help.
+        kept: tells what an interrupted command leaves (see also `keeps`).
         intermixed: whether options may stand before and between the arguments of a list.
     """
 
@@ -140,23 +141,23 @@ class Command:
 
     @classmethod
     def fill(cls, parser: Parser) -> None:
-        """Give its parser the texts of its help, its arguments and its options."""
+        """Give the command's parser the texts of its help, its arguments and its options."""
         parser.description, parser.epilog, parser.intermixed = inspect.getdoc(cls), cls.epilog, cls.intermixed
         cls.add_options(parser)
         parser.set_defaults(run=lambda args: cls.of(args).run(), kept=cls.kept)
 
     @classmethod
     def add_options(cls, parser: Parser) -> None:
-        """Add its arguments and options to its parser."""
+        """Add the command's arguments and options to its parser."""
         add_options(parser, cls)
 
     @classmethod
     def of(cls, args: argparse.Namespace) -> Self:
-        """The command that parsed arguments describe."""
+        """Return the command that parsed arguments describe."""
         return from_options(cls, args)
 
     def run(self) -> int:
-        """Run the command; returns its exit code."""
+        """Run the command and return its exit code."""
         raise NotImplementedError
 
     def refuse(self, option: str, value: object, expected: str) -> NoReturn:
@@ -174,7 +175,7 @@ class Reporting(Command):
     )  # fmt: skip
     quiet: bool = setting(False, "neither progress nor warnings on stderr", last=2)
     json: bool = setting(False, "print one JSON object on stdout instead of the text; keys carry their unit", last=3)
-    # Takes the answer of a call from Python (`cli.calls`), which prints nothing.
+    # Takes the answer where the command is called from Python (`cli.calls`), which prints nothing.
     tell: Callable[[Mapping[str, Any], str], None] | None = field(default=None, compare=False, repr=False)
 
     def answer(self, data: Mapping[str, Any], text: Callable[[], str], code: int = 0) -> int:
@@ -188,13 +189,13 @@ class Reporting(Command):
         return code
 
     def progress(self, plan: Mapping[str, float] | None = None) -> Progress:
-        """Its progress, with the expected seconds of stages."""
+        """Return the command's progress; `plan` gives the expected seconds of stages."""
         return Progress(plan, quiet=self.quiet)
 
 
 @contextmanager
 def keeps(text: str) -> Iterator[None]:
-    """Say this, not the command's `kept`, of what an interrupt inside the block leaves."""
+    """Say this, and not the command's `kept`, of what an interrupt inside the block leaves."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -206,7 +207,7 @@ def keeps(text: str) -> Iterator[None]:
 
 
 def amount(text: str, units: Mapping[str, str]) -> tuple[str, float]:
-    """Type of an argument that is a number and its unit, as 0.1px; `units`: what each is called, with an example."""
+    """Read an argument that is a number and its unit, as 0.1px; `units` tells what each is called, with an example."""
     match = re.fullmatch(r"([0-9.]{1,20}(?:e[+-]?[0-9]{1,3})?)([a-z]+)", text)
     try:
         if match and match[2] in units and 0 <= (value := float(match[1])) < 1e12:
@@ -217,7 +218,7 @@ def amount(text: str, units: Mapping[str, str]) -> tuple[str, float]:
 
 
 def rms_error(text: str) -> tuple[str, float]:
-    """Type of --within: the key of a model card's error, "rms_um" or "rms_px", and its bound."""
+    """Read --within: the key of a model card's error, "rms_um" or "rms_px", and its bound."""
     unit, value = amount(text, {"um": "micrometres, as 1um", "px": "pixels, as 0.1px"})
     if not value:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0")
@@ -225,7 +226,7 @@ def rms_error(text: str) -> tuple[str, float]:
 
 
 def words_of(choices: Sequence[str], least: str = "") -> Callable[[str], tuple[str, ...]]:
-    """Type of an argument that lists some of `choices`, each once, with commas; `least`, where given, is among them."""
+    """The type of an argument that lists some of `choices`, each once, with commas; `least` must be among them."""
 
     def convert(text: str) -> tuple[str, ...]:
         words = tuple(word.strip() for word in text.split(","))
@@ -238,7 +239,7 @@ def words_of(choices: Sequence[str], least: str = "") -> Callable[[str], tuple[s
 
 
 def named_lens(models: bool, cameras: bool, text: str) -> Any:
-    """Type of an argument that names a lens, as `resolve`: a path, or with `cameras` the text of a `Named`."""
+    """Read an argument that names a lens as `resolve` does: a path, or with `cameras` the text of a `Named`."""
     try:
         found = resolve(text, models=models, cameras=cameras)
         return str(found) if cameras else found.file
@@ -247,7 +248,7 @@ def named_lens(models: bool, cameras: bool, text: str) -> Any:
 
 
 def floats(text: str, between: str = ",") -> list[float]:
-    """The numbers of a text; none where a word is no number."""
+    """Return the numbers in a text; an empty list where a word is no number."""
     try:
         return [as_float(word) for word in text.split(between)]
     except ValueError:
@@ -258,7 +259,7 @@ def floats(text: str, between: str = ",") -> list[float]:
 
 
 def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: bool = False, **details: Any) -> Any:
-    """An argument of `named_lens`; `also`: what its help adds."""
+    """Return an argument of the type `named_lens`; `also` is added to its help."""
     taken = ", model (.onnx), or name of either" if models else ", or its name in lenses/"
     taken += ", thick:LENS, thin, pinhole or fisheye-PROJECTION" if cameras else ""
     details = {"metavar": "CAMERA" if cameras else "LENS", "kind": partial(named_lens, models, cameras)} | details
@@ -266,30 +267,30 @@ def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: b
 
 
 def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
-    """-o and --output, the file or folder that a command writes."""
+    """Return -o and --output, the file or folder that a command writes."""
     return setting(
         default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title, written=True
     )
 
 
 def plot_path(about: str) -> Any:
-    """An option that names the file of a plot."""
+    """Return an option that names the file of a plot."""
     return setting(None, f"{about} (.png, .pdf, .svg)", metavar="OUT.png", kind=Path, written=True)
 
 
 def film(default: Any = ..., about: str = "size of the film in mm", title: str = "") -> Any:
-    """--film."""
+    """Return --film, a film's width and height."""
     return setting(default, about, option="film", kind=film_size, metavar="WxH", title=title)
 
 
 def within(about: str, default: Any = None, title: str = "") -> Any:
-    """--within, an RMS error with its unit as `rms_error`."""
+    """Return --within, an RMS error with its unit, of the type `rms_error`."""
     old = {f"target-{unit}": partial(lambda unit, text: rms_error(text + unit), unit) for unit in ("um", "px")}
     return setting(default, about, metavar="ERROR", kind=rms_error, old=old, title=title)
 
 
 def dask(title: str = "") -> Any:
-    """--dask."""
+    """Return --dask, the scheduler that spreads the work over machines."""
     return setting(
         None, "run on a Dask cluster: the address of its scheduler (tcp://HOST:8786), or local (processes of this "
         "machine), or local:N, which no other user can reach. What a task reads travels with it: workers need "
@@ -299,18 +300,18 @@ def dask(title: str = "") -> Any:
 
 
 def exposure(default: float | None = 0.0, said: str = "0", title: str = "") -> Any:
-    """--exposure; `said`: what the help says of the default."""
+    """Return --exposure; `said` is what the help says of the default."""
     about = "stops by which the preview OUT.png is brighter; OUT.exr keeps the light as it is"
     return setting(default, f"{about} (default: {said})", within=(-40, 40), unit="stops", metavar="STOPS", title=title)
 
 
 def threads(about: str = "threads") -> Any:
-    """--threads."""
+    """Return --threads."""
     return setting(2, f"{about} (default: 2)", within=(1, 256))
 
 
 def more_glasses(files: Sequence[Path]) -> AbstractContextManager[None]:
-    """A block in which the catalogues of --glass are known; without any, nothing is imported."""
+    """Return a block in which the catalogues of --glass are known; without any, nothing is imported."""
     if not files:
         return nullcontext()
     from neurolens.optics.readers import glasses
@@ -319,7 +320,7 @@ def more_glasses(files: Sequence[Path]) -> AbstractContextManager[None]:
 
 
 def camera(name: str, shot: Shot, progress: Progress) -> Camera:
-    """The camera that an argument names; what it notes, as a film beyond the image circle, is a warning."""
+    """Make the camera that an argument names; what it notes (as a film beyond the image circle) becomes a warning."""
     from neurolens.cameras.build import make_camera
 
     made = make_camera(name, shot, progress)
@@ -401,7 +402,7 @@ lens_state = partial(group, "state of the lens")  # a field of `LensState` in a 
 
 
 def check_ids(files: Sequence[Path], command: str, option: str) -> None:
-    """Refuse lens files of one id, whose results would have one name; raises InputError."""
+    """Raise InputError for lens files of one id, whose results would have the same name."""
     ids = [lens_id_of(file) for file in files]
     if twice := sorted({name for name in ids if ids.count(name) > 1}):
         raise InputError(command, option, twice, "files whose names differ")
@@ -411,7 +412,8 @@ def check_written(path: Path, option: str, metavar: str) -> None:
     """Refuse a path that does not fit the placeholder of its option (see `Command`), or where no file can be made.
 
     Raises:
-        InputError: the path, or what it lacks. OSError: a file there cannot be replaced.
+        InputError: names the path and what it lacks.
+        OSError: a file there cannot be replaced.
     """
     if metavar in ("FOLDER", "DIR"):
         there = next(p for p in (path, *path.absolute().parents) if p.exists())
@@ -444,7 +446,7 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A number with significant digits (710, not 7.1e+02), "-" for None and NaN."""
+    """Write a number with significant digits (710, not 7.1e+02); "-" for None and NaN."""
     if value is None or isinstance(value, str):
         return value or "-"
     if isinstance(value, int):
@@ -453,12 +455,12 @@ def number(value: Any, digits: int = 4) -> str:
         return "-"
     if math.isinf(value):
         return "infinity"
-    text = f"{value + 0.0:.{digits}g}"  # no "-0"
+    text = f"{value + 0.0:.{digits}g}"  # turns -0 into 0
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
 def first_order_light(data: dict[str, Any]) -> tuple[str, str]:
-    """The wavelength of first-order data (`paraxial.light_of`); a note of what they are at the file's primary one."""
+    """Return the wavelength of first-order data (`paraxial.light_of`), and a note on them at the file's primary one."""
     note, primary = "of these figures", data["primary"]
     if primary is not None:
         efl, back = (f"{number(primary[key], 6)} mm" for key in ("efl_mm", "back_focus_mm"))
@@ -467,7 +469,7 @@ def first_order_light(data: dict[str, Any]) -> tuple[str, str]:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """Columns aligned by two spaces: the first `left` to the left, the others to the right."""
+    """Lay out columns, two spaces apart: the first `left` flush left, the others flush right."""
     lines = [list(header), *(list(row) for row in rows)]
     widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
 

@@ -40,9 +40,11 @@ from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.programs.blender import Form, PackedLens, add_lens, check_takes, user_folders, write_pack
 
-_KEPT = 4096  # kept files, of some 30 kB: five a lens
-_SIDE_IN, _DOTS, _MARGIN, _COLOURS = 2.56, 100, 1.08, 64  # of a thumbnail: 256 pixels; its side over the glass's
-_RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of a field: shares of the picture's radius; focal lengths
+_KEPT = 4096  # kept files, of some 30 kB each, five for a lens
+# of a thumbnail: size in inches and dots per inch, which make 256 pixels; its side over the glass's; its colours
+_SIDE_IN, _DOTS, _MARGIN, _COLOURS = 2.56, 100, 1.08, 64
+# of a field: shares of the picture's radius; nearest object in focal lengths
+_RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0
 Forms = dict[Path, Form]
 
 
@@ -53,7 +55,7 @@ class Blender(cli.Command):
 
     @classmethod
     def add_options(cls, parser: cli.Parser) -> None:
-        """Add its actions to its parser."""
+        """Add the command's actions to its parser."""
         actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=cli.Parser)
         Build.fill(actions.add_parser("build", help="pack the extension as a zip"))
         Add.fill(actions.add_parser("add", help="put a lens into the extension"))
@@ -91,7 +93,7 @@ class Build(cli.Reporting):
         began, packed = time.perf_counter(), []
         lens_folder = folder.parent / "lenses"
         if lens_folder.is_dir():
-            import torch  # noqa: F401 - traces the lenses; where it is missing, that is said before shaders are made
+            import torch  # noqa: F401 - traces the lenses; if it is missing, that is said before shaders are made
         places = list(library(folder, lens_folder, self.lens))
         if not places:
             self.refuse("--models", str(folder), "a folder with models (.onnx)")
@@ -151,10 +153,11 @@ class Add(cli.Reporting):
 
 
 def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:
-    """The shader of a model (.onnx) or of a lens file, with its facts; kept between runs. See `shader_of`.
+    """Return the shader of a model (.onnx) or of a lens file, with its facts, kept between runs; see `shader_of`.
 
     Raises:
-        InputError: the lens cannot be a shader. ModelError: the model is broken.
+        InputError: the lens cannot be a shader.
+        ModelError: the model is broken.
     """
     return Form(**_kept(file, zoom, make=lambda: asdict(_made_form(file, zoom, quiet))))
 
@@ -178,22 +181,24 @@ def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
 
 
 def _kept(file: Path, *more: str | None, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """A table that is made from a file and from `more`: the one kept by an earlier run, else a new one, which is
-    kept if it can be."""
+    """Return a table that is made from a file and from `more`: the one that an earlier run kept, or a new one.
+
+    The new one is kept if it can be.
+    """
     name = f"{fingerprint_of([_code(), file.name, sha256_of(file), *more])}.form"
     return kept_in_cache(name, _KEPT, make)
 
 
 @cache
 def _code() -> list[str]:
-    """The checksums of all files of the package, and what else changes shaders."""
+    """Return the checksums of all files of the package, and of what else changes shaders."""
     root = Path(neurolens.__file__).parent
     files = [f for f in sorted(root.rglob("*")) if f.is_file() and f.suffix != ".pyc"]
     return [*(f"{f.relative_to(root)} {sha256_of(f)}" for f in files), np.__version__, str(find_spec("torch") is None)]
 
 
 def _squeeze(file: Path, zoom: str | None) -> float:
-    """See `cameras.sampling.lens_state`."""
+    """Return the squeeze of a file's lens, see `cameras.sampling.lens_state`."""
     if not is_model(file):
         from neurolens.optics.setting.states import set_lens
 
@@ -207,7 +212,7 @@ def _squeeze(file: Path, zoom: str | None) -> float:
 
 
 def squeeze_of(lens: Lens) -> float:
-    """How many times an anamorphic lens squeezes its picture across; 1 for others."""
+    """Return how many times an anamorphic lens squeezes its picture across; 1 for other lenses."""
     if not lens.anamorphic:
         return 1.0
     return abs(float(first_order(lens).efl_mm / first_order(lens, meridian="x").efl_mm))
@@ -217,10 +222,10 @@ def forms_of(
     files: Sequence[Path], jobs: int, report: Callable[[float], object],
     zooms: Mapping[Path, str | None] = MappingProxyType({}),
 ) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
-    """The forms of many files, made by `jobs` processes, and why other files have none.
+    """Make the forms of many files in `jobs` processes; return them, and why other files have none.
 
     Args:
-        zooms: `zoom` of `form_of`, for files that have one.
+        zooms: the `zoom` of `form_of`, for files that have one.
 
     Raises:
         NeurolensError: a process ended early, as where memory is short.
@@ -241,7 +246,7 @@ def forms_of(
 
 
 def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
-    """The form of a file and a zoom, or why the lens cannot be a shader."""
+    """Return the form of a file and a zoom, or why the lens cannot be a shader."""
     file, zoom = task
     with ExitStack() as stack:
         if find_spec("torch") is not None:
@@ -257,7 +262,7 @@ def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
 def packed_of(
     files: Sequence[Path], forms: Sequence[Form], *, lens: Lens | None = None, zoom: str | None = None
 ) -> PackedLens:
-    """A lens of the menu from files of one lens and their forms.
+    """Make a lens of the menu from files of one lens and their forms.
 
     Args:
         lens: its prescription, for the thumbnail, where it is at hand.
@@ -299,7 +304,7 @@ def _character(lens: Lens) -> dict[str, Any]:
 
 
 def stated_lens(model: Path, lenses: Path) -> Lens | None:
-    """The prescription behind a model, scaled or zoomed as the model is, or of its range; None without a lens file."""
+    """The prescription behind a model, scaled and zoomed as the model is, or over its range; None without a file."""
     from neurolens.optics.setting.states import set_lens
 
     facts = read_card(model)["lens"]
@@ -313,7 +318,7 @@ def stated_lens(model: Path, lenses: Path) -> Lens | None:
 
 
 def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
-    """What a lens does to its picture wide open, as `extension.library.Field`; None where it cannot be traced."""
+    """What a lens does to its picture wide open, for `extension.library.Field`; None where it cannot be traced."""
     if find_spec("torch") is None:
         return None
     from neurolens.cameras.exact import ExactCamera
@@ -326,7 +331,7 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
     rows: dict[str, list[Any]] = {"distortion_um": [], "blur_um": [], "light": []}
     with suppress(InputError):
         for focus in (math.inf, near):
-            camera = ExactCamera(lens, Shot(film, focus, runtime="onnxruntime"))  # of few rays
+            camera = ExactCamera(lens, Shot(film, focus, runtime="onnxruntime"))  # it takes few rays
             nm, share = spectrum_of(camera)
             share = share / share.sum()
             places = prints.places_of(camera, points, np.full(radii.size, focus), nm, share)
@@ -343,17 +348,19 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
 
 
 def key_of(file: Path) -> str:
-    """The name of a lens in the menu's files: NAME of a model NAME.ols-64.onnx or of a lens file NAME.toml."""
+    """Return the name of a lens in the menu's files: NAME of a model NAME.ols-64.onnx, or of a lens file NAME.toml."""
     return file.name.split(".")[0] if is_model(file) else lens_id_of(file)
 
 
 def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple[list[Path], Path | None]]:
-    """Yield for every lens the best polynomial and the best network among its models, and its lens file, if it has one.
+    """Yield for every lens its best polynomial and best network among models, and its lens file, if it has one.
 
     A lens file without a model is a lens as well.
 
     Args:
-        folder: of models. lenses: of lens files. chosen: names of lenses, all where empty.
+        folder: of models.
+        lenses: of lens files.
+        chosen: names of lenses; all if empty.
 
     Raises:
         InputError: a name that no model and no lens file has.
@@ -379,7 +386,7 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
 
 
 def thumbnail(lens: Lens) -> bytes | None:
-    """The section of a lens as a PNG of 256 by 256 pixels; None where torch or matplotlib is missing."""
+    """Draw the section of a lens as a PNG of 256 by 256 pixels; None where torch or matplotlib is missing."""
     from neurolens.optics.setting.states import set_lens
 
     if find_spec("torch") is None or find_spec("matplotlib") is None:
@@ -397,7 +404,8 @@ def thumbnail(lens: Lens) -> bytes | None:
         layout = layout_profile(Scene(set_lens(lens), axis="y"))
         layout = replace(layout, rays=tuple(ray for ray in layout.rays if ray.field != 1))  # of the axis and the edge
         draw_section(axes, layout, lw=0.5)
-        arcs = np.concatenate([s.arc() for s in layout.surfaces])  # the glass fills the picture: menus show it small
+        # the glass fills the picture, for menus show it small
+        arcs = np.concatenate([s.arc() for s in layout.surfaces])
         z, height = (arcs.min(0) + arcs.max(0)) / 2, np.ptp(arcs, 0)
         half = _MARGIN * max(height) / 2
         axes.set(xlim=(z[0] - half, z[0] + half), ylim=(-half, half))
@@ -410,6 +418,6 @@ def thumbnail(lens: Lens) -> bytes | None:
 
 
 def kind_of(card: Mapping[str, Any]) -> str:
-    """Whether a card's model is a "network" or a "polynomial"."""
+    """Return whether a card's model is a "network" or a "polynomial"."""
     family = str(card["fit"]["settings"].get("method", card["fit"]["method"]))
     return "network" if family.startswith("mlp") else "polynomial"

@@ -1,4 +1,4 @@
-"""Commands as calls from Python: values in the place of words, and the answer in the place of what is printed.
+"""Commands as calls from Python: values take the place of words, and the answer that of what is printed.
 
 The parser of a command reads both, so that a call takes what the command takes: names, units, defaults and errors.
 """
@@ -26,7 +26,8 @@ class Answer(dict[str, Any]):
     """What a command found: the object that --json prints, whose keys carry their unit.
 
     Attributes:
-        text: what the command prints. code: its exit code, 1 where a promise is broken or a wish is not met.
+        text: what the command prints.
+        code: its exit code, which is 1 where a promise is broken or a wish is not met.
     """
 
     def __init__(self, data: Mapping[str, Any], text: str, code: int) -> None:
@@ -46,13 +47,13 @@ class Answer(dict[str, Any]):
         raise InputError("answer", "rgb", "(no picture)", "a command that writes an OpenEXR picture")
 
     def _repr_png_(self) -> bytes | None:
-        """The first PNG that was written, which may lie beside an OpenEXR picture; notebooks show it."""
+        """Return the first PNG that was written, which may lie beside an OpenEXR picture; notebooks show it."""
         shown = (file.with_suffix(".png") for file in _files(self, ".png", ".exr"))
         return next((file.read_bytes() for file in shown if file.is_file()), None)
 
 
 def _files(value: Any, *suffixes: str) -> list[Path]:
-    """The files of such kinds that an answer names."""
+    """Return the files of such kinds that an answer names."""
     if isinstance(value, Mapping | list):
         parts = value.values() if isinstance(value, Mapping) else value
         return [file for part in parts for file in _files(part, *suffixes)]
@@ -69,10 +70,11 @@ class _Parser(Parser):
 
 
 def parameters(cls: type[Command]) -> tuple[Parser, dict[str, argparse.Action]]:
-    """The parser of a command for calls, and its arguments and options by their names in Python.
+    """Return the parser of a command for calls, and its arguments and options by their names in Python.
 
-    A name is that of the option with its unit, as focus_m of --focus M, and for_ of --for. Arguments come first, then
-    the option that names the lens: in a call, as nl.render(scene, lens), these may stand without their names.
+    A name is that of the option with its unit, as focus_m for --focus M; --for becomes for_. First come the arguments
+    and then the option that names the lens: in a call these may stand without their names, as in nl.render(scene,
+    lens).
     """
     parser = _Parser(prog=cls.called, add_help=False)
     cls.fill(parser)
@@ -81,13 +83,13 @@ def parameters(cls: type[Command]) -> tuple[Parser, dict[str, argparse.Action]]:
 
 
 def _keyed(action: argparse.Action) -> bool:
-    """Whether a value stands with its name."""
+    """Test whether a value stands with its name."""
     of_lens = isinstance(action.type, partial) and action.type.func is named_lens
     return bool(action.option_strings) and not of_lens
 
 
 def signature_of(cls: type[Command]) -> inspect.Signature:
-    """The signature of a command as a call, annotated with what stands for values in its help."""
+    """Return the signature of a command as a call, annotated with what stands for values in its help."""
     kinds, found = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY), []
     for name, a in parameters(cls)[1].items():
         about = "bool" if a.nargs == 0 else a.metavar or "|".join(map(str, a.choices or ()))
@@ -97,10 +99,10 @@ def signature_of(cls: type[Command]) -> inspect.Signature:
 
 
 def command_of(cls: type[C], given: Sequence[Any], named: Mapping[str, Any]) -> C:
-    """The command that the values of a call describe; None counts as not given.
+    """Return the command that the values of a call describe; None counts as not given.
 
     Raises:
-        InputError: a name that the command has not, a value that it refuses.
+        InputError: a name that the command does not have, or a value that it refuses.
     """
     parser, known = parameters(cls)
     reject_unknown(cls.called, "", named, list(known))
@@ -110,32 +112,32 @@ def command_of(cls: type[C], given: Sequence[Any], named: Mapping[str, Any]) -> 
     values = dict(zip(bare, given, strict=False)) | dict(named)
     words = [(known[k].option_strings, _words(known[k], v)) for k, v in values.items() if v is not None]
     options, bare = ([w for named_by, ws in words if bool(named_by) is own for w in ws] for own in (True, False))
-    parser.intermixed = False  # which would lose the "--" before the arguments, whose values may start with "-"
+    parser.intermixed = False  # it would lose the "--" before the arguments, whose values may start with "-"
     return cls.of(parser.parse_args([*options, *(["--", *bare] if bare else [])]))
 
 
 def call(cls: type[Any], given: Sequence[Any], named: Mapping[str, Any]) -> Answer:
-    """Run a command with the values of a call. Several answers, as of frames, are a list "pictures".
+    """Run a command with the values of a call; several answers, as of frames, become a list "pictures".
 
     Raises:
-        InputError: as `command_of`, and as the command.
-        KeyboardInterrupt: the command was interrupted; what it kept stands on stderr.
+        InputError: as `command_of` and the command itself raise it.
+        KeyboardInterrupt: the command was interrupted; stderr tells what it kept.
     """
     told = list[tuple[Mapping[str, Any], str]]()
     command = replace(command_of(cls, given, named), tell=lambda *answer: told.append(answer))
     with more_glasses(command.glass):
         code = command.run()
-    if code >= 128:  # by a signal
+    if code >= 128:  # it ended by a signal
         raise KeyboardInterrupt
     data = told[0][0] if len(told) == 1 else {"pictures": [data for data, _ in told]}
     return Answer(data, "\n".join(text for _, text in told), code)
 
 
 def _words(action: argparse.Action, value: Any) -> list[str]:
-    """The words of a command line that give a parameter this value.
+    """Return the words of a command line that give a parameter this value.
 
     A tuple is one value of several numbers, as a film's sides or a light's angles. Where an option takes several
-    values, a list holds them, or a mapping those of KEY=VALUE.
+    values, a list holds them, or a mapping holds those of KEY=VALUE.
     """
     between = next((mark for mark in "x/" if mark in str(action.metavar)), ",")
 
@@ -149,6 +151,6 @@ def _words(action: argparse.Action, value: Any) -> list[str]:
     repeated = isinstance(action, argparse._AppendAction)
     texts = [text(v) for v in value] if isinstance(value, list) and (repeated or action.nargs) else [text(value)]
     option = action.option_strings[-1:]
-    if action.nargs == 0 and texts[0] in ("True", "False"):  # what else is given is refused as a value
+    if action.nargs == 0 and texts[0] in ("True", "False"):  # anything else is refused as a value
         return [*option] * (texts[0] == "True")
     return [f"{option[0]}={word}" for word in texts] if option and not action.nargs else [*option, *texts]

@@ -51,7 +51,7 @@ examples:
 
         with warned(self.file) as read:
             lens = read_any(self.file, self.unsaid)
-        if read:  # the file keeps what its source had besides, and what was assumed
+        if read:  # the file keeps what else its source had, and what was assumed
             lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
         write_checked(lens, self.out)
         data = {"file": str(self.file), "output": str(self.out), **_summary(lens, [*read, *_doubts(lens)])}
@@ -59,7 +59,7 @@ examples:
 
 
 def _doubts(lens: Lens) -> list[str]:
-    """Contradictions between the lens and statements of its file, as sentences."""
+    """Return contradictions between the lens and statements of its file, as sentences."""
     if find_spec("torch") is None:
         return [f"the lens is not checked against its file's statements: that needs torch ({pip_install('train')})"]
     from neurolens.optics.setting.check import check_lens, doubts
@@ -72,10 +72,10 @@ def _doubts(lens: Lens) -> list[str]:
 
 
 def write_checked(lens: Lens, path: Path) -> None:
-    """Write a lens file, and keep it only if it reads back to the same lens.
+    """Write a lens file, and keep it only if it reads back as the same lens.
 
     Raises:
-        InputError: it does not; with the file to be written.
+        InputError: it does not; the error names the file to be written.
     """
     from neurolens.optics.readers.lensfile import format_lens, read_lens
 
@@ -91,7 +91,7 @@ def write_checked(lens: Lens, path: Path) -> None:
 
 
 def _summary(lens: Lens, notes: list[str]) -> dict[str, Any]:
-    """Figures of the lens for text and --json; mm."""
+    """Return figures of the lens for text and --json, in mm."""
     from neurolens.optics.lens import paraxial
     from neurolens.optics.readers.assemble import first_order
 
@@ -139,7 +139,7 @@ def _text(data: dict[str, Any]) -> str:
 
 
 _CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")
-_NEAR_N_D, _NEAR_V_D = 0.01, 2.0  # what lies farther from a code has nothing to do with it
+_NEAR_N_D, _NEAR_V_D = 0.01, 2.0  # a glass farther from a code than this has nothing to do with it
 _TRANSMITTED_NM = (400.0, 450.0, 550.0, 700.0)
 _PLATE_MM = 10.0
 
@@ -192,7 +192,7 @@ examples:
 
 
 def _record(glass: Any) -> dict[str, Any]:
-    """Figures of one glass; internal transmittance by wavelength in nm, empty where the source has none."""
+    """Return figures of one glass; internal transmittance is by wavelength in nm, empty where the source has none."""
     figures = {name: getattr(glass, name) for name in ("n_d", "V_d", "form", "coefficients")}
     through = {
         f"{nm:.0f}": math.exp(-_PLATE_MM * glass.absorption_per_mm(nm)) for nm in _TRANSMITTED_NM if glass.absorption

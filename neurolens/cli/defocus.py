@@ -22,7 +22,7 @@ from neurolens.pictures.render.pictures import standard_attributes, write_channe
 from neurolens.pictures.render.sensor import about, expose
 from neurolens.pictures.render.settings import SensorSettings
 
-_MOST = 64  # fields along a side
+_MOST = 64  # fields along a side, at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +185,7 @@ examples:
 
 
 def _facts(cell: Cell) -> dict[str, Any]:
-    """What the metadata say of a kernel; light beside that of a point on the axis of an ideal lens, of each channel."""
+    """Return what the metadata say of a kernel, and its light by channel over that of an ideal lens on the axis."""
     distance = None if math.isinf(cell.distance_m) else cell.distance_m
     facts: dict[str, Any] = {"field": list(cell.field), "distance_m": distance, "place_px": list(cell.place_px)}
     lit = cell.kernel is not None

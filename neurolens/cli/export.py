@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _CAMERA = "camera: what a whole camera is set to"
-# Rays for the errors of an ONNX file with fixed inputs.
+# Rays that measure the errors of an ONNX file with fixed inputs.
 _HELD_OUT, _VIGNETTING = 20_000, 100_000
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 
@@ -125,7 +125,7 @@ examples:
         return self.answer(data, lambda: "\n".join([str(self.out), *lines]))
 
     def _write_model(self, file: Path, fixed: dict[str, list[float]]) -> dict[str, Any]:
-        """A model as source code or ONNX, some of its inputs fixed."""
+        """Write a model as source code or ONNX, with some of its inputs fixed."""
         loaded = load_model(file)
         if loaded.axes and (self.to == "onnx" or fixed or set(self.only) != set(_PARTS)):
             expected = "source code (--to c, glsl ...), without --fix, --only"
@@ -143,7 +143,7 @@ examples:
         return _about(written, [m.domain.wavelength_nm[0] for m in models])
 
     def _write_lens(self, file: Path) -> dict[str, Any]:
-        """The exact lens of a file as source code."""
+        """Write the exact lens of a file as source code."""
         from neurolens.cameras.shaders.lens_source import write_lens
 
         return _about(write_lens(file, self.out, self.to, name=self.name, zoom=self.zoom, progress=self.progress()))
@@ -165,7 +165,7 @@ examples:
         lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
         name = source.checked_name(self.to, f"{lens['id']}_camera", self.name)
         graph = camera.lens_graph()
-        # Compilers of shaders take minutes for an array of 43,000 constants: there the caller brings the table.
+        # For an array of 43,000 constants shader compilers take minutes: there the caller brings the table.
         own_table = self.to in ("c", source.DOUBLE, "cuda")
         program = camera_program(camera.film, graph, self.derivatives, own_table=own_table)
         numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
@@ -189,7 +189,7 @@ examples:
 
 
 def _about(written: source.Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
-    """What --json prints about source code."""
+    """Return what --json prints about source code."""
     s = written.signature
     return {
         "function": s.name,
@@ -202,7 +202,7 @@ def _about(written: source.Written, bands_nm: Sequence[float] = ()) -> dict[str,
 
 
 def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
-    """The numbers of --fix by name."""
+    """Return the numbers of --fix by name."""
     fixed: dict[str, list[float]] = {}
     for text in texts:
         key, _, value = text.partition("=")
@@ -219,7 +219,7 @@ def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
 
 
 def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[source.Fix, tuple[LensModel, ...]]:
-    """What the numbers of --fix fix, by name, and the models that know it."""
+    """Return what the numbers of --fix fix, by name, and the models that know it."""
     from neurolens.optics.setting.focusing import best_focus_z_mm
     from neurolens.optics.setting.states import set_lens
 
@@ -259,7 +259,7 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
 
 
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
-    """Write both inverse maps beside the model's file; returns their files and the share of rays that each finds."""
+    """Write both inverse maps beside the model's file; return their files and the share of rays that each finds."""
     from neurolens.models.export import export_inverse
     from neurolens.models.inverse import inverse_of
 

@@ -74,7 +74,7 @@ examples:
         return self.answer(data, lambda: _text(data))
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
-        """The maps of `stmap`, light as a grey picture with alpha, which all programs multiply by, and NVIDIA's."""
+        """The maps of `stmap`, the light as a grey picture with alpha, by which all programs multiply, and NVIDIA's."""
 
         def light(*given: Any) -> dict[str, Any]:
             grey = illumination_map(*given)["Y"]
@@ -94,7 +94,8 @@ class _Writer:
     """Writes what a shot has besides its maps.
 
     Attributes:
-        left: the worst that each standard leaves, of all frames. fits: of each kind of projection.
+        left: the largest error of each standard over all frames.
+        fits: what is fitted, by kind of projection.
         notes: what is not written, and why.
     """
 
@@ -106,7 +107,7 @@ class _Writer:
     notes: list[str] = field(default_factory=list)
 
     def files(self, data: dict[str, Any], progress: Progress) -> list[str]:
-        """Write all; their names."""
+        """Write all files and return their names."""
         names, command, shot = [], self.command, self.shot
         tables = command.noncentral or any(standards.noncentral_pays(row["parallax"]) for row in data["frames"])
         with progress.stage("fit projections, OpenTrackIO") as report:
@@ -114,7 +115,7 @@ class _Writer:
                 names += self._of_frame(k)
                 if tables:
                     names.append(self._ray_table(k))
-                else:  # one of an earlier run would not belong to these files
+                else:  # a file of an earlier run would not belong to these
                     standards.ray_table_path(self._name(k)).unlink(missing_ok=True)
                 report((k + 1) / len(self.frames))
         entries = self._entries(progress)
@@ -132,7 +133,7 @@ class _Writer:
         return names
 
     def _of_frame(self, k: int) -> list[str]:
-        """Write the sample of OpenTrackIO and the projections of a frame; their names."""
+        """Write the OpenTrackIO sample and the projections of a frame; return their names."""
         command, pinhole, traced = self.command, self.shot.frames[k], self.frames[k].fields[""]
         text, left_px, share = standards.opentrackio_sample(traced, pinhole, self.shot)
         atomic_write_text(path := command.out / f"shot.opentrackio{pinhole.name}.json", text)
@@ -155,7 +156,7 @@ class _Writer:
         return names
 
     def _ray_table(self, k: int) -> str:
-        """Write the table of rays of a frame; its name."""
+        """Write the table of rays of a frame; return its name."""
         command, frame = self.command, self.frames[k]
         field, near_m = frame.fields[""], command.near_m(frame.fields[""].frame)
         table, left = standards.ray_table(frame.camera, field, command.picture, command.film, frame.focus_m, near_m)
@@ -163,7 +164,7 @@ class _Writer:
         return standards.write_ray_table(self._name(k), table, left, self.shot.about, field)
 
     def _name(self, k: int) -> Path:
-        """The start of the names of a frame's files."""
+        """Return the start of the names of a frame's files."""
         return self.command.out / f"shot{self.shot.frames[k].name}"
 
     def _worse(self, name: str, value: float | None) -> None:
@@ -171,7 +172,7 @@ class _Writer:
             self.left[name] = max(value, self.left.get(name, 0.0))
 
     def _entries(self, progress: Progress) -> list[standards.LensfunEntry]:
-        """The entries of lensfun's profile, by focal length; none of a lens with cylinders."""
+        """Return the entries of lensfun's profile, by focal length; none for a lens with cylinders."""
         if self.shot.frames[0].squeeze != 1:
             self.notes.append("shot.lensfun.xml: lensfun knows no anamorphic lens")
             return []
@@ -200,7 +201,7 @@ class _Writer:
 
 
 def _rate(text: str) -> Fraction:
-    """Type of --fps."""
+    """Read --fps."""
     with suppress(ValueError, ZeroDivisionError):
         if len(text) < 20 and 1 <= (rate := Fraction(text)) <= 1000:
             return rate.limit_denominator(1001)

@@ -19,7 +19,7 @@ from neurolens.pictures.render.scenetables import FARTHEST_M
 
 _MOST = 100_000
 _PLACE_M = (-FARTHEST_M, FARTHEST_M)
-_Keys = list[tuple[int, list[float]]]  # frames, and the values there in the measure that is linear between keys
+_Keys = list[tuple[int, list[float]]]  # frames, and their values in the measure that is linear between keys
 
 
 def _inverse(value: float) -> float:
@@ -49,7 +49,7 @@ ALL_KEYS, LENS_KEYS = tuple(_QUANTITIES), ("focus", "f-number", "zoom")
 
 
 def _frames(text: str) -> range:
-    """Type of --frames; farms write FIRST-LAST."""
+    """Read --frames; farms write FIRST-LAST."""
     words = re.split("[:-]", text)
     if 2 <= len(words) <= 3 and all(w.isascii() and w.isdecimal() and len(w) <= 7 for w in words):
         first, last, step = (*map(int, words), 1)[:3]
@@ -72,7 +72,7 @@ class Frames:
     def states(
         self, fixed: Mapping[str, Any], command: str, names: Sequence[str] = ALL_KEYS
     ) -> list[tuple[int | None, str, dict[str, Any]]]:
-        """The frames as `frames_of` yields them; without --frames one: no number, no digits, no settings."""
+        """The frames as `frames_of` yields them; without --frames a single one with no number, digits or settings."""
         if self.frames is not None:
             return list(frames_of(self.frames, self.key, fixed, command, names))
         if self.key:
@@ -81,7 +81,7 @@ class Frames:
 
 
 def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
-    """A field of `Frames`; `does`: the help of --frames. `names`: the quantities of the keys."""
+    """Return a field of `Frames`; `does` is the help of --frames, `names` are the quantities that keys may set."""
     measures = ", ".join(f"{name} (linear in {_QUANTITIES[name].linear_in})" for name in names)
     measures += "; position and look-at are X/Y/Z in m" if "position" in names else ""
     return group("frames", texts={"frames": does, "key": measures})
@@ -90,13 +90,13 @@ def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
 def frames_of(
     frames: range, keys: Sequence[str], fixed: Mapping[str, Any], command: str, names: Sequence[str] = ALL_KEYS
 ) -> Iterator[tuple[int | None, str, dict[str, Any]]]:
-    """The frames of --frames: number, its digits in file names, and the settings that the keys have there.
+    """Yield the frames of --frames: number, its digits in file names, and the settings that the keys have there.
 
     Args:
-        fixed: the settings of the command line, of which no key may set one that is not None.
+        fixed: the settings of the command line; a key may set only one that is None.
 
     Raises:
-        InputError: a key that is none, or of a quantity that the command line sets too.
+        InputError: a text that is no key, or a key of a quantity that the command line sets too.
     """
     given = [track for text in keys for track in _tracks(text, command, names)]
     tracks = dict(given)
@@ -112,12 +112,12 @@ def frames_of(
 
 
 def numbered(file: Path, digits: str) -> Path:
-    """The file of a frame, OUT.0001.exr of OUT.exr."""
+    """Return the file of a frame: OUT.0001.exr for OUT.exr."""
     return file.with_name(f"{file.stem}.{digits}{file.suffix}") if digits else file
 
 
 def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str, _Keys]]:
-    """The quantities of one --key, or of the file of keys that it names."""
+    """Yield the quantities of one --key, or of the file of keys that it names."""
     path = Path(text)
     if path.suffix.lower() not in (".csv", ".json") or "=" in path.name:
         name, _, rest = text.partition("=")
@@ -146,7 +146,7 @@ def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str
 
 
 def _append(keys: _Keys, name: str, frame: str, value: str, place: tuple[str | Path, str]) -> None:
-    """Append a key that two words give; `place`: where they stand, for errors."""
+    """Append a key that two words give; `place` tells where they stand, for errors."""
     quantity = _QUANTITIES[name]
     numbers = floats(value, "/") if len(value) < 100 else []
     good = [within(quantity.bounds, v) for v in numbers]
@@ -158,7 +158,7 @@ def _append(keys: _Keys, name: str, frame: str, value: str, place: tuple[str | P
 
 
 def _at(name: str, keys: _Keys, frame: int) -> float | tuple[float, ...]:
-    """The value of a quantity at a frame."""
+    """Return the value of a quantity at a frame."""
     import numpy as np
 
     frames, measures = [k for k, _ in keys], np.transpose([m for _, m in keys])

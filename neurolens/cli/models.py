@@ -48,7 +48,7 @@ examples:
     )
 
     def run(self) -> int:
-        """Print the models; 1 where none is left."""
+        """Print the models; return 1 where none is left."""
         places = _places()
         rows = [m for place in places for m in models_in(place)]
         of_lens = [m for m in rows if self.lens is None or _is_of(m, self.lens)]
@@ -70,16 +70,16 @@ examples:
 
 
 def _advice(model: dict[str, Any]) -> list[Advice]:
-    """Advice between the best model of a lens and the lens itself, whose time is expected from its refractions."""
+    """Compare the best model of a lens with the lens itself, whose time is expected from its refractions."""
     file, lens = Path(model["file"]), model["lens"]
-    other = file.name.startswith(f"{lens}-")  # of another state or focal length than the lens's file has
+    other = file.name.startswith(f"{lens}-")  # of a state or focal length other than the file's
     row = {**model, "name": file.stem, "file": f"{file.parent.name}/{file.name}"}
     results = {"models": [row], "exact": [expected_exact(model["refractions"])], "lens": {"file": f"{lens}.toml"}}
     return advice(results | {"settings": {"lens": {"zoom": file.stem if other else None}}}, file.parent.parent)
 
 
 def _places() -> list[Path]:
-    """Folders of models that exist; the same one once."""
+    """Return the folders of models that exist, each once."""
     near = [Path("models"), *sorted(Path("runs").glob("*/models"))]
     shipped = library() / "models"
     found = [p for p in near if p.is_dir()]
@@ -87,7 +87,7 @@ def _places() -> list[Path]:
 
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
-    """The facts of the cards in a folder, with the times beside them; a file that is no model is left out."""
+    """Yield the facts of a folder's cards, with the times beside them; a file that is no model is left out."""
     from neurolens.models.card import read_card
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
@@ -105,7 +105,7 @@ def models_in(folder: Path) -> Iterator[dict[str, Any]]:
                 "efl_mm": float(card["lens"]["efl_mm"]),
                 "film_radius_mm": float(domain["film_radius_mm"]),
                 "focus_m": list(domain["focus_m"]),
-                "one_focus": domain["focus_m"][0] == domain["focus_m"][1],  # as of `neurolens plan`
+                "one_focus": domain["focus_m"][0] == domain["focus_m"][1],  # as `neurolens plan` makes them
                 "states": [str(a["name"]) for a in (card.get("states") or {}).get("axes", ())],
                 **{k: errors.get(k) for k in ("rms_um", "rms_px", "direction_rms_deg", "poor")},
                 "bytes": file.stat().st_size,
@@ -118,7 +118,7 @@ def models_in(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def _times(file: Path) -> dict[str, dict[str, Any]]:
-    """Records of an index or of a run, by file name; none where there is no such file."""
+    """Return records of an index or of a run, by file name; none where there is no such file."""
     try:
         rows = json.loads(file.read_text(encoding="utf-8"))["models"]
         return {Path(row["file"]).name: row for row in rows}
@@ -168,7 +168,7 @@ def _text(within: tuple[str, float] | None, listed: Sequence[dict[str, Any]], ke
 
 
 def _remarks(model: dict[str, Any]) -> list[str]:
-    """The remarks in the last column."""
+    """Return the remarks in the last column."""
     found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []
     found += ["one focus"] * model["one_focus"]
     found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []
@@ -207,7 +207,7 @@ keeps its own; ./lenses; the project's."""
     )
 
     def run(self) -> int:
-        """Measure, compare, time; 1 where a promise does not hold."""
+        """Measure, compare, time; return 1 where a promise does not hold."""
         from neurolens.cameras.model import load_model
         from neurolens.studies.check import check_model, check_states, lens_of_card, space_of_card
         from neurolens.studies.speed import time_model

@@ -31,7 +31,7 @@ _BUDGETS = {"px": "pixels, as 0.25px", "s": "seconds, as 20s"}
 
 
 def _budget(text: str) -> tuple[str, float]:
-    """Type of --budget: its unit, pixels where it has none, and the number."""
+    """Read --budget: its unit, which is pixels where none is given, and the number."""
     return cli.amount(f"{text}px" if text[-1:] in set("0123456789.") else text, _BUDGETS)
 
 
@@ -89,7 +89,7 @@ model of the shot from it, from scratch. --trade leaves trade.html besides, a pa
     out: Path | None = cli.output_path("FOLDER", "for the plan (default: runs/plan-SCENE-LENS)", None)
 
     def run(self) -> int:
-        """Plan, write, print; 1 where no camera for this target is within the budget."""
+        """Plan, write, print; return 1 where no camera for this target is within the budget."""
         if self.samples is not None and not self.trade:
             self.refuse("--samples", self.samples, "--trade beside it")
         began = os.times()
@@ -108,7 +108,7 @@ model of the shot from it, from scratch. --trade leaves trade.html besides, a pa
                 zoom=self.zoom, afterwards=self.comp, denoised=self.denoise, dispersion=self.dispersion or "full",
             )  # fmt: skip
             shown = plans.pictures(result, self.samples or 16, report) if self.trade else None
-        took = sum(os.times()[:4]) - sum(began[:4])  # of the processor, with compilers
+        took = sum(os.times()[:4]) - sum(began[:4])  # of the processor, compilers included
         title = f"{scene.name} through {lens.name}"
         data: dict[str, Any] = plain({"scene": str(self.scene), "lens": str(self.lens), **result.to_dict()})
         data |= {"plan_s": took, "front": [c.name for c in result.front], "half": result.half and result.half.name}
@@ -127,7 +127,7 @@ model of the shot from it, from scratch. --trade leaves trade.html besides, a pa
 
 
 def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
-    """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
+    """Return the models that ship for a lens, or for a state of its zoom, by its id and its figures."""
     from neurolens.models.card import read_card
     from neurolens.optics.setting.states import set_lens
 
@@ -161,8 +161,10 @@ def _text(command: Plan, result: plans.Plan, data: Mapping[str, Any], folder: Pa
 
 
 def _dear(result: plans.Plan, took: float, every: bool) -> list[str]:
-    """That a plan took more than its share of the picture that it is for, and why; nothing where it did not, or where
-    the time of the picture is not known."""
+    """Tell that a plan took more than its share of the time of the picture that it is for, and why.
+
+    Nothing is returned where it did not, or where the picture's time is not known.
+    """
     from neurolens.studies.plan.plan import SHARE
 
     best = result.best
@@ -174,7 +176,7 @@ def _dear(result: plans.Plan, took: float, every: bool) -> list[str]:
 
 
 def _needs(asked: SceneNeeds) -> str:
-    """What the scene asks of the lens."""
+    """Tell what the scene asks of the lens."""
     near, far = asked.nearest_m, asked.farthest_m
     view = "nothing with a distance" if near is None else f"{near:.4g} to {far:.4g} m"
     return (
@@ -185,7 +187,7 @@ def _needs(asked: SceneNeeds) -> str:
 
 
 def _sentences(result: plans.Plan, half: bool = False) -> list[str]:
-    """The camera to use and its price, or that there is none; `half`: with what half of its time buys."""
+    """Tell the camera to use and its price, or that there is none; `half` adds what half of its time buys."""
     best, seconds, unit = result.best, result.budget_s, result.unit_s
     if best is None:
         nearest = min(result.choices, key=lambda c: c.error_px, default=None)
@@ -219,14 +221,14 @@ def _sentences(result: plans.Plan, half: bool = False) -> list[str]:
 
 
 def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> list[str]:
-    """The command that makes the camera for the target; none for ideal cameras, which every renderer has."""
+    """Return the command that makes the camera for the target; none for ideal cameras, which every renderer has."""
     ideal = best.camera.startswith(("pinhole:", "thin:", "thick:"))
     lens = result.probed.lens
     model, shape = best.camera.endswith(".onnx"), lens.aperture
     state = ["--zoom", command.zoom] if command.zoom is not None and not model else []
     state += ["--dispersion", command.dispersion] if command.dispersion not in (None, "full") else []
     words = ["render", str(command.scene), "--camera", f"{folder}/plan.toml", *state, "-o", "render.exr"]
-    if model and shape is not None and shape.blades:  # models have none of their own
+    if model and shape is not None and shape.blades:  # models have no blades of their own
         words += ["--blades", f"{shape.blades}", "--blade-rotation", f"{shape.rotation_deg:g}"]
         words += ["--blade-curvature", f"{shape.curvature:g}"]
     if result.target != "render":
@@ -234,7 +236,7 @@ def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> 
             return []
         language, request = result.target, result.asked
         words = ["export", f"{folder}/plan.toml", "--to", language, *state, "-o", f"camera.{language}"]
-        if language != "osl":  # whose inputs they are
+        if language != "osl":  # in OSL they are inputs
             film, focus = "x".join(f"{v:g}" for v in request.shot.film_mm), f"{request.shot.focus_m:g}"
             words[2:2] = f"--whole-camera --film {film} --focus {focus} --f-number {request.f_number:.6g}".split()
     return [f"  {program()} {shlex.join(words)}"]
@@ -245,7 +247,7 @@ def _short(choice: Choice) -> str:
 
 
 def _cameras(result: plans.Plan, flips: Mapping[str, float]) -> pages.Table:
-    """Every camera with its figures: a disc before the choice for the budget, a ring where no other betters it."""
+    """List every camera with its figures: a disc marks the choice for the budget, a ring one that no other betters."""
     front = result.front
     records = [
         {**asdict(c), "seconds": {"min": c.seconds, "median": c.seconds + c.more}, "flip": flips.get(c.name)}

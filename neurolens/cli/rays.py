@@ -25,7 +25,7 @@ from neurolens.pictures.render.film import PixelGrid, check_memory
 from neurolens.pictures.render.pictures import write_channels
 from neurolens.programs.hosts import BYTES_A_RAY, HOSTS, Arrays, Host, RayJob, RaySettings
 
-_MOST_LAYERS = 64  # samples of an EXR
+_MOST_LAYERS = 64  # samples that an EXR may have as layers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,14 +79,14 @@ examples:
         return self.answer(data, lambda: "\n".join(map(_line, rows)))
 
     def _on_disk(self, files: ExitStack, shape: tuple[int, ...], kind: Any) -> NDArray[Any]:
-        """An array in a nameless file beside the output: what is made waits there, not in memory."""
+        """Return an array in a nameless file beside the output: what is made waits there, not in memory."""
         file = files.enter_context(tempfile.TemporaryFile(dir=self.out.parent))
-        if hasattr(os, "posix_fallocate"):  # else a full disk ends the process, not the command
+        if hasattr(os, "posix_fallocate"):  # else a full disk would end the process, not the command
             os.posix_fallocate(file.fileno(), 0, max(1, math.prod(shape) * np.dtype(kind).itemsize))
         return np.memmap(file, kind, "w+", shape=shape)
 
     def _writer(self) -> Callable[[Path, Arrays, dict[str, Any]], None]:
-        """What writes the arrays, chosen and checked before they are made."""
+        """Return what writes the arrays, chosen and checked before they are made."""
         kind, asked = self.out.suffix.lower(), self.rays
         if kind == ".npz":
             return lambda path, arrays, about: write_arrays(path, about, arrays)
@@ -95,7 +95,7 @@ examples:
 
             def tensors(path: Path, arrays: Arrays, about: dict[str, Any]) -> None:
                 with atomic_path(path) as temporary:
-                    mode = temporary.stat().st_mode  # the library's files are for their owner alone
+                    mode = temporary.stat().st_mode  # the library makes files that only their owner can read
                     save_file(dict(arrays), temporary, {"neurolens": json.dumps(about)})
                     temporary.chmod(mode)
 
@@ -108,7 +108,7 @@ examples:
 
 
 def channels(arrays: Arrays, host: Host) -> Arrays:
-    """The arrays of a host as channels [H, W] of an EXR; of several samples each is a layer."""
+    """Return the arrays of a host as channels [H, W] of an EXR; each of several samples is a layer."""
     planes = Arrays()
     for name, array in host.views({k: v for k, v in arrays.items() if k != "to_world"}).items():
         if array.ndim == 2:

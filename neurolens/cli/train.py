@@ -78,11 +78,11 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     )
 
     def run(self) -> int:
-        """Run the experiment, or one a lens, and print a summary."""
+        """Run the experiment, or one for each lens, and print a summary."""
         lenses = self.lens or ()
         if not lenses and self.experiment and self.experiment.suffix.lower() != ".toml":
             named = resolve(self.experiment, models=False, cameras=False).file
-            assert named is not None  # which only cameras without a lens lack
+            assert named is not None  # only cameras without a lens lack it
             return replace(self, experiment=None, lens=(named,)).run()
         if (self.experiment is None) == (not lenses):
             self.refuse("EXPERIMENT.toml or --lens", "(both)" if lenses else "(neither)", "one of them")
@@ -97,7 +97,7 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         return self.answer(data, lambda: _text(results, folder), 0 if met else 1)
 
     def _train(self, file: Path, out: Path | None, progress: Progress) -> tuple[Path, dict[str, Any]]:
-        """Run one experiment, or that of a lens file, in a folder; the folder and the results."""
+        """Run one experiment, or that of a lens file, in a folder; return the folder and the results."""
         from neurolens.studies.experiment import default_experiment, read_experiment
         from neurolens.studies.train import run_experiment
 
@@ -111,7 +111,7 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         return folder, run_experiment(experiment, folder, progress=progress, command=command)
 
     def _changes(self) -> list[str]:
-        """The options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
+        """Return the options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
         changes = ['lens.zoom="range"'] * self.zoom_range + ['lens.focus_mode="internal"'] * self.internal_focus
         if self.within is not None:
             unit = self.within[0].removeprefix("rms_")
@@ -120,7 +120,7 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         return [*changes, *([] if self.rounds is None else [f"evaluation.rounds={self.rounds}"]), *self.set]
 
     def _run_many(self, lenses: Sequence[Path]) -> int:
-        """One run a lens; a lens that fails is a line, and the exit code is 2 then."""
+        """Run one experiment for each lens; a lens that fails becomes a line, and the exit code is then 2."""
         cli.check_ids(lenses, self.called, "--lens")
         base, progress, failed, done = self.out or Path("runs"), self.progress(), dict[str, str](), list[str]()
         for file in lenses:
@@ -195,7 +195,7 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
     restart: bool = setting(False, "do finished files again", old=("again",))
 
     def run(self) -> int:
-        """Survey a folder; 1 where a file met a fault of neurolens."""
+        """Survey a folder; return 1 where a file met a fault of neurolens."""
         from neurolens.optics.readers.any_format import collection_of
         from neurolens.optics.readers.source import MAX_BYTES
         from neurolens.studies.survey import TIME_LIMIT_S, SurveySettings, summary_lines, summary_of, survey

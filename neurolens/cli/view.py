@@ -34,9 +34,9 @@ from neurolens.programs.view import Form, ViewLens, ghosts_glsl, path_glsl, sect
 
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
-_NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
-_SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
-_GHOSTS = 24  # of a lens at most: the brightest
+_NEAR_EFL = 10.0  # an exact lens's nearest focus in focal lengths
+_SAME = 1e-3  # of the focal length: models and a lens file of one id may differ by this share
+_GHOSTS = 24  # ghosts of a lens at most, the brightest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,7 @@ def _with_file(entry: _Entry, folder: Path) -> _Entry:
 
 
 def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mapping[Path, str]:
-    """OSL of lens files and models. A warning names those that cannot be OSL, which are left out."""
+    """Return the OSL of lens files and models; a warning names those that cannot be OSL, which are left out."""
     zooms = {e.file: e.zoom for e in entries if e.file is not None}
     files = [*zooms, *(model for entry in entries for model in entry.models)]
     with progress.stage("shaders") as report:
@@ -128,7 +128,7 @@ def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mappin
 
 
 def _library() -> Iterator[_Entry]:
-    """Every lens of lenses/ with its best models; zooms over their range where a model has it."""
+    """Yield every lens of lenses/ with its best models; a zoom over its range, where a model has it."""
     root = shipped()
     for models, file in library(root / "models", root / "lenses", ()):
         base, _, state = key_of(models[0]).partition("-")
@@ -139,7 +139,7 @@ def _library() -> Iterator[_Entry]:
 
 
 def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
-    """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
+    """Yield lenses in the order of their first word; models join the lens of their id, and replace the library's."""
     lenses, models = dict[str, Lens | None](), dict[str, list[Path]]()
     for path in paths:
         if is_model(path):
@@ -162,10 +162,10 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
 def _view_lens(
     entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mapping[Path, str], with_ghosts: bool
 ) -> ViewLens:
-    """A lens of the page.
+    """Return a lens of the page.
 
     Raises:
-        InputError: models of another state; a lens that the exact tracer's code cannot hold, without any model.
+        InputError: models of another state, or a lens without any model that the exact tracer's code cannot hold.
     """
     forms = [_model_form(file, folder, kinds, shaders.get(file)) for file in entry.models]
     section: dict[str, Any] = {}

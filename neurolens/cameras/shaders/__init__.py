@@ -1,1 +1,1 @@
-"""Cameras as shaders of Open Shading Language and as source code for other integrators."""
+"""Cameras as shaders of Open Shading Language, and as source code for other integrators."""

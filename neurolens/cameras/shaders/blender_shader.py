@@ -1,4 +1,4 @@
-"""Shaders for Blender's Cycles (`neurolens export --to osl`): of a model, or of a lens itself, every surface traced."""
+"""Shaders for Blender's Cycles (`neurolens export --to osl`), of a model or of a lens with every surface traced."""
 
 from __future__ import annotations
 
@@ -32,20 +32,26 @@ from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import read_any
 
-# Of an exact lens: its wavelengths; its nearest focus in focal lengths; best focus lies beside the paraxial one by less
-# than this share of the film's travel.
+# For an exact lens: its nearest focus in focal lengths; and the share of the film's travel by which best focus may lie
+# next to the paraxial one.
 _NEAR_EFL, _SPARE = 10.0, 0.1
-MAX_STEPS = 12_000  # of a ray: compilers take minutes for more
+MAX_STEPS = 12_000  # operations of a ray; for more, compilers take minutes
 
 
 @dataclass(frozen=True)
 class Shader:
-    """A camera's shader.
+    """A camera's shader, with what a user may want to know of it.
 
     Attributes:
-        name: of the shader. text: its source. operations: of one ray. parameters: names of its inputs.
-        passing: share of the rays that pass, by f-number. film_radius_mm, f_number, nearest_m: of the lens; the widest
-            stop, and the nearest object, None where the film does not focus. notes: sentences for the user.
+        name: the shader's name.
+        text: its source.
+        operations: how many one ray takes.
+        parameters: names of its inputs.
+        passing: share of the rays that pass, by f-number.
+        film_radius_mm: of the lens.
+        f_number: that of the widest stop.
+        nearest_m: distance of the nearest object; None where the film does not focus.
+        notes: sentences for the user.
     """
 
     name: str
@@ -63,11 +69,13 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
     """The shader of a model (.onnx) or of a lens file.
 
     Args:
-        zoom: state of a zoom by name or focal length; "range" makes it an input, as None does of a model of a range.
-        name: of the shader; None takes the lens's id.
+        file: the model or lens file.
+        zoom: state of a zoom by name or focal length. "range" makes the zoom an input, and so does None for a model of
+            a range.
+        name: the shader's name; None takes the lens's id.
 
     Raises:
-        InputError: a name that is no identifier, a lens that is too large for compilers.
+        InputError: a name that is no identifier, or a lens that is too large for compilers.
     """
     with Progress(quiet=quiet).stage(f"fit the pupil of {file.stem}") as report:
         lens_id, lens, lines = lens_of(file, zoom, report)
@@ -119,13 +127,13 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
 def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
     """A lens with every surface traced: its id, the lens as a shader has it, and lines that describe it.
 
-    Focused as its file says groups move; of a file that does not say, by moving the film, to ten focal lengths.
+    It focuses by its groups where its file tells how they move, else by its film, to ten focal lengths.
 
     Args:
-        zoom: as of `shader_of`.
+        zoom: as for `shader_of`.
 
     Raises:
-        InputError: a range of no zoom, or of one whose groups move to focus.
+        InputError: a range is asked of a lens without zoom, or of one whose groups move to focus.
     """
     from neurolens.models.fit import StateSpace, axes_of, gap_axis
     from neurolens.optics.setting.focusing import focus_states
@@ -135,7 +143,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
 
     lens, state = read_any(file), None if zoom == RANGE else zoom
     ranged, internal = zoom == RANGE, bool(focus_states(lens))
-    if ranged and internal:  # before minutes of work
+    if ranged and internal:  # refused before minutes of work
         raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")
     lines = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
     lines.append(TRANSMITTANCE)
@@ -160,11 +168,12 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
 
 
 def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: float = math.inf) -> ShaderLens:
-    """A lens in one state.
+    """Return a lens in one state as a shader has it.
 
     Args:
-        plane_mm: of its pupil points. far, inside_m: of groups that have moved, the lens at infinity focus, whose
-            picture's size holds, and the distance in focus.
+        plane_mm: the plane of its pupil points.
+        far, inside_m: for groups that have moved, the lens at infinity focus, whose picture keeps its size, and the
+            distance in focus.
     """
     from neurolens.optics.setting.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds

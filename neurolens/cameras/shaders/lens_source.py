@@ -1,4 +1,4 @@
-"""The exact lens of a file as source code, for one zoom position, or for all of them as an argument."""
+"""Writes the exact lens of a file as source code, for one zoom position or with the zoom as an argument."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds, pupil
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.tracegraph import TRANSMITTANCE, exact_graph
 
-_NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths
-_DISTANCES = 12  # about as many are placed for each lens
-_CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
+_NEAR_EFL = 10.0  # nearest focus of the function of the film's position, in focal lengths
+_DISTANCES = 12  # about as many distances are placed for each lens
+_CHECKED = (0.12, 0.42, 0.83)  # shares of the range where the film's position is measured
 
 
 def write_lens(
@@ -43,11 +43,14 @@ def write_lens(
     zoom: str | None = None,
     progress: Progress | None = None,
 ) -> Written:
-    """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
+    """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and any zoom range.
 
     Args:
-        to: of `models.source.WRITERS`. name: of the function, None takes the lens's id. zoom: a state of
-            `set_lens`, or "range".
+        file: the lens file.
+        out: the file to write.
+        to: one of `models.source.WRITERS`.
+        name: of the function; None takes the lens's id.
+        zoom: a state as `set_lens` takes it, or "range".
     """
     lens = read_any(file)
     name = checked_name(to, lens.lens_id, name)
@@ -96,18 +99,18 @@ def _head(lens: Lens, plane: str) -> list[str]:
 def _film(
     lens: Lens, nodes: Sequence[Lens], axes: Sequence[Axis], progress: Progress
 ) -> tuple[dict[str, Program], list[str]]:
-    """The film's position, as `film_extras`."""
+    """Return the film's position, as `film_extras` does."""
     between = [a.range[0] + (a.range[1] - a.range[0]) * share for a in axes for share in _CHECKED]
     lenses = [*nodes, *(set_lens(lens, zoom=v) for v in between)]
     data = [first_order(at) for at in lenses]
-    # The separation of the principal planes may change its sign in a zoom: one for all.
+    # In a zoom the separation of the principal planes may change its sign, so one number serves for all.
     apart = max(abs(float(d.rear_principal_z_mm - d.front_principal_z_mm)) for d in data)
     nearest_m = [(_NEAR_EFL * abs(float(d.efl_mm)) + apart) / 1000 for d in data]
     with progress.stage("best focus of distances and stops") as report:
         done = count(1)
 
         def focusing(at: Lens, near_m: float) -> Focusing:
-            """How a lens is focused by its film, to so near."""
+            """Return how a lens is focused by its film, up to a nearest distance."""
 
             def best(focus_m: float, stops_mm: Array) -> Array:
                 report(min(1.0, next(done) / (_DISTANCES * len(lenses))))
@@ -123,14 +126,14 @@ def _film(
 def lens_program(
     nodes: Sequence[Lens], axes: Sequence[Axis], planes_mm: Sequence[float], *, double: bool = False
 ) -> Program:
-    """The lens at the nodes of a state, a table each: gaps, and planes of pupil points, follow the state."""
+    """Return the program of the lens; gaps and planes of pupil points follow the state, from tables at its nodes."""
     program = lower([exact_graph(n, z, LIGHT_NM, double=double) for n, z in zip(nodes, planes_mm, strict=True)])
     program.mixture = mixture_of(axes) if axes else None
     return program
 
 
 def pupil_planes_mm(nodes: Sequence[Lens], axes: Sequence[Axis]) -> list[float]:
-    """The plane of the pupil points at each node: of a range straight between knots, as the tightest one jumps."""
+    """The plane of the pupil points at each node; of a range it is straight between knots, for the best one jumps."""
     if not axes:
         return [pupil_plane_z_mm(node) for node in nodes]
     (axis,) = axes
@@ -140,7 +143,7 @@ def pupil_planes_mm(nodes: Sequence[Lens], axes: Sequence[Axis]) -> list[float]:
 
 
 def numbers(nodes: Sequence[Lens], planes_mm: Sequence[float]) -> list[tuple[str, list[float], str]]:
-    """Names, values at the nodes, and how they follow the state: see `number_of`."""
+    """Return names of numbers, their values at the nodes, and how they follow the state: see `number_of`."""
     data, infinity = [first_order(n) for n in nodes], [film_z_mm(n, math.inf) for n in nodes]
     radii = [image_radius_mm(n)[0] for n in nodes]
     discs = [

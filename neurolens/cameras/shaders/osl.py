@@ -1,15 +1,16 @@
 """Cameras as shaders of Blender's Cycles (4.5 and later), in Open Shading Language.
 
-The whole camera is a graph: from a point of the picture and two random numbers to a weighted ray, at any stop and
-focus of the lens. Inputs of the shader (`parameters`) are numbers when the renderer compiles it, and what depends on
-them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
-picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the point in the picture.
-This distance and the places of the rays are in units of the scene, which are `unit_m` metres long.
+The whole camera is a graph, from a point of the picture and two random numbers to a weighted ray, at any stop and focus
+of the lens. Inputs of the shader (`parameters`) are plain numbers by the time the renderer compiles it, and what
+depends on them alone then costs nothing. From Blender's camera the shader reads the sensor's size (with its fit and the
+picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the point in the picture. This
+distance and the origins of rays are in units of the scene, each `unit_m` metres long.
 
-Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
-the nodes of its axes as a model's numbers are: the zoom is an input, internal focus the distance in focus.
+In a lens with several states (zoom, internal focus) every number of the camera follows the state. It is mixed from
+cameras at the nodes of the lens's axes, as a model's numbers are: the zoom is an input, internal focus is the distance
+in focus.
 
-Cycles gives two random numbers for the wavelength and the pupil: see `light`.
+Cycles gives two random numbers, which serve both wavelength and pupil: see `light`.
 """
 
 from __future__ import annotations
@@ -47,15 +48,16 @@ from neurolens.optics.lens.prescription import LINE_D_NM
 
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")
-_FAR_M = 1e-4  # Blender's focus distance below this means that depth of field is off
-_NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
-_LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it
-_QUADRATURE = 64  # points a side of the exposure on the axis
-_NEAR = 0.999  # of the near limit, for rounding
-# Errors of derivatives, whose mean size Cycles takes, by output and in all; nothing is nearer than this share of focus.
+_FAR_M = 1e-4  # a focus distance of Blender's below this means that depth of field is off
+_NEARLY, _EDGES = 0.99, 0.75  # share of rays that a margin holds, of those beyond this share of the stop's radius
+_LEAST = 1.7e-3  # of the stop's radius: the least margin of blades; a number that no other node of a graph has
+_QUADRATURE = 64  # points a side of the quadrature of the exposure on the axis
+_NEAR = 0.999  # factor of the near limit, for rounding
+# Errors allowed of derivatives, whose mean size Cycles takes, by output and in all; nothing is nearer than the last
+# share of the focus.
 _DERIVATIVES, _WORST, _SEEN = 0.05, 0.05, 0.25
-_ACROSS, _FILM_POWERS = 12, (7, 5)  # distances and stops at which the film is placed; powers of stop and distance
-_BESIDE = 0.01  # of the film radius: near the axis
+_ACROSS, _FILM_POWERS = 12, (7, 5)  # distances and stops of placed films; highest powers of stop and distance
+_BESIDE = 0.01  # share of the film radius that counts as near the axis
 FOCUS_AXIS = "focus"
 _FRAME = """\
     point raster = camera_shader_raster_position();
@@ -78,13 +80,17 @@ _FRAME = """\
 
 @dataclass(frozen=True)
 class OslCamera:
-    """The parts of the shader of a lens in one state.
+    """Holds the parts of the shader of a lens in one state.
 
     Attributes:
-        lens: the lens. graph: its graph with derivatives by the film point. pupil: where rays are sampled.
-        film, nearest_m: see `_film`. limit_m: nothing nearer is in focus; 0 where the film does not move.
-        entrance_mm: z of the entrance pupil, lens frame. margin: by which the stop's blades are widened for samples,
-            in units of the stop's radius. unit: whether directions are sure to be of unit length.
+        lens: the lens in this state.
+        graph: the lens's graph with derivatives by the film point.
+        pupil: where rays are sampled.
+        film, nearest_m: see `_film`.
+        limit_m: nothing nearer is in focus; 0 where the film does not move.
+        entrance_mm: z of the entrance pupil, lens frame.
+        margin: by how much the stop's blades are widened for samples, in units of the stop's radius.
+        unit: whether directions are sure to be of unit length.
     """
 
     lens: ShaderLens
@@ -99,17 +105,18 @@ class OslCamera:
 
     @cached_property
     def per_exposure(self) -> Array:
-        """See `_per_exposure`."""
+        """The exposure, see `_per_exposure`."""
         return _per_exposure(self)
 
 
 @dataclass(frozen=True)
 class OslLens:
-    """A lens as its shader has it.
+    """Holds a lens as its shader has it.
 
     Attributes:
-        nodes: the lens in each state of `product(axes)`; a lens without axes has one.
-        between: weights of the nodes, and the lens in states between them.
+        nodes: the lens in each state of `product(axes)`; a lens without axes has one node.
+        axes: what its state consists of.
+        between: the lens in states between nodes, each with the weights of the nodes.
     """
 
     nodes: list[OslCamera]
@@ -118,35 +125,38 @@ class OslLens:
 
     @property
     def near_m(self) -> tuple[float, float]:
-        """The nearest distance in focus in the state that focuses nearest and in the one that does least; 0: fixed."""
+        """The nearest distance in focus in the state that focuses nearest, and in that which does least; 0 if fixed."""
         limits = [c.limit_m for c in self.nodes]
         return min(limits), max(limits)
 
     @property
     def f_number(self) -> float:
-        """The widest of all states."""
+        """The widest f-number of all states."""
         return min(c.lens.f_number for c in self.nodes)
 
     @property
     def film_radius_mm(self) -> float:
-        """Radius of the picture that all states fill."""
+        """The radius of the picture that all states fill."""
         return min(c.pupil.film_radius_mm for c in self.nodes)
 
     def states(self) -> list[tuple[ShaderLens, PupilCircles]]:
-        """The lens and its pupil at each node, and in states between them."""
+        """Return the lens and its pupil at each node, and in the states between them."""
         first, *others = (c.pupil for c in self.nodes)
         nodes = zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True)
         return [(lens, first.mixed(others, weights)) for weights, lens in [*nodes, *self.between]]
 
     def passing(self) -> dict[float, float]:
-        """The share of the samples that pass, in the worst state, by shares of the widest stop."""
+        """Return the share of the samples that pass in the worst state, by shares of the widest stop."""
         shares = [passing_share(*state) for state in self.states()]
         return {stop: min(s[stop] for s in shares) for stop in shares[0]}
 
 
 def parameters(lens: OslLens) -> list[Parameter]:
-    """The inputs that a user turns, in order: f_number, focus_m, zoom_mm of a zoom's range, blades, roundness,
-    rotation, exposure, vignetting, dispersion, few, origin, unit_m, warn."""
+    """Return the inputs that a user turns, in their order in the shader.
+
+    They are f_number, focus_m, zoom_mm for a zoom's range, blades, roundness, rotation, exposure, vignetting,
+    dispersion, few, origin, unit_m and warn.
+    """
     widest = float(f"{lens.f_number:.4g}")
     zoom = []
     for axis, name in zip(lens.axes, state_names(lens.axes), strict=True):
@@ -176,24 +186,24 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
-    """The text of a camera's shader, and the operations of one ray through a round stop: compilers know the blades."""
+    """Write a camera's shader and count a ray's operations with a round stop, as compilers know the blades."""
     program = osl_program(lens).with_shorter_sums().in_order_of_need()
     text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
     return text, sum(osl_program(lens, {"count": 0.0}).count().values())
 
 
 def osl_program(lens: OslLens, fixed: Mapping[str, float] | None = None) -> Program:
-    """The camera as a program, some inputs numbers; inputs as of `osl_graph`, and `zoom_mm` of a zoom's range."""
+    """The camera as a program, some inputs fixed; inputs are those of `osl_graph`, and `zoom_mm` for a zoom's range."""
     program = lower([osl_graph(camera) for camera in lens.nodes], fixed).with_shared_inverses()
     program.mixture = _mixture(lens) if lens.axes else None
     return program
 
 
 def _mixture(lens: OslLens) -> Mixture:
-    """The mixture of the nodes; internal focus follows the distance in focus."""
+    """Return the mixture of the nodes, in which internal focus follows the distance in focus."""
     focus = [a for a in lens.axes if a.name == FOCUS_AXIS]
     others = tuple(a for a in lens.axes if a.name != FOCUS_AXIS)
-    far = lens.nodes[:: len(focus[0].nodes)] if focus else lens.nodes  # the last axis goes fastest
+    far = lens.nodes[:: len(focus[0].nodes)] if focus else lens.nodes  # the last axis varies fastest
     g, rows = followed_rows(others, [[c.lens.film_z_mm[0] - c.entrance_mm] for c in far])
     state = [g.input(name, per_call=True).clip(*a.range) for a, name in zip(others, state_names(others), strict=True)]
     if focus:
@@ -210,7 +220,7 @@ def _away(asked_m: Value) -> Value:
 
 
 def osl_graph(camera: OslCamera) -> Graph:
-    """The camera as a graph. Inputs are floats of `_FRAME` and the parameters, outputs `OUTPUTS` [3] each."""
+    """Write the camera as a graph from floats (`_FRAME`) and the parameters to the `OUTPUTS`, [3] each."""
     g = Graph()
     call = _Call(g, camera)
     film = (0.5 - g.concat(g.input("raster_x"), g.input("raster_y"))) * call.sensor
@@ -236,7 +246,7 @@ def osl_graph(camera: OslCamera) -> Graph:
 def _set_outputs(
     g: Graph, camera: OslCamera, call: _Call, film: Value, lens: Mapping[str, Value], throughput: Value, warned: Value
 ) -> None:
-    """Rays in the frame of Cycles, in units of the scene and x right, y up, z ahead; warnings as of a pinhole."""
+    """Set the outputs: rays in Cycles's frame (x right, y up, z ahead) and scene units, warnings as a pinhole's."""
     length = call.units_per_m * [1e-3, 1e-3, -1e-3]
     ahead = g.concat(film * -1.0, g.constant(camera.lens.efl_mm))
     ahead = ahead * (1.0 / g.square(ahead).sqrt())
@@ -253,13 +263,13 @@ def _set_outputs(
 
 
 class _Call:
-    """The values that all rays of a call share: stop, film position, exposure."""
+    """Holds the values that all rays of a call share: stop, film position, exposure."""
 
     def __init__(self, g: Graph, camera: OslCamera) -> None:
         self.g, self.camera = g, camera
         self.sensor = g.concat(self.number("sensor_x_mm"), self.number("sensor_y_mm"))
         self.share = (camera.lens.f_number / self.number("f_number")).minimum(1.0)
-        # Named, for it equals the unit of the pupil's numbers in some states of a lens only.
+        # It has a name, because only in some states of a lens does it equal the unit of the pupil's numbers.
         self.stop = self.share * g.constant(camera.lens.stop_radius_mm, "stop radius")
         at_pupil, away = self.number("at_pupil"), _away(self.number("asked_m"))
         ways = zip(camera.film, camera.nearest_m, strict=True)
@@ -274,7 +284,7 @@ class _Call:
         return self.g.input(name, per_call=True)
 
     def weighting(self) -> dict[str, Value]:
-        """The numbers of `weight_graph`."""
+        """Return the numbers of `weight_graph`."""
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.lens.table.pupil_z_mm)
         middle, half = _film_position(camera)
@@ -285,9 +295,9 @@ class _Call:
 
 
 def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:
-    """A polynomial in two numbers of the call, weights [N, M] of powers of the one and the other.
+    """Return a polynomial of two numbers of the call, with weights [N, M] of powers of the one and the other.
 
-    Shaders are compiled when the stop is known, and often before the focus is: it comes last.
+    A shader is often compiled when the stop is known and the focus is not: so the focus comes last.
     """
     total: Value | None = None
     for row in weights.T[::-1]:
@@ -298,13 +308,13 @@ def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:
 
 
 def _film_position(camera: OslCamera) -> tuple[float, float]:
-    """Middle and half range of film positions."""
+    """Return the middle and half the range of film positions."""
     low, high = camera.lens.film_z_mm
     return (low + high) / 2, max((high - low) / 2, 1e-6)
 
 
 def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[str, NDArray[np.float32]]:
-    """Rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of samples."""
+    """Return rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph, with `at_stop`."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * pupil.film_radius_mm * np.sqrt(rng.random(count))
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
@@ -319,8 +329,10 @@ def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[
 
 
 def _per_exposure(camera: OslCamera) -> Array:
-    """The square of the stop's share over the exposure on the axis, by powers [N, M] of that share and of the film
-    position, scaled to 1."""
+    """Fit the squared share of the stop over the exposure on the axis.
+
+    The fit is by powers [N, M] of that share and of the film position, scaled to 1.
+    """
     square, nanometres = stratified(_QUADRATURE, camera.lens.wavelength_nm)
     (low, high), (middle, half) = camera.lens.film_z_mm, _film_position(camera)
     positions = np.linspace(low, high, 3) if high > low else np.array([low])
@@ -341,21 +353,24 @@ def _per_exposure(camera: OslCamera) -> Array:
 
 
 def _powers(at: Array, values: Array, shape: tuple[int, int]) -> Array:
-    """Least squares weights [N, M] of powers of two numbers, at places [K, 2] with values [K]."""
+    """Fit weights [N, M] of powers of two numbers by least squares, at places [K, 2] with values [K]."""
     a = np.stack([at[:, 0] ** i * at[:, 1] ** j for i in range(shape[0]) for j in range(shape[1])], axis=1)
     return np.asarray(np.linalg.lstsq(a, values, rcond=None)[0]).reshape(shape)
 
 
 def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, float]]:
-    """Best focus (mm) by powers [2, N, M] of the stop's share and of the nearest distance over the distance, from the
-    film and from the entrance pupil; and that distance from either."""
+    """Fit best focus (mm) by powers of the stop's share and of the nearest distance over the distance.
+
+    Returns:
+        Weights [2, N, M] for distances from the film and from the entrance pupil, and the nearest distance from either.
+    """
     moves = math.isfinite(focusing.nearest_m)
     side = (1 - np.cos(np.pi * (np.arange(_ACROSS) + 0.5) / _ACROSS)) / 2
     side[[0, -1]] = 0.0, 1.0
     shares, vergence = SMALLEST + (1 - SMALLEST) * side, side if moves else np.zeros(1)
     z = focusing.places(vergence, shares)  # [D, S]
     nearest, powers = (focusing.nearest_m if moves else 1.0), (_FILM_POWERS[0], _FILM_POWERS[1] if moves else 1)
-    # The same places by the distance from the entrance pupil: 1 / distance = v / (nearest - v way).
+    # The same places by distance from the entrance pupil: 1 / distance = v / (nearest - v way).
     way = (z - entrance_mm) * 1e-3
     ahead = nearest - float(way[-1, -1]) * moves
     by_pupil = vergence[:, None] * ahead / (nearest - vergence[:, None] * way)
@@ -365,7 +380,7 @@ def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, f
 
 
 def model_lens(model: OnnxLens, report: Report, *, fixed: bool = False) -> OslLens:
-    """An exported model; `fixed`: in its state alone."""
+    """Return an exported model as a shader has it; `fixed` leaves it in its state."""
     if not model.axes or fixed:
         return osl_lens([shader_lens(model)], report)
     axes = model.axes
@@ -374,13 +389,13 @@ def model_lens(model: OnnxLens, report: Report, *, fixed: bool = False) -> OslLe
 
 
 def states_between(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
-    """The middles between neighbouring nodes."""
+    """Return the middles between neighbouring nodes."""
     middles = [[(a + b) / 2 for a, b in zip(axis.nodes, axis.nodes[1:], strict=False)] for axis in axes]
     return list(itertools.product(*middles))
 
 
 def shader_lens(model: OnnxLens) -> ShaderLens:
-    """A model in its state."""
+    """Return a model in its state as a shader has it."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
     all_nm = short, long = tuple(map(float, d["wavelength_nm"]))
@@ -407,7 +422,7 @@ def osl_lens(
     nodes: Sequence[ShaderLens], report: Report, axes: tuple[Axis, ...] = (),
     between: Sequence[tuple[Array, ShaderLens]] = (),
 ) -> OslLens:  # fmt: skip
-    """Any lens: what it is at each node of its axes, see `OslLens`.
+    """Make the shader's lens of any lens, from what it is at each node of its axes; see `OslLens`.
 
     Raises:
         InputError: no ray passes.
@@ -430,7 +445,7 @@ def osl_lens(
 
 
 def _blade_margin(lens: ShaderLens, pupil: PupilCircles) -> float:
-    """The margin, in stop radii, by which the sampler widens blades: a fit may put a passing ray beyond one."""
+    """Return the margin (stop radii) by which the sampler widens blades, for a fit may put a passing ray beyond one."""
     inputs = _samples(lens, pupil)
     ray = evaluate(lens.graph, inputs)
     passed = np.broadcast_to(ray["status"][0] == st.PASSED, inputs["at_stop"].shape[1:])
@@ -438,14 +453,14 @@ def _blade_margin(lens: ShaderLens, pupil: PupilCircles) -> float:
         (v[0] + 1j * v[1])[passed] for v in (inputs["at_stop"], ray["stop_xy_mm"] / inputs["stop_radius_mm"])
     )
     image, true = (v[np.abs(true) > _EDGES] for v in (image, true))
-    # Edges near a point face its direction, to within half a blade's angle.
+    # Near a point, the edge faces the point's direction, to within half a blade's angle.
     facing = true / np.abs(true) * np.exp(1j * np.linspace(-1, 1, 5)[:, None] * np.pi / 5)
     beyond = ((image - true) * facing.conj()).real.max(0)
     return max(float(np.quantile(beyond, _NEARLY)), _LEAST)
 
 
 def _entrance_mm(lens: ShaderLens) -> float:
-    """z of the entrance pupil: where the ray through the stop's middle, from beside the film's, crosses the axis."""
+    """Return z of the entrance pupil, where the ray from near the film's middle through the stop's meets the axis."""
     height, nudge = _BESIDE * lens.table.film_radius_mm, 1e-3 * lens.table.film_radius_mm
     nm = min(max(LINE_D_NM, lens.wavelength_nm[0]), lens.wavelength_nm[1])
     pupil = 0.0

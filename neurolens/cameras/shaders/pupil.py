@@ -1,11 +1,11 @@
 """The pupil of every film point at any stop and film position, for shaders: the stop's disc, cut by circles.
 
 The rays that pass a lens cross its stop within the opening, and within what the rims before and behind the stop leave
-of it. Seen in points of the stop, rims are circles whose centres and radii are short polynomials of the film point.
+of that. In points of the stop, rims are circles whose centres and radii are short polynomials of the film point.
 Samples fill what the circles have in common, and `shader_lens.StopImage` maps them to the pupil.
 
-Nothing here is a table: in a renderer's shader a table costs more than all of this. `pupil_outline` fits the pupil more
-closely, at one stop and focus.
+There is no table, since in a renderer's shader a table costs more than all of this. `pupil_outline` fits the pupil more
+closely, but at one stop and focus.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ from neurolens.cameras.shaders.shader_lens import HAIR, StopImage, frame_of_film
 from neurolens.graph.ir import Exponents, Graph, Value
 
 MAX_BLADES = 16
-_CLOSEST = 0.05  # of the stop's radius: the middle of a pupil to an edge; nearer, or beyond it, points stay apart
+# share of the stop's radius: how near the middle of a pupil may come to an edge before points stay apart
+_CLOSEST = 0.05
 
 
 class Blades:
-    """The opening of `Aperture` of inputs of the call: `count` (below 3 the stop is round), `roundness` of its edges,
-    cosine and sine of half a blade's angle and of the first edge's direction (`half_cos`, `edge_cos` and so on).
+    """The opening of an `Aperture` whose numbers are inputs of the call.
 
-    Points are in units of the stop's radius. Edges of fewer blades repeat.
+    Inputs are `count` (below 3 the stop is round), `roundness` of the edges, and cosine and sine of half a blade's
+    angle and of the first edge's direction (`half_cos`, `edge_cos` and so on). Points are in units of the stop's
+    radius. The graph has a fixed number of edges; those of fewer blades repeat.
     """
 
     def __init__(self, g: Graph) -> None:
@@ -47,23 +49,26 @@ class Blades:
         self.scale = 1.0 - self.curvature * self.middle
 
     def _excess(self, point: Value) -> Value:
-        """With `scale` times the distance of a point along an edge's direction added, above 0 beyond the edge; see
-        `Aperture.opening`."""
+        """Return a value to which `scale` times the point's distance along an edge's direction is added.
+
+        The sum is above 0 beyond that edge; see `Aperture.opening`.
+        """
         return self.curvature * 0.5 * (self.middle * self.middle + point.graph.square(point)) - self.middle
 
     def opened(self, point: Value) -> Value:
-        """1 for points [2] within the opening, 0 for others."""
+        """Return 1 for points [2] within the opening, 0 for others."""
         along = reduce(Value.maximum, (point[0] * cos + point[1] * sin for cos, sin in self.edges))
         inside = point.graph.select(along * self.scale + self._excess(point) <= 0.0, 1.0, 0.0)
         return point.graph.select(self.none, 1.0, inside)
 
     def drawn(self, start: Value, way: Value, margin: float) -> Value:
-        """The share of a way [2] from a point [2] on which the opening ends, 1 at most.
+        """Return the share of a way [2] from a point [2] at which the opening ends, at most 1.
 
-        Beyond an edge at the share s is a s^2 + b s > c, with one end 1 / s = (b + sqrt(b^2 + 4 a c)) / 2 c.
+        A point at the share s lies beyond an edge where a s^2 + b s > c; the end is where 1 / s = (b + sqrt(b^2 + 4 a
+        c)) / 2 c.
 
         Args:
-            margin: by which edges are moved out.
+            margin: by how much edges are moved outwards.
         """
         g = start.graph
         a, turned = self.curvature * 0.5 * g.square(way), self.curvature * g.dot(start, way)
@@ -76,9 +81,9 @@ class Blades:
 
 
 Array = NDArray[np.float64]
-_NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))  # Gauss's nodes and weights over a disc, on a diameter
-_TIP = 1e-7  # of 1 - x^2 near the ends of a diameter
-_ROUNDS = 2  # of finding the blades from the pupil's middle: the pupil's width there depends on where they are
+_NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))  # Gauss's nodes and weights over a disc, along a diameter
+_TIP = 1e-7  # least 1 - x^2, near the ends of a diameter
+_ROUNDS = 2  # how often the blades are found from the pupil's middle, whose place depends on where they are
 
 
 @dataclass(frozen=True)
@@ -86,13 +91,15 @@ class PupilCircles:
     """Circles that hold the passing rays of film points, in points of the stop in units of `image.stop_mm`.
 
     Attributes:
-        film_radius_mm: beyond it no light passes. image: from points of the stop to the pupil.
-        wide: how wide the stop's disc is, in units of the stop's radius: on the axis, and what is added by the square
-            of the film radius squared times the stop; and what is added at all stops, in units of `image.stop_mm`,
-            where the stop's image folds: there is no circle then, and the image but moves and scales the stop.
-        exponents: [M, 3] of film x and y, scaled as the image does, and of the film position.
-        numbers: [K, 3, M] of each rim's circle: u^2 + v^2 <= c + 2 a u + 2 b v with c, a, b of these monomials.
-        squeeze: film points' y is scaled by it for the direction in which the pupil of an anamorphic lens is filled.
+        film_radius_mm: beyond it no light passes.
+        image: maps points of the stop to the pupil.
+        wide: three numbers for how wide the stop's disc is. The first two are in units of the stop's radius: the width
+            on the axis, and what the square of (film radius squared times the stop) adds. The third, in units of
+            `image.stop_mm`, is added at all stops where the stop's image folds; there is no circle then, and the image
+            only moves and scales the stop.
+        exponents: [M, 3], of film x and y, scaled as in the image, and of the film position.
+        numbers: [K, 3, M], for each rim's circle u^2 + v^2 <= c + 2 a u + 2 b v: c, a and b in these monomials.
+        squeeze: scales film points' y where the direction is taken in which the pupil of an anamorphic lens is filled.
     """
 
     film_radius_mm: float
@@ -104,20 +111,20 @@ class PupilCircles:
 
     @cached_property
     def graph(self) -> Graph:
-        """`sampler` of a round stop."""
+        """Write `sampler` for a round stop."""
         return self.sampler()
 
     def sampler(self, blades: type[Blades] | None = None, margin: float = 0.0) -> Graph:
-        """The pupil point of a film point and a point of the unit square.
+        """Write the graph from a film point and a point of the unit square to a pupil point.
 
         Args:
             blades: moves points of the disc towards its middle, to where the stop's blades end.
-            margin: by which blades are widened, in units of the stop's radius, as the image is not exact.
+            margin: by how much blades are widened, in units of the stop's radius, because the image is not exact.
 
-        Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call `film_z_mm`, `stop_radius_mm`.
-        Outputs: `pupil_mm` [2]; `area_mm2`, the inverse of its density, 0 where nothing passes; `mean_area_mm2`, its
-        mean over the square of a round stop, as if the pupil were everywhere stretched as at the point; `at_stop` [2],
-        about where the ray crosses the stop, in units of its radius.
+        Inputs are `film_mm`, `square` [2] and `wavelength_nm`; for a whole call, `film_z_mm` and `stop_radius_mm`.
+        Outputs are `pupil_mm` [2]; `area_mm2`, the inverse of its density, 0 where nothing passes; `mean_area_mm2`, the
+        mean of that over the square for a round stop, as if the pupil were stretched everywhere as at the point; and
+        `at_stop` [2], about where the ray crosses the stop, in units of its radius.
         """
         g = Graph()
         film, square = g.input("film_mm", 2), g.input("square", 2)
@@ -153,16 +160,16 @@ class PupilCircles:
         return g
 
     def _disc(self, film: Value, size: Value) -> Value:
-        """The radius of the stop's disc."""
+        """Return the radius of the stop's disc."""
         g = film.graph
         grown = g.square(film * (1 / self.image.film_mm)) * size
-        # Named: states whose numbers equal others of the graph have the same structure as the rest.
+        # They have names, so that states in which they equal other numbers of the graph keep the same structure.
         first, second, more = (g.constant(value, f"wide {k}") for k, value in enumerate(self.wide))
         disc = size * (grown * grown * second + first)
         return disc + more if self.wide[2] else disc
 
     def _rims(self, field: Value, film_z: Value, turn: Value) -> list[_Circle]:
-        """The rims' circles in the frame in which the disc is filled."""
+        """Return the rims' circles in the frame in which the disc is filled."""
         circles = []
         for c, a, b in self._rows(field, film_z):
             if self.image.anamorphic:
@@ -174,7 +181,7 @@ class PupilCircles:
         return circles
 
     def _rows(self, film: Value, film_z: Value) -> list[tuple[Value, Value, Value]]:
-        """c, a and b of every circle. Those that are 0 by symmetry have no terms."""
+        """Return c, a and b of every circle; those that are 0 by symmetry have no terms."""
         g, (middle, half) = film.graph, self.image.film_z_mm
         position, variables = (film_z - middle) * (1 / half), film * (1 / self.image.film_mm)
         circles = []
@@ -190,14 +197,17 @@ class PupilCircles:
         return circles
 
     def _terms(self, row: int) -> NDArray[np.bool_]:
-        """The monomials that c, a or b has by symmetry."""
+        """Return which monomials c, a or b has by symmetry."""
         x, y = self.exponents[:, 0] + (row == 1), self.exponents[:, 1] + (row == 2)
         return np.asarray((x % 2 == 0) & (y % 2 == 0) & (self.image.anamorphic | (row < 2)))
 
     @cached_property
     def checked(self) -> Graph:
-        """How far points of the stop lie inside: inputs `film_mm`, `point_mm` [2], `film_z_mm`, `stop_radius_mm`; for a
-        round lens in the film point's frame. Output `within`: of the disc, then of the circles."""
+        """Write the graph of how far points of the stop lie inside.
+
+        Inputs are `film_mm`, `point_mm` [2], `film_z_mm` and `stop_radius_mm`; a round lens takes points in the film
+        point's frame. The output `within` is how far inside the disc, then inside each circle.
+        """
         g = Graph()
         film, point = g.input("film_mm", 2), g.input("point_mm", 2) * (1 / self.image.stop_mm)
         size = g.input("stop_radius_mm") * (1 / self.image.stop_mm)
@@ -209,7 +219,7 @@ class PupilCircles:
         return g
 
     def mixed(self, others: Sequence[PupilCircles], weights: Array) -> PupilCircles:
-        """The pupil of a state between states, with these weights of itself and of others of the same lens."""
+        """Return the pupil in a state between states, with these weights of itself and of others of the same lens."""
         states = [self, *others]
 
         def mean(values: Sequence[Array | float]) -> Array:
@@ -228,8 +238,10 @@ class PupilCircles:
 
 @dataclass(frozen=True)
 class _Circle:
-    """A circle (x' - x)^2 + (y' - y)^2 <= radius^2 in the frame in which the disc is filled, where y is None if all
-    centres lie on the x axis. Its half height at x' is the root of level + 2 x x' - x'^2."""
+    """A circle (x' - x)^2 + (y' - y)^2 <= radius^2 in the frame in which the disc is filled.
+
+    Here y is None if all centres lie on the x axis. Its half height at x' is the root of level + 2 x x' - x'^2.
+    """
 
     x: Value
     y: Value | None
@@ -248,7 +260,7 @@ class _Circle:
 class _Shape:
     """The region that circles have in common, of which the first is the stop's.
 
-    The unit disc maps to it chord by chord, so that densities stay nearly even.
+    The unit disc is mapped to it chord by chord, so that densities stay nearly even.
     """
 
     def __init__(self, circles: Sequence[_Circle]) -> None:
@@ -258,7 +270,7 @@ class _Shape:
         self.half, self.middle = (self.high - self.low) * 0.5, (self.low + self.high) * 0.5
 
     def chord(self, x: Value) -> tuple[Value | None, Value]:
-        """The middle along y (None: 0) of the chord at x of the unit disc, and its half height over the disc's."""
+        """Return the middle along y (None: 0) of the unit disc's chord at x, and its half height over the disc's."""
         square, at = ((x + 1.0) * (1.0 - x)).maximum(_TIP), self.middle + self.half * x
         twice, below = at * 2.0, at * at
         levels = [c.level + c.x * twice for c in self.circles]
@@ -272,7 +284,7 @@ class _Shape:
         return (top + bottom) * 0.5, ((top - bottom) * 0.5).maximum(0.0) / square.sqrt()
 
     def point(self, disc: Value, x: Value) -> tuple[Value, Value, Value]:
-        """x, y and the half height over that of the disc, for a point of the unit disc on the chord at x."""
+        """Return x, y and the half height over that of the disc, for a point of the unit disc on the chord at x."""
         centre, tall = self.chord(x)
         y = disc[1] * tall
         return self.middle + self.half * disc[0], y if centre is None else centre + y, tall
@@ -281,7 +293,7 @@ class _Shape:
 def _within_blades(
     disc: Value, shape: _Shape, at_stop: Callable[[Value, Value], Value], blades: Blades, margin: float
 ) -> Value:
-    """The factor that moves a point of the disc towards the middle until it lies within the blades."""
+    """Return the factor that moves a point of the disc towards the middle until it lies within the blades."""
     g = disc.graph
     centre, _ = shape.chord(g.constant(0.0))
     start = at_stop(shape.middle, g.constant(0.0) if centre is None else centre)

@@ -1,9 +1,9 @@
 """The fit of a shader's pupil to the rays that pass a lens: circles in the stop, or one wide disc.
 
-In points of the stop, how far a ray lies within a rim's circle is linear in the circle's numbers: least squares put the
-circle through rays that this rim all but stops. Rays beyond it weigh more, and new rays widen it until few enough of
-those that pass are lost in any zone of film and stop. Where the stop's image folds, or circles lose too much, one disc
-holds them all.
+In points of the stop, how far a ray lies within a rim's circle is linear in the circle's numbers, so least squares put
+the circle through rays that this rim all but stops. Rays beyond the circle get more weight, and new rays widen it,
+until few enough of those that pass are lost in any zone of film and stop. Where the stop's image folds, or circles lose
+too much, one disc holds all rays.
 """
 
 from __future__ import annotations
@@ -26,24 +26,28 @@ from neurolens.graph.ir import Exponents
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 _RAYS = 6_000  # random rays of a zone
-_STOPS = (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.0, 1.0)  # of the widest stop
-_AROUND = 1.1  # stop radii, within which rays are drawn
-_BESIDE, _FOLDED = 0.25, 0.01  # of the pupil's size, and the share of rays that may lie so far from the image
-# Highest powers of the film point of round lenses and anamorphic ones; of terms with the film position and its square.
+_STOPS = (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.0, 1.0)  # shares of the widest stop at which rays are drawn
+_AROUND = 1.1  # radius, in stop radii, within which rays are drawn
+# share of the pupil's size that a ray may lie from the image, and share of the rays that may lie farther
+_BESIDE, _FOLDED = 0.25, 0.01
+# Highest powers of the film point, for round lenses and anamorphic ones; and of terms with the film position and its
+# square.
 _DEGREE, _MOVING = (8, 4), (3, 1)
-_EDGES, _HALVINGS, _CODES, _RARE = 20_000, 12, 4000, 300  # rays between which edges are sought; edges of a rim
-_ZONES, _FEW = (8, 3, 3), 2500  # of film radius squared, azimuth and stop; rays that tell about a zone
+# rays between which edges are sought, halvings, edges of a rim that are kept, and edges with which a rim counts
+_EDGES, _HALVINGS, _CODES, _RARE = 20_000, 12, 4000, 300
+_ZONES, _FEW = (8, 3, 3), 2500  # zones of film radius squared, azimuth and stop; rays with which a zone counts
 _ALL = int(np.prod(_ZONES))
 _SQUEEZES = (1.0, 0.7, 0.5, 0.35, 1.4, 2.0)  # those that are tried
-_ROUNDS, _HEAVIER = 20, 20.0  # of least squares; by how much rays that a circle would lose weigh more
-_RIDGE, _CALM = 1e-9, 1e-3  # of the equations' diagonal; rays, by whose force numbers stay at those of all states
-# Shares of a zone's new rays that all circles may lose, in turn, until they lose at most `_SURE`; with more than `LOST`
-# they give way to a wide disc.
+_ROUNDS, _HEAVIER = 20, 20.0  # rounds of least squares; how many times the weight that rays beyond a circle then have
+# share of the equations' diagonal; rays with whose force numbers are held at those of all states
+_RIDGE, _CALM = 1e-9, 1e-3
+# Shares of a zone's new rays that all circles may lose, tried in turn until they lose at most `_SURE`. If they still
+# lose more than `LOST`, they give way to a wide disc.
 _ALLOWED = (8e-4, 8e-4, 4e-4, 2e-4, 2e-4, 1e-4)
 LOST, _SURE = 1e-3, 6e-4
-_NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
-_DRAWN, _DISC_LOST = 24, 6e-4  # draws of rays that tell how wide a disc has to be; what may be lost
-_INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
+_NEIGHBOUR = 0.3  # share of the greatest weight that nodes next to a state have
+_DRAWN, _DISC_LOST = 24, 6e-4  # draws of rays that tell how wide a disc has to be, and the share that it may lose
+_INNER = 0.1  # zones count as the axis where what `PupilCircles.wide` grows by is less than this share
 
 
 @dataclass(frozen=True)
@@ -59,18 +63,20 @@ class _Rays:
         return np.asarray(self.codes == st.PASSED)
 
     def at(self, rows: NDArray[np.intp]) -> _Rays:
-        """Some of the rays."""
+        """Return some of the rays."""
         return _Rays({name: row[:, rows] for name, row in self.inputs.items()}, self.codes[rows], self.zone[rows])
 
 
 def fit_pupil(
     lenses: Sequence[ShaderLens], report: Report, between: Sequence[tuple[Array, ShaderLens]] = ()
 ) -> list[PupilCircles]:
-    """The pupil of a lens in each of its states. All but 1 in 1000 of the rays that pass, in any zone, lie inside.
+    """Fit the pupil of a lens in each of its states, so that at most 1 in 1000 passing rays of any zone lies outside.
 
     Args:
         lenses: the lens at each node of its states.
-        between: weights of the nodes and the lens in states between them: mixtures of the pupils hold its rays, too.
+        report: is told what is done.
+        between: the lens in states between the nodes, each with their weights; mixtures of the pupils hold its rays
+            too.
 
     Raises:
         InputError: no ray passes.
@@ -89,7 +95,7 @@ def _fit_circles(
     lenses: Sequence[ShaderLens], images: Sequence[StopImage], report: Report,
     between: Sequence[tuple[Array, ShaderLens]],
 ) -> tuple[list[PupilCircles], float]:  # fmt: skip
-    """Circles, and the share of the rays of the worst zone that they lose."""
+    """Fit circles; return them and the share of the rays that they lose in the worst zone."""
     exponents, pairs = _exponents(lenses[0].anamorphic), list(zip(lenses, images, strict=True))
     pupils = [PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0, 0.0), exponents[:0, :3], np.zeros((0, 3, 0)))
               for lens, image in pairs]  # fmt: skip
@@ -114,7 +120,7 @@ def _fit_circles(
 def _widened(
     pupils: list[PupilCircles], lenses: Sequence[ShaderLens], between: Sequence[tuple[Array, ShaderLens]]
 ) -> tuple[list[PupilCircles], float]:
-    """Circles as much wider as new random rays need, and the share that they lose of others."""
+    """Widen circles as much as new random rays need; return them and the share of other new rays that they lose."""
     states = [*zip(np.eye(len(pupils)), lenses, strict=True), *between]
     lost = np.ones(len(states))
     for seed, allowed in enumerate((*_ALLOWED, 0.0)):
@@ -131,7 +137,8 @@ def _widened(
                 more /= weights[near].sum()
                 wide = _disc(mixed, rays, len(more))
                 pupils = [_wider(p, more, wide) if w else p for p, w in zip(pupils, near, strict=True)]
-                for other, (mix, _) in enumerate(states):  # a state loses by what widens a node that it subtracts
+                # what widens a node loses rays in states that subtract that node
+                for other, (mix, _) in enumerate(states):
                     lost[other] = 1.0 if (mix[near] < 0).any() else lost[other]
     return pupils, float(lost.max())
 
@@ -143,8 +150,11 @@ def _wider(pupil: PupilCircles, more: Array, wide: tuple[float, float, float]) -
 
 
 def _edges(lens: ShaderLens, pupil: PupilCircles, rays: _Rays) -> _Rays:
-    """Rays that rims all but stop, each with the code of the rim: halfway, again and again, between a ray that a rim
-    stops and the point of one that passes, from about the same film point."""
+    """Find rays that rims all but stop, each with the code of its rim.
+
+    They lie between a ray that a rim stops and the point of one that passes, from about the same film point, by
+    halving.
+    """
     inputs, size = rays.inputs, rays.inputs["stop_radius_mm"][0]
     place = inputs["film_mm"][0] ** 2 + inputs["film_mm"][1] ** 2 / 3
     blocked = np.flatnonzero(~rays.passed & (np.hypot(*inputs["point_mm"]) < size))[:_EDGES]
@@ -165,7 +175,7 @@ def _edges(lens: ShaderLens, pupil: PupilCircles, rays: _Rays) -> _Rays:
 
 
 def _codes(lens: ShaderLens, pupil: PupilCircles, rays: _Rays, point: Array) -> NDArray[np.int32]:
-    """Status [N] of the rays through other points of the widest stop."""
+    """Return the status [N] of the rays through other points of the widest stop."""
     film, z, nm = (rays.inputs[name] for name in ("film_mm", "film_z_mm", "wavelength_nm"))
     through = replace(lens, graph=pupil.image.through_stop(lens.graph))
     return through.status(film, point, nm[0], z[0], lens.stop_radius_mm)
@@ -174,11 +184,13 @@ def _codes(lens: ShaderLens, pupil: PupilCircles, rays: _Rays, point: Array) -> 
 def _fit_rims(
     edges: Sequence[_Rays], lit: Sequence[_Rays], pupils: Sequence[PupilCircles], exponents: Exponents, code: int
 ) -> list[Array]:
-    """Numbers [M + 1] of a rim's circle in every state: least squares, which stay near those of all states together
-    where no ray tells otherwise.
+    """Fit the numbers [M + 1] of a rim's circle in every state, by least squares.
+
+    Where no ray tells otherwise, they stay near the numbers for all states together.
 
     Args:
-        edges: of `_edges`. lit: rays that pass.
+        edges: from `_edges`.
+        lit: rays that pass.
     """
     rows, on_edge = [], []
     for at_rims, inside, pupil in zip(edges, lit, pupils, strict=True):
@@ -191,8 +203,11 @@ def _fit_rims(
 
 
 def _least(features: Array, on_edge: Array, near: Array) -> Array:
-    """Numbers [M] for which a margin, with the last number 1, is nearly 0 on the edge, rather above it than below, not
-    below 0 for rays inside, and which lie near others; `on_edge` [N] is 1 or 0."""
+    """Find numbers [M] for which a margin, with 1 as the last number, is nearly 0 on the edge.
+
+    There it is rather above 0 than below; it must not be below 0 for rays inside, and the numbers lie near others.
+    `on_edge` [N] is 1 or 0.
+    """
     size = np.sqrt(np.square(features).mean(1))
     matrix, numbers, weight = features[:-1] / size[:-1, None], near, on_edge
     lacks = -features[-1] - near @ features[:-1]
@@ -204,7 +219,7 @@ def _least(features: Array, on_edge: Array, near: Array) -> Array:
 
 
 def _with_circles(pupil: PupilCircles, exponents: Exponents, numbers: Array) -> PupilCircles:
-    """The pupil with circles of these numbers [K, M + 1]."""
+    """Return the pupil with circles of these numbers [K, M + 1]."""
     monomials = np.unique(exponents[:, :3], axis=0)
     rows = np.zeros((len(numbers), 3, len(monomials)))
     for powers, values in zip(exponents, (numbers[:, :-1] / numbers[:, -1:]).T, strict=True):
@@ -214,7 +229,7 @@ def _with_circles(pupil: PupilCircles, exponents: Exponents, numbers: Array) -> 
 
 
 def _exponents(anamorphic: bool) -> Exponents:
-    """[M, 5] of film x, y, film position, stop x, y: terms that mirrors leave alone, linear in the stop point."""
+    """Exponents [M, 5] of film x, y, film position, stop x, y for terms that mirrors keep, linear in the stop point."""
     terms, degree = [], _DEGREE[anamorphic]
     for i in range(degree + 1):
         for j in range(degree + 1 if anamorphic else 1):
@@ -225,7 +240,7 @@ def _exponents(anamorphic: bool) -> Exponents:
 
 
 def _drawn(lens: ShaderLens, pupil: PupilCircles, seed: int) -> _Rays:
-    """Random rays through points of all stops and a little beyond."""
+    """Draw random rays through points of all stops, and a little beyond."""
     rng, count = np.random.default_rng(seed), _RAYS * (_ALL if lens.anamorphic else _ALL // _ZONES[1])
     radius = pupil.film_radius_mm * 0.9999 * rng.random(count) ** 0.5
     angle = 2 * np.pi * rng.random(count) if lens.anamorphic else np.zeros(count)
@@ -239,13 +254,13 @@ def _drawn(lens: ShaderLens, pupil: PupilCircles, seed: int) -> _Rays:
     inputs = {"film_mm": film, "point_mm": point, "film_z_mm": z[None]}
     inputs["wavelength_nm"], inputs["stop_radius_mm"] = nm[None], share[None] * lens.stop_radius_mm
     aside = np.abs(np.arctan2(np.abs(film[1]), np.abs(film[0]))) / (np.pi / 2)
-    shares = (radius / pupil.film_radius_mm) ** 2, aside, share * 0.7501  # the widest stop is a separate zone
+    shares = (radius / pupil.film_radius_mm) ** 2, aside, share * 0.7501  # the widest stop is a zone of its own
     zones = [np.minimum(s * n, n - 1).astype(np.intp) for s, n in zip(shares, _ZONES, strict=True)]
     return _Rays(inputs, codes, np.ravel_multi_index(zones, _ZONES))
 
 
 def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float, float]:
-    """`PupilCircles.wide`: images err most where the film ends."""
+    """Return `PupilCircles.wide`; an image errs most where the film ends."""
     size = rays.inputs["stop_radius_mm"][0] / pupil.image.stop_mm
     beyond = np.hypot(*rays.inputs["point_mm"]) / pupil.image.stop_mm / size - 1
     growth = (np.square(rays.inputs["film_mm"]).sum(0) / pupil.image.film_mm**2 * size) ** 2
@@ -255,7 +270,7 @@ def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float, fl
 
 
 def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[NDArray[np.intp], float]]:
-    """The rays that pass in each zone, and by how much their margins lack, so that this share at most is lost."""
+    """Return the rays that pass in each zone, and the margin they lack if at most this share shall be lost."""
     passed = np.flatnonzero(rays.passed)
     zones = rays.zone[passed]
     ends = np.searchsorted(zones, np.arange(_ALL + 1), sorter=(order := np.argsort(zones, kind="stable")))
@@ -268,7 +283,7 @@ def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[NDArray[np.in
 
 
 def _features(rays: _Rays, pupil: PupilCircles, exponents: Exponents) -> Array:
-    """[M + 1, N] what a circle's margin is linear in."""
+    """Return [M + 1, N], in which a circle's margin is linear."""
     inputs, image = rays.inputs, pupil.image
     point = inputs["point_mm"] / image.stop_mm
     position = (inputs["film_z_mm"] - image.film_z_mm[0]) / image.film_z_mm[1]
@@ -283,19 +298,19 @@ def _features(rays: _Rays, pupil: PupilCircles, exponents: Exponents) -> Array:
 
 
 def _lost(rays: _Rays, within: Array) -> float:
-    """The share of the rays that pass which lie outside, in the worst zone."""
+    """Return the largest share, over zones, of passing rays that lie outside."""
     passed, missed = _missed(rays, within)
     return float((missed / np.maximum(passed, _FEW)).max())
 
 
 def _missed(rays: _Rays, within: Array) -> Array:
-    """Counts [2, zones] of the rays that pass, and of those among them that lie outside."""
+    """Return counts [2, zones] of the rays that pass, and of those among them that lie outside."""
     out = rays.passed & (within < 0).any(0)
     return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
 
 
 def light_lost(lens: ShaderLens, pupil: PupilCircles) -> float:
-    """The share of the rays that pass which no sample is, in the worst zone of film and stop, by new random rays."""
+    """Return the largest share, over zones of film and stop, of passing new rays that no sample reaches."""
     if pupil.wide[2]:
         return max(float(np.mean(rows > pupil.wide[2])) for rows in _beyond_discs(lens, pupil, 100))
     counts = np.zeros((2, _ALL))
@@ -306,8 +321,10 @@ def light_lost(lens: ShaderLens, pupil: PupilCircles) -> float:
 
 
 def _beside(lens: ShaderLens, image: StopImage) -> float:
-    """The share of random rays that pass far beside the image of their point of the stop, in the worst part of the
-    film: where an image folds, two pupil points show one point of the stop."""
+    """The share of random rays that pass far from the image of their point of the stop, in the worst part of the film.
+
+    Where an image folds, two pupil points show one point of the stop.
+    """
     rays = draw_rays(lens, None, 5)
     inputs = {"film_mm": rays.film_mm, "point_mm": rays.point_mm}
     inputs |= {"film_z_mm": rays.film_z_mm[None], "wavelength_nm": rays.wavelength_nm[None]}
@@ -317,7 +334,7 @@ def _beside(lens: ShaderLens, image: StopImage) -> float:
 
 
 def _wide_discs(lenses: Sequence[ShaderLens], between: Sequence[tuple[Array, ShaderLens]] = ()) -> list[PupilCircles]:
-    """One wide disc for each state; arguments of `fit_pupil`."""
+    """Return one wide disc for each state; arguments are those of `fit_pupil`."""
     images = fit_stop_images(lenses, folded=True)
     if images is None:
         raise InputError("export", "pupil", "(hardly a ray passes)", "a lens that light can pass")
@@ -333,8 +350,10 @@ def _wide_discs(lenses: Sequence[ShaderLens], between: Sequence[tuple[Array, Sha
 
 
 def _beyond_discs(lens: ShaderLens, pupil: PupilCircles, seed: int) -> list[Array]:
-    """How far random rays that pass lie beyond the image of the smallest stop that they pass, in units of
-    `StopImage.stop_mm`; for each zone of the film and that stop with enough rays."""
+    """Return how far passing random rays lie beyond the image of the smallest stop that they pass.
+
+    The unit is `StopImage.stop_mm`; there is one array for each zone of the film and that stop with enough rays.
+    """
     beyond, zones = [], []
     for k in range(_DRAWN):
         rays = draw_rays(lens, None, seed + k)

@@ -1,7 +1,7 @@
 """A lens in one state as a shader uses it, and the image of its stop: pupil points by film point and stop point.
 
 Seen from a film point, a pupil may have many shapes. In coordinates of the stop it is nearly a disc, which the rims cut
-by other discs. Discs are easy to sample, and this map takes the samples to the pupil.
+by other discs. Discs are easy to sample, and the image takes the samples to the pupil.
 """
 
 from __future__ import annotations
@@ -30,20 +30,23 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 _PART = 1 << 15  # rays that are evaluated together
-_PARTS, _LOW_BITS = 16.0, 4096.0  # of the spectrum; the bits of a number below 1 / 4096 choose the place within a part
+_PARTS, _LOW_BITS = 16.0, 4096.0  # parts of the spectrum; a number's bits below 1 / 4096 choose the place within a part
 
 
 @dataclass(frozen=True)
 class ShaderLens:
-    """A lens in one state.
+    """Holds a lens in one state.
 
     Attributes:
         graph: the lens; see `cameragraph.LensGraph`.
-        table: boxes on the pupil plane that hold the rays which pass.
-        film_z_mm, wavelength_nm: the ranges. stop_radius_mm: the widest stop.
-        stop_surface: its number, for the status of the rays that it blocks.
+        table: boxes on the pupil plane that hold the passing rays.
+        film_z_mm, wavelength_nm: the ranges of film position and light.
+        stop_radius_mm: radius of the widest stop.
+        stop_surface: the stop's surface, which the status of rays names that it blocks.
         anamorphic: whether the lens is symmetric about the x and y axes only.
-        focusing: where the film stands. f_number: of the widest stop. efl_mm: the focal length.
+        focusing: where the film stands.
+        f_number: that of the widest stop.
+        efl_mm: the focal length.
     """
 
     graph: Graph
@@ -59,7 +62,7 @@ class ShaderLens:
 
     @property
     def film_radius_mm(self) -> float:
-        """The model knows no ray from beyond it."""
+        """The radius beyond which the model knows no ray."""
         return self.table.film_radius_mm
 
     def end_of_light_mm(self) -> float:
@@ -73,7 +76,7 @@ class ShaderLens:
         return min(max(radii), self.film_radius_mm)
 
     def drawn_in_boxes(self, radius: Array, rng: np.random.Generator) -> Array:
-        """Random pupil points [2, N] in the boxes of film points at radii [N] along +x."""
+        """Draw random pupil points [2, N] in the boxes of film points at radii [N] along +x."""
         radii = np.linspace(0, self.film_radius_mm, self.table.rows.shape[1])
         low, high, half = (np.interp(radius, radii, row) for row in self.table.rows)
         return np.stack([low + (high - low) * rng.random(radius.size), half * rng.uniform(-1, 1, radius.size)])
@@ -91,8 +94,10 @@ class ShaderLens:
     def status(
         self, film: ArrayLike, pupil: ArrayLike, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike
     ) -> NDArray[Any]:
-        """Status [N] of rays from film points [2, N] through pupil points [2, N] (mm). The other arguments are [N] or
-        one number."""
+        """Return the status [N] of rays from film points [2, N] through pupil points [2, N] (mm).
+
+        The other arguments are [N] or one number.
+        """
         film = np.asarray(film)
         rays = np.concatenate([film, pupil, np.broadcast_to(nanometres, (1, film.shape[1]))]).astype(np.float32)
         call = {"film_z_mm": _row(film_z), "stop_radius_mm": _row(stop)}
@@ -106,7 +111,7 @@ class ShaderLens:
 
     @cached_property
     def _status(self) -> Graph:
-        """The graph of the status alone."""
+        """The graph that gives the status alone."""
         return replace(self.graph, outputs={"status": self.graph.outputs["status"]})
 
 
@@ -120,9 +125,9 @@ _SAMPLES, _TRIES = 20_000, 64  # film points; samples that decide whether one ha
 def passing_share(
     lens: ShaderLens, pupil: PupilCircles, stops: Sequence[float] = (1.0, 0.5, 0.25)
 ) -> dict[float, float]:
-    """The share of samples that pass, all over the film, by shares of the widest stop.
+    """Return the share of samples that pass, all over the film, by shares of the widest stop.
 
-    Film points without light do not count: those whose ray is blocked count where any of 64 more rays passes.
+    Film points without light do not count. One whose ray is blocked counts where any of 64 more rays passes.
     """
     rng, shares = np.random.default_rng(3), {}
     for stop in stops:
@@ -133,7 +138,8 @@ def passing_share(
         blocked = np.flatnonzero(~passed)
         lit, tries = np.zeros(blocked.size, bool), 0
         while tries < _TRIES and not lit.all():
-            # Each round doubles the rays of a dark point: a call with few rays takes nearly as long as one with many.
+            # Each round doubles the rays of a dark point, because a call with few rays takes nearly as long as one with
+            # many.
             more = min(max(1, min(tries, _SAMPLES // int(np.count_nonzero(~lit)))), _TRIES - tries)
             dark, tries = np.repeat(blocked[~lit], more), tries + more
             again = _sampled(lens, pupil, rng.random((2, dark.size)), film[:, dark], call[:, dark], stop)
@@ -154,15 +160,16 @@ def _sampled(
 
 
 def light(range_nm: tuple[float, float], numbers: Value, in_colour: Value) -> tuple[Value, Value, Value]:
-    """Choose a ray's wavelength and colour weights [3], red to blue; its two random numbers leave two for its pupil.
+    """Choose a ray's wavelength and colour weights [3], red to blue, and return them with two numbers for its pupil.
 
-    Cycles's numbers are the second and third dimension of Sobol's sequence, most even in their high bits. Four bits
-    choose one of sixteen parts of the spectrum: the first of either number, whether the second ones differ, and the
-    third of the first number. Its lowest bits choose the wavelength within the part, and the other bits are left. So
-    sixteen samples of a pixel hold each eighth of the spectrum twice, once in either half by which adaptive sampling
-    judges noise. A half holds the samples whose index has an odd number of the bits 2, 8, 32...: the second bit of a
-    number is uneven there, and the first ones, and whether the second ones differ, are even. The weights are
-    Bernstein's polynomials of second order: never negative, of mean 1 each.
+    Cycles's numbers are the second and third dimension of Sobol's sequence, and their high bits are the most even. Four
+    bits choose one of sixteen parts of the spectrum: the first bit of either number, whether their second bits differ,
+    and the third bit of the first number. The lowest bits choose the wavelength within the part, and the other bits are
+    left for the pupil. So sixteen samples of a pixel hold each eighth of the spectrum twice, once in each of the halves
+    by which adaptive sampling judges noise. A half holds the samples whose index has an odd number of the bits 2, 8,
+    32...: within it the second bit of a number is uneven, but the first bits are even, and so is whether the second
+    bits differ. The weights are Bernstein's polynomials of second order, which are never negative and each have the
+    mean 1.
     """
     g, (short, long) = numbers.graph, range_nm
     halves = numbers * 2.0
@@ -182,30 +189,34 @@ def light(range_nm: tuple[float, float], numbers: Value, in_colour: Value) -> tu
 
 HAIR = 1e-18  # mm; keeps the direction of a film point on the axis finite
 _RAYS, _FEWEST = 4_000, 1_000  # rays of a fit at most, and how many have to pass
-_TERMS = ((12, 24, 72), (16, 32, 72))  # most terms of each fit; rays of the next are drawn through the last
+_TERMS = ((12, 24, 72), (16, 32, 72))  # most terms of each fit; rays of the next fit are drawn through the last one
 _ENOUGH = 0.0012  # RMS error, in units of the stop's radius, at which a fit needs no more terms
-_SIZES, _REACH = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.0), 1.06  # stops whose edges count most; how far beyond rays lie
-# Highest powers of film and stop point together, of the stop point, and of film and stop point in terms that move with
-# the wavelength or the film: of round lenses, of anamorphic ones.
+# stops whose edges count most; how far beyond them rays lie
+_SIZES, _REACH = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.0), 1.06
+# Highest powers of film and stop point together, of the stop point alone, and of film and stop point in terms that move
+# with wavelength or film; each for round lenses and for anamorphic ones.
 _DEGREE, _STOP_DEGREE, _MOVING = (13, 7), (7, 5), (7, 4)
-_FIELD = 21  # powers of the film radius in a round lens's terms that are linear in the stop point: fisheyes need them
-_MOVES = ((0, 0), (1, 0), (0, 1), (0, 2), (1, 1), (2, 0))  # powers of the wavelength's variable and the film position
+# powers of the film radius in those terms of a round lens that are linear in the stop point, for fisheyes need them
+_FIELD = 21
+# powers of the wavelength's variable and of the film position
+_MOVES = ((0, 0), (1, 0), (0, 1), (0, 2), (1, 1), (2, 0))
 
 
 @dataclass(frozen=True)
 class StopImage:
     """Pupil points of points (x, y) of the stop, by two polynomials P and Q.
 
-    A round lens is described in the frame of the film point, whose x axis points to it: the pupil point is
-    (x P + Q, y P) with P and Q of the film radius, x and x^2 + y^2. This is the general form of a map that rotations
-    and mirrors leave alone. The pupil point of an anamorphic lens is (P, Q), of film point and stop point.
+    A round lens is described in the frame of the film point, whose x axis points to it. There the pupil point is (x P +
+    Q, y P), with P and Q polynomials of the film radius, x and x^2 + y^2, which is the general form of a map that
+    rotations and mirrors leave alone. The pupil point of an anamorphic lens is (P, Q), of film point and stop point.
 
     Attributes:
-        film_mm, stop_mm: units of film points and of stop points. They are the same in all states of a lens.
-        film_z_mm, wave: middle and half range of film positions, and of (1000 / wavelength)^2.
+        film_mm, stop_mm: units of film points and of stop points, which are the same in all states of a lens.
+        film_z_mm, wave: middle and half the range of film positions, and of (1000 / wavelength)^2.
         anamorphic: which of the two forms it is.
-        exponents: [M, 7]: 0 for terms of P and 1 for Q, then powers of two film variables, of two stop variables, of
-            the wavelength's variable and of the film position. numbers: [M], mm.
+        exponents: [M, 7]: 0 for terms of P and 1 for Q, then the powers of two film variables, of two stop variables,
+            of the wavelength's variable and of the film position.
+        numbers: [M], coefficients in mm.
     """
 
     film_mm: float
@@ -218,8 +229,11 @@ class StopImage:
 
     @cached_property
     def graph(self) -> Graph:
-        """Inputs `film_mm`, `point_mm` [2], `wavelength_nm`, and of the call `film_z_mm`; output `pupil_mm` [2] with
-        its derivatives by the point. A film point of a round lens is (radius, 0)."""
+        """Write the graph of the image.
+
+        Inputs are `film_mm`, `point_mm` [2] and `wavelength_nm`, and for a whole call `film_z_mm`; the output is
+        `pupil_mm` [2], with its derivatives by the point. A round lens takes (radius, 0) as the film point.
+        """
         g = Graph()
         (middle, half), (mean, reach) = self.film_z_mm, self.wave
         position = (g.input("film_z_mm", per_call=True) - middle) * (1 / half)
@@ -232,7 +246,7 @@ class StopImage:
         return with_derivatives(g, ["pupil_mm"], [("point_mm", 0), ("point_mm", 1)])
 
     def _polynomial(self, part: int, field: Value, stop: Value, position: Value) -> Value:
-        """P or Q, as a polynomial of the stop variables: their derivatives share its coefficients."""
+        """Return P or Q as a polynomial of the stop variables, whose derivatives share its coefficients."""
         g, mine = field.graph, self.exponents[:, 0] == part
         exponents, numbers = self.exponents[mine, 1:], self.numbers[mine]
         powers, index = np.unique(exponents[:, 2:4], axis=0, return_inverse=True)
@@ -245,14 +259,14 @@ class StopImage:
         return g.dot(g.concat(*rows), g.polynomial(powers, np.eye(len(powers)), stop))
 
     def placed(self, film: Value, film_z: Value, nanometres: Value, point: Value) -> tuple[Value, Value]:
-        """The pupil point [2] of a point of the stop (mm), and the area in the pupil of a unit of area there."""
+        """Return the pupil point [2] of a point of the stop (mm), and the area in the pupil of a unit of area there."""
         inputs = {"film_mm": film, "film_z_mm": film_z, "wavelength_nm": nanometres, "point_mm": point}
         rows = film.graph.inline(self.graph, inputs)
         by_x, by_y = (rows[derivative("pupil_mm", f"point_mm_{axis}")] for axis in (0, 1))
         return rows["pupil_mm"], (by_x[0] * by_y[1] - by_x[1] * by_y[0]).abs()
 
     def through_stop(self, lens: Graph) -> Graph:
-        """The graph of the lens with points of the stop in place of pupil points."""
+        """Write the lens's graph with points of the stop in place of pupil points."""
         g = Graph()
         rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
         film, point, nanometres = rays[0:2], rays[2:4], rays[4]
@@ -268,15 +282,17 @@ class StopImage:
 
 
 def frame_of_film_point(film: Value) -> tuple[Value, Value, Value]:
-    """Its distance from the axis, and unit vectors towards it and across."""
+    """Return a film point's distance from the axis, and unit vectors towards it and across."""
     radius = film.graph.square(film).sqrt()
     turn = (film + [HAIR, 0.0]) * (1.0 / (radius + HAIR))
     return radius, turn, film.graph.affine([[0.0, -1.0], [1.0, 0.0]], turn)
 
 
 def moving_polynomial(exponents: Exponents, numbers: Array, variables: Value, position: Value) -> Value:
-    """A polynomial of variables of a ray, the last of its exponents [M, K + 1] that of the film position of the call:
-    coefficients follow the position once a call."""
+    """Return a polynomial of a ray's variables whose coefficients follow the film position, once a call.
+
+    The last of its exponents [M, K + 1] is that of the film position.
+    """
     g = variables.graph
     monomials, index = np.unique(exponents[:, :-1], axis=0, return_inverse=True)
     powers, moved = np.unique(exponents[:, -1], return_inverse=True)
@@ -297,9 +313,9 @@ class StopRays(NamedTuple):
 
 
 def fit_stop_images(lenses: Sequence[ShaderLens], folded: bool = False) -> list[StopImage] | None:
-    """The image of the stop in every state of a lens, with the same terms; None where too few rays pass.
+    """Fit the image of the stop in every state of a lens, with the same terms in all; None where too few rays pass.
 
-    Where it is `folded`, the best that but moves and scales the stop.
+    Where it is `folded`, return the best image that only moves and scales the stop.
     """
     candidates = _candidates(lenses[0].anamorphic)
     if folded:
@@ -333,8 +349,10 @@ def _without_terms(lens: ShaderLens, states: Sequence[ShaderLens]) -> StopImage:
 
 
 def _equations(image: StopImage, rays: StopRays, exponents: Exponents) -> tuple[Array, Array]:
-    """Columns [M, 2 N] of terms and pupil points [2 N] that they should sum to, in stop radii; small stops count as
-    much as the widest."""
+    """Return columns [M, 2 N] of terms, and pupil points [2 N] that they shall sum to, in stop radii.
+
+    Small stops count as much as the widest.
+    """
     (middle, half), (mean, reach) = image.film_z_mm, image.wave
     film, (x, y) = rays.film_mm / image.film_mm, rays.point_mm / image.stop_mm
     weight = 1 / np.maximum(np.hypot(x, y), _SIZES[0])
@@ -361,12 +379,12 @@ def _powers(values: Array, powers: NDArray[np.int64]) -> Array:
 
 
 def _lowest(exponents: NDArray[np.int64]) -> int:
-    """The lowest power of the film radius that a round lens's term can have."""
+    """Return the lowest power of the film radius that a round lens's term can have."""
     return int(exponents[3] + exponents[0])
 
 
 def _radial(radius: Array, exponents: Exponents) -> Array:
-    """Factors of the film radius while terms are chosen: Chebyshev's polynomials differ more than powers do."""
+    """The factors of the film radius for choosing terms: Chebyshev's polynomials, which differ more than powers."""
     pairs = [(_lowest(e), (int(e[1]) - _lowest(e)) // 2) for e in exponents]
     factors = {(least, degree): radius**least * _chebyshev(degree)(radius**2) for least, degree in set(pairs)}
     return np.stack([factors[pair] for pair in pairs])
@@ -377,7 +395,7 @@ def _chebyshev(degree: int) -> np.polynomial.Chebyshev:
 
 
 def _with_terms(image: StopImage, numbers: Array, exponents: Exponents) -> StopImage:
-    """The image with terms of `_equations`, as powers."""
+    """Return the image with terms of `_equations`, as powers."""
     if image.anamorphic:
         return replace(image, exponents=exponents, numbers=numbers)
     total: dict[tuple[int, ...], float] = {}
@@ -391,7 +409,7 @@ def _with_terms(image: StopImage, numbers: Array, exponents: Exponents) -> StopI
 
 
 def _candidates(anamorphic: bool) -> Exponents:
-    """Exponents of all terms among which a fit chooses."""
+    """Return the exponents of all terms among which a fit chooses."""
     terms = _of_anamorphic() if anamorphic else _of_round()
     return np.array(list(terms), np.int64)
 
@@ -412,7 +430,7 @@ def _of_anamorphic() -> Iterator[tuple[int, ...]]:
     for part, *powers in product((0, 1), *[range(degree + 1)] * 2, *[range(of_stop + 1)] * 2):
         if sum(powers) > degree or sum(powers[2:]) > of_stop:
             continue
-        # Odd in what lies along the coordinate's axis, and even in the other: mirrors leave the lens alone.
+        # Odd in the coordinate's own axis and even in the other: mirrors leave the lens alone.
         if (powers[part] + powers[2 + part]) % 2 == 1 and (powers[1 - part] + powers[3 - part]) % 2 == 0:
             for wave, position in _MOVES:
                 if wave + position == 0 or sum(powers) <= moving:
@@ -420,8 +438,10 @@ def _of_anamorphic() -> Iterator[tuple[int, ...]]:
 
 
 def draw_rays(lens: ShaderLens, image: StopImage | None, seed: int) -> StopRays:
-    """Random rays that pass the widest stop, from film points on +x of round lenses: through the lens's boxes, or
-    through an image of the stop, such that the edges of all stops are met."""
+    """Draw random rays that pass the widest stop, from film points on +x for round lenses.
+
+    They go through the lens's boxes, or through an image of the stop, so that they meet the edges of all stops.
+    """
     rng = np.random.default_rng(seed)
     count, stop = _RAYS * (4 if image is None else 1), lens.stop_radius_mm
     radius = lens.film_radius_mm * np.sqrt(rng.random(count)) * 0.9999

@@ -1,7 +1,7 @@
-"""Source code for other integrators: whole cameras, constants of a model, the film's position by focus and stop.
+"""Source code for other integrators: whole cameras, constants of a model, and the film's position by focus and stop.
 
 A camera's program is the graph that compiled cameras run (`cameragraph`), with its numbers and the table of the pupil's
-outline written in: it takes a film point and two random numbers to a weighted ray, at one focus and stop.
+outline written into it: it takes a film point and two random numbers to a weighted ray, at one focus and stop.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ Array = NDArray[np.float64]
 FOCUS = "focus_m"
 Focus = Literal["best", "widest", "paraxial"]
 
-SMALLEST = 1 / 16  # of the widest stop: at smaller ones the film stays
-_SAMPLES = (8, 12)  # distances and stops at which the film is placed, and where errors are measured
+SMALLEST = 1 / 16  # share of the widest stop; at smaller stops the film stays
+_SAMPLES = (8, 12)  # distances and stops at which the film is placed, and at which errors are measured
 _CHECKS = (4, 6)
 # Degrees in 1 / distance and in the stop's radius, and the error (mm) that is enough.
 _SAMPLES_OF_STATES = (5, 8)  # at each of the nodes
 _BEST, _BEST_MM = ((3, 2), (4, 4), (4, 6), (5, 6), (6, 8), (6, 10)), 2e-4
 _PARAXIAL, _PARAXIAL_MM = tuple((n, 0) for n in range(2, 13)), 1e-5
-_RISING, _RISING_MM = 200, 1e-4  # distances at which the film must rise; a fall by less is rounding
+_RISING, _RISING_MM = 200, 1e-4  # distances at which the film must rise, and a fall (mm) that counts as rounding
 
 
 @dataclass(frozen=True)
 class Focusing:
-    """The focusing of a lens in one state.
+    """Describes how a lens in one state is focused.
 
     Attributes:
-        nearest_m: nearest object, distance to the film; inf where the film does not focus.
-        stop_radius_mm: of the widest stop.
-        paraxial: the film's place (mm) in the paraxial image of an object at so many metres.
-        best: that of least spot at some stop radii [S].
-        film_z_mm: first and last place of the film, None where it has no ends.
+        nearest_m: the nearest object's distance from the film; inf where the film does not focus.
+        stop_radius_mm: radius of the widest stop.
+        paraxial: gives the film's place (mm) in the paraxial image of an object at so many metres.
+        best: gives the places of least spot at stop radii [S].
+        film_z_mm: first and last place of the film; None where it has no ends.
     """
 
     nearest_m: float
@@ -60,7 +60,7 @@ class Focusing:
     film_z_mm: tuple[float, float] | None = None
 
     def places(self, vergence: Array, stops: Array) -> Array:
-        """[D, S] film for 1 / distance [D] as share of the nearest's, at shares [S] of the stop; of none: paraxial."""
+        """The film [D, S] for 1 / distance [D], as shares of the nearest's, at shares [S] of the stop; or paraxial."""
         far = [self.nearest_m / v if v > 0 else np.inf for v in vergence]
         if stops.size:
             z = np.array([self.best(d, stops * self.stop_radius_mm) for d in far])
@@ -70,10 +70,11 @@ class Focusing:
 
 
 def number_of(axes: Sequence[Axis], nodes: Sequence[float], rule: str = "") -> float | Program:
-    """A number that follows the state as those of a model do: of one value at all nodes a constant, else a function.
+    """Return a number that follows the state as a model's numbers do: a constant if all nodes agree, else a function.
 
     Args:
-        nodes: at each node. rule: "square" or "reciprocal" where that is what is mixed.
+        nodes: its value at each node.
+        rule: "square" or "reciprocal" where that is what is mixed.
     """
     values = np.array(nodes, np.float64)
     if (values == values[0]).all():
@@ -90,13 +91,14 @@ def film_function(
     between: Sequence[tuple[Sequence[float], Focusing]] = (),
     focus: Focus = "best",
 ) -> tuple[Program, float]:
-    """The film by the distance in m (inf allowed) and, of "best", the stop's radius in mm; its largest error in mm.
+    """The film's place as a function of distance (m, inf allowed) and, for "best", stop radius (mm); and its error.
 
-    The film never falls back as the object comes nearer, and stays beyond the nearest one and the ends of the stop.
+    The error is the largest, in mm. The film never falls back as the object comes nearer, and it stays in place beyond
+    the nearest object and beyond the smallest and widest stop.
 
     Args:
-        nodes: the lens at every node of the axes; one without.
-        between: states, and the lens there, at which errors are measured; without axes that is the lens itself.
+        nodes: the lens at every node of the axes; one lens without axes.
+        between: states, and the lens in them, at which errors are measured; without axes that is the lens itself.
         focus: "widest" is best focus at the widest stop.
     """
     moved = np.isfinite(nodes[0].nearest_m)
@@ -124,7 +126,7 @@ def film_function(
 
 
 def followed_rows(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]:
-    """A graph of the state's numbers, and in it numbers [nodes, n] that follow it, n rows; constants of no axes."""
+    """A graph of the state's numbers, and in it numbers [nodes, n] that follow it, n rows; constants without axes."""
     g, values = Graph(), np.asarray(nodes, np.float64)
     if not axes:
         return g, g.constant(values[0])
@@ -134,17 +136,17 @@ def followed_rows(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]
 
 
 def _roots(count: int) -> Array:
-    """The roots of the Chebyshev polynomial of that degree, scaled to 0 to 1."""
+    """Return the roots of the Chebyshev polynomial of that degree, scaled to 0 to 1."""
     return np.asarray((1 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) / 2)
 
 
 def _fitted(
     nodes: Sequence[Focusing], axes: Sequence[Axis], placed: Array, at: tuple[Array, Array], degrees: tuple[int, int]
 ) -> Graph:
-    """The function of polynomials of these degrees: least squares of what is `placed` [nodes, D, S] at each node."""
+    """Fit the function by polynomials of these degrees: least squares of what is `placed` [nodes, D, S] there."""
     moved, by_stop = (len(places) > 1 for places in at)
     across, along = degrees[0] * moved, degrees[1] * by_stop
-    # Of high degree in one alone, not in both.
+    # The degree is high in one variable alone, not in both.
     exponents = np.array(
         [(i, j) for i in range(across + 1) for j in range(along + 1) if i * along + j * across <= across * along]
     )
@@ -166,7 +168,7 @@ def _fitted(
 
 
 def _centred(share: Any) -> Any:
-    """A share of the stop, from `SMALLEST` to 1, as -1 to 1."""
+    """Return a share of the stop, from `SMALLEST` to 1, scaled to -1 to 1."""
     return share * (2 / (1 - SMALLEST)) - (1 + SMALLEST) / (1 - SMALLEST)
 
 
@@ -178,7 +180,7 @@ def _error(
     wanted: Array,
     at: tuple[Array, Array],
 ) -> float:
-    """Largest error in mm at a state, infinite of a function that falls as the object comes nearer."""
+    """Return the largest error in mm at a state; infinite for a function that falls as the object comes nearer."""
 
     def values(distances: Array) -> Array:
         v, s = np.meshgrid(distances, at[1] if at[1].size else np.ones(1), indexing="ij")
@@ -200,13 +202,14 @@ Derivatives by the film point are in metres (directions: 1) per mm."""
 
 
 def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, own_table: bool = True) -> Program:
-    """A camera as one program.
+    """Write a camera as one program.
 
     Args:
-        film, lens: of the same focus and stop. derivatives: of the ray by the film point, too: the graph's own.
+        film, lens: of the same focus and stop.
+        derivatives: whether to include the ray's derivatives by the film point, which are the graph's own.
         own_table: whether the outline's table is part of it; else the caller gives `outline`.
 
-    Inputs: film_x_mm, film_y_mm, u, v, wavelength_nm. Outputs: see `CAMERA_FRAME`.
+    Inputs are film_x_mm, film_y_mm, u, v and wavelength_nm; for outputs see `CAMERA_FRAME`.
 
     Raises:
         InputError: a stop whose shape is a picture.
@@ -222,7 +225,7 @@ def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, o
     return program
 
 
-# Names in the source, where they stand in the card, and how they follow a state (as in `models.card`).
+# Names in the source, where the numbers stand in the card, and how they follow a state (as in `models.card`).
 _NUMBERS = (
     (("efl_mm",), "lens", "efl_mm", "reciprocal"),
     (("film_radius_mm",), "domain", "film_radius_mm", "square"),
@@ -232,16 +235,17 @@ _NUMBERS = (
     (("stop_radius_max_mm",), "domain", "stop_radius_mm", ""),
     (("wavelength_min_nm", "wavelength_max_nm"), "domain", "wavelength_nm", ""),
 )
-_BETWEEN = (0.12, 0.42, 0.83)  # of the range of each axis: states at which functions of them are measured
+_BETWEEN = (0.12, 0.42, 0.83)  # shares of the range of each axis: states at which functions of them are measured
 
 
 def model_extras(model: OnnxLens, *, film: bool = True, stop_mm: float | None = None) -> tuple[Extras, list[str]]:
-    """Constants of a model's card, those that follow a state as functions of it, and the film's position.
+    """Return a model's constants, those that follow a state as functions of it, and the film's position.
+
+    They come with lines for the comment, which tell what the functions are, their range and measured error.
 
     Args:
-        film: whether the film is to be placed. stop_mm: a fixed radius of the stop; None leaves it an argument.
-
-    Returns them with lines for the comment: what the functions are, their range and measured error.
+        film: whether the film is to be placed.
+        stop_mm: a fixed radius of the stop; None leaves it an argument.
     """
     axes = model.axes
     cards = model.card["states"]["nodes"] if axes else [model.card]
@@ -271,7 +275,7 @@ def model_extras(model: OnnxLens, *, film: bool = True, stop_mm: float | None = 
 def followed(
     axes: Sequence[Axis], numbers: Iterable[tuple[str, Sequence[float], str]]
 ) -> tuple[dict[str, float], dict[str, Program]]:
-    """Numbers by name, their values at the nodes and their rule (see `number_of`), as constants or functions."""
+    """Numbers as constants or functions, of their name, their values at the nodes and their rule (`number_of`)."""
     found = {name: number_of(axes, values, rule) for name, values, rule in numbers}
     return (
         {name: value for name, value in found.items() if isinstance(value, float)},
@@ -280,7 +284,7 @@ def followed(
 
 
 def state_ranges(axes: Sequence[Axis]) -> dict[str, float]:
-    """The range of each of a state's numbers as constants."""
+    """Return the range of each of a state's numbers as constants."""
     constants: dict[str, float] = {}
     for axis, name in zip(axes, state_names(axes), strict=True):
         word, _, unit = name.partition("_")
@@ -289,7 +293,7 @@ def state_ranges(axes: Sequence[Axis]) -> dict[str, float]:
 
 
 def model_focusing(model: OnnxLens, state: Sequence[float] = (), stop_mm: float | None = None) -> Focusing:
-    """The focusing of a model in a state, with its stop as wide as it goes, or fixed."""
+    """Return the focusing of a model in a state, with its stop as wide as it goes, or fixed."""
     at = model.at(*state) if state else model
     lens, domain = at.card["lens"], at.card["domain"]
     light, widest = tuple(domain["wavelength_nm"]), float(domain["stop_radius_mm"])
@@ -314,10 +318,10 @@ def film_extras(
     *,
     by_stop: bool = True,
 ) -> tuple[dict[str, Program], list[str]]:
-    """The film's position as functions: `film_z_mm`, best focus, and `film_z_paraxial_mm`, where the film focuses.
+    """Return the film's position as functions: `film_z_mm`, best focus, and, where it focuses, `film_z_paraxial_mm`.
 
-    Arguments as of `film_function`; not `by_stop`: at the widest stop alone. Returns them with lines for the comment:
-    range and measured error.
+    They come with lines for the comment: range and measured error. Arguments are those of `film_function`; `by_stop`
+    false means at the widest stop alone.
     """
     near, wide, state = nodes[0].nearest_m, nodes[0].stop_radius_mm, list(state_names(axes))
     distance = [FOCUS] if math.isfinite(near) else []

@@ -358,11 +358,10 @@ def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray
 
 @dataclass(frozen=True)
 class PupilBounds:
-    """Bounds of the passing rays on the pupil plane at equally spaced film radii (as in pbrt: Pharr et al. 2016,
-    6.4.5).
+    """Bounds of the passing rays on the pupil plane, at equally spaced film radii.
 
-    For a film point at radius r along +x, the passing rays lie within `low` <= u <= `high` along +x and within |v| <=
-    `half` across.
+    As in pbrt (Pharr et al. 2016, 6.4.5), for a film point at radius r along +x the passing rays lie within `low` <= u
+    <= `high` along +x and within |v| <= `half` across.
 
     Attributes:
         pupil_z_mm: the pupil plane.

@@ -152,8 +152,7 @@ def converged(
     fields: int,
     first: int = 0,
 ) -> tuple[list[Array], dict[str, Array]]:
-    """Compute arrays [F, ...] at finer and finer levels until two agree, field by field; take the last level if none
-    do.
+    """Compute arrays [F, ...] at finer and finer levels until two agree, field by field, or levels end.
 
     Args:
         compute: gives the arrays of a level, from 0, for some of the fields.
