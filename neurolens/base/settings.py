@@ -267,15 +267,15 @@ def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False)
     """Make settings from the options of `add_options`; options that were not added have their defaults.
 
     Args:
-        unset: whether options that were not given are None in the result.
+        unset: whether fields that were not given are None in the result.
 
     Raises:
         InputError: what the class refuses.
     """
-    hints, values = _hints(cls), dict[str, Any]()
+    hints, values = _hints(cls), dict.fromkeys((f.name for f in fields(cls)) if unset else (), None)  # type: ignore[arg-type]
     for f in _options(cls):
         if is_dataclass(hints[f.name]):
-            values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", False))
+            values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", unset))
         elif (value := getattr(args, _dest(f, f.metadata["option"]), None)) is not None or unset:
             values[f.name] = tuple(value) if isinstance(value, list) else value
     return cls(**values)
@@ -290,10 +290,18 @@ def changed(settings: Any, *, unset: bool = False) -> dict[str, Any]:
     for f in _options(type(settings)):
         value = getattr(settings, f.name)
         if is_dataclass(value):
-            found |= changed(value, unset=f.metadata.get("more", {}).get("unset", False))
+            found |= changed(value, unset=f.metadata.get("more", {}).get("unset", unset))
         elif value != (None if unset else f.default) and not f.metadata["option"].positional:
             found[spelling(f, f.metadata["option"])] = value
     return found
+
+
+def with_changes(settings: T, changes: object) -> T:
+    """Settings with the values of `changes`, a mapping or an object with such fields, that are not None."""
+    values = changes
+    if not isinstance(values, Mapping):
+        values = {f.name: getattr(changes, f.name, None) for f in fields(settings)}  # type: ignore[arg-type]
+    return dataclasses.replace(settings, **{name: v for name, v in values.items() if v is not None})  # type: ignore[type-var]
 
 
 def _options(cls: type) -> list[Any]:
