@@ -26,7 +26,7 @@ from neurolens.base.files import check_writable
 from neurolens.base.lensname import Named, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.base.settings import setting, whole, with_changes
+from neurolens.base.settings import setting, setting_of, whole, with_changes
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.optics.lens.shot import Shot, film_size
@@ -67,20 +67,14 @@ _PALER = 1e-3  # a share of the light that may lie below zero without a warning
 class Picture:
     """The settings of a picture that are options of commands. None leaves a setting to the scene."""
 
-    samples: int | None = setting(None, "per pixel (default: the scene's)", within=(1, 2**20))
-    width: int | None = setting(
-        None, "width (default: the scene's, or from --height and the film's shape)", within=(1, 16384),
-        metavar="PIXELS",
-    )  # fmt: skip
-    height: int | None = setting(
-        None, "height (default: the scene's, or from --width and the film's shape)", within=(1, 16384),
-        metavar="PIXELS",
-    )  # fmt: skip
+    samples: int | None = setting_of(CameraSettings, "samples")
+    width: int | None = setting_of(CameraSettings, "width")
+    height: int | None = setting_of(CameraSettings, "height")
     film_mm: tuple[float, float] | None = setting(
         None, "width and height of the film in mm (default: the scene's)", option="film", kind=film_size, metavar="WxH"
     )
     seed: int = setting(0, "of the random numbers (default: 0)", kind=whole(0))
-    max_depth: int | None = setting(None, "bounces (default: the scene's)", within=(1, 1000))
+    max_depth: int | None = setting_of(CameraSettings, "max_depth")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = setting(
         0.0, "stops by which the preview OUT.png is brighter; OUT.exr keeps the light as it is (default: 0)",
@@ -354,7 +348,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
 
 def _state(frame: Frame) -> tuple[Any, ...]:
     """Return what frames with the same lens share."""
-    return frame.shot.focus_m, frame.shot.f_number, frame.shot.zoom
+    return tuple(value for name, value in vars(frame.shot).items() if name != "aperture")  # which is one for all
 
 
 def _raster(prepared: Prepared) -> Raster:
