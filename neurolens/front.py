@@ -23,13 +23,12 @@ from neurolens.base import lensname
 from neurolens.base.errors import InputError, installed, one_line
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.progress import Progress
-from neurolens.base.settings import setting_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens
 from neurolens.cli import arguments as cli
 from neurolens.cli import command
 from neurolens.cli.calls import Answer, call, command_of, parameters, signature_of
 from neurolens.models.file import read_model
-from neurolens.optics.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.optics.lens.shot import Shot
 from neurolens.programs.hosts import rays
 
 if TYPE_CHECKING:
@@ -138,8 +137,7 @@ class _Chosen:
     @property
     def of_shot(self) -> dict[str, Any]:
         """What is set, as `Shot` names it, but a camera's film as "film"."""
-        known, found = {"film", *Shot.__dataclass_fields__}, vars(self._read) | self._read.state.settings()
-        return {name: value for name, value in found.items() if name in known and value is not None}
+        return {k: v for k, v in vars(self._read).items() if k == "film"} | self._read.state.shot().given
 
     def set(self, **settings: Any) -> Self:
         """The same with further settings; None takes one away. Raises InputError for one that cannot be."""
@@ -162,10 +160,7 @@ class _ReadCamera(cli.Command):
     called: ClassVar[str] = "nl.camera"
     camera: str = cli.lens(models=True, cameras=True, positional=True)
     film: tuple[float, float] = cli.film((36.0, 24.0), "in mm (default: 36x24)")
-    film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
-    vignetting: Vignetting | None = setting_of(Shot, "vignetting")
-    dispersion: Dispersion | None = setting_of(Shot, "dispersion")
-    state: cli.LensState = cli.lens_state()
+    state: cli.LensState = cli.camera_state()
 
 
 class Lens(_Chosen):
@@ -190,8 +185,9 @@ class Lens(_Chosen):
     @cached_property
     def prescription(self) -> Prescription:
         """Its surfaces, gaps and glasses in this state."""
-        found: Prescription = self._read.state.set_lens(self._tabled)
-        return found
+        from neurolens.optics.setting.states import set_lens
+
+        return set_lens(self._tabled, self._read.state.shot())
 
     @cached_property
     def _figures(self) -> Mapping[str, float]:
@@ -217,7 +213,9 @@ class Lens(_Chosen):
     @property
     def focus_m(self) -> float:
         """From the film to the object in focus, or inf."""
-        return float(self._read.state.focus_of(self._tabled, self.prescription))
+        from neurolens.optics.setting.states import focus_of
+
+        return focus_of(self.prescription, self._read.state.shot())
 
     @installed()
     def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
@@ -294,9 +292,7 @@ class Camera(_Chosen):
         Raises:
             InputError: a setting that this kind of camera does not have.
         """
-        settings = self.of_shot
-        shot = self._read.state.shot(settings.pop("film"), **settings)
-        return cli.camera(self._read.camera, shot, Progress(quiet=True))
+        return cli.camera(self._read.camera, self._read.state.shot(self._read.film), Progress(quiet=True))
 
 
 class Model(OnnxLens):

@@ -157,7 +157,7 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "thin", "--exposure", "1e9"], ["--exposure", "stops", "-40 to 40"]),
         (["--camera", "thin", "--focus", "0.1"], ["focus_m", "focal lengths"]),
         (["--camera", "thin", "--zoom", "72mm"], ["zoom", "lens file"]),
-        (["--camera", "pinhole", "--blades", "5"], ["aperture", "point"]),
+        (["--camera", "pinhole", "--blades", "5"], ["aperture", "lens files"]),
         (["--camera", "pinhole", "--film-offset", "1"], ["film_offset_mm"]),
         (["--camera", "thin", "--film", "36e6x24e6"], ["--film", "0.001 to 10000"]),
         (["--camera", "thin", "--blades", "2"], ["--blades", "from 3 to 100"]),
@@ -533,7 +533,7 @@ def test_render_through_a_model_needs_no_torch_and_keeps_its_card(
     for args, words in (
         (["--focus", "0.3"], ["focus", "0.3"]),
         (["--f-number", "1"], ["f_number", "1"]),
-        (["--focal-length", "35"], ["focal_length_mm", "one size"]),
+        (["--focal-length", "35"], ["focal_length_mm", "lens files"]),
     ):
         line = failure(capsys, "render", scene, "--camera", MODEL, "-o", out, "--quiet", *args)
         assert all(word in line for word in words), line

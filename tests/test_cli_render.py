@@ -16,6 +16,7 @@ from command_line import failure, run_json
 from PIL import Image
 from shipped import whole
 
+from neurolens.base.errors import InputError
 from neurolens.cli import main
 from neurolens.cli.keys import frames_of
 from neurolens.pictures.render.pictures import read_exr, read_layers, write_exr
@@ -228,6 +229,17 @@ def test_keys_of_files(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     for empty in ("", "frame,focus\n", "frame,focus\n1,\n2,\n", "frame\n1\n"):  # a file that was cut, for one
         csv.write_text(empty)
         assert "keys.csv: keys: got (none), expected a value of focus" in failure(capsys, *start)
+
+
+def test_keys_take_units_and_every_number_of_a_shot() -> None:
+    """Units are those of the options: 6 ft is 1.8288 m, f/4 is 4. A film offset moves evenly in mm."""
+    words = ["focus=1:6ft,3:2.5e2cm", "f-number=1:f/4", "film-offset=1:0,3:0.1cm", "position=1:0/100cm/2m,3:0/1/3"]
+    first, middle, last = (values for _, _, values in frames_of(range(1, 4), words, {}, "render"))
+    assert first["focus_m"] == pytest.approx(1.8288) and last["focus_m"] == pytest.approx(2.5)
+    assert middle["f_number"] == pytest.approx(4) and first["position_m"] == (0, 1, 2)
+    assert [each["film_offset_mm"] for each in (first, middle, last)] == pytest.approx([0, 0.5, 1])
+    with pytest.raises(InputError, match="FRAME:VALUE"):
+        list(frames_of(range(1, 4), ["focus=1:2kg"], {}, "render"))
 
 
 def test_frames_follow_their_keys_and_what_exists_is_kept(

@@ -1,6 +1,8 @@
 """The command line on lens states, whole tables, doubtful lenses; C, GLSL and ONNX of a model file."""
 
 import json
+import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,13 +13,19 @@ import pytest
 from command_line import described, failure, run_json
 from lens_models import edited
 
+import neurolens as nl
 from neurolens.base.errors import NeurolensWarning
+from neurolens.cameras.build import make_camera
 from neurolens.cli import main
 from neurolens.cli.arguments import Parser
 from neurolens.models.card import MODEL_KEY
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.render.pictures import read_exr, write_exr
 
 LENSES = Path(__file__).parents[1] / "lenses"
+GAUSS, _UNITS = LENSES / "laikin_double_gauss_50.toml", re.compile("_(m|mm|deg)$")
 ANAMORPHIC, NIKON = LENSES / "cooke_anamorphic_42.toml", LENSES / "nikon_zoom_70_200.toml"
 SINGLET, TAJIMA = LENSES / "thorlabs_lb1471_biconvex_50.toml", LENSES / "tajima_retrofocus_24.toml"
 MODEL = LENSES.parent / "models" / "laikin_double_gauss_50.ols-28.onnx"
@@ -32,6 +40,39 @@ def test_a_focus_state_is_focused_at_its_object(capsys: pytest.CaptureFixture[st
     assert small["focus_m"] == pytest.approx((750.55 + small["film_z_mm"]) / 1000)
     large = run_json(capsys, "lens", NIKON, "--zoom", "135mm near", "--efl", 200)
     assert large["focus_m"] / small["focus_m"] == pytest.approx(large["efl_mm"] / small["efl_mm"])
+
+
+@pytest.mark.parametrize(
+    ("file", "asked"),
+    [
+        (TAJIMA, {"zoom": "0.3m"}),
+        (TAJIMA, {"zoom": "0.3m", "focus_m": 1.5, "focus_mode": "paraxial"}),
+        (TAJIMA, {"focus_m": 2.0, "focus_mode": "internal", "f_number": 8.0}),
+        (GAUSS, {"focal_length_mm": 100.0, "cover_glass_mm": 4.0}),
+        (GAUSS, {"field_deg": 20.0, "focus_m": 3.0, "cover_glass_mm": 4.0, "f_number": 5.6}),
+    ],
+)
+def test_a_lens_is_set_alike_for_cameras_commands_and_python(
+    file: Path, asked: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The film stands at one place, by the settings of one shot; a plate that is added does not grow with the lens."""
+    words = [word for k, v in asked.items() for word in (f"--{_UNITS.sub('', k).replace('_', '-')}", v)]
+    told = run_json(capsys, "lens", file, *words)
+    one, shot = nl.lens(file, **asked), Shot.part(film_mm=(12.0, 8.0), runtime="onnxruntime", **asked)
+    cameras: list[Any] = [make_camera(f"thick:{file}", shot)]
+    cameras += [make_camera(file, shot)] if len(asked) == 1 else []  # which searches its pupil
+    for lens in (one.prescription, set_lens(read_lens(file), shot), *(c.lens for c in cameras[1:])):
+        assert float(lens.film_z_mm) == pytest.approx(told["film_z_mm"], abs=1e-9)
+        if "cover_glass_mm" in asked:
+            assert lens.surfaces[-2].thickness_mm == 4.0
+    told["focus_m"] = None if told["focus_m"] == "infinity" else told["focus_m"]
+    for camera in cameras:
+        assert camera.settings["film_z_mm"] == pytest.approx(told["film_z_mm"], abs=1e-9)
+    assert {told["focus_m"], *(camera.settings["focus_m"] for camera in cameras)} == {
+        None if math.isinf(one.focus_m) else one.focus_m
+    }
+    if asked.keys() == {"zoom"}:
+        assert one.focus_m == pytest.approx((207.03 + told["film_z_mm"]) / 1000)
 
 
 def test_an_anamorphic_lens_is_described_in_both_planes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

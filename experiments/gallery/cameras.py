@@ -35,6 +35,7 @@ from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import Shot as CameraShot
 from neurolens.optics.lens.shot import StopShape
 from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.focusing import focused_inside
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.render.images import make_aperture
 from neurolens.pictures.render.scene import Scene
@@ -93,7 +94,8 @@ def shot_of(panel: Panel, scene: Scene) -> Shot:
     lens = lens.with_aperture(shape or scene.aperture or lens.aperture)
     focus_m = camera.focus_m if panel.focus_m is None else panel.focus_m
     f_number = panel.f_number or camera.f_number or float(first_order(lens).f_number)
-    lens = set_lens(lens, f_number=f_number, focus_m=focus_m, focus_mode=panel.focus_mode)
+    lens, inside = set_lens(lens, f_number=f_number), panel.focus_mode == "internal"
+    lens = focused_inside(lens, focus_m) if inside else set_lens(lens, focus_m=focus_m, focus_mode=panel.focus_mode)
     assert lens.film_z_mm is not None  # `at` places the film
     film_z = float(lens.film_z_mm) + panel.film_offset_mm
     lens = replace(lens, infinity_mm=())  # groups that have moved to focus stay there

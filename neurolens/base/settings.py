@@ -126,21 +126,54 @@ def group(title: str, **more: Any) -> Any:
     return field(metadata={"group": title, "more": more})
 
 
+@dataclass(frozen=True)
+class Rule:
+    """What the values of a field have in common; a type that has it is `Annotated[kind, rule]`.
+
+    Attributes:
+        good: the test that a value must pass. expected: what a message says of good values.
+        colour: whether values are colours, for which one number stands for a grey.
+    """
+
+    good: Callable[[Any], bool]
+    expected: str
+    colour: bool = False
+
+
+def bounded(low: float, high: float, unit: str = "a number", kind: type = float) -> Rule:
+    """Return the rule that a number lies from `low` to `high`."""
+
+    def good(value: Any) -> bool:
+        return isinstance(value, Real) and not isinstance(value, bool) and within((low, high), float(value))
+
+    return Rule(good, _expected(kind, (low, high), unit))
+
+
+@cache
+def rules_of(cls: Any) -> dict[str, Rule]:
+    """Return the rules of a dataclass's fields: of their bounds, of a list of texts, or of their types."""
+    typed, rules = get_type_hints(cls, include_extras=True), dict[str, Rule]()
+    for f in fields(cls):
+        option, kind = f.metadata.get("option"), _kind(_hints(cls)[f.name])[0]
+        notes = [note for k in (typed[f.name], *get_args(typed[f.name])) for note in getattr(k, "__metadata__", ())]
+        if option and option.within:
+            rules[f.name] = bounded(option.within[0], option.within[1], option.unit, kind)
+        elif get_origin(kind) is Literal:
+            rules[f.name] = Rule(get_args(kind).__contains__, f"one of: {', '.join(map(str, get_args(kind)))}")
+        elif notes:
+            rules[f.name] = notes[0]
+    return rules
+
+
 def check_bounds(settings: Any, what: str) -> None:
-    """Refuse numbers out of their fields' bounds, and texts that their types do not list; called in `__post_init__`.
+    """Refuse values that their fields' rules (`rules_of`) do not allow; None is allowed. Called in `__post_init__`.
 
     Raises:
         InputError: about `what`.
     """
-    hints = _hints(type(settings))
-    for f in fields(settings):
-        value, option, (kind, _) = getattr(settings, f.name), f.metadata.get("option"), _kind(hints[f.name])
-        if get_origin(kind) is Literal and value is not None and value not in get_args(kind):
-            raise InputError(what, f.name, value, f"one of: {', '.join(map(str, get_args(kind)))}")
-        if not option or option.within is None or value is None:
-            continue
-        if not isinstance(value, Real) or isinstance(value, bool) or not within(option.within, float(value)):
-            raise InputError(what, f.name, value, _expected(kind, option.within, option.unit))
+    for name, rule in rules_of(type(settings)).items():  # type: ignore[arg-type]
+        if (value := getattr(settings, name)) is not None and not rule.good(value):
+            raise InputError(what, name, value, rule.expected)
 
 
 def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
@@ -250,7 +283,7 @@ def _details(
         details["metavar"] = option.metavar or (unit[2].upper() if unit else _PLACEHOLDERS[kind])
         bounds = None if option.kind else option.within
         details["type"] = between(*bounds, option.unit, kind) if bounds else option.kind or kind
-        typed = "f" if f.name == "f_number" else unit[2] if unit else str(option.metavar).lower()
+        typed = unit_of(f.name) or str(option.metavar).lower()
         if typed == "f" or any(typed in worth for worth in WORTH):
             details["type"] = in_unit(typed, details["type"])
     if option.nargs is not None:
@@ -267,15 +300,15 @@ def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False)
     """Make settings from the options of `add_options`; options that were not added have their defaults.
 
     Args:
-        unset: whether options that were not given are None in the result.
+        unset: whether fields that were not given are None in the result.
 
     Raises:
         InputError: what the class refuses.
     """
-    hints, values = _hints(cls), dict[str, Any]()
+    hints, values = _hints(cls), dict.fromkeys((f.name for f in fields(cls)) if unset else (), None)  # type: ignore[arg-type]
     for f in _options(cls):
         if is_dataclass(hints[f.name]):
-            values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", False))
+            values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", unset))
         elif (value := getattr(args, _dest(f, f.metadata["option"]), None)) is not None or unset:
             values[f.name] = tuple(value) if isinstance(value, list) else value
     return cls(**values)
@@ -290,10 +323,18 @@ def changed(settings: Any, *, unset: bool = False) -> dict[str, Any]:
     for f in _options(type(settings)):
         value = getattr(settings, f.name)
         if is_dataclass(value):
-            found |= changed(value, unset=f.metadata.get("more", {}).get("unset", False))
+            found |= changed(value, unset=f.metadata.get("more", {}).get("unset", unset))
         elif value != (None if unset else f.default) and not f.metadata["option"].positional:
             found[spelling(f, f.metadata["option"])] = value
     return found
+
+
+def with_changes(settings: T, changes: object) -> T:
+    """Settings with the values of `changes`, a mapping or an object with such fields, that are not None."""
+    values = changes
+    if not isinstance(values, Mapping):
+        values = {f.name: getattr(changes, f.name, None) for f in fields(settings)}  # type: ignore[arg-type]
+    return dataclasses.replace(settings, **{name: v for name, v in values.items() if v is not None})  # type: ignore[type-var]
 
 
 def _options(cls: type) -> list[Any]:
@@ -426,9 +467,17 @@ def _join(prefix: str, name: str) -> str:
     return f"{prefix}.{name}" if prefix else name
 
 
+def unit_of(name: str) -> str:
+    """Return the unit that a field's name ends with: "m" of focus_m, "f" of f_number; "" without one."""
+    unit = _UNIT.fullmatch(name)
+    return "f" if name == "f_number" else unit[2] if unit else ""
+
+
 def _in_unit_of(name: str, value: Any) -> Any:
-    """Convert a text with a unit ("6ft") to a number in the unit that the field's name ends with; keep other values."""
-    if isinstance(value, str) and (unit := _UNIT.fullmatch(name)) and (plain := in_unit(unit[2], str)(value)) != value:
+    """Convert texts with a unit ("6ft"), also in a list, to numbers in the unit of the field; keep other values."""
+    if isinstance(value, list):
+        return [_in_unit_of(name, item) for item in value]
+    if isinstance(value, str) and (unit := unit_of(name)) and (plain := in_unit(unit, str)(value)) != value:
         with suppress(ValueError):  # two numbers
             return float(plain)
     return value

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.base.lensname import FISHEYES, IDEAL_OF, is_model, resolve
+from neurolens.base.lensname import IDEAL_OF, is_model, resolve
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, ThinLens, check_field
 from neurolens.cameras.reduced import ReducedDispersion, Vignetted
-from neurolens.cameras.sampling import beyond_circle, refuse
+from neurolens.cameras.sampling import beyond_circle
 from neurolens.graph.compiler import has_compiler
-from neurolens.optics.lens.shot import Shot
+from neurolens.optics.lens.shot import BY_LENSES, Shot
 
 if TYPE_CHECKING:
     from neurolens.optics.lens.prescription import Lens
@@ -31,7 +31,7 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
     """Make the camera that `spec` names, set for a shot.
 
     Args:
-        spec: as `resolve` takes it.
+        spec: as `resolve` takes it. shot: whole, or in part: defaults are those of `Shot`.
         progress: shows what takes long, see `ExactCamera`.
 
     Raises:
@@ -39,7 +39,8 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
             reach.
         ModelError: a model that cannot be trusted.
     """
-    camera = with_dispersion(as_c(_camera(str(spec), shot, progress)), shot)
+    camera, shot = as_c(_camera(str(spec), shot, progress)), shot.whole()
+    camera = with_dispersion(camera, shot)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
 
 
@@ -58,36 +59,28 @@ def with_dispersion(camera: Camera, shot: Shot) -> Camera:
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     kind, path = resolve(spec)
     if path is None:
-        return _ideal(kind, shot)
+        return _ideal(kind, shot.whole())
     if kind in IDEAL_OF:
         return _ideal_of(kind, path, shot)
     if is_model(path):
         from neurolens.cameras.model import OnnxCamera, load_model
 
-        return OnnxCamera(load_model(path), shot, progress=progress)
+        return OnnxCamera(load_model(path), shot.whole(), progress=progress)
     return _exact(path, shot, progress)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
-    fisheye, point = kind in FISHEYES, kind != "thin"
-    refuse(kind, "cover_glass_mm", shot.cover_glass_mm or None, "left out: only a lens file takes a plate")
-    refuse(kind, "zoom", shot.zoom, "left out: only a lens file has zoom states")
-    internal = "internal" if shot.focus_mode == "internal" else None
-    refuse(kind, "focus_mode", internal, "left out: only lens files have groups")
-    refuse(kind, "field_deg", None if fisheye else shot.field_deg, "left out: set focal_length_mm")
-    if not point:
+    shot.check_taken(kind, (ThinLens if kind == "thin" else Pinhole if kind == "pinhole" else Fisheye).takes)
+    if kind == "thin":
         focal, f_number = shot.focal_length_mm or _FOCAL_MM, shot.f_number or _THIN_F_NUMBER
         moved = shot.film_offset_mm
         return ThinLens(focal, f_number, shot.focus_m, shot.film_mm, aperture=shot.aperture, film_offset_mm=moved)
-    refuse(kind, "film_offset_mm", shot.film_offset_mm or None, "left out: set focal_length_mm")
-    refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this camera is a point")
     f_number = shot.f_number or _PINHOLE_F_NUMBER
-    if not fisheye:
+    if kind == "pinhole":
         return Pinhole(shot.focal_length_mm or _FOCAL_MM, shot.film_mm, f_number)
     projection = kind.removeprefix("fisheye-")
     focal = shot.focal_length_mm or _FISHEYE_MM
     if shot.field_deg is not None:
-        refuse(kind, "focal_length_mm", shot.focal_length_mm, "left out: the field sets it")
         edge = float(PROJECTIONS[projection].radius(np.array(check_field(projection, shot.field_deg))))
         focal = min(shot.film_mm) / 2 / edge
     return Fisheye(projection, focal, shot.film_mm, field_deg=shot.field_deg, f_number=f_number)
@@ -95,18 +88,15 @@ def _ideal(kind: str, shot: Shot) -> Camera:
 
 def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
     from neurolens.optics.readers.any_format import read_any
-    from neurolens.optics.setting.states import set_lens
+    from neurolens.optics.setting.states import focus_of, set_lens
 
-    if kind != "thin:":
-        refuse(f"{kind}{path}", "film_offset_mm", shot.film_offset_mm or None, "left out: set focus_m")
-    lens = set_lens(read_any(path), replace(shot, aperture=None, film_offset_mm=0.0))
+    given, shot = shot, shot.whole()
+    shot.check_taken(f"{kind}{path}", {*BY_LENSES, *(ThinLens.takes if kind == "thin:" else ())})
+    lens = set_lens(read_any(path), replace(shot, focus_m=given.focus_m, aperture=None, film_offset_mm=0.0))
+    shot = replace(shot, focus_m=focus_of(lens, given))
     camera = ideal_as(kind, lens, shot)
-    camera.settings |= {
-        "lens": lens.identity,
-        "zoom": shot.zoom,
-        "focus_mode": shot.focus_mode,
-        "derived": lens.derived,
-    }
+    of_lens = {name: value for name, value in shot.record(BY_LENSES).items() if name not in camera.settings}
+    camera.settings |= of_lens | {"lens": lens.identity, "derived": lens.derived}
     return camera
 
 

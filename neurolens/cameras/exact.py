@@ -22,7 +22,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.lenscamera import LensCamera, LensFilm, LensScene
+from neurolens.cameras.lenscamera import LensCamera, LensScene
 from neurolens.cameras.onnxlens import LensRun
 from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTable, outline_of, wavelength_between
 from neurolens.cameras.sampling import lens_state
@@ -32,10 +32,10 @@ from neurolens.models.assemble import SCALARS, Form
 from neurolens.optics.lens.glass import LINE_D_NM, check_light, index_of
 from neurolens.optics.lens.paraxial import PupilBounds, chief_reach_mm, first_order
 from neurolens.optics.lens.prescription import Lens, Surface
-from neurolens.optics.lens.shot import Shot
+from neurolens.optics.lens.shot import BY_LENSES, Shot
 from neurolens.optics.setting.focusing import at_infinity
 from neurolens.optics.setting.pupils import passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
-from neurolens.optics.setting.states import set_lens
+from neurolens.optics.setting.states import focus_of, set_lens
 from neurolens.optics.trace.surfaces import Rays, media
 from neurolens.optics.trace.tracegraph import exact_graph, light_limits
 
@@ -66,9 +66,12 @@ class ExactCamera(LensCamera):
         InputError: a focus nearer than four focal lengths, a lens that no ray passes, light of no known index.
     """
 
+    takes = frozenset({*LensCamera.takes, *BY_LENSES})
+
     def __init__(
         self, lens: Lens, shot: Shot, *, bounds: PupilBounds | None = None, progress: Progress | None = None
     ) -> None:
+        given, shot = shot, shot.whole()
         self.film_mm, self.path, self.name = shot.film_mm, Path(lens.path), lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = shot.wavelength_nm if self.dispersive else None
@@ -76,31 +79,17 @@ class ExactCamera(LensCamera):
         self._light_nm = used = shot.wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         for nm in used:
             check_light(lens, nm)
-        self.lens = set_lens(lens, shot)
+        self.lens = set_lens(lens, replace(shot, focus_m=given.focus_m))
+        shot = replace(shot, focus_m=focus_of(self.lens, given))
         film_z, tabled, stop_mm = self.lens.film_z_mm, at_infinity(self.lens), float(self.lens.stop_radius_mm)
         assert film_z is not None  # `set_lens` places the film
         plane = pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm
         scene = LensScene(ExactRun(self.lens, plane, shot.wavelength_nm), float(film_z), stop_mm, self.lens.aperture)
-        self.film = LensFilm(self._outline(scene, plane, bounds, progress), used, scene)
         data = first_order(self.lens)
-        self.settings: dict[str, Any] = {
-            "camera": "exact",
-            "lens": tabled.identity,
-            "efl_mm": float(data.efl_mm),
-            "f_number": float(data.f_number),
-            "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m,
-            "film_mm": list(self.film_mm),
-            "film_z_mm": float(film_z),
-            "film_offset_mm": shot.film_offset_mm,
-            "stop_radius_mm": stop_mm,
-            "focus_mode": shot.focus_mode,
-            "zoom": shot.zoom,
-            "derived": self.lens.derived,
-            "rims": lens.rims,
-            "aperture": self.lens.aperture and self.lens.aperture.settings(),
-            "lens_state": state_of(self.lens, used, float(first_order(tabled).efl_mm)),
-        }
-        self.start(shot.runtime, progress)
+        about = {"camera": "exact", "lens": tabled.identity, "efl_mm": float(data.efl_mm)}
+        about |= {"f_number": float(data.f_number), "derived": self.lens.derived, "rims": lens.rims}
+        about["lens_state"] = state_of(self.lens, used, float(first_order(tabled).efl_mm))
+        self.place(self._outline(scene, plane, bounds, progress), scene, shot, about, progress)
 
     @property
     def front(self) -> Surface:

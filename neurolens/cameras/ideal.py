@@ -263,6 +263,8 @@ class ThinLens(ThickLens):
         InputError: a value is not above 0, `focus_m` is below 4 focal lengths, or the offset leaves no way to the film.
     """
 
+    takes = frozenset({"focal_length_mm", "aperture", "film_offset_mm"})  # settings of a shot besides those of all
+
     def __init__(
         self,
         focal_length_mm: float,
@@ -360,6 +362,7 @@ class Fisheye:
             cannot see.
     """
 
+    takes = frozenset({"focal_length_mm", "field_deg"})
     dispersive = False
     achromatic = True
     wavelength_nm: tuple[float, float] | None = None
@@ -469,6 +472,7 @@ class Pinhole(Fisheye):
         InputError: a length or the f-number is not a finite number above 0.
     """
 
+    takes = frozenset({"focal_length_mm"})
     rays_a_call = MANY_RAYS_A_CALL
 
     def __init__(

@@ -48,7 +48,7 @@ from neurolens.models.assemble import ONNX, SCALARS, Form
 from neurolens.models.inverse import InverseRays
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.prescription import LINE_D_NM, Surface
-from neurolens.optics.lens.shot import Runtime
+from neurolens.optics.lens.shot import Runtime, Shot
 from neurolens.optics.setting.pupils import GROUPS
 from neurolens.optics.trace.shapes import sag_and_derivatives
 
@@ -203,7 +203,7 @@ class LensCamera:
     Attributes:
         path: of the file of the lens or the model, for messages.
         film: film and pupil of the lens at its focus and stop. film_mm: width and height of the film.
-        runtime: what runs the camera's graph.
+        runtime: what runs the camera's graph. takes: settings of a shot besides those that every camera takes.
         differentials_error: RMS error of fitted differentials over their size; None where differentials are the
             graph's own, or were not sampled yet. Compiled cameras fit them by polynomials of low order, within
             `loworder.WORST`: the graph's own cost as much as its rays.
@@ -220,6 +220,20 @@ class LensCamera:
     _told: Callable[[str], None]
     _asked: bool
     differentials_error: float | None = None
+
+    takes = frozenset({"zoom", "focus_mode", "internal", "aperture", "film_offset_mm"})
+
+    def place(
+        self, outline: PupilOutline | None, scene: LensScene, shot: Shot, about: Mapping[str, Any],
+        progress: Progress | None,
+    ) -> None:  # fmt: skip
+        """Put film and pupil in place, start what runs the camera, and keep in `settings` `about`, the settings of the
+        shot, and the place of the film and the size of the stop; raises InputError as `LensFilm` and `start`."""
+        self.film = LensFilm(outline, self._light_nm, scene)
+        shape = scene.aperture and scene.aperture.settings()
+        film = {"film_z_mm": scene.film_z_mm, "stop_radius_mm": scene.stop_radius_mm, "aperture": shape}
+        self.settings = {**shot.record(self.takes), **about, **film}
+        self.start(shot.runtime, progress)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """Return the graph of the lens with its stop."""

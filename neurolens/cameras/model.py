@@ -17,15 +17,10 @@ from neurolens.base.progress import Progress
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.lenscamera import LensCamera, LensFilm, LensScene
+from neurolens.cameras.lenscamera import LensCamera, LensScene
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
-from neurolens.cameras.sampling import (
-    beyond_circle,
-    common_light,
-    lens_state,
-    refuse,
-)
+from neurolens.cameras.sampling import beyond_circle, common_light, lens_state
 from neurolens.models.assemble import ONNX, SCALARS, Form
 from neurolens.models.card import state_for
 from neurolens.models.inverse import InverseModel, inverse_of
@@ -93,27 +88,20 @@ class OnnxCamera(LensCamera):
             outline = outline.on_plane(float(domain["pupil_z_mm"]), film_z)
         else:
             outline = _outline_of(round_stop, used)
-        self.film = LensFilm(outline, used, scene)
-        self.settings: dict[str, Any] = {
+        notes = beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
+        poor = ", ".join(card["errors"].get("poor") or ())
+        f_number = lens["f_number"] * lens["stop_radius_mm"] / stop
+        about = {
             "camera": "model",
             "model": str(model.path),
             "efl_mm": lens["efl_mm"],
-            "f_number": lens["f_number"] * lens["stop_radius_mm"] / stop,
-            "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m,
-            "film_mm": list(self.film_mm),
-            "film_z_mm": film_z,
-            "film_offset_mm": shot.film_offset_mm,
-            "focus_mode": shot.focus_mode,
-            "stop_radius_mm": stop,
-            "aperture": shot.aperture and shot.aperture.settings(),
+            "f_number": f_number,
             "state": dict(zip((a.name for a in model.axes), model.state, strict=True)),
             "card": {k: v for k, v in card.items() if k not in _NOT_KEPT},
+            "lens_state": _state_of(scene, used, f_number),
+            "notes": [*([f"the model is poor, as its card says: {poor}"] if poor else []), *notes],
         }
-        self.settings["lens_state"] = _state_of(scene, used, self.settings["f_number"])
-        notes = beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
-        poor = ", ".join(card["errors"].get("poor") or ())
-        self.settings["notes"] = [*([f"the model is poor, as its card says: {poor}"] if poor else []), *notes]
-        self.start(shot.runtime, progress)
+        self.place(outline, scene, shot, about, progress)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """Return the graph of the model in the camera's state, with its stop."""
@@ -336,12 +324,7 @@ def _stop_radius(model: OnnxLens, shot: Shot) -> float:
 
 
 def _check_shot(model: OnnxLens, shot: Shot) -> None:
-    """Refuse settings that a model does not have."""
-    axes, path = [a.name for a in model.axes], str(model.path)
-    for field in ("focal_length_mm", "field_deg"):
-        refuse(path, field, getattr(shot, field), "left out: a model is of one size of its lens")
-    refuse(path, "cover_glass_mm", shot.cover_glass_mm or None, "left out: only a lens file takes a plate")
-    if "zoom" not in axes:
-        refuse(path, "zoom", shot.zoom, "left out: the model is of one zoom position")
-    if "focus" not in axes and shot.focus_mode == "internal":
-        refuse(path, "focus_mode", shot.focus_mode, "left out: the model knows no moving groups")
+    """Refuse settings that the model does not have, which its axes decide, too."""
+    axes = [a.name for a in model.axes]
+    lacks = {name for name, axis in (("zoom", "zoom"), ("internal", "focus")) if axis not in axes}
+    shot.check_taken(str(model.path), LensCamera.takes - lacks)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.cameragraph import concentric_disk
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.contract import Camera, CameraRays, FilmPoints, FloatArray
 from neurolens.optics.lens.prescription import Surface
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.trace.shapes import sag_mm
 from neurolens.optics.trace.surfaces import meet_front
 
@@ -167,10 +168,10 @@ def beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, the
     return [f"{told}: its corners {then}"]
 
 
-def refuse(camera: str, field: str, value: object, expected: str) -> None:
-    """Raise InputError for a setting that a kind of camera does not have, where it is given."""
-    if value is not None:
-        raise InputError(f"camera {camera}", field, value, expected)
+def focus_m(camera: Camera, shot: Shot) -> float:
+    """Film to object in metres: as a shot has it, else as its camera has chosen."""
+    chosen = camera.settings.get("focus_m") if shot.focus_m is None else shot.focus_m
+    return math.inf if chosen is None else float(chosen)
 
 
 def positive(field: str, value: float, *, infinite: bool = False) -> float:

@@ -141,16 +141,17 @@ examples:
         from neurolens.optics.analysis.fields import Scene
         from neurolens.optics.lens.glass import check_light
         from neurolens.optics.readers.any_format import read_any
+        from neurolens.optics.setting.states import focus_of, set_lens
         from neurolens.studies.describe import file_doubts, rim_doubts
 
         with warned(self.file) as notes:  # such as glasses that contradict the catalogue, or constant indices
             tabled = read_any(self.file)
-        lens = self.state.set_lens(tabled)
-        scene = Scene(lens, self.state.focus_of(tabled, lens), self.axis)
+        lens = set_lens(tabled, shot := self.state.shot())
+        scene = Scene(lens, focus_of(lens, shot), self.axis)
         with warned(self.file) as doubts:
             for nm in self.waves_nm or scene.waves_nm:
                 check_light(lens, nm)
-        return scene, [*notes, *rim_doubts(lens), *file_doubts(tabled, states=bool(self.state.zoom)), *doubts]
+        return scene, [*notes, *rim_doubts(lens), *file_doubts(tabled, states=bool(self.state.given.zoom)), *doubts]
 
     def _one(self, what: str, scene: Scene, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
         """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""

@@ -10,7 +10,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
@@ -25,16 +25,15 @@ from neurolens.base.settings import (
     from_options,
     group,
     setting,
-    setting_of,
     spelling,
+    with_changes,
 )
 from neurolens.base.units import as_float
-from neurolens.optics.lens.shot import FocusMode, Shot, StopShape, film_size
+from neurolens.optics.lens.shot import BY_LENSES, Shot, StopShape, film_size
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import Camera
     from neurolens.optics.lens.apertures import Aperture
-    from neurolens.optics.lens.prescription import Lens
 
 CAMERAS_HELP = """\
 cameras:
@@ -331,15 +330,9 @@ def camera(name: str, shot: Shot, progress: Progress) -> Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class LensState:
-    """The options that set a lens: fields of a `Shot`, None where the command line has none."""
+    """The options that set a lens or a camera: settings of a shot, and the shape of the stop."""
 
-    focus_m: float | None = setting_of(Shot, "focus_m")
-    f_number: float | None = setting_of(Shot, "f_number")
-    focal_length_mm: float | None = setting_of(Shot, "focal_length_mm")
-    zoom: str | None = setting_of(Shot, "zoom")
-    field_deg: float | None = setting_of(Shot, "field_deg")
-    focus_mode: FocusMode | None = setting_of(Shot, "focus_mode")
-    cover_glass_mm: float | None = setting_of(Shot, "cover_glass_mm")
+    given: Shot = setting(Shot.part(), "what the command line has of a shot")
     stop: StopShape = group("shape of the stop")
 
     def aperture(self) -> Aperture | None:
@@ -352,50 +345,22 @@ class LensState:
 
         return make_aperture(self.stop)
 
-    def settings(self) -> dict[str, Any]:
-        """The settings as `Shot` and `frames.Frame` name them; None is not given."""
-        return {k: v for k, v in vars(self).items() if k != "stop"} | {"aperture": self.aperture()}
-
-    def shot(self, film_mm: tuple[float, float], **settings: Any) -> Shot:
-        """The settings of a camera with such a film and further `settings`, of which None counts as not given; a focus
-        that is not given is infinity.
+    def shot(self, film_mm: tuple[float, float] | None = None, **settings: Any) -> Shot:
+        """What is given of a shot, with a camera's film and further `settings`; None counts as not given.
 
         Raises:
             InputError: as `Shot` and `aperture`.
         """
-        given = {name: value for name, value in (self.settings() | settings).items() if value is not None}
-        return Shot(film_mm, **({"focus_m": math.inf} | given))
+        return with_changes(self.given, {"aperture": self.aperture(), "film_mm": film_mm} | settings)
 
-    def set_lens(self, tabled: Lens) -> Lens:
-        """The lens of a file in this state; raises InputError as `optics.setting.states.set_lens`."""
-        from neurolens.optics.setting.focusing import best_focused, with_cover_glass
-        from neurolens.optics.setting.states import set_lens
-
-        mode = self.focus_mode or "best"
-        lens = set_lens(
-            tabled.with_aperture(self.aperture() or tabled.aperture), zoom=self.zoom,
-            focal_length_mm=self.focal_length_mm, field_deg=self.field_deg, f_number=self.f_number,
-            focus_m=self.focus_m, focus_mode=mode,
-        )  # fmt: skip
-        lens = best_focused(lens, self.focus_of(tabled, lens)) if mode == "internal" else lens
-        return with_cover_glass(lens, self.cover_glass_mm or 0.0, self.focus_of(tabled, lens), mode, lens.light_nm)
-
-    def focus_of(self, tabled: Lens, lens: Lens) -> float:
-        """Film to object in metres: as given, else of the focus state that the zoom names, else inf.
-
-        `tabled` is the lens of the file, `lens` its state.
-        """
-        if self.focus_m is not None:
-            return self.focus_m
-        near = next((c.object_distance_mm for c in tabled.configurations if c.name == self.zoom), None)
-        if near is None:
-            return math.inf
-        row = 1 if tabled.surfaces[0].stop else 0  # a stop's diameter follows the f-number, too
-        scale = lens.surfaces[row].diameter_mm / tabled.surfaces[row].diameter_mm
-        return float(near * scale + (lens.film_z_mm or lens.vertices_mm[-1])) / 1000
+    def at(self, **settings: Any) -> Self:
+        """With other settings of the shot."""
+        return replace(self, given=replace(self.given, **settings))
 
 
-lens_state = partial(group, "state of the lens")  # a field of `LensState` in a command
+# Fields of `LensState` in a command: of a lens alone, and of any camera.
+lens_state = partial(group, "state of the lens", names=BY_LENSES, unset=True)
+camera_state = partial(group, "state of the lens", unset=True)
 
 
 # Checks

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neurolens import __version__
-from neurolens.base.settings import group, positive, setting, setting_of, whole
+from neurolens.base.settings import group, positive, setting, whole
 from neurolens.cameras.field import frame_of
+from neurolens.cameras.sampling import focus_m
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
-from neurolens.optics.lens.shot import Dispersion, Runtime, Shot, Vignetting
 from neurolens.pictures.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
 from neurolens.pictures.defocus.picture import SAMPLES, check_field, defocus
 from neurolens.pictures.defocus.plate import DepthSettings, read_plate
@@ -63,15 +63,11 @@ examples:
         f"(default: {SAMPLES})", within=(8, 512),
     )  # fmt: skip
     no_highlights: bool = setting(False, "do not spread very bright pixels as discs; their blur is then noisy")
-    film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
-    vignetting: Vignetting | None = setting_of(Shot, "vignetting")
-    dispersion: Dispersion | None = setting_of(Shot, "dispersion")
-    runtime: Runtime | None = setting_of(Shot, "runtime")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = cli.exposure()
     sensor: SensorSettings = group("sensor (any of these adds what it reads as channels raw)", unset=True)
     seed: int = setting(0, "seed of the sensor's noise, for each frame another (default: 0)", kind=whole(0))
-    state: cli.LensState = cli.lens_state()
+    state: cli.LensState = cli.camera_state()
     threads: int = cli.threads()
 
     def run(self) -> int:
@@ -83,9 +79,7 @@ examples:
         if self.depth_scale == 0:
             self.refuse("--depth-scale", 0, "metres of a unit")
         progress = self.progress()
-        settings = {k: getattr(self, k) for k in ("film_offset_mm", "vignetting", "dispersion", "runtime")}
-        shot = self.state.shot(self.film, **settings)
-        camera = cli.camera(self.lens, shot, progress)
+        camera = cli.camera(self.lens, shot := self.state.shot(self.film), progress)
         check_field(camera)
         starts = {"auto": None, "film": True, "pinhole": False}
         depth = DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
@@ -97,7 +91,7 @@ examples:
         layers = {}
         if sensor is not None:
             layers, metadata["sensor"] = expose(found.rgb, sensor, self.seed), about(sensor, self.seed)
-        focus = None if math.isinf(shot.focus_m) else shot.focus_m
+        focus = None if math.isinf(metres := focus_m(camera, shot)) else metres
         attributes = standard_attributes(camera.settings, *plate.size)
         write_exr(
             files.out, found.rgb, half=self.half, metadata=metadata | {"focus_m": focus}, space=plate.space,

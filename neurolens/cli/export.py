@@ -13,16 +13,18 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.lensname import is_model, split_kind
-from neurolens.base.settings import positive, setting
+from neurolens.base.settings import changed, group, setting
 from neurolens.cameras.build import make_camera
+from neurolens.cameras.lenscamera import LensCamera
 from neurolens.cameras.onnxlens import load_model
+from neurolens.cameras.sampling import focus_m
 from neurolens.cameras.shaders.blender_shader import shader_of
 from neurolens.cameras.shaders.source import CAMERA_FRAME, camera_program, model_extras
 from neurolens.cli import arguments as cli
 from neurolens.graph.c import Extras
 from neurolens.models import source
 from neurolens.optics.lens.paraxial import film_z_mm
-from neurolens.optics.lens.shot import Shot
+from neurolens.optics.lens.shot import BY_LENSES
 
 if TYPE_CHECKING:
     from neurolens.models.model import LensModel
@@ -81,17 +83,7 @@ examples:
     )
     whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA)
     film: tuple[float, float] = cli.film((36.0, 24.0), "film in mm (default: 36x24)", _CAMERA)
-    focus_m: float = setting(
-        math.inf, "distance from the film to the object in focus in metres (default: inf)",
-        kind=positive("a distance in metres", infinite=True), title=_CAMERA,
-    )  # fmt: skip
-    f_number: float | None = setting(
-        None, "default: the widest", kind=positive("an f-number"), metavar="N", title=_CAMERA
-    )
-    zoom: str | None = setting(
-        None, "state of a zoom by name or focal length; of a lens file also range: an argument, of OSL an input",
-        metavar="STATE", title=_CAMERA,
-    )  # fmt: skip
+    state: cli.LensState = group(_CAMERA, names={*BY_LENSES, *LensCamera.takes}, unset=True)
 
     def run(self) -> int:
         """Check the options, then load, fix and write."""
@@ -106,8 +98,8 @@ examples:
         if self.name is not None:
             source.checked_name(self.to, "", self.name)
         if self.to == "osl":
-            if not whole or self.whole_camera or self.f_number is not None or self.focus_m != math.inf:
-                options = "--fix, --only, --whole-camera, --focus, --f-number"
+            if not whole or self.whole_camera or set(changed(self.state, unset=True)) - {"--zoom"}:
+                options = "--fix, --only, --whole-camera, --focus, --f-number, ..."
                 expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
                 self.refuse(options, "(with --to osl)", expected)
             write: Callable[[Path], dict[str, Any]] = self._write_osl
@@ -146,11 +138,13 @@ examples:
         """Write the exact lens of a file as source code."""
         from neurolens.cameras.shaders.lens_source import write_lens
 
-        return _about(write_lens(file, self.out, self.to, name=self.name, zoom=self.zoom, progress=self.progress()))
+        return _about(
+            write_lens(file, self.out, self.to, name=self.name, zoom=self.state.given.zoom, progress=self.progress())
+        )
 
     def _write_osl(self, file: Path) -> dict[str, Any]:
         """A camera for Cycles."""
-        shader = shader_of(file, zoom=self.zoom, name=self.name, quiet=self.quiet)
+        shader = shader_of(file, zoom=self.state.given.zoom, name=self.name, quiet=self.quiet)
         atomic_write_text(self.out, shader.text)
         return {
             "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
@@ -159,7 +153,7 @@ examples:
 
     def _write_camera(self, file: Path) -> dict[str, Any]:
         """The whole camera of a model or a lens file as source code."""
-        shot = Shot(self.film, self.focus_m, self.f_number, zoom=self.zoom, runtime="onnxruntime")
+        shot = self.state.shot(self.film, runtime="onnxruntime")
         camera: Any = make_camera(file, shot, self.progress())
         facts = camera.settings
         lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
@@ -174,7 +168,7 @@ examples:
         told = ", ".join(f"{key} {value:.6g}" for key, value in constants.items())
         comment = [
             f"{lens['name']}: a whole camera, written by neurolens {__version__} from {file.name}.",
-            f"Lens data: sha256 {str(lens.get('sha256'))[:16]}. Focus {self.focus_m:g} m; {told}.",
+            f"Lens data: sha256 {str(lens.get('sha256'))[:16]}. Focus {focus_m(camera, shot):g} m; {told}.",
             CAMERA_FRAME,
         ]
         if not own_table:

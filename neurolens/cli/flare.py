@@ -29,6 +29,7 @@ from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.optics.analysis.layout import lens_layout
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
 from neurolens.pictures.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
@@ -159,7 +160,7 @@ examples:
     @property
     def focus_m(self) -> float:
         """Distance to the object in focus in metres."""
-        return math.inf if self.state.focus_m is None else self.state.focus_m
+        return math.inf if self.state.given.focus_m is None else self.state.given.focus_m
 
     @property
     def picture(self) -> Path:
@@ -236,11 +237,11 @@ examples:
 
     def _states(self) -> Iterator[Flare]:
         """The command with the settings of each frame."""
-        for frame, digits, values in self.frames.states(vars(self.state), self.called):
-            of_lens = {"focus_m": self.focus_m} | {k: v for k, v in values.items() if k in vars(self.state)}
+        for frame, digits, values in self.frames.states(vars(self.state.given), self.called):
+            of_lens = {"focus_m": self.focus_m} | {k: v for k, v in values.items() if k in vars(self.state.given)}
             place = {name: value for name, value in values.items() if name not in of_lens}
             out = self.out and numbered(self.out, digits)
-            yield replace(self, state=replace(self.state, **of_lens), frame=frame, out=out, **place)
+            yield replace(self, state=self.state.at(**of_lens), frame=frame, out=out, **place)
 
     def _write_all(self, states: list[Flare], shots: Shots, progress: Progress) -> dict[str, Any]:
         """Write the picture, or those of the frames that are missing.
@@ -294,7 +295,7 @@ class Shots:
         self._tracks = [t for path in command.lights if path.suffix.lower() != ".toml" for t in read_lights(path)]
         scenes = [(path, load_scene(path)) for path in command.lights if path.suffix.lower() == ".toml"]
         self._scenes = [(path, scene, SceneLights(scene)) for path, scene in scenes]
-        self._lens = cache(lambda state: with_coating(state.set_lens(tabled), command.settings))
+        self._lens = cache(lambda state: with_coating(set_lens(tabled, state.shot()), command.settings))
         self._progress, self._fields = progress, dict[cli.LensState, Field]()
         self._last: tuple[Flare, Shot] | None = None
 

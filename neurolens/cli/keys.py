@@ -6,15 +6,17 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
-from neurolens.base.settings import F_NUMBER, FOCAL_MM, group, said, setting, within
+from neurolens.base.settings import FOCAL_MM, Option, group, said, setting, spelling, unit_of, within
 from neurolens.base.tomlfile import reject_unknown
+from neurolens.base.units import in_unit
 from neurolens.cli.arguments import floats
+from neurolens.optics.lens.shot import Shot
 from neurolens.pictures.render.scenetables import FARTHEST_M
 
 _MOST = 100_000
@@ -27,25 +29,45 @@ def _inverse(value: float) -> float:
 
 
 class _Quantity(NamedTuple):
-    """A quantity that keys change: its name in a `Frame`, its components and their bounds, and the measure that is
-    linear between keys with the functions that lead to it and back."""
+    """A quantity that keys change.
+
+    Attributes:
+        setting: its name in a `Frame` or a `Shot`. unit: of its numbers. size: how many numbers it has.
+        linear_in: the measure that is linear between keys. to, back: the functions that lead to it and back.
+    """
 
     setting: str
-    size: int
     bounds: tuple[float, float]
+    unit: str
     linear_in: str
     to: Callable[[float], float] = float
     back: Callable[[float], float] = float
+    size: int = 1
 
 
-_QUANTITIES = {
-    "focus": _Quantity("focus_m", 1, (1e-6, math.inf), "1/m", _inverse, _inverse),
-    "f-number": _Quantity("f_number", 1, F_NUMBER, "stops", math.log, math.exp),
-    "zoom": _Quantity("zoom", 1, FOCAL_MM, "the logarithm of mm", math.log, math.exp),
-    "position": _Quantity("position_m", 3, _PLACE_M, "m"),
-    "look-at": _Quantity("look_at_m", 3, _PLACE_M, "m"),
+_LOGARITHM = "the logarithm of mm", math.log, math.exp
+_MEASURES: dict[str, tuple[Any, ...]] = {
+    "focus_m": ("1/m", _inverse, _inverse),
+    "f_number": ("stops", math.log, math.exp),
+    "focal_length_mm": _LOGARITHM,
+    "zoom": _LOGARITHM,
 }
-ALL_KEYS, LENS_KEYS = tuple(_QUANTITIES), ("focus", "f-number", "zoom")
+
+
+def _of_shot() -> Iterator[tuple[str, _Quantity]]:
+    """Yield the numbers of a `Shot` by the names of their options; most are linear in themselves."""
+    for f in fields(Shot):
+        option: Option | None = f.metadata.get("option")
+        if option and (bounds := FOCAL_MM if f.name == "zoom" else option.within):
+            unit = "mm" if f.name == "zoom" else unit_of(f.name)
+            yield spelling(f, option)[2:], _Quantity(f.name, bounds, unit, *_MEASURES.get(f.name, (unit,)))
+
+
+_QUANTITIES = dict(_of_shot()) | {
+    "position": _Quantity("position_m", _PLACE_M, "m", "m", size=3),
+    "look-at": _Quantity("look_at_m", _PLACE_M, "m", "m", size=3),
+}
+ALL_KEYS, LENS_KEYS = tuple(_QUANTITIES), tuple(name for name, q in _QUANTITIES.items() if q.size == 1)
 
 
 def _frames(text: str) -> range:
@@ -148,7 +170,8 @@ def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str
 def _append(keys: _Keys, name: str, frame: str, value: str, place: tuple[str | Path, str]) -> None:
     """Append a key that two words give; `place` tells where they stand, for errors."""
     quantity = _QUANTITIES[name]
-    numbers = floats(value, "/") if len(value) < 100 else []
+    parts = value.split("/") if quantity.size > 1 else [value]
+    numbers = in_unit(quantity.unit, floats)(",".join(parts)) if len(value) < 100 else []
     good = [within(quantity.bounds, v) for v in numbers]
     later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
     if not later or len(numbers) != quantity.size or not all(good):

@@ -97,21 +97,22 @@ examples:
         """Print and draw one lens."""
         from neurolens.models.pairs import domain_of
         from neurolens.optics.readers.any_format import read_any
+        from neurolens.optics.setting.states import focus_of, set_lens
         from neurolens.studies.describe import file_doubts, glass_table, layout_profile, lens_facts
 
         began = time.perf_counter()
         with warned(file) as notes:
             tabled = read_any(file)
-        lens = self.state.set_lens(tabled)
-        focus, film_z = self.state.focus_of(tabled, lens), float(lens.film_z_mm or 0.0)
+        lens = set_lens(tabled, shot := self.state.shot())
+        focus, film_z = focus_of(lens, shot), float(lens.film_z_mm or 0.0)
         domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
         facts = lens_facts(lens, domain)
         facts["warnings"] += notes + file_doubts(tabled)
         data = {
             "file": str(file),
             **facts,
-            "zoom": self.state.zoom,
-            "focus_mode": self.state.focus_mode or "best",
+            "zoom": self.state.given.zoom,
+            "focus_mode": self.state.given.focus_mode or "best",
             "derived": lens.derived,
             "aperture": lens.aperture and lens.aperture.settings(),
             "configurations": [

@@ -10,9 +10,8 @@ from typing import Any
 from neurolens import __version__
 from neurolens.base.progress import duration
 from neurolens.base.records import plain
-from neurolens.base.settings import positive, setting, setting_of, whole
+from neurolens.base.settings import positive, setting, whole
 from neurolens.cli import arguments as cli
-from neurolens.optics.lens.shot import Dispersion, Runtime, Shot
 from neurolens.pictures.frames import Files
 from neurolens.pictures.render.pictures import standard_attributes, write_exr, write_png
 from neurolens.programs.mitsuba import load_scene, render
@@ -43,9 +42,7 @@ examples:
         kind=positive("scene units in a metre"),
     )  # fmt: skip
     exposure: float = cli.exposure()
-    dispersion: Dispersion | None = setting_of(Shot, "dispersion")
-    runtime: Runtime | None = setting_of(Shot, "runtime")
-    state: cli.LensState = cli.lens_state()
+    state: cli.LensState = cli.camera_state()
 
     def run(self) -> int:
         """Render, write both pictures, print a summary."""
@@ -54,8 +51,7 @@ examples:
         width, height = (int(v) for v in scene.sensors()[0].film().size())
         progress = self.progress()
         film = self.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width)
-        shot = self.state.shot(film, dispersion=self.dispersion, runtime=self.runtime)
-        camera = cli.camera(self.camera, shot, progress)
+        camera = cli.camera(self.camera, self.state.shot(film), progress)
         began = time.perf_counter()
         with progress.stage(f"render {self.scene}, {camera.name}") as report:
             picture = render(

@@ -55,11 +55,11 @@ examples:
     def run(self) -> int:
         """Make and write the rays of every frame."""
         write, progress = self._writer(), self.progress()
-        fixed = vars(self.state) | vars(self.rays)
+        fixed = vars(self.state.given) | vars(self.rays)
         rows, made = list[dict[str, Any]](), None
         for _, digits, values in self.frames.states(fixed, self.called, ALL_KEYS):
             place = {name: values.pop(name) for name in ("position_m", "look_at_m") if name in values}
-            state = replace(self.state, **values)
+            state = self.state.at(**values)
             if made is None or made[0] != state:
                 made = state, *self.make(state, progress, None, self.rays.light_nm)
             job = RayJob(made[1], PixelGrid(*self.picture, self.film), replace(self.rays, **place), made[2].focus_m)

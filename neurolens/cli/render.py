@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,11 @@ from neurolens.base.files import atomic_write_text, library
 from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
 from neurolens.base.records import plain, program
-from neurolens.base.settings import changed, group, positive, setting, setting_of
+from neurolens.base.settings import changed, group, positive, setting
 from neurolens.base.tasks import Stopping, Unfinished
 from neurolens.cameras.contract import FloatArray
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
-from neurolens.optics.lens.shot import Dispersion, Runtime, Shot, Vignetting
 from neurolens.pictures.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
 from neurolens.pictures.frames.farm import how_to_resume, render_frames
 from neurolens.pictures.render.pictures import write_png
@@ -76,10 +75,6 @@ examples:
         (), "scene file (.toml), or tiles of --merge", positional=True, metavar="SCENE", nargs="*"
     )
     camera: str | None = cli.lens(None, models=True, cameras=True)
-    film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
-    vignetting: Vignetting | None = setting_of(Shot, "vignetting")
-    dispersion: Dispersion | None = setting_of(Shot, "dispersion")
-    runtime: Runtime | None = setting_of(Shot, "runtime")
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
     colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)
@@ -109,7 +104,7 @@ examples:
         False, "keep OUT.exr.part, so that the same command with more --samples adds them (from a multiple of 16)",
         title=_LONG,
     )  # fmt: skip
-    state: cli.LensState = cli.lens_state()
+    state: cli.LensState = cli.camera_state()
     threads: int = cli.threads("workers, each pinned to a core if there are as many as cores")
 
     def run(self) -> int:
@@ -127,8 +122,8 @@ examples:
             distributed()  # before a camera is made
         frame = self.frame()
         frames = {
-            numbered(self.out, digits): replace(frame, **values, number=number, seed=frame.seed + (number or 0))
-            for number, digits, values in self.frames.states(vars(frame), self.called)
+            numbered(self.out, digits): frame.at(**values, number=number, seed=frame.seed + (number or 0))
+            for number, digits, values in self.frames.states(vars(frame) | vars(frame.shot), self.called)
         }
         missing = frames if self.frames.frames is None else self._missing(frames)
         if self.dask is not None:
@@ -146,10 +141,9 @@ examples:
     def frame(self) -> Frame:
         """The frame that the options describe."""
         assert self.camera is not None
-        same = ("film_offset_mm", "vignetting", "dispersion", "runtime", "colour", "sensor", "tile")
         return Frame.of(
-            self.scene[0], self.camera, **self.state.settings(), **vars(self.picture), glass_files=self.glass,
-            **{name: getattr(self, name) for name in same},
+            self.scene[0], self.camera, shot=self.state.shot(), **vars(self.picture), glass_files=self.glass,
+            colour=self.colour, sensor=self.sensor, tile=self.tile,
         )  # fmt: skip
 
     def _missing(self, frames: Mapping[Path, Frame]) -> dict[Path, Frame]:

@@ -21,6 +21,7 @@ from neurolens.base.records import plain
 from neurolens.base.settings import LIGHT_NM, positive, setting, wavelengths_nm
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Field, Frame, diagonal_points, field_of, frame_of, lit_points, shown_at, spectrum_of
+from neurolens.cameras.sampling import focus_m
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
 from neurolens.optics.lens.shot import Runtime, Shot
@@ -86,7 +87,7 @@ class PictureCommand(cli.Reporting):
         None, argparse.SUPPRESS, kind=whole_pair("WIDTHxHEIGHT in pixels", _LARGEST), metavar="WxH",
     )  # fmt: skip  # the old spelling
     film: tuple[float, float] = cli.film()
-    state: cli.LensState = cli.lens_state()
+    state: cli.LensState = cli.camera_state()
 
     @property
     def picture(self) -> tuple[int, int]:
@@ -110,8 +111,9 @@ class PictureCommand(cli.Reporting):
             InputError: a film whose shape is not that of the picture.
         """
         PixelGrid(*self.picture, self.film)
-        shot = state.shot(self.film, wavelength_nm=light_nm, runtime=runtime)
-        return cli.camera(self.camera, shot, progress), shot
+        shot = state.shot(self.film, wavelength_nm=light_nm, runtime=state.given.runtime or runtime)
+        camera = cli.camera(self.camera, shot, progress)
+        return camera, replace(shot, focus_m=focus_m(camera, shot))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,8 +212,8 @@ examples:
 
     def states(self) -> list[tuple[str, cli.LensState]]:
         """The numbers of frames as file names have them, and the state of the lens there."""
-        keyed = self.frames.states(vars(self.state), self.called, LENS_KEYS)
-        return [(digits, replace(self.state, **values)) for _, digits, values in keyed]
+        keyed = self.frames.states(vars(self.state.given), self.called, LENS_KEYS)
+        return [(digits, self.state.at(**values)) for _, digits, values in keyed]
 
     def traced(self, progress: Progress) -> tuple[list[TracedFrame], Plates]:
         """All frames with their fields, and the pictures that hold what any of them shows."""

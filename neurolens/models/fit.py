@@ -66,7 +66,7 @@ from neurolens.models.terms import (
 )  # fmt: skip
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.setting.focusing import film_range_mm, infinity_states, nearest_focus_m
+from neurolens.optics.setting.focusing import film_range_mm, focused_inside, infinity_states, nearest_focus_m
 from neurolens.optics.setting.pupils import image_radius_mm
 from neurolens.optics.setting.states import set_lens
 
@@ -206,10 +206,8 @@ class StateSpace:
         return self._lens(*self._settings(state))
 
     def _lens(self, zoom: str | float | None, focus_m: float | None) -> Lens:
-        if focus_m is None:
-            return set_lens(self.lens, zoom=zoom, f_number=self.f_number)
-        distance = None if math.isinf(focus_m) else focus_m
-        return set_lens(self.lens, zoom=zoom, f_number=self.f_number, focus_mode="internal", focus_m=distance)
+        lens = set_lens(self.lens, zoom=zoom, f_number=self.f_number)
+        return lens if focus_m is None else focused_inside(lens, focus_m)
 
     def domain_at(self, state: Sequence[float]) -> Domain:
         """Return the domain of a state: the full lit film, and the film positions that focusing by the film needs.

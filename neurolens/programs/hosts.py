@@ -40,6 +40,7 @@ from neurolens.base.settings import (
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.field import frame_of
+from neurolens.cameras.sampling import focus_m
 from neurolens.optics.lens.shot import Shot, check_film
 from neurolens.pictures.render.colour import ChannelWavelengths
 from neurolens.pictures.render.film import PixelGrid, check_memory
@@ -227,9 +228,9 @@ def rays(
         raise InputError("rays", "film", film, f"a width and a height, each {said(FILM_MM)} mm") from None
     grid = PixelGrid(*size_by_shape(film[0] / film[1], width, height), film)
     check_memory(grid.width, grid.height, BYTES_A_RAY * asked.samples)
-    given: dict[str, Any] = {"focus_m": math.inf, "wavelength_nm": asked.light_nm} | settings
-    shot = Shot(film, **given)
-    found: dict[str, Any] = RayJob(make_camera(os.fspath(camera), shot), grid, asked, shot.focus_m).arrays()
+    shot = Shot.part(**{"film_mm": film, "wavelength_nm": asked.light_nm} | settings)
+    made = make_camera(os.fspath(camera), shot)
+    found: dict[str, Any] = RayJob(made, grid, asked, focus_m(made, shot)).arrays()
     if device is None:
         return found
     import torch

@@ -32,6 +32,7 @@ from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.focusing import focused_inside
 from neurolens.optics.setting.pupils import pupil_plane_z_mm
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.tracegraph import exact_graph
@@ -192,7 +193,7 @@ def test_groups_of_a_lens_file_move_where_the_camera_is_focused(monkeypatch: pyt
     assert passed.mean() > 0.5
     start, way = (np.array([found[f"{name}_{k}"][passed] for k in range(3)]) for name in ("position", "direction"))
     # All rays of a film point meet where the lens, its groups moved, has the point's image.
-    lens = set_lens(read_lens(file), focus_mode="internal", focus_m=focus_m)
+    lens = focused_inside(set_lens(read_lens(file)), focus_m)
     data = first_order(lens)
     away = (focus_m * 1e3 + data.front_principal_z_mm - lens.film_z_mm) / 1e3  # from the front principal plane
     plane = start + (focus_m - start[2]) / way[2] * way

@@ -65,7 +65,7 @@ class Shader:
     notes: tuple[str, ...] = ()
 
 
-def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False) -> Shader:
+def shader_of(file: Path, *, zoom: str | float | None = None, name: str | None = None, quiet: bool = False) -> Shader:
     """The shader of a model (.onnx) or of a lens file.
 
     Args:
@@ -107,13 +107,13 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
     )  # fmt: skip
 
 
-def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
+def lens_of(file: Path, zoom: str | float | None, report: Report) -> tuple[str, OslLens, list[str]]:
     """The id of a model (.onnx) or lens file, the lens as a shader has it, and lines that describe it. Arguments and
     errors are those of `shader_of`."""
     return _of_model(file, zoom, report) if is_model(file) else exact_lens(file, zoom, report)
 
 
-def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
+def _of_model(file: Path, zoom: str | float | None, report: Report) -> tuple[str, OslLens, list[str]]:
     model, fixed = load_model(file), zoom not in (None, RANGE)
     if fixed or (zoom is not None and not model.axes):
         model = model.at(*state_for(model.path, model.axes, model.state, zoom, math.inf))
@@ -124,7 +124,7 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
     return str(lens["id"]), made, lines + [f"State: {state}."] * bool(state and fixed)
 
 
-def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
+def exact_lens(file: Path, zoom: str | float | None, report: Report) -> tuple[str, OslLens, list[str]]:
     """A lens with every surface traced: its id, the lens as a shader has it, and lines that describe it.
 
     It focuses by its groups where its file tells how they move, else by its film, to ten focal lengths.

@@ -40,7 +40,7 @@ def write_lens(
     to: str,
     *,
     name: str | None = None,
-    zoom: str | None = None,
+    zoom: str | float | None = None,
     progress: Progress | None = None,
 ) -> Written:
     """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and any zoom range.

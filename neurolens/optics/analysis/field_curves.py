@@ -20,7 +20,7 @@ from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, LINE_G_
 from neurolens.optics.lens.paraxial import PathOfRay, System, chief_reach_mm, first_order, system_of
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import FocusMode
-from neurolens.optics.setting.focusing import focus_states, nearest_focus_m
+from neurolens.optics.setting.focusing import focus_states, focused_inside, nearest_focus_m
 from neurolens.optics.setting.pupil_nodes import FilmLight, converged
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.optics.setting.states import set_lens
@@ -403,7 +403,8 @@ def breathing(lens: Lens, focus_m: Sequence[float], focus_mode: FocusMode = "par
         raise InputError("breathing", "focus_m", "(none)", "distances in m")
     radius, breaths = image_radius_mm(set_lens(lens))[0], []
     for distance in focus_m:
-        state = set_lens(lens, focus_m=distance, focus_mode=focus_mode)
+        inside = focus_mode == "internal"
+        state = focused_inside(lens, distance) if inside else set_lens(lens, focus_m=distance, focus_mode=focus_mode)
         data, reach, film_z = first_order(state), chief_reach_mm(state), state.film_z_mm
         assert film_z is not None
         breaths.append(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import re
 from argparse import ArgumentTypeError
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, LIGHT_NM, between, check_bounds, said, setting, within
@@ -17,6 +18,15 @@ FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
 Dispersion = Literal["full", "lateral", "off"]
 Runtime = Literal["c", "onnxruntime"]
+# Settings that every camera takes, and those of a lens alone, without its film; "internal" is the focus mode.
+BY_ALL = (
+    "film_mm", "focus_m", "f_number", "focus_mode", "wavelength_nm", "clamp_f_number", "vignetting", "dispersion",
+    "runtime",
+)  # fmt: skip
+BY_LENSES = (
+    "focus_m", "f_number", "focal_length_mm", "zoom", "field_deg", "focus_mode", "internal", "aperture",
+    "cover_glass_mm",
+)  # fmt: skip
 FILMS = {"super35": "24.89x18.66", "fullframe": "36x24", "apsc": "23.6x15.7", "mft": "17.3x13", "super16": "12.52x7.41"}
 
 
@@ -26,13 +36,17 @@ class Shot:
 
         shot = Shot(film_mm=(36.0, 24.0), focus_m=2.0, f_number=2.8)
 
+    Options, keys and scene files give some of the settings: a `part` of a shot, whose other settings are None.
+
     Attributes:
         film_mm: width and height of the film.
-        focus_m: distance from the film to the object in focus, inf allowed.
+        focus_m: distance from the film to the object in focus, inf allowed. Where it is not given, it is that of the
+            focus state which `zoom` names, else infinity.
         f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for a point.
         focal_length_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole, 14 mm for a fisheye projection
             unless `field_deg` sets it. A model has its own.
         zoom: state of a lens file by name, or a focal length in mm between its states; also of a model of a whole zoom.
+            A focus state that is named keeps its groups, and the film moves from there.
         field_deg: full field of view that the film's image circle shall see; sets the size of a lens file. For a
             fisheye projection it is what the circle within the film shall see; beyond it the film is dark.
         focus_mode: "best" places the film where the spot on the axis is smallest, "paraxial" in the paraxial image;
@@ -49,12 +63,13 @@ class Shot:
             else onnxruntime.
 
     Raises:
-        InputError: a film, focus, f-number, focus mode, vignetting, dispersion or runtime that no camera has.
+        InputError: a film, focus, f-number, focus mode, vignetting, dispersion or runtime that no camera has; a focal
+            length beside a field.
     """
 
     film_mm: tuple[float, float]
     focus_m: float = setting(
-        ..., "distance from the film to the object in focus, or inf (default: the scene's, or inf)",
+        math.inf, "distance from the film to the object in focus, or inf (default: the scene's, or inf)",
         within=(1e-6, math.inf), unit="a distance in metres",
     )  # fmt: skip
     f_number: float | None = setting(
@@ -104,8 +119,49 @@ class Shot:
 
     def __post_init__(self) -> None:
         check_bounds(self, "camera")
-        object.__setattr__(self, "film_mm", check_film(self.film_mm))
-        object.__setattr__(self, "focus_m", float(self.focus_m))
+        if self.field_deg is not None and self.focal_length_mm is not None:
+            expected = "left out beside focal_length_mm: each sets the size"
+            raise InputError("camera", "field_deg", self.field_deg, expected)
+        if self.film_mm is not None:
+            object.__setattr__(self, "film_mm", check_film(self.film_mm))
+        if self.focus_m is not None:
+            object.__setattr__(self, "focus_m", float(self.focus_m))
+
+    @classmethod
+    def part(cls, **given: Any) -> Self:
+        """Some settings of a shot; the others are None, which stands for not given."""
+        return cls(**{f.name: None for f in fields(cls)} | given)
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The settings that are not None, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    def whole(self) -> Self:
+        """The shot with the defaults of the settings that are not given."""
+        return type(self)(**self.given)
+
+    def check_taken(self, camera: str, takes: Collection[str]) -> None:
+        """Raise InputError for a setting that a kind of camera does not take.
+
+        `takes`: what it has besides `BY_ALL`; "internal" is that focus mode.
+        """
+        for f in fields(self):
+            value, taken = getattr(self, f.name), f.name in {*takes, *BY_ALL}
+            if taken if f.name != "focus_mode" else value != "internal" or "internal" in takes:
+                continue
+            if value != f.default:
+                value = value.settings() if f.name == "aperture" else value
+                own = ", ".join(g.name for g in fields(self) if g.name in takes)
+                expected = f"left out: lens files take it; of this camera one sets film, focus, f-number, {own}"
+                raise InputError(f"camera {camera}", f.name, value, expected)
+
+    def record(self, takes: Collection[str]) -> dict[str, Any]:
+        """What the settings of a camera say of its shot, as JSON has it: film, focus (None is inf), what it `takes`."""
+        found: dict[str, Any] = {"film_mm": list(self.film_mm)}
+        found |= {f.name: getattr(self, f.name) for f in fields(self) if f.name in takes}
+        found["focus_m"] = None if math.isinf(self.focus_m) else self.focus_m
+        return found | ({"aperture": self.aperture.settings()} if self.aperture else {})
 
     def f_number_for(self, widest: float) -> float | None:
         """The f-number of a lens that opens to `widest`; None stands for its widest."""

@@ -1,4 +1,4 @@
-"""A lens set as a photographer does, in this order: zoom, size, f-number, focus.
+"""A lens set as a photographer does, in this order: zoom, size, aperture, f-number, focus, cover glass, film offset.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
 focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which
@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.base.settings import F_NUMBER, FOCAL_MM, said, within
 from neurolens.optics.lens import paraxial
 from neurolens.optics.lens.prescription import Configuration, Lens
 from neurolens.optics.lens.shot import FocusMode, Shot
@@ -35,99 +34,92 @@ from neurolens.optics.setting.rims import check_clearance
 
 
 def set_lens(
-    lens: Lens,
-    shot: Shot | None = None,
-    *,
-    focus_m: float | None = None,
-    f_number: float | None = None,
-    focal_length_mm: float | None = None,
-    field_deg: float | None = None,
-    zoom: str | float | None = None,
-    focus_mode: FocusMode = "paraxial",
-    wavelength_nm: tuple[float, float] | None = None,
-) -> Lens:
-    """Return the lens zoomed, scaled, stopped down and focused, for a shot or for some settings of one::
+    lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "paraxial", **settings: Any
+) -> Lens:  # fmt: skip
+    """Return the lens set for a shot: its zoom, size, aperture, f-number, focus, cover glass and film offset::
 
         lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=2.0, f_number=4.0)
 
     Args:
-        shot: all of the settings, with the shape of the stop and the film's offset; the other arguments are then left
-            out. After "internal" focus the film, too, moves to the least spot.
-        focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state that is
-            named: at the object of the source), and leaves the focus where `f_number` alone is given.
-        f_number: focal length over the diameter of the paraxial entrance pupil at infinity focus, of a bladed stop by
-            the circle round it. None keeps the stop, except for a zoom state with a stop of its own. A stop wider than
-            the rims let light through is allowed: they then vignette.
-        focal_length_mm: the whole lens is scaled until its focal length at infinity focus is this.
-        field_deg: full field of view of the image circle at infinity focus: the lens is scaled, the image circle stays
-            (by the traced chief ray, along x; distortion included).
-        zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its text.
-            A lens between states is marked in `derived`.
-        focus_mode: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to
-            the least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as the
-            file's focus states do, and the film stays.
-        wavelength_nm: range of the light that "best" focuses; None takes `Lens.light_nm`.
+        shot: some or all settings of a shot, as commands and cameras have them; what its `focus_mode` leaves open is
+            "best". Or some by name, as in the example.
+        focus_mode: of settings by name: "paraxial" moves the film as the paraxial image does; "best" to the least RMS
+            spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as the file's focus states
+            do (`focusing.focused_inside`), and then the film to that spot.
+        settings: as in `Shot`. An f-number alone closes the stop of a lens that is set, whose focus stays. An f-number
+            is the focal length over the diameter of the paraxial entrance pupil at infinity focus, of a bladed stop by
+            the circle round it; a stop wider than the rims let light through is allowed: they then vignette. A field is
+            that of the image circle at infinity focus, by the traced chief ray along x. Light that is not given is
+            `Lens.light_nm`.
 
     Raises:
-        InputError: the state is unknown, the focal length lies beyond the zoom's range, a value is not positive, the
-            focus is nearer than the lens allows, the lens does not see the field, or a size is asked of a lens that
-            diverges.
+        InputError: the state is unknown, the focal length lies beyond the zoom's range, a setting is out of its bounds,
+            the focus is nearer than the lens allows, the lens does not see the field, the cover glass has no room, or a
+            size is asked of a lens that diverges.
     """
-    if shot is not None:
-        return _set_for(lens, shot)
-    _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus_mode)
-    others = (focus_m, focal_length_mm, field_deg, zoom)
-    if f_number is not None and lens.film_z_mm is not None and others == (None,) * 4:
-        # Closing the stop leaves the focus where it is.
-        return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
-    lens, object_mm = at_infinity(lens), None
+    if shot is None:
+        shot = Shot.part(focus_mode=focus_mode, **settings)
+        if lens.film_z_mm is not None and shot.f_number and shot.given.keys() <= {"f_number", "focus_mode"}:
+            return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), shot.f_number))
+    lens, mode, light_nm = at_infinity(lens), shot.focus_mode or Shot.focus_mode, shot.wavelength_nm or lens.light_nm
+    lens = _sized(_zoomed_to(lens, shot.zoom), shot)
+    lens = lens.with_aperture(shot.aperture or lens.aperture)
+    if shot.f_number is not None:
+        far = at_infinity(lens)
+        widest = paraxial.first_order(far).f_number if shot.clamp_f_number else 0.0
+        if (f_number := shot.f_number_for(widest)) is not None:
+            lens = lens.with_stop_radius(paraxial.stop_radius_mm(far, f_number))
+    object_mm = _object_mm(lens, shot)
+    if mode == "internal":
+        lens = focused_inside(lens, shot.focus_m, object_mm)
+    elif shot.focus_m is None and object_mm is not None:
+        lens = replace(lens, film_z_mm=paraxial.image_z_mm(lens, -object_mm))
+    else:
+        lens = replace(lens, film_z_mm=paraxial.film_z_mm(lens, focus_of(lens, shot)))
+    if mode != "paraxial":
+        lens = best_focused(lens, focus_of(lens, shot), light_nm)
+    lens = with_cover_glass(lens, shot.cover_glass_mm or 0.0, focus_of(lens, shot), mode, light_nm)
+    assert lens.film_z_mm is not None
+    return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
+
+
+def focus_of(lens: Lens, shot: Shot) -> float:
+    """Film to object in metres, of a lens that is set for a shot: as given, else of the focus state that its zoom
+    names, else inf."""
+    if shot.focus_m is not None:
+        return shot.focus_m
+    object_mm = _object_mm(lens, shot)
+    return math.inf if object_mm is None else float(object_mm + (lens.film_z_mm or lens.vertices_mm[-1])) / 1000
+
+
+def _object_mm(lens: Lens, shot: Shot) -> float | None:
+    """From the object of the focus state that a shot names to the front vertex; None of other states."""
+    return next((c.object_distance_mm for c in lens.configurations if c.name == shot.zoom), None)
+
+
+def _zoomed_to(lens: Lens, zoom: str | float | None) -> Lens:
+    """The lens in the state that is named, or at a focal length, as a number or its text."""
+    if zoom is None:
+        return lens
     if isinstance(zoom, str) and zoom not in [c.name for c in lens.configurations]:
         with suppress(ValueError):  # a name, then, that no state has
             zoom = float(zoom)
-    if isinstance(zoom, str):
-        state = state_named(lens, zoom)
-        lens, object_mm = in_state(lens, state), state.object_distance_mm
-        if focus_mode == "internal" and focus_m is not None:
-            lens = at_infinity(lens)
-    elif zoom is not None:
-        lens = zoomed(lens, zoom)
-    if focal_length_mm is not None:
+    return in_state(lens, state_named(lens, zoom)) if isinstance(zoom, str) else zoomed(lens, zoom)
+
+
+def _sized(lens: Lens, shot: Shot) -> Lens:
+    """The lens scaled to the focal length or the field of a shot, whose image circle stays."""
+    if shot.focal_length_mm is not None:
         now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
         if now_mm < 0:
             expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
-            raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
-        factor = focal_length_mm / now_mm
-    else:
-        factor = 1.0 if field_deg is None else _factor_for_field(lens, field_deg)
-    image_radius = lens.image_radius_mm
-    if factor != 1:
-        lens, object_mm = lens.scaled(factor), None if object_mm is None else object_mm * factor
-    if field_deg is not None:
-        lens = replace(lens, image_radius_mm=image_radius, half_field_deg=field_deg / 2)
-    if f_number is not None:
-        lens = lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
-    if focus_mode == "internal":
-        return focused_inside(lens, focus_m, object_mm)
-    if object_mm is not None and focus_m is None:
-        film_z = paraxial.image_z_mm(lens, -object_mm)
-        focus_m = (film_z + object_mm) / 1000
-    else:
-        focus_m = math.inf if focus_m is None else focus_m
-        film_z = paraxial.film_z_mm(lens, focus_m)
-    lens = replace(lens, film_z_mm=film_z)
-    return best_focused(lens, focus_m, wavelength_nm or lens.light_nm) if focus_mode == "best" else lens
-
-
-def _set_for(lens: Lens, shot: Shot) -> Lens:
-    lens = set_lens(lens, focal_length_mm=shot.focal_length_mm, field_deg=shot.field_deg, zoom=shot.zoom)
-    lens = lens.with_aperture(shot.aperture or lens.aperture)
-    f_number, light_nm = shot.f_number_for(paraxial.first_order(lens).f_number), shot.wavelength_nm
-    lens = set_lens(lens, f_number=f_number, focus_m=shot.focus_m, focus_mode=shot.focus_mode, wavelength_nm=light_nm)
-    if shot.focus_mode == "internal":
-        lens = best_focused(lens, shot.focus_m, light_nm)
-    lens = with_cover_glass(lens, shot.cover_glass_mm, shot.focus_m, shot.focus_mode, light_nm)
-    assert lens.film_z_mm is not None  # `set_lens` places the film
-    return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
+            raise InputError(lens.path, "focal_length_mm", shot.focal_length_mm, expected)
+        factor = shot.focal_length_mm / now_mm
+        return lens if factor == 1 else lens.scaled(factor)
+    if shot.field_deg is None:
+        return lens
+    scaled = lens.scaled(_factor_for_field(lens, shot.field_deg))
+    return replace(scaled, image_radius_mm=lens.image_radius_mm, half_field_deg=shot.field_deg / 2)
 
 
 def state_named(lens: Lens, name: str) -> Configuration:
@@ -163,27 +155,6 @@ def _f_number_in(lens: Lens, state: Configuration) -> float:
         focused = zoom_state_of(lens, state)
         return lens.f_number if focused is None or focused.f_number is None else focused.f_number
     return lens.f_number if state.f_number is None else state.f_number
-
-
-def _check(
-    lens: Lens,
-    focus_m: float | None,
-    f_number: float | None,
-    focal_length_mm: float | None,
-    field_deg: float | None,
-    focus_mode: FocusMode,
-) -> None:
-    for field, value, bounds in (("f_number", f_number, F_NUMBER), ("focal_length_mm", focal_length_mm, FOCAL_MM)):
-        if value is not None and not within(bounds, value):
-            raise InputError(lens.path, field, value, f"a number {said(bounds)}")
-    if focus_m is not None and not focus_m > 0:
-        raise InputError(lens.path, "focus_m", focus_m, "a positive number")
-    if field_deg is not None and not 0 < field_deg < 360:
-        raise InputError(lens.path, "field_deg", field_deg, "a full field of view in degrees, above 0 and below 360")
-    if field_deg is not None and focal_length_mm is not None:
-        raise InputError(lens.path, "field_deg", field_deg, "left out beside focal_length_mm: each sets the size")
-    if focus_mode not in get_args(FocusMode):
-        raise InputError(lens.path, "focus_mode", focus_mode, " or ".join(f'"{f}"' for f in get_args(FocusMode)))
 
 
 def _factor_for_field(lens: Lens, field_deg: float) -> float:

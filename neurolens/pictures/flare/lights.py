@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
+from neurolens.base.settings import unit_of
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.base.units import as_float
+from neurolens.base.units import as_float, in_unit
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.field import Array, Field
 from neurolens.optics.lens.prescription import Lens
@@ -248,7 +249,7 @@ def _value(path: Path, place: str, name: str, given: Any) -> float:
     if given in (None, "") and not math.isnan(default):
         return default
     try:
-        value = math.nan if isinstance(given, bool) else as_float(str(given))
+        value = math.nan if isinstance(given, bool) else as_float(in_unit(unit_of(name), str)(str(given)))
     except (TypeError, ValueError, OverflowError):
         value = math.nan
     if not least <= value <= most:

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -26,10 +26,10 @@ from neurolens.base.files import check_writable
 from neurolens.base.lensname import Named, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.base.settings import setting, whole
+from neurolens.base.settings import setting, setting_of, whole, with_changes
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.optics.lens.shot import Dispersion, FocusMode, Runtime, Shot, Vignetting, film_size
+from neurolens.optics.lens.shot import Shot, film_size
 from neurolens.optics.readers.glasses import more_glasses
 from neurolens.pictures.render.behind import Behind
 from neurolens.pictures.render.colour import (
@@ -57,39 +57,24 @@ if TYPE_CHECKING:
     from neurolens.pictures.flare.canvas import Raster
     from neurolens.pictures.flare.layers import Choice
 
-T = TypeVar("T")
 Vector = tuple[float, float, float]
 Layers = dict[str, FloatArray]
 _CHOICE_FRAMES = 16  # frames of an animation that decide the brightest ghosts
 _PALER = 1e-3  # a share of the light that may lie below zero without a warning
 
 
-def with_changes(settings: T, changes: object) -> T:
-    """Return settings with those values of `changes`, a mapping or an object with such fields, that are not None."""
-    values = changes
-    if not isinstance(values, Mapping):
-        values = {f.name: getattr(changes, f.name, None) for f in fields(settings)}  # type: ignore[arg-type]
-    return replace(settings, **{name: v for name, v in values.items() if v is not None})  # type: ignore[type-var]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Picture:
     """The settings of a picture that are options of commands. None leaves a setting to the scene."""
 
-    samples: int | None = setting(None, "per pixel (default: the scene's)", within=(1, 2**20))
-    width: int | None = setting(
-        None, "width (default: the scene's, or from --height and the film's shape)", within=(1, 16384),
-        metavar="PIXELS",
-    )  # fmt: skip
-    height: int | None = setting(
-        None, "height (default: the scene's, or from --width and the film's shape)", within=(1, 16384),
-        metavar="PIXELS",
-    )  # fmt: skip
+    samples: int | None = setting_of(CameraSettings, "samples")
+    width: int | None = setting_of(CameraSettings, "width")
+    height: int | None = setting_of(CameraSettings, "height")
     film_mm: tuple[float, float] | None = setting(
         None, "width and height of the film in mm (default: the scene's)", option="film", kind=film_size, metavar="WxH"
     )
     seed: int = setting(0, "of the random numbers (default: 0)", kind=whole(0))
-    max_depth: int | None = setting(None, "bounces (default: the scene's)", within=(1, 1000))
+    max_depth: int | None = setting_of(CameraSettings, "max_depth")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = setting(
         0.0, "stops by which the preview OUT.png is brighter; OUT.exr keeps the light as it is (default: 0)",
@@ -111,8 +96,7 @@ class Frame(Picture):
 
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
-        focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, cover_glass_mm,
-            vignetting, dispersion, runtime: as in `optics.lens.shot.Shot`.
+        shot: settings of the camera; its film is `film_mm`.
         glass_files: Zemax's catalogues, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
         colour: changes of the scene's [film] table by key, such as {"white_balance": "A"}.
@@ -122,18 +106,7 @@ class Frame(Picture):
 
     scene: Path
     camera: Named
-    focus_m: float | None = None
-    f_number: float | None = None
-    focal_length_mm: float | None = None
-    zoom: str | float | None = None
-    field_deg: float | None = None
-    focus_mode: FocusMode | None = None
-    aperture: Aperture | None = None
-    film_offset_mm: float | None = None
-    cover_glass_mm: float | None = None
-    vignetting: Vignetting | None = None
-    dispersion: Dispersion | None = None
-    runtime: Runtime | None = None
+    shot: Shot = Shot.part()
     glass_files: tuple[Path, ...] = ()
     position_m: Vector | None = None
     look_at_m: Vector | None = None
@@ -144,13 +117,20 @@ class Frame(Picture):
 
     @classmethod
     def of(cls, scene: str | Path, camera: str | Path, **settings: Any) -> Frame:
-        """A frame of a scene file through a camera, both by name, as in `neurolens render SCENE --camera CAMERA`."""
-        return cls(scene=Path(scene), camera=resolve(camera), **settings)
+        """Return the frame of a scene file through a camera, both by name, as `neurolens render SCENE --camera CAMERA`
+        has it; `settings` as of `at`."""
+        return cls(scene=Path(scene), camera=resolve(camera)).at(**settings)
 
-    def shot(self, settings: CameraSettings, aperture: Aperture | None) -> Shot:
+    def at(self, **settings: Any) -> Frame:
+        """Return the frame with other settings, of its own or of its shot, by name."""
+        of_shot = {name: settings.pop(name) for name in settings.keys() & vars(self.shot).keys() - vars(self).keys()}
+        return replace(self, shot=replace(settings.pop("shot", self.shot), **of_shot), **settings)
+
+    def whole_shot(self, settings: CameraSettings, aperture: Aperture | None) -> Shot:
         """Return the scene's settings of the camera, with this stop's shape and the frame's changes."""
         # A scene's f-number is clamped to the lens's; that of the frame must be possible.
-        return with_changes(replace(settings.shot(aperture), clamp_f_number=self.f_number is None), self)
+        scenes = replace(settings.shot(aperture), clamp_f_number=self.shot.f_number is None)
+        return with_changes(with_changes(scenes, self.shot), {"film_mm": self.film_mm})
 
     def reads(self, settings: SensorSettings | None) -> SensorSettings | None:
         """Return the scene's [sensor] table with the frame's changes; None: no sensor."""
@@ -274,7 +254,7 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
     scene = seen_from(load_scene(frame.scene), frame.scene, frame.position_m, frame.look_at_m)
     files.spare(frame.scene.parent / name for name in files_named(scene.settings))
     settings = scene.settings.camera
-    shot, (width, height) = frame.shot(settings, scene.aperture), frame.size(settings)
+    shot, (width, height) = frame.whole_shot(settings, scene.aperture), frame.size(settings)
     film, sensor = with_changes(scene.settings.film, frame.colour), frame.reads(scene.settings.sensor)
     if frame.colour is not None and film.white_balance is not None:
         check_name(frame.scene, "--white-balance", film.white_balance, scene.illuminants)
@@ -359,7 +339,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
     scenes = []
     for frame in frames[:: -(-len(frames) // _CHOICE_FRAMES)]:
         if _state(frame) not in lenses:
-            shot = frame.shot(scene.settings.camera, scene.aperture)
+            shot = frame.whole_shot(scene.settings.camera, scene.aperture)
             lenses[_state(frame)] = make_camera(str(frame.camera), replace(shot, runtime="onnxruntime")).lens  # type: ignore[attr-defined]
         scenes.append((seen_from(scene, frame.scene, frame.position_m, frame.look_at_m), lenses[_state(frame)]))
     with _errors_of_table(prepared.frame.scene):
@@ -368,7 +348,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
 
 def _state(frame: Frame) -> tuple[Any, ...]:
     """Return what frames with the same lens share."""
-    return frame.focus_m, frame.f_number, frame.zoom
+    return tuple(value for name, value in vars(frame.shot).items() if name != "aperture")  # which is one for all
 
 
 def _raster(prepared: Prepared) -> Raster:

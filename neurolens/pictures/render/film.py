@@ -25,6 +25,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import CHUNK_BYTES, fingerprint_of, read_arrays, write_arrays
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.optics.lens.shot import Shot
 from neurolens.pictures.render.settings import FilmSettings
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ BYTES_A_PIXEL = 8 * COLUMNS + 100
 _ASPECT_TOLERANCE = 0.02
 # Settings of a camera that do not affect its rays: where it was read and notes.
 _NO_MATTER = ("model", "notes")
+_SCENES = ("film_mm", "wavelength_nm", "aperture", "clamp_f_number")  # of a shot's settings, those of its scene
 _NOTHING = "(nothing)"  # stands for a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
 _FORMAT = 4
@@ -241,7 +243,8 @@ def identity(job: Job) -> dict[str, Any]:
     """
     scene, camera = job.scene, job.camera
     # These are given separately, and may differ from the scene's.
-    common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, focus_m=1.0, f_number=None)
+    asked: dict[str, Any] = {f.name: f.default for f in fields(Shot) if f.name not in _SCENES}
+    common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, **asked)
     bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings(), sensor=None))
     kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
     identity = {

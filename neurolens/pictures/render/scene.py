@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, printable
-from neurolens.base.settings import F_NUMBER, FILM_MM, LIGHT_NM, from_dict, said, within
+from neurolens.base.settings import LIGHT_NM, Rule, from_dict, setting, setting_of
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.lens.apertures import Aperture
@@ -28,48 +28,45 @@ from neurolens.pictures.render.scenetables import (
     Checked,
     Material,
     MeasuredSpectrum,
-    Rule,
     Texture,
     Vector,
-    between,
     require,
 )
 from neurolens.pictures.render.settings import FilmSettings, FlareSettings, SensorSettings
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
 _FILM_MM = (36.0, 20.25)
-_SIDES = Rule(lambda film: all(within(FILM_MM, side) for side in film), f"sides {said(FILM_MM)} mm")
 _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraSettings(StopShape, Checked):
-    """Place, film and picture of the camera; which camera it is, the caller of `render` chooses.
+class CameraSettings(Shot, StopShape, Checked):
+    """Place, shot and picture of the camera; which camera it is, the caller of `render` chooses.
 
-    Attributes:
+    Attributes: those of `Shot` and `StopShape`, whose mask is a picture beside the scene, and
         position_m: the film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
-        focus_m: distance from the film to the object in focus. f_number: None leaves it to the lens.
-        blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
-            `optics.lens.apertures`; the mask is a picture beside the scene. Without them it is the lens's own, else
-            round.
-        film_mm: width and height of the part of the film that is used.
-        wavelength_nm: range of light. width, height: of the picture, in pixels. samples: per pixel.
+        width, height: of the picture, in pixels. samples: per pixel.
         max_depth: at how many surfaces along a path light is scattered.
     """
 
     position_m: tables.Place
     look_at_m: tables.Place
-    focus_m: Annotated[float, Rule(lambda v: v > 0, "a number above 0")]
     up: tables.Place = (0.0, 1.0, 0.0)
-    f_number: Annotated[float | None, between(*F_NUMBER, "an f-number")] = None
-    film_mm: Annotated[tuple[float, float], _SIDES] = _FILM_MM
+    focus_m: float = setting_of(Shot, "focus_m", ...)
+    film_mm: tuple[float, float] = _FILM_MM
     wavelength_nm: Annotated[
         tuple[float, float], Rule(lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780")
     ] = field(default=LIGHT_NM, metadata={"was": ("wavelengths_nm",)})
-    width: Annotated[int, between(1, 16384, "an integer")] = 320
-    height: Annotated[int, between(1, 16384, "an integer")] = 180
-    samples: Annotated[int, Rule(lambda v: 1 <= v <= 1 << 20, f"an integer from 1 to {1 << 20}")] = 64
-    max_depth: Annotated[int, between(1, 1000, "an integer")] = 6
+    aperture: Any = field(default=None, init=False)
+    clamp_f_number: bool = field(default=True, init=False)
+    width: int = setting(
+        320, "width (default: the scene's, or from --height and the film's shape)", within=(1, 16384), metavar="PIXELS"
+    )
+    height: int = setting(
+        180, "height (default: the scene's, or from --width and the film's shape)", within=(1, 16384), metavar="PIXELS"
+    )
+    samples: int = setting(64, "per pixel (default: the scene's)", within=(1, 2**20))
+    max_depth: int = setting(6, "bounces (default: the scene's)", within=(1, 1000))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,10 +78,7 @@ class CameraSettings(StopShape, Checked):
 
     def shot(self, aperture: Aperture | None = None) -> Shot:
         """Return the scene's shot; its f-number is clamped to that of the lens."""
-        light_nm = self.wavelength_nm
-        return Shot(
-            self.film_mm, self.focus_m, self.f_number, aperture=aperture, wavelength_nm=light_nm, clamp_f_number=True
-        )
+        return Shot(**{f.name: getattr(self, f.name) for f in fields(Shot)} | {"aperture": aperture})
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,13 @@ irradiance intensity / d^2, as much as from a small sphere of radius r and emiss
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from inspect import get_annotations
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from neurolens.base.errors import InputError
-from neurolens.base.settings import said, within
+from neurolens.base.settings import Rule, bounded, check_bounds, rules_of
 
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -33,25 +31,6 @@ _NARROWEST_DEG = 0.01  # falloff of a spot: in a narrower one, two cosines would
 def require(ok: bool, field: str, value: object, expected: str) -> None:
     if not ok:
         raise InputError("scene", field, value, expected)
-
-
-@dataclass(frozen=True)
-class Rule:
-    """What the values of a field have in common.
-
-    Attributes:
-        good: the test that a value must pass. expected: what a message says of good values.
-        colour: whether values are colours, for which one number stands for a grey.
-    """
-
-    good: Callable[[Any], bool]
-    expected: str
-    colour: bool = False
-
-
-def between(low: float, high: float, unit: str = "a number") -> Rule:
-    """Return the rule that a value lies from `low` to `high`."""
-    return Rule(lambda v: within((low, high), v), f"{unit} {said((low, high))}")
 
 
 def each_between(low: float, high: float) -> Rule:
@@ -76,9 +55,9 @@ def _is_direction(vector: Vector) -> bool:
     return _is_near(vector) and math.hypot(*vector) >= SMALLEST_M
 
 
-_SIZE = between(SMALLEST_M, FARTHEST_M, "a length")
+_SIZE = bounded(SMALLEST_M, FARTHEST_M, "a length")
 Size = Annotated[float, Rule(_SIZE.good, f"{_SIZE.expected} m")]
-Angle = Annotated[float, between(-36000, 36000, "degrees")]
+Angle = Annotated[float, bounded(-36000, 36000, "degrees")]
 Place = Annotated[Vector, Rule(_is_near, f"three numbers within {FARTHEST_M:g} m")]
 Direction = Annotated[Vector, Rule(_is_direction, f"a direction, between {SMALLEST_M:g} and {FARTHEST_M:g} long")]
 Light = Annotated[Vector, each_between(0, BRIGHTEST)]
@@ -94,31 +73,17 @@ _MATRIX = Rule(_is_regular, f"three rows of four numbers within {FARTHEST_M:g}, 
 _ABBE = Rule(lambda v: 10 <= v < math.inf, "a number from 10")
 
 
-@cache
-def _rules(table: type) -> dict[str, Rule]:
-    """Return the rules that the types of a table's fields carry: `Annotated[kind, rule]`, also beside None."""
-    rules: dict[str, Rule] = {}
-    for base in reversed(table.__mro__):
-        for name, hint in get_annotations(base, eval_str=True).items():  # as the module of the base knows them
-            for kind in (hint, *get_args(hint)):
-                if notes := getattr(kind, "__metadata__", ()):
-                    rules[name] = notes[0]
-    return rules
-
-
 class Checked:
     """A table whose values obey the rules of their types; None stands for a missing field."""
 
     @classmethod
     def keys_read(cls, data: Mapping[str, Any]) -> dict[str, Any]:
         """Read the keys of a file's table; a colour that is one number becomes three."""
-        greys = {name for name, rule in _rules(cls).items() if rule.colour}  # type: ignore[arg-type]
+        greys = {name for name, rule in rules_of(cls).items() if rule.colour}  # type: ignore[arg-type]
         return {k: [v] * 3 if k in greys and type(v) in (int, float) else v for k, v in data.items()}
 
     def __post_init__(self) -> None:
-        for field, rule in _rules(type(self)).items():  # type: ignore[arg-type]
-            value = getattr(self, field)
-            require(value is None or rule.good(value), field, value, rule.expected)
+        check_bounds(self, "scene")
 
 
 @dataclass(frozen=True)
@@ -319,7 +284,7 @@ class Material(Checked):
     reflectance: Reflectance | None = None
     texture: str | None = None
     specular: Share | None = None
-    roughness: Annotated[float | None, between(0.02, 1)] = None
+    roughness: Annotated[float | None, bounded(0.02, 1)] = None
     n_d: Annotated[float | None, Rule(lambda v: 1 < v <= 4, "a number above 1, at most 4")] = None
     V_d: Annotated[float | None, _ABBE] = None
     transmittance: Annotated[Vector | None, each_between(1e-6, 1)] = None
@@ -421,6 +386,6 @@ class Sky(Checked):
 
     sun_elevation_deg: Annotated[float, Rule(lambda v: 0 <= v <= 90, "a number from 0 (horizon) to 90 (zenith)")]
     sun_azimuth_deg: Angle = 0.0
-    turbidity: Annotated[float, between(2, 10)] = 3.0
+    turbidity: Annotated[float, bounded(2, 10)] = 3.0
     sun: bool = True
-    white_kcd_per_m2: Annotated[float, between(1e-6, 1e6)] = 20.0
+    white_kcd_per_m2: Annotated[float, bounded(1e-6, 1e6)] = 20.0

@@ -19,6 +19,7 @@ from neurolens.optics.setting.focusing import (
     best_focus_z_mm,
     film_range_mm,
     focus_states,
+    focused_inside,
     infinity_states,
     nearest_focus_m,
 )
@@ -314,7 +315,7 @@ def test_focused_inside_near_rays_from_the_object_meet_on_a_film_that_stands_sti
     for zoom in [c.name for c in infinity_states(tabled(name))]:
         infinity = set_lens(tabled(name), zoom=zoom)
         for focus_m in (20.0, 3.0, 1.001 * nearest_focus_m(infinity)):
-            lens = set_lens(infinity, focus_m=focus_m, focus_mode="internal").with_stop_radius(1e-3)
+            lens = focused_inside(infinity, focus_m).with_stop_radius(1e-3)
             start = Rays(*map(torch.from_numpy, axial_rays(lens, lens.film_z_mm - 1000 * focus_m)))
             out = trace(lens, start, towards="film")
             r = out.rays
@@ -357,7 +358,7 @@ def test_between_zoom_states_focusing_is_interpolated_too() -> None:
     lens = tabled("nikon_zoom_70_200")
     for asked in (90.0, 160.0):
         zoomed = set_lens(lens, zoom=asked)
-        near = set_lens(lens, zoom=asked, focus_m=1.2, focus_mode="internal")
+        near = focused_inside(zoomed, 1.2)
         assert near.film_z_mm == pytest.approx(zoomed.film_z_mm, abs=0.02)
         assert near.derived
         check_clearance(near.surfaces, "near")
@@ -420,7 +421,7 @@ def test_a_thin_lens_breathes_by_its_extension() -> None:
 def test_breathing_of_groups_that_move_inside_is_traced_magnification() -> None:
     lens = set_lens(tabled("nikon_zoom_70_200"), zoom="196mm")
     near = breathing(lens, [1.2], "internal")[0]
-    state = set_lens(lens, focus_m=1.2, focus_mode="internal")
+    state = focused_inside(lens, 1.2)
     assert near.magnification == pytest.approx(magnification(state, state.film_z_mm - 1200), rel=1e-6)
     film = breathing(lens, [math.inf, 1.2])
     inside = breathing(lens, [math.inf, 1.2], "internal")

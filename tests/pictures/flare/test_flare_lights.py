@@ -50,6 +50,9 @@ def test_lists_hold_keys_and_both_kinds_say_the_same(tmp_path: Path) -> None:
     assert read_lights(one)[0].at(1) == Light(-10.0, 2.0, (SUN,) * 3)
     one.write_text("azimuth_deg,elevation_deg\n1,2\n3,4\n")
     assert [track.at(0) for track in read_lights(one)] == [Light(*at, (SUN,) * 3) for at in ((1.0, 2.0), (3.0, 4.0))]
+    one.write_text("azimuth_deg,elevation_deg,distance_m\n0.1rad,2 deg,6ft\n")
+    lamp = read_lights(one)[0].at(0)
+    assert (lamp.azimuth_deg, lamp.distance_m) == pytest.approx((math.degrees(0.1), 1.8288))
     one.write_text("azimuth_deg,elevation_deg,diameter_deg\n1,2,0.533\n3,4,0\n")
     sun, point = (track.at(0) for track in read_lights(one))
     assert sun.about["shape"] == pytest.approx([0.533, 0.533], abs=1e-3) and point.shape is None

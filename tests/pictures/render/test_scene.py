@@ -1,5 +1,6 @@
 """Scene files: the shipped ones, pictures and solids in them, and one clear error for each mistake."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from PIL import Image
 from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.pictures.render import images
@@ -169,6 +171,19 @@ def test_the_stop_s_shape_by_blades_or_by_a_picture_beside_the_scene(tmp_path: P
     Image.fromarray(np.array([[255, 0], [255, 255]], np.uint8)).save(tmp_path / "stop.png")
     made = scene_from_tables({"camera": CAMERA | {"aperture_mask": "stop.png"}}, tmp_path / "a.toml")
     assert made.aperture == Aperture(mask=np.array([[1, 0], [1, 1]]))
+
+
+def test_a_scene_sets_its_shot_with_units_and_a_camera_refuses_what_it_does_not_take() -> None:
+    """The table [camera] has every setting of a shot, in the bounds and units of the options."""
+    asked = {"focus_m": "6ft", "f_number": "f/4", "film_offset_mm": "0.1cm", "focus_mode": "paraxial", "zoom": "72mm"}
+    shot = scene(asked).settings.camera.shot()
+    assert shot.focus_m == pytest.approx(1.8288) and (shot.f_number, shot.film_offset_mm) == (4, 1)
+    assert (shot.focus_mode, shot.zoom, shot.clamp_f_number) == ("paraxial", "72mm", True)
+    with pytest.raises(InputError, match="camera pinhole: .*zoom: got '72mm', expected left out: .*focal_length_mm"):
+        make_camera("pinhole", replace(shot, film_offset_mm=0.0))
+    for key, value, said in (("cover_glass_mm", 200, "mm from 0 to 100"), ("clamp_f_number", True, "unknown key")):
+        with pytest.raises(InputError, match=f"camera.{key}: .*{said}"):
+            scene({key: value})
 
 
 def test_only_closed_meshes_that_face_outwards_are_solid() -> None:

@@ -12,6 +12,7 @@ from command_line import failure
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.base.settings import with_changes
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cli import main
@@ -20,7 +21,7 @@ from neurolens.optics.analysis.spots import mtf, spots
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
-from neurolens.pictures.frames import Frame, prepare, with_changes, write_pictures
+from neurolens.pictures.frames import Frame, prepare, write_pictures
 from neurolens.pictures.render.pictures import read_channels, read_metadata
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import scene_from_tables
