@@ -134,7 +134,7 @@ class Dask(ThreadPoolExecutor):
             future.release()
 
     def _shared(self, client: Any, value: Shared) -> Any:
-        """The place of shared bytes on the cluster, to which they are sent again where all workers lost them."""
+        """Return the place of shared bytes on the cluster, to which they are sent again where all workers lost them."""
         with self._lock:
             place = self._sent.get(value)
             if place is None or place.status not in ("finished", "pending"):

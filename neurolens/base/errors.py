@@ -107,13 +107,13 @@ def warned(file: str | Path = "") -> Iterator[list[str]]:
 
 
 def pip_install(extra: str) -> str:
-    """The command that installs an extra of this project: in a checkout from there, else by our name on PyPI."""
+    """Return the command that installs an extra of this project: in a checkout from there, else by our name on PyPI."""
     checkout = (Path(__file__).parents[2] / "pyproject.toml").is_file()
     return f"pip install '{'.' if checkout else neurolens.DISTRIBUTION}[{extra}]'"
 
 
 def missing(error: BaseException) -> str:
-    """The package that an import did not find, and the command that brings it; empty for any other error."""
+    """Return the package that an import did not find, and the command that brings it; empty for any other error."""
     package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if package not in EXTRAS:
         return ""

@@ -128,7 +128,7 @@ def check_writable(path: str | Path) -> None:
 
 
 def _temporary(target: Path) -> Path:
-    """A new empty file in the folder of `target`, which only this call has opened."""
+    """Return a new empty file in the folder of `target`, which only this call has opened."""
     suffix = target.suffix if re.fullmatch(r"\.\w{1,16}", target.suffix) else ""
     temporary = target.with_name(f".neurolens-{secrets.token_hex(8)}.tmp{suffix}")
     try:

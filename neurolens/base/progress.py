@@ -23,7 +23,7 @@ class Report(Protocol):
 
 
 def duration(seconds: float) -> str:
-    """A time as text: "0.4 s", "12 s", "3 min 05 s", "2 h 10 min"."""
+    """Return a time as text: "0.4 s", "12 s", "3 min 05 s", "2 h 10 min"."""
     if seconds < 9.95:
         return f"{max(seconds, 0.0):.1f} s"
     whole = round(seconds)

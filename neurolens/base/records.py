@@ -135,7 +135,7 @@ def plain(value: Any, strict: bool = True) -> Any:
 def break_even_rays(
     fit_s: float | None, load_s: float | None, ns_exact: float | None, ns_model: float | None
 ) -> float | None:
-    """Rays after which fitting and loading have paid for themselves against an exact tracer.
+    """Return rays after which fitting and loading have paid for themselves against an exact tracer.
 
     (fit_s + load_s) seconds / (ns_exact - ns_model) nanoseconds per ray, both timed in one run with the same threads.
     None where a figure is missing, or where the model is no faster than the exact tracer: it never pays.
@@ -152,7 +152,7 @@ def reaches(record: Mapping[str, Any], most: float, key: str = "rms_um") -> bool
 
 
 def target_record(models: Sequence[Mapping[str, Any]], within_um: float) -> dict[str, Any]:
-    """The error asked for, whether it was met, and the name and error of the closest model that was tried."""
+    """Return the error asked for, whether it was met, and the name and error of the closest model that was tried."""
     best = min(models, key=error_of)
     return {
         "within_um": within_um,

@@ -364,7 +364,7 @@ def _kind(hint: Any) -> tuple[Any, bool]:
 
 
 def read_config(cls: type[T], path: str | Path, overrides: Sequence[str] = ()) -> T:
-    """The settings of a TOML file, with overrides such as "fit.terms=40" applied on top.
+    """Return the settings of a TOML file, with overrides such as "fit.terms=40" applied on top.
 
     Raises:
         InputError: see `read_toml`, `apply_overrides` and `from_dict`; a mistake in an override names "--set".
@@ -379,7 +379,7 @@ def read_config(cls: type[T], path: str | Path, overrides: Sequence[str] = ()) -
 
 
 def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """A copy of `data` with each "dotted.key=value" set. Values are TOML; a bare word is a string.
+    """Return a copy of `data` with each "dotted.key=value" set. Values are TOML; a bare word is a string.
 
     Raises:
         InputError: no "=", an empty key, broken TOML, or a key inside something that is not a table.
@@ -414,7 +414,7 @@ def _override_value(dotted: str, text: str) -> Any:
 
 
 def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: str = "") -> T:
-    """An instance of the dataclass `cls` from the tables of a TOML file.
+    """Return an instance of the dataclass `cls` from the tables of a TOML file.
 
     Keys of earlier versions that changed no ray, `cls.WITHOUT_EFFECT`, are skipped with a warning. A class may have a
     function `keys_read`, which first rewrites other spellings of values.
@@ -450,7 +450,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
 def _with_new_names(
     known: Mapping[str, dataclasses.Field[Any]], data: Mapping[str, Any], file: str | Path, prefix: str
 ) -> Mapping[str, Any]:
-    """The data with keys that were renamed (the field's metadata `was`) under their new names."""
+    """Return the data with keys that were renamed (the field's metadata `was`) under their new names."""
     for name, f in known.items():
         for old in f.metadata.get("was", ()):
             if old not in data:

@@ -277,7 +277,7 @@ def answer_of(outcome: Any) -> Any:
 
 
 def cores() -> int:
-    """The number of cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -321,7 +321,7 @@ def _end_of(process: Any) -> str:
 
 
 def _serve(pipe: Any, work: Callable[..., Any], number: int, jobs: int, parent: int) -> None:
-    """The main function of a forked process."""
+    """Run as the main function of a forked process."""
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     with suppress(AttributeError, OSError):  # fewer processes than cores are left to the scheduler
         if jobs >= len(free := sorted(os.sched_getaffinity(0))):
@@ -342,7 +342,7 @@ def _end_with(parent: int) -> None:
 
 
 def _work(pipe: Any, work: Callable[..., Any], args: Any, named: Any) -> None:
-    """The main function of a process."""
+    """Run as the main function of a process."""
     end_at_once()
     threading.Thread(target=_end_unread, args=(pipe.fileno(),), daemon=True).start()
     with suppress(BrokenPipeError):  # the process that asked was killed

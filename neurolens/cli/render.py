@@ -139,7 +139,7 @@ examples:
         return 0
 
     def frame(self) -> Frame:
-        """The frame that the options describe."""
+        """Return the frame that the options describe."""
         assert self.camera is not None
         return Frame.of(
             self.scene[0], self.camera, shot=self.state.shot(), **vars(self.picture), glass_files=self.glass,
@@ -230,7 +230,7 @@ def _interrupted(stopping: Stopping, kept: str) -> int:
 
 
 def _so_far(result: RenderResult, files: Files) -> str:
-    """The part of an interrupted picture that is done."""
+    """Return the part of an interrupted picture that is done."""
     samples = result.layers.samples
     least, most = int(samples.min()), int(samples.max())
     spread = f" ({least} to {most})" if least < most else ""

@@ -48,7 +48,7 @@ _RULES: dict[str, Rule] = {
 
 
 def adjoint(program: Program, outputs: Collection[str], inputs: Collection[str]) -> Program:
-    """The program that turns gradients by results into gradients by inputs.
+    """Return the program that turns gradients by results into gradients by inputs.
 
     It takes the inputs of the program and, for each of the results, the gradient `outer_NAME` of some number by it; it
     gives the gradient `by_NAME` of that number by each of the inputs. Where the program has a status, that is a result,

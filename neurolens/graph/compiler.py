@@ -36,7 +36,7 @@ if hasattr(os, "register_at_fork"):  # not under Windows
 
 
 def find_compiler() -> str:
-    """The C compiler: $CC, which may have arguments ("ccache gcc"), else cc, gcc or clang.
+    """Return the C compiler: $CC, which may have arguments ("ccache gcc"), else cc, gcc or clang.
 
     Raises:
         InputError: there is none, or $CC names none.
@@ -54,7 +54,7 @@ def find_compiler() -> str:
 
 
 def has_compiler() -> bool:
-    """Whether `find_compiler` finds one."""
+    """Return whether `find_compiler` finds one."""
     try:
         return bool(find_compiler())
     except InputError:
@@ -62,7 +62,7 @@ def has_compiler() -> bool:
 
 
 def _words(compiler: str) -> list[str]:
-    """The words of a compiler's command; the path of a file, also with spaces, is one word."""
+    """Return the words of a compiler's command; the path of a file, also with spaces, is one word."""
     if shutil.which(compiler):
         return [compiler]
     try:

@@ -86,7 +86,7 @@ class _Space:
         return array.astype(self.like.dtype)
 
     def cast(self, x: Rows, whole: bool = False) -> Rows:
-        """A truth or a status as numbers."""
+        """Return a truth or a status as numbers."""
         if self.torch:
             return x.to(self.torch.int32 if whole else self.like.dtype)
         return x.astype(np.int32 if whole else self.like.dtype)
@@ -100,7 +100,7 @@ class _Space:
 
 
 def monomials(x: Rows, exponents: Exponents) -> Rows:
-    """[M, N] products of powers of the rows of x [V, N], an array or a tensor, for exponents [M, V]."""
+    """Return [M, N] products of powers of the rows of x [V, N], an array or a tensor, for exponents [M, V]."""
     space = _Space(x)
     powers = [space.ones_like(x)]
     for _ in range(int(exponents.max(initial=0))):

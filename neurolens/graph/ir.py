@@ -283,11 +283,11 @@ class Graph:
         return self.add("quadratic", (x,), len(forms), arrays=(b,), static=tuple(tuple(f) for f in forms))
 
     def square(self, x: Value) -> Value:
-        """The squared length of x, one row."""
+        """Return the squared length of x, one row."""
         return self.quadratic(x, [tuple((i, i) for i in range(x.rows))])
 
     def dot(self, a: Value, b: Value) -> Value:
-        """The scalar product of a and b, one row."""
+        """Return the scalar product of a and b, one row."""
         if a == b:
             return self.square(a)
         return self.quadratic(self.concat(a, b), [tuple((k, a.rows + k) for k in range(a.rows))])
@@ -359,7 +359,7 @@ def _needed(graph: Graph, node: Node, rows: Collection[int]) -> Iterator[tuple[i
 
 
 def live_rows(graph: Graph, outputs: Mapping[str, Value]) -> dict[int, set[int]]:
-    """The rows of each node that the outputs need; nodes that are not needed are missing."""
+    """Return the rows of each node that the outputs need; nodes that are not needed are missing."""
     needed: dict[int, set[int]] = {}
 
     def ask(number: int, rows: Iterable[int]) -> None:

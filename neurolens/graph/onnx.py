@@ -68,7 +68,7 @@ def write_onnx(
 
 
 def _shape(node: Node) -> list[int | str]:
-    """The shape of an input or a table."""
+    """Return the shape of an input or a table."""
     if node.kind == "table":
         return ["cells", node.rows]
     return [node.rows] if node.per_call else [node.rows, "N"]
@@ -162,7 +162,7 @@ class _Writer:
         return _Linear(value.value, own * value.weight, own * value.bias + other * numbers)
 
     def name(self, number: int) -> str:
-        """The tensor of a node's value."""
+        """Return the tensor of a node's value."""
         value = self.known[number]
         if isinstance(value, _Linear):
             self.known[number] = value = self.affine(value.weight, value.value, value.bias)
@@ -178,7 +178,7 @@ class _Writer:
         return name
 
     def const(self, value: ArrayLike, dtype: type = np.float32) -> str:
-        """A constant of all graphs; equal ones are stored once."""
+        """Return a constant of all graphs; equal ones are stored once."""
         with np.errstate(over="ignore"):
             array: NDArray[Any] = np.ascontiguousarray(np.asarray(value, dtype=dtype))
         if array.dtype.kind == "f" and not np.isfinite(array).all():

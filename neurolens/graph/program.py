@@ -52,7 +52,7 @@ Argument = int | Literal  # the number of an earlier step, or a literal
 
 
 def row_names(name: str, rows: int) -> tuple[str, ...]:
-    """The names of the rows of an input or output of a graph."""
+    """Return the names of the rows of an input or output of a graph."""
     if "_by_" in name:  # derivatives
         output, by = name.split("_by_")
         return tuple(f"{row}_by_{by}" for row in row_names(output, rows))
@@ -99,7 +99,7 @@ class Expr:
         return self.argument if isinstance(self.argument, tuple) else None
 
     def is_literal(self, value: float) -> bool:
-        """Whether this is the same number in every table."""
+        """Return whether this is the same number in every table."""
         return self.literal is not None and all(v == value for v in self.literal)
 
     def __add__(self, other: Number) -> Expr:
@@ -157,7 +157,7 @@ class Mixture:
     transform: NDArray[np.float64]
 
     def weights(self, inputs: Mapping[str, ArrayLike]) -> tuple[NDArray[np.float64], bool]:
-        """The weights [nodes] of a state, and whether the state is in range."""
+        """Return the weights [nodes] of a state, and whether the state is in range."""
         features = self.program.evaluate(inputs)
         inside = bool(features.pop("inside"))
         return np.array(list(features.values()), np.float64) @ self.transform, inside
@@ -241,7 +241,7 @@ class Program:
         return self.op("select", a, b, then, otherwise)
 
     def horner(self, t: Expr, coefficients: Sequence[Number]) -> Expr:
-        """A polynomial in t, lowest coefficient first."""
+        """Return a polynomial in t, lowest coefficient first."""
         value = self.expr(coefficients[-1])
         for c in reversed(coefficients[:-1]):
             value = self.fma(value, t, c)
@@ -489,7 +489,7 @@ class Program:
         return once, rest
 
     def count(self) -> dict[str, int]:
-        """The number of operations of each kind."""
+        """Return the number of operations of each kind."""
         kinds = [self.steps[k].kind for k in self.live()]
         return {kind: kinds.count(kind) for kind in sorted(set(kinds) - {"input"})}
 

@@ -119,7 +119,7 @@ def model_proto(
     metadata: Mapping[str, str],
     versions: tuple[int, int],
 ) -> bytes:
-    """A whole model. `versions` are those of the format (IR) and of the operators (opset)."""
+    """Return a whole model. `versions` are those of the format (IR) and of the operators (opset)."""
     repeated = ((1, nodes), (5, constants), (11, inputs), (12, outputs))
     graph = _message((2, "neurolens"), *((number, part) for number, parts in repeated for part in parts))
     entries = ((14, _message((1, key), (2, text))) for key, text in metadata.items())

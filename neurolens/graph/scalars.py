@@ -299,7 +299,7 @@ def _depth_first(nodes: list[Exponent], factors: dict[Exponent, Pair], wanted: s
 
 
 def level_of(e: Exponent) -> int:
-    """The level of a monomial: 0 for a variable, 1 for degree 2, 2 for 3 to 4, 3 for 5 to 8 ..."""
+    """Return the level of a monomial: 0 for a variable, 1 for degree 2, 2 for 3 to 4, 3 for 5 to 8 ..."""
     return (sum(e) - 1).bit_length()
 
 

@@ -109,7 +109,7 @@ class Axis:
         return np.asarray(np.linalg.inv(np.stack([self.features(v) for v in self.nodes])), dtype=np.float64)
 
     def weights(self, value: float) -> Array:
-        """[K] weights of the nodes at a value: 1 at a node itself. Raises InputError: a value out of range."""
+        """Return [K] weights of the nodes at a value: 1 at a node itself. Raises InputError: a value out of range."""
         low, high = self.limits
         if not low <= value <= high:
             expected = f"{self.range[0]:.6g} to {self.range[1]:.6g} {self.unit}"
@@ -145,7 +145,7 @@ def product(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
 
 
 def weights(axes: Sequence[Axis], state: Sequence[float]) -> Array:
-    """[K] weights of the nodes of `product`.
+    """Return [K] weights of the nodes of `product`.
 
     Raises:
         InputError: another number of values than axes, or one out of range.
@@ -164,7 +164,7 @@ def _kron(arrays: Iterable[Array]) -> Array:
 
 
 def state_numbers(axes: Sequence[Axis], state: ArrayLike) -> tuple[float, ...]:
-    """The numbers of a state, in range or not.
+    """Return the numbers of a state, in range or not.
 
     Raises:
         InputError: another number of values than axes, or no numbers.
@@ -185,7 +185,7 @@ def state_names(axes: Sequence[Axis]) -> tuple[str, ...]:
 
 
 def state_graph(axes: Sequence[Axis]) -> tuple[Graph, Array]:
-    """The graph of a state, and the matrix [K, nodes] by which its features become the weights of the nodes.
+    """Return the graph of a state, and the matrix [K, nodes] by which its features become the weights of the nodes.
 
     Input `state` [A] of the call. Outputs: `features` [K], the products of the axes' features, those of the last axis
     fastest; `inside`, whether the state lies in its range.

@@ -40,7 +40,7 @@ _FAR = 1e-9  # 1 / distance (1/m) that counts as infinity
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:
-    """The metadata of a model file.
+    """Return the metadata of a model file.
 
     Raises:
         ModelError: a file that is missing, too large, truncated, or no ONNX model, or with an entry that stands twice.
@@ -78,7 +78,7 @@ def _entry(data: Any) -> tuple[str, str]:
 
 
 def read_card(path: str | Path) -> dict[str, Any]:
-    """The card of a lens model's file; only its kind and its schema are checked.
+    """Return the card of a lens model's file; only its kind and its schema are checked.
 
     Raises:
         ModelError: as `read_metadata` and `card_in`.
@@ -87,7 +87,7 @@ def read_card(path: str | Path) -> dict[str, Any]:
 
 
 def card_in(file: Any, metadata: dict[str, str], expected: str = CARD_KIND) -> dict[str, Any]:
-    """The card in a file's metadata.
+    """Return the card in a file's metadata.
 
     Args:
         file: the name that an error shows.
@@ -130,7 +130,7 @@ def card_to_json(card: dict[str, Any]) -> str:
 
 
 def _culprit(value: Any, path: str) -> tuple[str, Any]:
-    """The place of the first value that JSON cannot hold, and the value."""
+    """Return the place of the first value that JSON cannot hold, and the value."""
     items: Any = value.items() if isinstance(value, dict) else ()
     if isinstance(value, (list, tuple)):
         items = enumerate(value)
@@ -146,7 +146,7 @@ def _culprit(value: Any, path: str) -> tuple[str, Any]:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether this is a number of JSON that a float holds."""
+    """Return whether this is a number of JSON that a float holds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     try:
@@ -156,7 +156,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_positive(value: Any) -> bool:
-    """Whether a number and its reciprocal are above 0 in float32, too."""
+    """Return whether a number and its reciprocal are above 0 in float32, too."""
     return _is_number(value) and 1e-30 <= value <= 1e30
 
 
@@ -320,7 +320,7 @@ def card_at(card: Mapping[str, Any], axes: Sequence[Axis], state: Sequence[float
 def state_for(
     path: Any, axes: Sequence[Axis], state: Sequence[float], zoom: str | float | None, focus_m: float
 ) -> tuple[float, ...]:
-    """The state for a photographer's settings.
+    """Return the state for a photographer's settings.
 
     Args:
         path: what an error names.

@@ -111,7 +111,7 @@ class Field:
         return g.quadratic(self.planes, forms)
 
     def colour(self) -> Value:
-        """Return w where it varies."""
+        """Return w, which must vary, as it is given or from the fifth row of the planes."""
         return self.w if self.w is not None else self.planes.graph.quadratic(self.planes, [((4, 4),)], [self.w_bias])
 
 

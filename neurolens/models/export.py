@@ -181,7 +181,7 @@ def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
 
 
 def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
-    """The card of a model, JSON-able; `errors` are those on held-out rays, as the evaluation gives them."""
+    """Return the card of a model, JSON-able; `errors` are those on held-out rays, as the evaluation gives them."""
     stop, stopped = st.blocked(model.lens.stop_index, st.RIM), f"blocked by the stop, surface {model.lens.stop_index}"
     codes = {st.PASSED, st.OUTSIDE_DOMAIN, stop, *(g.status for g in model.gates)}
     return {
@@ -242,7 +242,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
 
 
 def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict[str, Any]:
-    """Rays with the answers of the float64 model, by which a client checks its own evaluation.
+    """Return rays with the answers of the float64 model, by which a client checks its own evaluation.
 
     Left out are rays within 0.01 of any boundary (relative; 0.001 where no passing ray is further from all), and rays
     whose status float32 changes. For every status that the model gives there are up to `others` rays. `rounding` is the
@@ -277,7 +277,7 @@ def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict
 
 
 def _clear_rays(model: LensModel, count: int, least: float) -> tuple[FilmRays, Prediction, Tensor]:
-    """Rays of the domain, the float64 model's answers, and which of the rays are clear of every boundary."""
+    """Return rays of the domain, the float64 model's answers, and which of the rays are clear of every boundary."""
     rays = sample_domain(model.domain, count, seed=11)
     # One film plane for all: a graph takes one film position a call. In float32, which the file's nine digits hold.
     rays = replace(rays, film_z=torch.full_like(rays.film_z, float(rays.film_z.mean()))).to(torch.float32)

@@ -89,7 +89,7 @@ class ModelFile:
 
 
 def read_model(path: str | Path) -> ModelFile:
-    """The model of an exported file.
+    """Return the model of an exported file.
 
     Raises:
         ModelError: a file that is missing, too large, no exported model, or damaged; one without coefficients; one
@@ -231,7 +231,7 @@ def onnx_of(
     *,
     derivatives: bool = False,
 ) -> bytes:
-    """The ONNX file of a model, whose inputs and outputs `export.export_onnx` describes.
+    """Return the ONNX file of a model, whose inputs and outputs `export.export_onnx` describes.
 
     Args:
         nodes: one model, or one for every node of the axes. Numbers that are equal at all nodes are constants; the
@@ -257,7 +257,7 @@ def onnx_of(
 
 
 def coefficients_text(nodes: Sequence[LensModel]) -> str:
-    """The metadata entry of a model, or of the nodes of one of many states: deflated JSON in base64.
+    """Return the metadata entry of a model, or of the nodes of one of many states: deflated JSON in base64.
 
     Raises:
         InputError: a core that no file can hold.
@@ -277,7 +277,7 @@ def coefficients_text(nodes: Sequence[LensModel]) -> str:
 
 
 def as_stored(nodes: Sequence[LensModel]) -> tuple[LensModel, ...]:
-    """The models as their file will give them: with coefficients rounded to float32, and one angle for all."""
+    """Return the models as their file will give them: with coefficients rounded to float32, and one angle for all."""
     return tuple(replace(node, core=unpack(pack(node.core))) for node in with_one_angle(nodes))
 
 
@@ -288,7 +288,7 @@ def deflated(data: dict[str, Any]) -> str:
 
 
 def inflated(text: str) -> bytes:
-    """The JSON of `deflated`. Raises ValueError: damaged, or too long."""
+    """Return the JSON of `deflated`. Raises ValueError: damaged, or too long."""
     unpacker = zlib.decompressobj()
     try:
         data = unpacker.decompress(base64.b64decode(text, validate=True), _MAX_TEXT)
@@ -327,7 +327,7 @@ def pack(value: Any) -> Any:
 
 
 def unpack(packed: Any) -> Any:
-    """The inverse of `pack`. Raises ValueError, KeyError, TypeError: damaged, or larger than files may be."""
+    """Return the inverse of `pack`. Raises ValueError, KeyError, TypeError: damaged, or larger than files may be."""
     return _unpacked(packed, 0, [_MAX_CORES])
 
 

@@ -211,7 +211,7 @@ def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
 
 
 def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
-    """Rays of the same distribution as `sample_domain`, but from the boxes of `Domain.bounds` alone.
+    """Return rays of the same distribution as `sample_domain`, but from the boxes of `Domain.bounds` alone.
 
     Returns fewer than `count` rays, because the corners of a box may lie outside the disc, and the number of rays of
     `sample_domain` that they stand for.

@@ -182,7 +182,7 @@ def _choose(sweep: Sweep, settings: ModelSettings) -> list[int]:
 
 
 def ideal_map(lens: Lens, encoding: Encoding, method: ParaxialMethod) -> Tensor:
-    """[2, 2]: position (scaled) and slope (dx / -dz) of the scene-side ray per unit of scaled p and u.
+    """Return [2, 2]: position (scaled) and slope (dx / -dz) of the scene-side ray per unit of scaled p and u.
 
     The position is that in the plane of the front vertex. "thin" puts both principal planes at the rear one.
     """
@@ -239,7 +239,7 @@ def _weights(encoding: Encoding, m: float) -> tuple[float, float]:
 
 
 def _proper(encoding: Encoding, shift: Shift) -> bool:
-    """Whether the moved p plane is neither the u plane nor at infinity, nor far from where it was."""
+    """Return whether the moved p plane is neither the u plane nor at infinity, nor far from where it was."""
     p_weight, u_weight = _weights(encoding, shift[1])
     least = 0.05 / encoding.film_scale_mm
     return max(map(abs, shift)) <= _FARTHEST and p_weight > least and abs(p_weight + u_weight) > least
@@ -288,7 +288,7 @@ def fit_planes(pairs: RayPairs, encoding: Encoding, terms: int, position_weight:
 
 
 def _mirror_columns(exponents: Exponents, axis: int, field: LightField) -> Tensor:
-    """[2 M, N] terms of one component: monomials [M, 7], each times p (first M columns) and times u (M more)."""
+    """Return [2 M, N] terms of one component: monomials [M, 7], each times p (first M columns) and times u (M more)."""
     m = monomials(field.invariants(mirror=True), exponents)
     return torch.cat([m * field.p[axis], m * field.u[axis]])
 

@@ -120,7 +120,7 @@ class Projection:
 
 
 def activations(hidden: list[Tensor], inputs: Tensor) -> list[Tensor]:
-    """The inputs and every tanh layer, [N, width + 1] each, with a column of ones for the bias."""
+    """Return the inputs and every tanh layer, [N, width + 1] each, with a column of ones for the bias."""
     layers = [_with_ones(inputs)]
     for weight in hidden:
         layers.append(_with_ones(torch.tanh(layers[-1] @ weight.T)))
@@ -175,7 +175,7 @@ def _squares(a: Tensor) -> Tensor:
 
 
 def _unpacked(packed: Tensor, size: int) -> Tensor:
-    """[..., size, size] symmetric matrices from their upper triangles [..., size (size + 1) / 2]."""
+    """Return [..., size, size] symmetric matrices from their upper triangles [..., size (size + 1) / 2]."""
     i, j = torch.triu_indices(size, size)
     full = torch.empty((*packed.shape[:-1], size, size), dtype=packed.dtype)
     full[..., i, j] = packed

@@ -1,6 +1,6 @@
-"""Source code of models in C99 or a shading language, the card as a comment on top; and what a scene fixes in them.
+"""Source code of models in C99 or a shading language, with the card as a comment on top.
 
-Only fixing needs torch.
+Inputs that a scene fixes can be folded into the code, which takes torch; all else does without it.
 """
 
 from __future__ import annotations

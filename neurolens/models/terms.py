@@ -44,7 +44,7 @@ def powers(variables: int, degree: int) -> list[tuple[int, ...]]:
 
 
 def invariant_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
-    """[M, 4] exponents of rho, sigma, tau, w up to a total `degree` in the first three.
+    """Return [M, 4] exponents of rho, sigma, tau, w up to a total `degree` in the first three.
 
     The wavelength multiplies lower degrees only: the index is nearly linear in w, and dispersion is small beside
     refraction. w^1 goes with degrees up to degree - 2, w^2 with degree - 4, w^3 with degree - 5.
@@ -54,7 +54,7 @@ def invariant_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
 
 
 def ordered(rows: Sequence[tuple[int, ...]]) -> Exponents:
-    """[M, V] exponents, the lowest degree first."""
+    """Return [M, V] exponents, the lowest degree first."""
     return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
 
 
@@ -66,7 +66,7 @@ def united(supports: Sequence[Exponents]) -> tuple[Exponents, list[list[int]]]:
 
 
 def further(candidates: Exponents, known: Exponents) -> Exponents:
-    """The candidates [K, V] that are not among the known [M, V], each once."""
+    """Return the candidates [K, V] that are not among the known [M, V], each once."""
     there = {tuple(e) for e in known.tolist()}
     new = [e for e in dict.fromkeys(map(tuple, candidates.tolist())) if e not in there]
     return np.array(new, dtype=np.int64).reshape(-1, known.shape[1])
@@ -101,7 +101,7 @@ def vector_gram(
 
 
 def _products(features: Tensor, weights: Tensor) -> Tensor:
-    """Sum products of features [M, N] over rays, weighted by [N]: [M, M] is symmetric, and a third is not summed."""
+    """Return weighted sums over rays of products of features [M, N]: [M, M], of which symmetry saves a third."""
     gram = features.new_empty((len(features), len(features)))
     size = -(-len(features) // 3)
     for start in range(0, len(features), max(size, 1)):
@@ -224,7 +224,7 @@ class Sweep:
             self.add(k)
 
     def scores(self, rule: Rule) -> Floats:
-        """[M] gain of every candidate: squared correlation with the residual ("omp") or its true fall ("ols").
+        """Return [M] gain of every candidate: squared correlation with the residual ("omp") or its true fall ("ols").
 
         It is -1 for chosen candidates, and for those that the chosen ones span in any problem.
         """

@@ -66,7 +66,7 @@ class ShaderLens:
         return self.table.film_radius_mm
 
     def end_of_light_mm(self) -> float:
-        """The film radius at which light ends."""
+        """Return the film radius at which light ends."""
         low, high = self.film_z_mm
         radii = [0.0]
         for z in {low, (low + high) / 2, high}:

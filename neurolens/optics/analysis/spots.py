@@ -171,9 +171,9 @@ class Fans(OverField):
 
     Attributes:
         pupil: [n] share of the stop's radius, -1 to 1.
-        tangential_um: [F, W, n] aberration in the meridional plane of rays along that plane.
-        sagittal_um: [F, W, n] aberration across the meridional plane of rays along the other line. Both count from the
-        chief ray of the first wavelength; NaN where a rim blocks.
+        tangential_um: [F, W, n] aberration of rays in the meridional plane, measured in that plane.
+        sagittal_um: [F, W, n] aberration of rays in the plane across it, measured across the meridional plane. Both
+            count from the chief ray of the first wavelength; NaN where a rim blocks.
     """
 
     wavelength_nm: Array

@@ -164,7 +164,7 @@ class Shot:
         return found | ({"aperture": self.aperture.settings()} if self.aperture else {})
 
     def f_number_for(self, widest: float) -> float | None:
-        """The f-number of a lens that opens to `widest`; None stands for its widest."""
+        """Return the f-number of a lens that opens to `widest`; None stands for its widest."""
         too_wide = self.clamp_f_number and self.f_number is not None and self.f_number < widest
         return None if too_wide else self.f_number
 

@@ -232,7 +232,7 @@ def _parts(
 ) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
     """Yield the patches of a light, and the ghosts of each with their grids and moves.
 
-    Patches are finer for a ghost much of whose light comes or goes over a patch, because rims cut it differently there.
+    A ghost that rims cut differently over a patch, so that much of its light comes or goes, has finer patches.
     """
     raster, middle_nm = job.raster, 0.5 * sum(job.wavelength_nm)
     half_mm, cell = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), job.settings.cell_px / raster.per_mm

@@ -35,7 +35,7 @@ class Behind:
         self._axes, self._position_m = camera_axes(pose), np.array(pose.position_m, np.float32)[:, None]
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays of the other camera that begin behind what they meet."""
+        """Return rays of the other camera that begin behind what they meet."""
         rays = self._camera.sample(film_mm, pupil, wavelength_nm)
         origin, direction = self._axes @ rays.origin_m + self._position_m, self._axes @ rays.direction
         way, follows = self._world.behind(origin, direction, self._things)

@@ -171,7 +171,7 @@ def _tables() -> dict[str, FloatArray64]:
 
 
 def table(name: str) -> FloatArray64:
-    """A column of the shipped table, one value every 5 nm from 380 to 780 nm."""
+    """Return a column of the shipped table, one value every 5 nm from 380 to 780 nm."""
     return _tables()[name]
 
 
@@ -312,7 +312,7 @@ class SpectralRange:
             self._set_edges(self._quantiles(*light))
 
     def same(self, other: SpectralRange) -> bool:
-        """Whether another range has the same tables."""
+        """Return whether another range has the same tables."""
         tables = ("edges_nm", "basis", "response")
         return self.lanes == other.lanes and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in tables)
 

@@ -136,7 +136,7 @@ class Tiling:
         return -(-self.samples // self.step)
 
     def pixels_of(self, first: int, stop: int | None = None) -> slice:
-        """The pixels of a tile, or of the tiles from `first` up to `stop`, counted from `start`."""
+        """Return the pixels of a tile, or of the tiles from `first` up to `stop`, counted from `start`."""
         return slice(first * self.tile, min((first + 1 if stop is None else stop) * self.tile, self.pixels))
 
     def samples_done(self, done: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -143,7 +143,7 @@ class Job:
         self.film = Film(self.tiling)
 
     def _reach(self) -> int:
-        """The largest difference between the pixel numbers of a companion and of its hero."""
+        """Return the largest difference between the pixel numbers of a companion and of its hero."""
         if self.mode != "companions":
             return 0
         reach_mm = self.camera.companion_reach_mm  # type: ignore[attr-defined]

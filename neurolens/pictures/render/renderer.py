@@ -350,7 +350,7 @@ class Tile:
         return frame
 
     def settings(self) -> dict[str, Any]:
-        """The settings that all tiles of one picture share."""
+        """Return the settings that all tiles of one picture share."""
         metadata, render = self.metadata, self.metadata["render"]
         chosen = {name: render[name] for name in ("width", "height", "samples")}
         stored = {

@@ -26,7 +26,7 @@ _ZOOM = 'cycles_custom["zoom_mm"]'
 
 
 def camera_of(context: Any) -> Any:
-    """The camera object that operators act on: the panel's, else the scene's.
+    """Return the camera object that operators act on: the panel's, else the scene's.
 
     Raises:
         LensError: there is none, or it belongs to another file.
