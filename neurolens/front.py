@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from neurolens.optics.trace.rays import Towards
 
 _LENS = "laikin_double_gauss_50"
-EXAMPLES = {  # of each name: its docstring has it, and a test runs it
+EXAMPLES = {  # of each name: its docstring shows it, and a test runs it
     "find": "nl.find('double gauss')",
     "lens": f"nl.lens('{_LENS}').set(focus_m=2, f_number=4)",
     "camera": f"nl.camera('{_LENS}.ols-36', film=(36, 24), focus_m=2)",
@@ -59,7 +59,7 @@ EXAMPLES = {  # of each name: its docstring has it, and a test runs it
 
 
 class Call:
-    """A function of the front."""
+    """A function of the front, which runs a command."""
 
     def __init__(self, name: str, run: Callable[..., Any], doc: str, signature: inspect.Signature) -> None:
         self._run, self.__name__, self.__doc__, self.__signature__ = run, name, doc, signature
@@ -73,7 +73,7 @@ class Call:
 
 
 def of(name: str) -> Call:
-    """The function of the front that has this name; its docstring has the parameters and an example."""
+    """Make the function of the front that has this name; its docstring has the parameters and an example."""
     example = f"Example::\n\n    >>> import neurolens as nl\n    >>> {EXAMPLES[name]}\n"
     others: dict[str, Callable[..., Any]] = {"load": load, "fit": fit, "rays": rays}
     if (own := others.get(name)) is not None:
@@ -101,22 +101,22 @@ def _settings(value: Any) -> Mapping[str, Any]:
 
 
 def _rays(*given: Any, **named: Any) -> dict[str, Any]:
-    """Rays with the settings that a lens or camera brings, where the call has none of the same name."""
+    """Return rays with the settings that a lens or camera brings, where the call itself gives none of the same name."""
     brought = getattr(given[0] if given else named.get("camera"), "of_shot", {})
     return rays(*given, **{k: v for k, v in brought.items() if k != "film" or len(given) < 2} | named)
 
 
 @dataclass(frozen=True, repr=False)
 class _Chosen:
-    """A name and its settings: every call takes both where it takes a lens."""
+    """A name and its settings; every call that takes a lens takes both from it."""
 
     name: str
     settings: Mapping[str, Any]
-    reads: ClassVar[type[cli.Command]]  # the settings, by its parser
+    reads: ClassVar[type[cli.Command]]  # the command whose parser reads the settings
 
     @classmethod
     def make(cls, name: str | os.PathLike[str], **settings: Any) -> Self:
-        """One of a name, or of another with its settings; mistakes are raised here."""
+        """Make one from a name, or from another one and its settings; mistakes are raised here."""
         settings = {**_settings(name), **settings}
         return cls(os.fspath(name), {key: value for key, value in settings.items() if value is not None})
 
@@ -136,17 +136,17 @@ class _Chosen:
 
     @property
     def of_shot(self) -> dict[str, Any]:
-        """What is set, as `Shot` names it, but a camera's film as "film"."""
+        """What is set, by the names of `Shot`, but a camera's film as "film"."""
         return {k: v for k, v in vars(self._read).items() if k == "film"} | self._read.state.shot().given
 
     def set(self, **settings: Any) -> Self:
-        """The same with further settings; None takes one away. Raises InputError for one that cannot be."""
+        """Return the same with further settings; None takes one away. Raises InputError for one that cannot be."""
         return self.make(self, **settings)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _ReadLens(cli.Command):
-    """What `nl.lens` takes."""
+    """Holds what `nl.lens` takes."""
 
     called: ClassVar[str] = "nl.lens"
     file: Path = cli.lens(positional=True)
@@ -155,7 +155,7 @@ class _ReadLens(cli.Command):
 
 @dataclass(frozen=True, kw_only=True)
 class _ReadCamera(cli.Command):
-    """What `nl.camera` takes."""
+    """Holds what `nl.camera` takes."""
 
     called: ClassVar[str] = "nl.camera"
     camera: str = cli.lens(models=True, cameras=True, positional=True)
@@ -168,7 +168,7 @@ class Lens(_Chosen):
     and `draw` need the extra "train" (torch).
 
     Raises:
-        InputError: no such lens, with the nearest name; a setting that it cannot have.
+        InputError: there is no such lens (the error names the nearest), or it cannot have a setting.
     """
 
     reads = _ReadLens
@@ -184,7 +184,7 @@ class Lens(_Chosen):
 
     @cached_property
     def prescription(self) -> Prescription:
-        """Its surfaces, gaps and glasses in this state."""
+        """The surfaces, gaps and glasses of the lens in this state."""
         from neurolens.optics.setting.states import set_lens
 
         return set_lens(self._tabled, self._read.state.shot())
@@ -197,7 +197,7 @@ class Lens(_Chosen):
 
     @property
     def focal_length_mm(self) -> float:
-        """At the d line, of an anamorphic lens along y."""
+        """The focal length at the d line; of an anamorphic lens, that along y."""
         return self._figures["effective_focal_length_mm"]
 
     @property
@@ -212,22 +212,22 @@ class Lens(_Chosen):
 
     @property
     def focus_m(self) -> float:
-        """From the film to the object in focus, or inf."""
+        """The distance from the film to the object in focus, or inf."""
         from neurolens.optics.setting.states import focus_of
 
         return focus_of(self.prescription, self._read.state.shot())
 
     @installed()
     def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
-        """Trace rays through every surface; the answer has the form of a model's, in float64.
+        """Trace rays through every surface; the answer has the form of a model's answer, in float64.
 
         Args:
-            rays: x, y, z in mm and unit direction [6, N], lens frame.
-            wavelength_nm: None takes the lens's reference, of most the d line.
-            towards: "scene" for camera rays, which run towards -z, or "film".
+            rays: [6, N], x, y, z in mm and the unit direction, lens frame.
+            wavelength_nm: None takes the lens's reference wavelength, which for most lenses is the d line.
+            towards: "scene" for camera rays, which travel towards -z, or "film".
 
         Raises:
-            InputError: another shape; as `neurolens.optics.trace.rays.trace`.
+            InputError: an array of another shape, or what `neurolens.optics.trace.rays.trace` raises.
         """
         import torch
 
@@ -244,15 +244,15 @@ class Lens(_Chosen):
         return LensRays(*(column.numpy() for column in columns))
 
     def analyse(self, *what: str, **options: Any) -> Answer:
-        """Its spots, mtf, distortion and more, by these names or all: `nl.analyse`."""
+        """Analyse the lens: spots, mtf, distortion and more, by these names, or all without any; see `nl.analyse`."""
         return run_command(command("analyse"), self, list(what), **options)
 
     def describe(self, **options: Any) -> Answer:
-        """All that `neurolens lens` prints, and draws: pupils, image circle, what stops its light, surfaces, doubts."""
+        """All that `neurolens lens` prints, and draw: pupils, image circle, what stops light, surfaces, doubts."""
         return run_command(command("lens"), self, **options)
 
     def draw(self, output: str | Path) -> None:
-        """Draw its section with rays, as PNG, PDF or SVG."""
+        """Draw the section of the lens with rays, as PNG, PDF or SVG."""
         self.describe(layout=output)
 
     def __repr__(self) -> str:
@@ -280,14 +280,14 @@ class Camera(_Chosen):
     """A lens, a model or an ideal camera by its name, set for a shot; nl.render takes it with all its settings.
 
     Raises:
-        InputError: no such lens, with the nearest name; a setting that is none.
+        InputError: there is no such lens (the error names the nearest), or it has no such setting.
     """
 
     reads = _ReadCamera
 
     @cached_property
     def made(self) -> MadeCamera:
-        """By itself, film points and random numbers to weighted scene rays: see `neurolens.cameras.contract`.
+        """The camera itself, from film points and random numbers to weighted rays; see `neurolens.cameras.contract`.
 
         Raises:
             InputError: a setting that this kind of camera does not have.
@@ -296,7 +296,7 @@ class Camera(_Chosen):
 
 
 class Model(OnnxLens):
-    """An exported model. Its `card` says of what it is, how exact and where; `rays` makes scene rays of camera rays."""
+    """An exported model: `card` tells what it stands for, how exact it is and where, and `rays` traces camera rays."""
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -305,17 +305,18 @@ class Model(OnnxLens):
         return f"{self.path}: {self.card['fit']['method']} of {self.card['lens']['name']}"
 
     def export(self, to: str, output: str | Path, **options: Any) -> Answer:
-        """Write it in another form, "c", "glsl", "osl" and more: `nl.export`."""
+        """Write the model in another form, "c", "glsl", "osl" and more; see `nl.export`."""
         return run_command(command("export"), self, to=to, output=output, **options)
 
 
 def load(model: str | os.PathLike[str]) -> Model:
-    """An exported model by its file, or by the name of one that ships, checked; it needs no torch.
+    """Load an exported model by its file, or by the name of one that ships, and check it; torch is not needed.
 
-    It has card, rays() and export(), and every call takes it where a model is named.
+    The model has `card`, `rays` and `export`, and every call takes it where a model is named.
 
     Raises:
-        InputError: no such model. ModelError: a file that cannot be trusted.
+        InputError: there is no such model.
+        ModelError: the file cannot be trusted.
     """
     file = lensname.resolve(os.fspath(model), cameras=False).file
     if file is None or not lensname.is_model(file):
@@ -324,15 +325,16 @@ def load(model: str | os.PathLike[str]) -> Model:
 
 
 def fit(lens: str | os.PathLike[str], within_um: float | None = None, **options: Any) -> Model:
-    """Fit models to a lens as `nl.train` does, but time none, and load the one to use: a minute, as a rule.
+    """Fit models to a lens as `nl.train` does, without timing them, and load the one to use: a minute, as a rule.
 
     Args:
         lens: a name, a file, or a lens that is set, whose zoom, f-number and focal length count.
-        within_um: film-equivalent RMS error on rays that the fit has not seen: the smallest model within it.
-        options: further ones of `nl.train`, as output, the folder of the run, and set, a mapping.
+        within_um: the film-equivalent RMS error wanted, on rays that the fit has not seen; the smallest model within it
+            is loaded.
+        options: further ones of `nl.train`, such as output, the folder of the run, and set, a mapping.
 
     Raises:
-        InputError: a setting that models do not have; no model within the error.
+        InputError: a setting that models do not have, or no model is within the error.
     """
     from neurolens.studies.pages import CLOSE_UM, to_use
 

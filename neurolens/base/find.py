@@ -1,6 +1,6 @@
-"""Lenses of the library found by words: product, maker, focal length, f-number, mount, year, character, nickname.
+"""Finds lenses of the library by words: product, maker, focal length, f-number, mount, year, character, nickname.
 
-lenses/index.jsonl says what each lens is, and lenses/nicknames.jsonl what people call it; no lens file is read.
+lenses/index.jsonl tells what each lens is, and lenses/nicknames.jsonl what people call it; no lens file is read.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ CHARACTER = {  # what a lens is known for: the figure of `studies.describe`, and
     "softness": ("softness_um", "soft um"), "flare": ("flare", "flare"),
 }  # fmt: skip
 _NEAR, _LONGEST = 3, 300  # lenses that are offered where none has all words; characters of a query that count
-_WHOLE, _BEGUN, _INSIDE = 3, 2, 1  # how well a word agrees: it is a lens's, begins one, or stands inside its name
-_LIKE = 0.5  # of the mean word of a query: what is less alike is not near
-_IDLE = {"lens", "lenses", "mount", "the", "f", "mm"}  # what people type and no lens is told by
+# how well a word agrees: it is one of a lens's words, begins one, or stands inside its name
+_WHOLE, _BEGUN, _INSIDE = 3, 2, 1
+_LIKE = 0.5  # share of a query's mean word: a lens that is less alike is not near
+_IDLE = {"lens", "lenses", "mount", "the", "f", "mm"}  # words that people type, and that tell no lens from another
 _N = r"\d{1,6}(?:\.\d+)?"
 _TOKEN = re.compile(
     rf"(?:\b[ft]/ ?|\b[ft](?=\d)|\b1:(?=[2-9]|\d\.))({_N})(?:-{_N})?|((?:18|19|20)\d0)'?s\b|({_N})-({_N}) ?mm"
@@ -36,15 +37,15 @@ _TOKEN = re.compile(
 
 
 def words_of(text: str) -> list[str]:
-    """A text as photographers read it: "Zoom-Nikkor 80-200mm F4.5" as zoom, nikkor, 80-200mm, f/4.5.
+    """Split a text as photographers read it: "Zoom-Nikkor 80-200mm F4.5" gives zoom, nikkor, 80-200mm, f/4.5.
 
-    Accents and capitals do not count; T-stops are as f-numbers; a number without a unit stays one.
+    Accents and capitals do not count; T-stops count as f-numbers; a number without a unit stays one.
     """
     bare = unicodedata.normalize("NFKD", text[:_LONGEST].replace("\N{EN DASH}", "-")).casefold()
     bare = "".join(c for c in bare if not unicodedata.combining(c))
     bare = re.sub(r"(?<=\d),(?=\d)|(?<=[\W_]f\d)_(?=\d)", ".", bare).replace("_", " ")
     bare = re.sub(rf"(?<![a-z\d/.])({_N})/({_N})", _as_stop, bare)
-    bare = re.sub(r"(?<=[a-z])(?=\d)(?<!\b[ft])", " ", bare)  # rf50
+    bare = re.sub(r"(?<=[a-z])(?=\d)(?<!\b[ft])", " ", bare)  # splits rf50
     found = []
     for stop, decade, low, high, length, unit, number, word in _TOKEN.findall(bare):
         if stop:
@@ -59,15 +60,21 @@ def words_of(text: str) -> list[str]:
 
 
 def _as_stop(found: re.Match[str]) -> str:
-    """50/1.2 and 1.2/50, as lenses are engraved, with the f-number marked."""
+    """Mark the f-number in 50/1.2 or 1.2/50, as lenses are engraved."""
     low, high = sorted(found.groups(), key=float)
     return f"{high} f/{low}"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A lens of the library: its name in lenses/, its row of the index (empty without one), and its words, those of
-    its own name first."""
+    """A lens of the library.
+
+    Attributes:
+        lens: its name in lenses/.
+        row: its row of the index; empty without one.
+        own: the words of its own name.
+        words: all its words, those of its name first.
+    """
 
     lens: str
     row: Mapping[str, Any]
@@ -76,7 +83,7 @@ class Entry:
 
     @classmethod
     def of(cls, lens: str, row: Mapping[str, Any]) -> Entry:
-        """The lens with its words: what is engraved counts, computed figures only where nothing is."""
+        """Make the entry of a lens; of its figures, engraved ones give words, and computed ones only where none are."""
         own = words_of(str(row.get("believed_to_be") or row.get("name") or lens))
         more = words_of(" ".join(str(row.get(key) or "") for key in ("name", "maker", "mount"))) + words_of(lens)
         spans = [word[:-2].split("-") for word in own if re.fullmatch(rf"{_N}-{_N}mm", word)]
@@ -89,17 +96,17 @@ class Entry:
 
     @property
     def name(self) -> str:
-        """Of the product, else of the design."""
+        """The product's name, or where there is none the design's."""
         return str(self.row.get("believed_to_be") or self.row.get("name") or self.lens)
 
     def strength(self, character: str) -> float:
-        """How much it has of a character, a key of `CHARACTER`; -inf where that is not known."""
+        """Return how much of a character (a key of `CHARACTER`) the lens has; -inf where that is not known."""
         figures = self.row.get("character") or {}
         value = figures.get(CHARACTER[character][0]) if figures.get("cats_eye") is not None else None  # a condenser
         return -math.inf if value is None else -value if character == "cats-eye" else float(value)
 
     def agrees(self, word: str) -> int:
-        """How well a word of a query agrees, 0 for not at all."""
+        """Return how well a word of a query agrees with the lens, 0 for not at all."""
         if not self.words.isdisjoint({word, f"{word}mm", f"f/{word}"} if word[0].isdigit() else {word}):
             return _WHOLE
         if not word.isalpha() or len(word) < 3:
@@ -113,9 +120,10 @@ class Found:
     """What a query finds.
 
     Attributes:
-        hits: the lenses that have all its words, best first; `chosen` is the one that is meant, where one is.
-        near: the nearest lenses, where none has them.
-        notes: on nicknames in the query.
+        hits: the lenses that have all words of the query, best first.
+        chosen: the one that is meant, if one is.
+        near: the nearest lenses, where none has all words.
+        notes: sentences about nicknames in the query.
     """
 
     hits: Sequence[Entry]
@@ -125,10 +133,11 @@ class Found:
 
 
 def find(text: str) -> Found:
-    """The lenses of the library that have all words of a query; where it names a character, the strongest first.
+    """Find the lenses of the library that have all words of a query; if it names a character, the strongest come first.
 
-    Of lenses that agree equally well products come before designs, and those of whose name the query leaves out less.
-    One is chosen where it agrees better than all others, or where its whole name is said.
+    Of lenses that agree equally well, products come before designs, and a lens with few words in its name that the
+    query leaves out comes before one with many. One lens is chosen where it agrees better than all others, or where its
+    whole name is given.
     """
     words, notes = _translated(text)
     sorts = [word for word in words if word in CHARACTER]
@@ -154,7 +163,7 @@ def find(text: str) -> Found:
 
 
 def _alike(a: str, b: str) -> float:
-    """How alike two words are, from 0 to 1; numbers by their ratio."""
+    """Return how alike two words are, from 0 to 1; numbers are compared by their ratio."""
     x, y = (re.match(rf"(f/)?({_N})(?:-{_N})?(mm)?", word) for word in (a, b))
     if x is None or y is None:
         return SequenceMatcher(None, a, b).ratio() if x is y else 0.0
@@ -164,17 +173,17 @@ def _alike(a: str, b: str) -> float:
 
 
 def nicknames() -> list[dict[str, Any]]:
-    """The table of nicknames: what is said (a list), the words that are meant, and a sentence on them."""
+    """Return the table of nicknames: what is said (a list), the words that are meant, and a sentence about them."""
     return _lines(NICKNAMES)
 
 
 def said_of(entry: Entry) -> list[str]:
-    """What people call a lens of the library."""
+    """Return what people call a lens of the library."""
     return [said for row in nicknames() for said in row["said"] if all(map(entry.agrees, words_of(row["means"])))]
 
 
 def _translated(text: str) -> tuple[list[str], list[str]]:
-    """The words of a query, those of nicknames replaced, and the notes on these."""
+    """Return the words of a query, with nicknames replaced by what they mean, and the notes about these."""
     asked, notes = f" {' '.join(words_of(text))} ", list[str]()
     table = [(f" {' '.join(words_of(said))} ", row) for row in nicknames() for said in row["said"]]
     for said, row in sorted(table, key=lambda pair: -len(pair[0])):
@@ -186,7 +195,7 @@ def _translated(text: str) -> tuple[list[str], list[str]]:
 
 
 def read_index() -> dict[str, dict[str, Any]]:
-    """The entries of the library's index by file; none without an index."""
+    """Return the entries of the library's index by file; none without an index."""
     return {entry["file"]: entry for entry in _lines(INDEX)}
 
 
@@ -196,7 +205,7 @@ def _lines(name: str) -> list[dict[str, Any]]:
 
 
 def entries() -> Sequence[Entry]:
-    """The lenses of the library, by name; read again where a file has come or gone, or the index is another."""
+    """Return the lenses of the library, by name; they are read again where a file or the index has changed."""
     folder = library() / "lenses"
     stamps = [path.stat().st_mtime_ns if path.exists() else 0 for path in (folder, folder / INDEX)]
     return _entries(folder, *stamps)

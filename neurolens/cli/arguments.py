@@ -330,35 +330,35 @@ def camera(name: str, shot: Shot, progress: Progress) -> Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class LensState:
-    """The options that set a lens or a camera: settings of a shot, and the shape of the stop."""
+    """Holds the options that set a lens or a camera: settings of a shot, and the shape of the stop."""
 
     given: Shot = setting(Shot.part(), "what the command line has of a shot")
     stop: StopShape = group("shape of the stop")
 
     def aperture(self) -> Aperture | None:
-        """The stop's shape; None if not given.
+        """Return the stop's shape; None if it is not given.
 
         Raises:
-            InputError: shapes that exclude each other, a picture that cannot be read.
+            InputError: shapes that exclude each other, or a picture that cannot be read.
         """
         from neurolens.pictures.render.images import make_aperture
 
         return make_aperture(self.stop)
 
     def shot(self, film_mm: tuple[float, float] | None = None, **settings: Any) -> Shot:
-        """What is given of a shot, with a camera's film and further `settings`; None counts as not given.
+        """Return what is given of a shot, with a camera's film and further `settings`; None counts as not given.
 
         Raises:
-            InputError: as `Shot` and `aperture`.
+            InputError: what `Shot` and `aperture` raise.
         """
         return with_changes(self.given, {"aperture": self.aperture(), "film_mm": film_mm} | settings)
 
     def at(self, **settings: Any) -> Self:
-        """With other settings of the shot."""
+        """Return the same with other settings of the shot."""
         return replace(self, given=replace(self.given, **settings))
 
 
-# Fields of `LensState` in a command: of a lens alone, and of any camera.
+# Fields of `LensState` in a command: for a lens alone, and for any camera.
 lens_state = partial(group, "state of the lens", names=BY_LENSES, unset=True)
 camera_state = partial(group, "state of the lens", unset=True)
 

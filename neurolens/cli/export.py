@@ -143,7 +143,7 @@ examples:
         )
 
     def _write_osl(self, file: Path) -> dict[str, Any]:
-        """A camera for Cycles."""
+        """Write a camera for Cycles."""
         shader = shader_of(file, zoom=self.state.given.zoom, name=self.name, quiet=self.quiet)
         atomic_write_text(self.out, shader.text)
         return {
@@ -152,7 +152,7 @@ examples:
         }  # fmt: skip
 
     def _write_camera(self, file: Path) -> dict[str, Any]:
-        """The whole camera of a model or a lens file as source code."""
+        """Write the whole camera of a model or a lens file as source code."""
         shot = self.state.shot(self.film, runtime="onnxruntime")
         camera: Any = make_camera(file, shot, self.progress())
         facts = camera.settings

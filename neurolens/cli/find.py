@@ -37,7 +37,7 @@ examples:
     )
 
     def run(self) -> int:
-        """Print the lenses; 1 where none has all words."""
+        """Print the lenses; return 1 where none has all words."""
         found = find(" ".join(self.words))
         rows = [_row(entry) for entry in found.hits or found.near]
         data = {"found": len(found.hits), "chosen": found.chosen and found.chosen.lens, "notes": list(found.notes)}
@@ -45,7 +45,7 @@ examples:
 
 
 def _row(entry: Entry) -> dict[str, Any]:
-    """What is told of a lens: its name in lenses/, its files, and figures of the index."""
+    """Return what is told of a lens: its name in lenses/, its files, and figures of the index."""
     keys = ("maker", "year", "efl_mm", "f_number", "t_stop", "mount", "match", "verdict", "character")
     folder = library() / "lenses"
     picture = folder / "thumbnails" / f"{entry.lens}.svg"

@@ -35,7 +35,7 @@ _FARMS, _LONG = "farms", "long renders"  # titles in the help
 
 
 def _tile(text: str) -> tuple[int, int]:
-    """Type of --tile."""
+    """Read --tile."""
     words = text.split("/")
     if len(words) == 2 and all(w.isascii() and w.isdecimal() and len(w) <= 6 for w in words):
         number, count = map(int, words)
@@ -108,7 +108,7 @@ examples:
     threads: int = cli.threads("workers, each pinned to a core if there are as many as cores")
 
     def run(self) -> int:
-        """Render frames, or merge tiles; returns the exit code of the first frame that fails."""
+        """Render frames, or merge tiles; return the exit code of the first frame that fails."""
         if not self.merge and (len(self.scene) != 1 or self.camera is None):
             missing = "SCENE" if len(self.scene) != 1 else "--camera"
             self.refuse(missing, " ".join(map(str, self.scene)) or "(none)", "one of it")
@@ -147,7 +147,7 @@ examples:
         )  # fmt: skip
 
     def _missing(self, frames: Mapping[Path, Frame]) -> dict[Path, Frame]:
-        """The frames that are to be rendered: without --restart those that do not exist, or that have a checkpoint.
+        """Return the frames to render: without --restart those that do not exist, or that have a checkpoint.
 
         Warns:
             NeurolensWarning: frames that exist are kept, whatever keys they were rendered by.
@@ -187,7 +187,7 @@ examples:
         return self.answer(data, lambda: _summary(stats, files))
 
     def _watch(self, files: Files, stop: Stopping) -> Watch:
-        """Preview, checkpoint and stop."""
+        """Return what watches a render: it updates the preview, writes checkpoints, and stops when asked to."""
         return Watch(
             preview=partial(write_png, files.preview, exposure=self.picture.exposure), checkpoint=files.checkpoint,
             checkpoint_s=self.checkpoint_every, restart=self.restart, keep=self.keep_checkpoint,
@@ -210,7 +210,7 @@ examples:
         return self._say_pictures(pictures)
 
     def _merge(self) -> int:
-        """Put tiles together."""
+        """Put tiles together to their picture."""
         taken = ("--merge", "--output", "--exposure", "--quiet", "--json")
         for option in changed(self):
             if option not in taken:
@@ -224,7 +224,7 @@ examples:
 
 
 def _interrupted(stopping: Stopping, kept: str) -> int:
-    """Print what remains of an interrupted render to stderr; the exit code, 128 plus the signal's number."""
+    """Print what remains of an interrupted render to stderr; return the exit code, 128 plus the signal's number."""
     print(f"\nneurolens: interrupted; {printable(kept)}", file=sys.stderr)
     return 128 + (stopping.number or signal.SIGINT)
 
@@ -239,7 +239,7 @@ def _so_far(result: RenderResult, files: Files) -> str:
 
 
 def _summary(stats: dict[str, Any], files: Files) -> str:
-    """Summary of a finished render."""
+    """Return the summary of a finished render."""
     return (
         f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
         f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "

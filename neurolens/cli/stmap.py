@@ -48,7 +48,7 @@ _NAMES = ("red", "green", "blue")
 
 
 def whole_pair(names: str, most: int) -> Callable[[str], tuple[int, int]]:
-    """Type of --size and --grid: two whole numbers with x between them."""
+    """Return the type of --size and --grid: two whole numbers with x between them."""
 
     def pair(text: str) -> tuple[int, int]:
         words = text.lower().split("x")
@@ -60,7 +60,7 @@ def whole_pair(names: str, most: int) -> Callable[[str], tuple[int, int]]:
 
 
 def channels_nm(text: str) -> tuple[float, ...]:
-    """Type of --wavelengths: those of red, green and blue."""
+    """Read --wavelengths: those of red, green and blue."""
     waves = wavelengths_nm(text)
     if len(waves) == 3 and all(LIGHT_NM[0] <= nm <= LIGHT_NM[1] for nm in waves):
         return waves
@@ -103,7 +103,7 @@ class PictureCommand(cli.Reporting):
         runtime: Runtime | None = "onnxruntime",
         light_nm: tuple[float, float] = LIGHT_NM,
     ) -> tuple[Camera, Shot]:
-        """The camera in a state of its lens, for light of this range, and its settings; what it notes is a warning.
+        """Make the camera in a state of its lens, for light of this range; return it with its settings.
 
         `runtime`: as of `Shot`; maps take so few rays that compiling would take longer.
 
@@ -127,14 +127,14 @@ class FieldCommand(PictureCommand):
     )  # fmt: skip
 
     def near_m(self, frame: Frame) -> float:
-        """The nearest distance, which is checked against the entrance pupil's."""
+        """Return the nearest distance, checked against the entrance pupil's."""
         pupil = 1e-3 * max(frame.pupil_mm)
         if self.near is not None and self.near <= pupil:
             self.refuse("--near", self.near, f"more than {pupil:.4g} m, the distance of the entrance pupil")
         return self.near or max(_NEAR_M, 1.5 * pupil)
 
     def parallax(self, camera: Camera, field: Field) -> list[dict[str, float]]:
-        """By distance, at infinity and near, by how much things are elsewhere than the field's one centre has them."""
+        """Return, by distance (at infinity and near), how far things are from where the field's one centre has them."""
         point = np.concatenate([lit_points(field, self.film, _SEEN), diagonal_points(field, self.film)])
         point = point[field.lit(point)]
         pixel = self.film[0] / self.picture[0], self.film[1] / self.picture[1]
@@ -153,7 +153,7 @@ class TracedFrame:
 
     @property
     def index(self) -> int | None:
-        """Its number; None of a single frame."""
+        """The frame's number; None for a single frame."""
         return int(self.number) if self.number else None
 
 
@@ -211,12 +211,12 @@ examples:
         return self.answer(data, lambda: _stmap_text(data))
 
     def states(self) -> list[tuple[str, cli.LensState]]:
-        """The numbers of frames as file names have them, and the state of the lens there."""
+        """Return the numbers of frames as file names have them, with the state of the lens in each."""
         keyed = self.frames.states(vars(self.state.given), self.called, LENS_KEYS)
         return [(digits, self.state.at(**values)) for _, digits, values in keyed]
 
     def traced(self, progress: Progress) -> tuple[list[TracedFrame], Plates]:
-        """All frames with their fields, and the pictures that hold what any of them shows."""
+        """Return all frames with their fields, and the pictures that hold what any of them shows."""
         states, frames = self.states(), list[TracedFrame]()
         colours = dict(zip(_NAMES, self.wavelengths, strict=True)) if self.lateral_colour else {}
         with progress.stage(f"trace the field of {self.camera}") as report:
@@ -236,14 +236,16 @@ examples:
         return frames, plates_of([f for frame in frames for f in frame.fields.values()], self.picture, self.film)
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
-        """The maps of a frame: kind, colour ("" for the mean one), and what makes the channels."""
+        """Return the maps of a frame: kind, colour ("" for the mean one), and what makes the channels."""
         makers = {"undistort": undistort_map, "redistort": redistort_map}
         pairs = [(kind, name, make) for name in frame.fields for kind, make in makers.items()]
         return [*pairs, ("illumination", "", illumination_map)]
 
     def maps(self, frames: list[TracedFrame], plates: Plates, progress: Progress, start: Path) -> list[str]:
-        """Write the maps of all frames, but those that an earlier run of the same settings left; their names, which
-        begin with `start`."""
+        """Write the maps of all frames and return their names, which begin with `start`.
+
+        Maps that an earlier run of the same settings left are kept.
+        """
         files, todo = list[str](), [(frame, *job) for frame in frames for job in self.jobs(frame)]
         with progress.stage("write the maps") as report:
             for k, (frame, kind, name, make) in enumerate(todo):
@@ -263,7 +265,7 @@ examples:
         return files
 
     def _facts(self, frame: TracedFrame, plates: Plates, kind: str, name: str) -> dict[str, Any]:
-        """What the header of a map says of it."""
+        """Return what the header of a map says of it."""
         field = frame.fields[name]
         about: dict[str, Any] = {"version": __version__, "name": frame.camera.name}
         about |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
@@ -272,7 +274,7 @@ examples:
         return about | {"map": kind, "wavelengths_nm": field.spectrum[0].tolist(), **_ideal(field, plates)}
 
     def data_of(self, frames: list[TracedFrame], plates: Plates) -> dict[str, Any]:
-        """The figures of the maps."""
+        """Return the figures of the maps."""
         rows = []
         for frame in frames:
             field = frame.fields[""]
@@ -297,15 +299,17 @@ examples:
 
 
 def _is_of(path: Path, facts: dict[str, Any]) -> bool:
-    """Whether a map is there, whole, with this in its header."""
+    """Test whether a map is there, whole, with these facts in its header."""
     with suppress(InputError):
         return read_channels(path)[1] == plain(facts)
     return False
 
 
 def _ideal(field: Field, plates: Plates) -> dict[str, Any]:
-    """The camera that an undistorted picture is of; lists are of the x and the y meridian. A pixel of both pictures is
-    `pixel_aspect` times as wide as high in what it shows, as viewers stretch it."""
+    """Describe the camera that an undistorted picture is of; lists are for the x and the y meridian.
+
+    In what it shows, a pixel of both pictures is `pixel_aspect` times as wide as high, and viewers stretch it so.
+    """
     (x, y), (width, height) = field.frame.reach_mm, plates.pixel_mm
     return {
         "projection": field.target,
@@ -344,7 +348,7 @@ def _stmap_text(data: dict[str, Any]) -> str:
 
 
 def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) -> str:
-    """What one centre leaves of things at other distances, as a sentence."""
+    """Return what one centre leaves of things at other distances, as a sentence."""
     told = [
         f"{cli.number(p['rms_px'], 2)} pixels RMS, {cli.number(p['worst_px'], 2)} at most, {_where(p['distance_m'])}"
         for p in parallax

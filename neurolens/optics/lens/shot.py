@@ -18,7 +18,7 @@ FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
 Dispersion = Literal["full", "lateral", "off"]
 Runtime = Literal["c", "onnxruntime"]
-# Settings that every camera takes, and those of a lens alone, without its film; "internal" is the focus mode.
+# Settings that every camera takes, and those of a lens alone, without its film; "internal" stands for the focus mode.
 BY_ALL = (
     "film_mm", "focus_m", "f_number", "focus_mode", "wavelength_nm", "clamp_f_number", "vignetting", "dispersion",
     "runtime",
@@ -93,7 +93,7 @@ class Shot:
         "best", "the film where the spot on the axis is smallest at this aperture, in the paraxial image, or first the "
         "groups moved as the focus states of the lens file do (default: best)", old=("focusing",),
     )  # fmt: skip
-    aperture: Any = None  # an `Aperture`, whose module loads numpy, which help of the command line does not
+    aperture: Any = None  # an `Aperture`, whose module loads numpy, which the help of the command line does without
     wavelength_nm: tuple[float, float] = LIGHT_NM
     film_offset_mm: float = setting(
         0.0, "move the film away from the lens after focusing (default: 0)", within=(-1e3, 1e3), unit="mm"
@@ -129,7 +129,7 @@ class Shot:
 
     @classmethod
     def part(cls, **given: Any) -> Self:
-        """Some settings of a shot; the others are None, which stands for not given."""
+        """Return some settings of a shot; the others are None, which stands for not given."""
         return cls(**{f.name: None for f in fields(cls)} | given)
 
     @property
@@ -138,13 +138,13 @@ class Shot:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def whole(self) -> Self:
-        """The shot with the defaults of the settings that are not given."""
+        """Return the shot with defaults for the settings that are not given."""
         return type(self)(**self.given)
 
     def check_taken(self, camera: str, takes: Collection[str]) -> None:
         """Raise InputError for a setting that a kind of camera does not take.
 
-        `takes`: what it has besides `BY_ALL`; "internal" is that focus mode.
+        `takes` names what it takes besides `BY_ALL`; "internal" is that focus mode.
         """
         for f in fields(self):
             value, taken = getattr(self, f.name), f.name in {*takes, *BY_ALL}
@@ -157,7 +157,7 @@ class Shot:
                 raise InputError(f"camera {camera}", f.name, value, expected)
 
     def record(self, takes: Collection[str]) -> dict[str, Any]:
-        """What the settings of a camera say of its shot, as JSON has it: film, focus (None is inf), what it `takes`."""
+        """Return what a camera's settings say of its shot, for JSON: film, focus (None is inf), and what it `takes`."""
         found: dict[str, Any] = {"film_mm": list(self.film_mm)}
         found |= {f.name: getattr(self, f.name) for f in fields(self) if f.name in takes}
         found["focus_m"] = None if math.isinf(self.focus_m) else self.focus_m
@@ -170,7 +170,7 @@ class Shot:
 
 
 def film_size(text: str) -> tuple[float, float]:
-    """Type of an option: a film's width x height in mm, as in 36x24, also with units, or its name in `FILMS`."""
+    """Read an option: a film's width x height in mm, as in 36x24, also with units, or its name in `FILMS`."""
     named = FILMS.get(re.sub(r"[-_ ]", "", text.lower()), text.lower())
     width, _, height = named.partition("x")
     expected = f"the film's width x height in mm, as in 36x24, or one of {', '.join(FILMS)}, each"
@@ -182,7 +182,7 @@ def film_size(text: str) -> tuple[float, float]:
 
 
 def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
-    """Width and height of a film as floats; raises InputError for any that no film has."""
+    """Return width and height of a film as floats; raises InputError for any that no film has."""
     if len(film_mm) != 2:
         raise InputError("camera", "film_mm", film_mm, "a width and a height")
     width, height = film_mm
@@ -195,7 +195,7 @@ def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
 class StopShape:
     """The shape of the stop's opening, as files and options state it; without any field it is the lens file's.
 
-    `pictures.render.images.make_aperture` makes an `Aperture` of it, which reads the picture of a mask.
+    `pictures.render.images.make_aperture` makes an `Aperture` of it and reads the picture of a mask.
     """
 
     blades: int | None = setting(

@@ -84,8 +84,10 @@ def set_lens(
 
 
 def focus_of(lens: Lens, shot: Shot) -> float:
-    """Film to object in metres, of a lens that is set for a shot: as given, else of the focus state that its zoom
-    names, else inf."""
+    """Return the distance (m) from film to object, of a lens that is set for a shot.
+
+    It is the shot's focus if given, else that of the focus state that its zoom names, else inf.
+    """
     if shot.focus_m is not None:
         return shot.focus_m
     object_mm = _object_mm(lens, shot)
@@ -93,22 +95,22 @@ def focus_of(lens: Lens, shot: Shot) -> float:
 
 
 def _object_mm(lens: Lens, shot: Shot) -> float | None:
-    """From the object of the focus state that a shot names to the front vertex; None of other states."""
+    """The distance from the object of the focus state that a shot names to the front vertex; None without one."""
     return next((c.object_distance_mm for c in lens.configurations if c.name == shot.zoom), None)
 
 
 def _zoomed_to(lens: Lens, zoom: str | float | None) -> Lens:
-    """The lens in the state that is named, or at a focal length, as a number or its text."""
+    """Return the lens in the state that is named, or at a focal length, given as a number or its text."""
     if zoom is None:
         return lens
     if isinstance(zoom, str) and zoom not in [c.name for c in lens.configurations]:
-        with suppress(ValueError):  # a name, then, that no state has
+        with suppress(ValueError):  # it is a name, then, that no state has
             zoom = float(zoom)
     return in_state(lens, state_named(lens, zoom)) if isinstance(zoom, str) else zoomed(lens, zoom)
 
 
 def _sized(lens: Lens, shot: Shot) -> Lens:
-    """The lens scaled to the focal length or the field of a shot, whose image circle stays."""
+    """Return the lens scaled to the focal length of a shot, or to its field, in which case the image circle stays."""
     if shot.focal_length_mm is not None:
         now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
         if now_mm < 0:
@@ -254,7 +256,7 @@ def _varying_gaps(lens: Lens) -> list[int]:
 
 
 def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) -> Vector:
-    """The groups' places for this focal length, the paraxial image on the film, by Gauss-Newton with least moves."""
+    """Return the groups' places for this focal length, the paraxial image on the film: Gauss-Newton, least moves."""
     x = [math.log(s.efl_mm) for s in states]
     target = min(max(math.log(efl_mm), x[0]), x[-1])
     known = np.array([s.places for s in states])
