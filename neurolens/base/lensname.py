@@ -115,7 +115,7 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
 
 
 def _is_words(text: str) -> bool:
-    """Whether a text may be words of a lens, not a path or the name of a file; f/1.2 and 50/1.2 have a stroke."""
+    """Test whether a text may be words of a lens, and no path or file name; f/1.2 and 50/1.2 contain a slash, too."""
     bare = re.sub(r"(?<=\b[fFtT])/|(?<=\d)/(?=[\d.])", " ", text)
     return not re.search(r"[/\\]|\.[^\W\d][\w-]*$", bare)
 

@@ -116,7 +116,7 @@ def _times(a: Moved, b: Value) -> Moved:
 
 
 def _column(value: Value) -> tuple[Array, tuple[Value, Array] | None] | None:
-    """Return rows that are numbers, or numbers plus others times a value of the call, as columns; else None."""
+    """Return rows as columns if each is a number, or a number plus another times a value of the call; else None."""
     g, node, rows = value.graph, value.node, list(range(value.rows))
     if node.kind == "take":
         node, rows = g.nodes[node.inputs[0]], list(node.static)

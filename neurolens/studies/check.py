@@ -168,7 +168,7 @@ def _error(place: str, promised: float, measured: float | None, each: EachRay, p
 
 
 def _p99_deviation(values: Tensor) -> float:
-    """The relative standard deviation of the 99th percentile, from the quantile one deviation of its rank higher."""
+    """Return the 99th percentile's relative standard deviation, from the quantile one deviation of its rank higher."""
     if not len(values):
         return 0.0
     higher = min(1.0, 0.99 + math.sqrt(0.99 * 0.01 / len(values)))

@@ -369,7 +369,7 @@ def program_candidate(
     name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None, flags: tuple[str, ...] = FLAGS,
     double: bool = False,
 ) -> Candidate:  # fmt: skip
-    """Return a program of `models.source`, compiled when the race prepares it; the domain's stop without a radius."""
+    """Return a program of `models.source`, compiled when the race prepares it; None takes the stop of the domain."""
     compiled = cache(lambda: CompiledSource(program, flags, double))
 
     @cache

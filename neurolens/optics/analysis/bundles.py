@@ -302,7 +302,7 @@ class Filled:
         return some
 
     def bundle(self, level: int, path: bool = False) -> Bundle:
-        """Trace the bundle of a level of `lit_nodes`, with optical paths (half of the time) or NaN for them."""
+        """Trace the bundle of a level of `lit_nodes`; without `path`, optical paths are NaN, in half the time."""
         nodes = lit_nodes(self._passes, self.part, level)
         aim = self._aim(nodes.u.shape[1])
         u, v, area = (c.reshape(-1) for c in nodes)

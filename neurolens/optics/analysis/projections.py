@@ -280,7 +280,7 @@ def _adjusted(
 
 
 def inverse_polynomial(projection: Projection) -> tuple[float, ...]:
-    """Return b_1 to b_5 of an f-theta's other direction at NVIDIA: the angle by powers of the radius in pixels."""
+    """Return b_1 to b_5 of NVIDIA's f-theta in the other direction: the angle by powers of the radius in pixels."""
     angle = np.linspace(0, min(projection.widest_rad, projection.fold_rad), _ANGLES)
     radius = angle * _series(projection.numbers[2:], angle)
     powers = radius.max() ** np.arange(1, 6)

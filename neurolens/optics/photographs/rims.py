@@ -180,7 +180,7 @@ def _around(lit: Any, u: Array, v: Array, box: Array) -> Array:
 
 
 def _slopes(radius: Array, axis: int) -> Array:
-    """Return how much distances change from cell to cell; beside rays that get lost, on the side of the others."""
+    """Return how much distances change from cell to cell; next to lost rays, the change on the other side."""
     with np.errstate(invalid="ignore"):
         step = np.abs(np.diff(radius, axis=axis, prepend=np.inf, append=np.inf))
     step = np.where(np.isfinite(step), step, np.inf)
@@ -358,7 +358,7 @@ def with_ring(lens: Lens, ring: Ring) -> Lens:
 
 
 def _with_rings(lens: Lens) -> tuple[list[tuple[int, Ring]], Lens]:
-    """Return the rings that are tried, each with its place among a lens's surfaces that has all, and that lens."""
+    """Return the rings to try, each with its place among the surfaces of a lens that has them all, and that lens."""
     z = [float(v) for v in lens.vertices_mm]
     _, rear_z = rear_opening_mm(lens, float(lens.film_z_mm or z[-1]))
     last = min(range(len(lens.surfaces)), key=lambda k: abs(z[k] - rear_z))

@@ -255,7 +255,7 @@ def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[f
 
 
 def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
-    """The lens of a draft, in mm, checked as by `assemble.finish`; another unit than the file's is an InputError."""
+    """Return the lens of a draft, in mm, checked by `assemble.finish`; InputError if `options` give another unit."""
     options = options or ReadOptions()
     if +draft.skipped:
         listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())

@@ -312,7 +312,7 @@ def _glass(file: File, line: Line, rest: list[str]) -> dict[str, Any]:
 
 
 def _check_figures(file: File) -> None:
-    """Refuse figures behind unknown names where those behind known names are another glass's, or a name has two sets.
+    """Refuse the figures of unknown glasses if any are stale: another glass's, or two sets behind one name.
 
     Programs that exchange glasses leave the figures of the previous glasses.
     """

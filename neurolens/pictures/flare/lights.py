@@ -393,7 +393,7 @@ class SceneLights:
 
 
 class KeptLights(NamedTuple):
-    """The lights that are kept, brightest first; `of` how many; and the share of the energy that is left out."""
+    """The lights that are kept, brightest first, `of` how many, and the share of the energy that is left out."""
 
     lights: list[Light]
     of: int

@@ -131,7 +131,7 @@ class LightGroup:
 
 
 class Lights:
-    """Lights of several kinds, numbered group by group (some may be empty); the light at `target_m` matters most."""
+    """Lights of several kinds, numbered group by group (some may be empty); what reaches `target_m` counts most."""
 
     def __init__(self, groups: Sequence[LightGroup], target_m: Vector = BLACK) -> None:
         self._groups: list[tuple[int, LightGroup]] = []

@@ -395,7 +395,7 @@ class World:
         return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in self._shining_m)
 
     def nearest(self, rays: Rays) -> tuple[FloatArray, IntArray]:
-        """Distance [N] in m (inf: none) and surface [N] that rays hit first: -1 for none, of a box its first face."""
+        """Return the distance [N] in m (inf: none) and surface [N] that rays hit first (-1: none; a box: its first)."""
         count = rays.origin.shape[1]
         best, found = np.full(count, np.inf, np.float32), np.full(count, -1, np.int32)
         for shape in self._primitives:
