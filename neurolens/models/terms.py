@@ -240,7 +240,7 @@ class Sweep:
         return np.where(usable, gain, -1.0)
 
     def _needed(self, table: Floats) -> Floats | float:
-        """What must be left of each candidate [M], so that every chosen column keeps a share of `SPANNED` beside it."""
+        """Return how independent each candidate [M] must be, so that with it every chosen column keeps `SPANNED`."""
         if not self.chosen:
             return 0.0
         # Sweeping k in adds table[j, k]^2 / left[k] to the inverse of what is left of j, which is -table[j, j].

@@ -190,7 +190,7 @@ def _slopes(radius: Array, axis: int) -> Array:
 
 
 def _measured(radius: Array, cos4: Array, cell: Array) -> OpenLight:
-    """Return what is kept of the fine grid."""
+    """Return the light of a fine grid's cells, with how distances from the axis change across each cell."""
     slopes = np.stack([_slopes(radius, axis) for axis in (-2, -1)])
     slopes = np.where(np.isfinite(slopes), slopes, 1.0)
     least = np.maximum(_FLATTEST * slopes.max(axis=0), 1e-9)

@@ -184,9 +184,10 @@ def _glass(row: Table) -> dict[str, Any]:
 
 
 def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """Return the lens with its stated focal length: of several, an anamorphic lens's by meridian, else the first.
+    """Return the lens with the focal length that its file states.
 
-    The first is that of the table.
+    Where the file states two for an anamorphic lens, they are those of its meridians; else the first of several, which
+    is that of the table, is taken.
     """
     given = data.get("efl_mm")
     values = [given] if not isinstance(given, list) else given

@@ -199,7 +199,7 @@ class Trial:
         return {"min": cost, "median": cost}, noise(seen.weight, self.share)
 
     def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
-        """The cost of a camera without a lens, and its noise times the area of its picture, which has more paths."""
+        """Return the cost of a camera without a lens, and its noise times `area`: a larger picture has more paths."""
         known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
         timing, times = self.timed(camera, seen) if known is None else self.counted(known[name], seen)
         return timing, area * times
