@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.table_figures import Measures, measure
-from neurolens.optics.analysis.fields import Result
+from neurolens.base.report import Report
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.photographs.profiles import Profile
@@ -175,7 +175,7 @@ def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float, round
 
 
 @dataclass(frozen=True)
-class Checked(Result):
+class Checked(Report):
     """A table by its figures, and the single change that makes it sound.
 
     Attributes:

@@ -12,7 +12,7 @@ import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -113,18 +113,27 @@ def write_results(path: str | Path, results: Results) -> None:
     write_json(path, {"schema_version": SCHEMA_VERSION, **plain(asdict(results))})
 
 
-def plain(value: Any, strict: bool = True) -> Any:
+def plain(value: Any, strict: bool = True, full: bool = True) -> Any:
     """Return `value` in JSON's own types: scalars and arrays of numpy and torch become numbers and lists, paths text.
+
+    A dataclass becomes a mapping of its fields, unless `full` without those in bulk; see `base.report`.
 
     Infinity becomes the text "infinity" or "-infinity" and NaN null; unless `strict` both stay floats. In a path that
     is no UTF-8, the bytes that are no letters become \\u and four digits.
     """
     if isinstance(value, Mapping):
-        return {str(key): plain(item, strict) for key, item in value.items()}
+        return {str(key): plain(item, strict, full) for key, item in value.items()}
+    if is_dataclass(value):
+        found: dict[str, Any] = {}
+        for f in fields(value):
+            if full or "bulk" not in f.metadata:
+                item = plain(getattr(value, f.name), strict, full)
+                found |= item if "part" in f.metadata else {f.name: item}
+        return found
     if hasattr(value, "tolist"):
         return plain(value.tolist(), strict)
     if isinstance(value, list | tuple):
-        return [plain(item, strict) for item in value]
+        return [plain(item, strict, full) for item in value]
     if strict and isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
     if value is None or isinstance(value, bool | int | float):

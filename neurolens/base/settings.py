@@ -341,10 +341,15 @@ def _options(cls: type) -> list[Any]:
     return [f for f in fields(cls) if {"option", "group"} & f.metadata.keys()]
 
 
+def without_unit(name: str) -> str:
+    """Return the name of a figure, "focus_m", without its unit: "focus"."""
+    unit = _UNIT.fullmatch(name)
+    return unit[1] if unit else name
+
+
 def spelling(f: Any, option: Option) -> str:
     """Return how the option of a field is written: "--f-number"."""
-    unit = _UNIT.fullmatch(f.name)
-    return f"--{option.option or (unit[1] if unit else f.name).replace('_', '-')}"
+    return f"--{option.option or without_unit(f.name).replace('_', '-')}"
 
 
 def _dest(f: Any, option: Option) -> str:

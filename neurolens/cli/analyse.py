@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from neurolens.base.errors import InputError, warned
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import WAVELENGTH_NM, between, said, setting, wavelengths_nm
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
-    from neurolens.optics.analysis.fields import Scene
+    from neurolens.optics.analysis.field_curves import Colour, Curvature, Distortion, Illumination, Seidel
+    from neurolens.optics.analysis.fields import FieldEdge, Scene
+    from neurolens.optics.analysis.layout import Layout
+    from neurolens.optics.analysis.spots import Fans, Mtf, Psf, Spots
 
 
 WHATS = (
     "layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "mtf-height", "seidel", "psf",
 )  # fmt: skip
 _OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --field-points, and as mtf-height --wavelengths
-_BULK = {  # left out of the JSON unless asked for: a number per ray or a pixel
-    "layout": ("rays", "surfaces"),
-    "spots": ("tangential_um", "sagittal_um", "slope_tangential", "slope_sagittal"),
-    "psf": ("geometric", "diffraction"),
-}
 
 
 class Analysis(NamedTuple):
@@ -35,11 +35,11 @@ class Analysis(NamedTuple):
 
     compute: Callable[..., Any]
     draw: Callable[..., None]
-    table: Callable[[dict[str, Any]], str]
+    table: Callable[[Any], str]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Analyse(cli.Reporting):
+class Analyse(cli.Figures):
     """Trace a lens from the scene and analyse its image. WHAT is any of:
 
       layout      the section of the lens with rays
@@ -104,9 +104,8 @@ examples:
         scene, doubts = self._scene()
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
-        edge = scene.edge
-        doubts += [edge.warning] if edge.warning else []
-        results: dict[str, Any] = {}
+        doubts += [scene.edge.warning] if scene.edge.warning else []
+        results: dict[str, Report] = {}
         pictures, notes = {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
         for what in self.what or WHATS:
             try:
@@ -118,23 +117,11 @@ examples:
                 continue
             if picture is not None:
                 pictures[what] = str(picture)
-        head = {"file": str(self.file), "name": scene.lens.name, "axis": scene.axis, "focus_m": scene.focus_m}
-        more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
-        bulk = {} if self.full else _BULK
-        shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in results.items()}
-
-        def text() -> str:
-            widest = f"fields to {edge.field_deg:.2f}°, {edge.height_mm:.2f} mm: {edge.name}"
-            parts = [
-                f"{scene.lens.name}\n{state_text(scene)}\n{widest}",
-                *(analysis_of(w).table(d) for w, d in results.items()),
-            ]
-            parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
-            if pictures:
-                parts.append(f"{len(pictures)} pictures drawn in {self.out}")
-            return "\n\n".join(parts)
-
-        return self.answer({**head, "edge": edge.to_dict(), **shown, **more}, text)
+        found = Analysed(
+            str(self.file), scene.lens.name, scene.axis, scene.focus_m, scene.edge, results, pictures, notes, doubts,
+            time.perf_counter() - began, state_text(scene),
+        )  # fmt: skip
+        return self.answer(found, full=self.full)
 
     def _scene(self) -> tuple[Scene, list[str]]:
         """Return the lens with its object in its state, and warnings."""
@@ -153,8 +140,8 @@ examples:
                 check_light(lens, nm)
         return scene, [*notes, *rim_doubts(lens), *file_doubts(tabled, states=bool(self.state.given.zoom)), *doubts]
 
-    def _one(self, what: str, scene: Scene, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
-        """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""
+    def _one(self, what: str, scene: Scene, doubts: list[str]) -> tuple[Report, Path | None]:
+        """One analysis, and its picture where a folder is given; new warnings are added to `doubts`."""
         from neurolens.optics.analysis.bundles import check_light
         from neurolens.optics.analysis.layout import state_text
 
@@ -166,9 +153,8 @@ examples:
         elif what == "mtf-height":
             options = {"frequency_per_mm": self.frequencies, "wavelength_nm": self.waves_nm}
         result = analysis.compute(scene, **{k: v for k, v in options.items() if v is not None})
-        data = result.to_dict()
         if self.out is None:
-            return data, None
+            return result, None
         across = f"_{self.axis}" if scene.lens.anamorphic else ""
         path = self.out / f"{scene.lens.lens_id}_{what}{across}.{self.format}"
         warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
@@ -176,7 +162,37 @@ examples:
             analysis.draw(replace(result, subtitle="\n".join([result.subtitle, *warning])), path)
         else:
             analysis.draw(result, path, scene.lens.name, "\n".join([state_text(scene), *warning]))
-        return data, path
+        return result, path
+
+
+@dataclass(frozen=True)
+class Analysed(Report):
+    """The analyses of a lens by name, with the widest field that they go to."""
+
+    file: str
+    name: str
+    axis: str
+    focus_m: float
+    edge: FieldEdge
+    results: dict[str, Report] = field(metadata=PART)
+    pictures: dict[str, str]
+    notes: list[str]
+    warnings: list[str]
+    seconds: float
+    state: str
+
+    def text(self) -> str:
+        """Every analysis as a table."""
+        edge, drawn = self.edge, f"{len(self.pictures)} pictures drawn in"
+        widest = f"fields to {edge.field_deg:.2f}°, {edge.height_mm:.2f} mm: {edge.name}"
+        folders = {str(Path(file).parent) for file in self.pictures.values()}
+        return "\n\n".join([
+            f"{self.name}\n{self.state}\n{widest}",
+            *(analysis_of(what).table(found) for what, found in self.results.items()),
+            *(f"Note: {note}" for note in self.notes),
+            *(f"Warning: {warning}" for warning in self.warnings),
+            *(f"{drawn} {folder}" for folder in folders),
+        ])  # fmt: skip
 
 
 def analysis_of(what: str) -> Analysis:
@@ -206,110 +222,110 @@ _WRAP = 90  # characters of a line that the narrowest picture has room for
 _MTF_PER_MM = (10, 20, 30, 40, 50)
 
 
-def _layout_text(data: dict[str, Any]) -> str:
-    counts: dict[str, int] = {}
-    for ray in data["rays"]:
-        counts[ray["label"]] = counts.get(ray["label"], 0) + 1
-    rows = [(label, str(count)) for label, count in counts.items()]
-    return f"Layout: {len(data['surfaces'])} surfaces\n" + cli.table(("field", "rays drawn"), rows)
+def _layout_text(found: Layout) -> str:
+    rows = [(label, str(count)) for label, count in Counter(ray.label for ray in found.rays).items()]
+    return f"Layout: {len(found.surfaces)} surfaces\n" + cli.table(("field", "rays drawn"), rows)
 
 
-def _spots_text(data: dict[str, Any]) -> str:
-    off = data["spread"]
-    of_waves = zip(*(zip(*d["rms_by_wavelength_um"], strict=True) for d in (data, off)), strict=True)
+def _spots_text(found: Spots) -> str:
+    off = found.spread
+    of_waves = zip(found.rms_by_wavelength_um.T, off["rms_by_wavelength_um"].T, strict=True)
     places = [_digits(spread) + 1 for spread in off["best_shift_mm"]]
     columns = [
-        ("RMS µm", _each(_three, data["rms_um"], off["rms_um"])),
-        *((nm, _each(_three, *both)) for nm, both in zip(_nanometres(data), of_waves, strict=True)),
-        ("largest µm", _each(_three, data["geometric_um"], [20 * spread for spread in off["geometric_um"]])),
-        ("passed", _each(_percent, data["passed"], off["passed"])),
-        ("best focus mm", _each(_fixed, data["best_shift_mm"], places)),
-        ("RMS there", _each(_three, data["best_rms_um"], off["best_rms_um"])),
+        ("RMS µm", _each(_three, found.rms_um, off["rms_um"])),
+        *((nm, _each(_three, *both)) for nm, both in zip(_nanometres(found.wavelength_nm), of_waves, strict=True)),
+        ("largest µm", _each(_three, found.geometric_um, [20 * spread for spread in off["geometric_um"]])),
+        ("passed", _each(_percent, found.passed, off["passed"])),
+        ("best focus mm", _each(_fixed, found.best_shift_mm, places)),
+        ("RMS there", _each(_three, found.best_rms_um, off["best_rms_um"])),
     ]
-    airy, working = cli.number(data["airy_um"], 3), cli.number(data["working_f_number"], 3)
+    airy, working = cli.number(found.airy_um, 3), cli.number(found.working_f_number, 3)
     airy = f"Airy disc radius {airy} µm at the working f/{working}"
     head = f"Spots (radius from the centroid, all wavelengths; each by itself; {airy})"
-    return _over_field(head, data, columns, every=True)
+    return _over_field(head, found, columns, every=True)
 
 
-def _fans_text(data: dict[str, Any]) -> str:
+def _fans_text(found: Fans) -> str:
     def largest(row: Sequence[float]) -> str:
         return _three(max((abs(v) for v in row if not math.isnan(v)), default=math.nan))
 
     columns = [
-        (f"{name} {nm}", _each(largest, [rows[w] for rows in data[key]]))
-        for name, key in (("tang.", "tangential_um"), ("sag.", "sagittal_um"))
-        for w, nm in enumerate(_nanometres(data))
+        (f"{name} {nm}", _each(largest, values[:, w]))
+        for name, values in (("tang.", found.tangential_um), ("sag.", found.sagittal_um))
+        for w, nm in enumerate(_nanometres(found.wavelength_nm))
     ]
-    return _over_field("Ray fans (largest transverse aberration, µm)", data, columns, every=True)
+    return _over_field("Ray fans (largest transverse aberration, µm)", found, columns, every=True)
 
 
-def _colour_text(data: dict[str, Any]) -> str:
-    some = _some(len(data["spectrum_nm"]), 9)
-    zones = ("paraxial", *(f"zone {z:.2f}" for z in data["zone"][1:]))
-    first = [(f"{data['spectrum_nm'][i]:.0f} nm", *_each(_three, data["focus_shift_mm"][i])) for i in some]
+def _colour_text(found: Colour) -> str:
+    some = _some(len(found.spectrum_nm), 9)
+    zones = ("paraxial", *(f"zone {z:.2f}" for z in found.zone[1:]))
+    first = [(f"{found.spectrum_nm[i]:.0f} nm", *_each(_three, found.focus_shift_mm[i])) for i in some]
     head = "Lateral colour (height from that of the first line, µm)"
-    of_lines = zip(data["line_nm"], zip(*data["lateral_um"], strict=True), strict=True)
-    lateral = _over_field(head, data, [(f"{nm:.0f} nm", _each(_three, values)) for nm, values in of_lines])
+    of_lines = zip(found.line_nm, found.lateral_um.T, strict=True)
+    lateral = _over_field(head, found, [(f"{nm:.0f} nm", _each(_three, values)) for nm, values in of_lines])
     return f"Longitudinal colour (focus from the film, mm)\n{cli.table(('wavelength', *zones), first)}\n\n{lateral}"
 
 
-def _curvature_text(data: dict[str, Any]) -> str:
-    head = f"Field curvature (focus from the film, mm; Petzval radius {cli.number(data['petzval_radius_mm'])} mm)"
-    columns = [(name, _each(_three, data[f"{name.lower()}_mm"])) for name in ("tangential", "sagittal", "Petzval")]
-    return _over_field(head, data, columns)
+def _curvature_text(found: Curvature) -> str:
+    head = f"Field curvature (focus from the film, mm; Petzval radius {cli.number(found.petzval_radius_mm)} mm)"
+    curves = {"tangential": found.tangential_mm, "sagittal": found.sagittal_mm, "Petzval": found.petzval_mm}
+    columns = [(name, _each(_three, values)) for name, values in curves.items()]
+    return _over_field(head, found, columns)
 
 
-def _distortion_text(data: dict[str, Any]) -> str:
+def _distortion_text(found: Distortion) -> str:
     head = (
-        f"Distortion (%; {_fixed(data['edge_percent'], 2)}% at {data['edge']}, against {data['reference']}; "
-        f"closest is {data['best']}; {cli.number(data['scale_mm'])} mm per radian on the axis)"
+        f"Distortion (%; {_fixed(found.edge_percent, 2)}% at {found.edge}, against {found.reference}; "
+        f"closest is {found.best}; {cli.number(found.scale_mm)} mm per radian on the axis)"
     )
-    columns = [(name.partition(",")[0], _each(_three, values)) for name, values in data["error_percent"].items()]
-    return _over_field(head, data, columns)
+    columns = [(name.partition(",")[0], _each(_three, values)) for name, values in found.error_percent.items()]
+    return _over_field(head, found, columns)
 
 
-def _vignetting_text(data: dict[str, Any]) -> str:
+def _vignetting_text(found: Illumination) -> str:
     names = {"relative": "illumination", "unvignetted": "without rims", "passed": "rims pass", "cos4": "cos^4"}
-    settled = [0.0] * len(data["field_deg"])
-    columns = [(name, _each(_percent, data[key], data["spread"].get(key, settled))) for key, name in names.items()]
-    return _over_field("Vignetting and relative illumination", data, columns)
+    settled = [0.0] * len(found.field_deg)
+    columns = [
+        (name, _each(_percent, getattr(found, key), found.spread.get(key, settled))) for key, name in names.items()
+    ]
+    return _over_field("Vignetting and relative illumination", found, columns)
 
 
-def _mtf_text(data: dict[str, Any], over_height: bool = False) -> str:
+def _mtf_text(found: Mtf, over_height: bool = False) -> str:
     """The contrast at frequencies of `_MTF_PER_MM` for every field, or at all of them over the image height."""
-    at = [k for k, f in enumerate(data["frequency_per_mm"]) if over_height or f in _MTF_PER_MM]
-    limit = ", ".join(_fixed(data["diffraction_limit"][k]) for k in at)
-    waves = ", ".join(f"{w:.0f}" for w in data["wavelength_nm"])
+    at = [k for k, f in enumerate(found.frequency_per_mm) if over_height or f in _MTF_PER_MM]
+    limit = ", ".join(_fixed(found.diffraction_limit[k]) for k in at)
+    waves = ", ".join(f"{w:.0f}" for w in found.wavelength_nm)
     name = "Geometric MTF" + " against image height" * over_height
     head = f"{name} ({waves} nm; T tangential, S sagittal; without diffraction, whose limit is {limit})"
     columns = []
     for k in at:
         for key in ("tangential", "sagittal"):
-            values, spreads = ([row[k] for row in d[key]] for d in (data, data["spread"]))
-            heading = f"{data['frequency_per_mm'][k]:g}/mm {key[0].upper()}"
+            values, spreads = (each[key][:, k] for each in (vars(found), found.spread))
+            heading = f"{found.frequency_per_mm[k]:g}/mm {key[0].upper()}"
             columns.append((heading, _each(_fixed, values, _each(_digits, spreads))))
-    return _over_field(head, data, columns, every=not over_height)
+    return _over_field(head, found, columns, every=not over_height)
 
 
-def _seidel_text(data: dict[str, Any]) -> str:
-    header = ("surface", *(name.replace(" colour", "") for name in data["names"]))
-    rows = [(str(k), *(f"{round(v, 5) + 0.0:.5f}" for v in row)) for k, row in enumerate(data["surfaces"])]
-    rows.append(("total", *(f"{round(v, 5) + 0.0:.5f}" for v in data["total"])))
-    odd = data["odd_powers"]
+def _seidel_text(found: Seidel) -> str:
+    header = ("surface", *(name.replace(" colour", "") for name in found.names))
+    rows = [(str(k), *(f"{round(v, 5) + 0.0:.5f}" for v in row)) for k, row in enumerate(found.surfaces)]
+    rows.append(("total", *(f"{round(v, 5) + 0.0:.5f}" for v in found.total)))
+    odd = found.odd_powers
     note = f"\nNot counted: the odd powers of surface {', '.join(map(str, odd))}" if odd else ""
-    head = f"Seidel sums (mm, {data['wavelength_nm']:.0f} nm, image height {cli.number(data['image_height_mm'])} mm)"
+    head = f"Seidel sums (mm, {found.wavelength_nm:.0f} nm, image height {cli.number(found.image_height_mm)} mm)"
     return f"{head}\n" + cli.table(header, rows) + note
 
 
-def _psf_text(data: dict[str, Any]) -> str:
-    off = data["spread"]
+def _psf_text(found: Psf) -> str:
+    off = found.spread
     columns = [
-        ("half width µm", _each(_three, data["half_width_um"], [20 * spread for spread in off["half_width_um"]])),
-        ("Strehl ratio", _each(_fixed, data["strehl"], _each(_digits, off["strehl"]))),
+        ("half width µm", _each(_three, found.half_width_um, [20 * spread for spread in off["half_width_um"]])),
+        ("Strehl ratio", _each(_fixed, found.strehl, _each(_digits, off["strehl"]))),
     ]
-    head = f"Point spread ({data['wavelength_nm'][0]:.0f} nm; Strehl ratio '-' where aberrations rule out diffraction)"
-    return _over_field(head, data, columns, every=True)
+    head = f"Point spread ({found.wavelength_nm[0]:.0f} nm; Strehl ratio '-' where aberrations rule out diffraction)"
+    return _over_field(head, found, columns, every=True)
 
 
 def _each(form: Callable[..., Any], *values: Iterable[Any]) -> list[Any]:
@@ -317,18 +333,18 @@ def _each(form: Callable[..., Any], *values: Iterable[Any]) -> list[Any]:
     return [form(*those) for those in zip(*values, strict=True)]
 
 
-def _over_field(head: str, data: dict[str, Any], columns: Sequence[tuple[str, list[str]]], every: bool = False) -> str:
+def _over_field(head: str, found: Any, columns: Sequence[tuple[str, list[str]]], every: bool = False) -> str:
     """A table of headings and cells with a row for some fields, or for every one: its angle, its height, the cells."""
-    count = len(data["field_deg"])
-    angles = ["axis" if field == 0 else f"{field:.2f}°" for field in data["field_deg"]]
-    heights = [("height mm", _each(partial(_fixed, places=2), data["height_mm"]))] if "height_mm" in data else []
+    count = len(found.field_deg)
+    angles = ["axis" if field == 0 else f"{field:.2f}°" for field in found.field_deg]
+    heights = [("height mm", _each(partial(_fixed, places=2), found.height_mm))] if hasattr(found, "height_mm") else []
     shown = [*heights, *columns]
     rows = [(angles[i], *(cells[i] for _, cells in shown)) for i in (range(count) if every else _some(count))]
     return f"{head}\n{cli.table(('field', *(heading for heading, _ in shown)), rows)}"
 
 
-def _nanometres(data: dict[str, Any]) -> list[str]:
-    return [f"{w:.0f} nm" for w in data["wavelength_nm"]]
+def _nanometres(waves: Iterable[float]) -> list[str]:
+    return [f"{nm:.0f} nm" for nm in waves]
 
 
 def _some(count: int, rows: int = _ROWS) -> list[int]:

@@ -20,6 +20,7 @@ from neurolens.base.files import check_writable
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, program
+from neurolens.base.report import Report, write_tables
 from neurolens.base.settings import (
     add_options,
     from_options,
@@ -177,12 +178,17 @@ class Reporting(Command):
     # Takes the answer where the command is called from Python (`cli.calls`), which prints nothing.
     tell: Callable[[Mapping[str, Any], str], None] | None = field(default=None, compare=False, repr=False)
 
-    def answer(self, data: Mapping[str, Any], text: Callable[[], str], code: int = 0) -> int:
-        """Print `data` if --json asks for it, else `text`; returns the exit code."""
+    def answer(
+        self, found: Report | Mapping[str, Any], text: Callable[[], str] | None = None, code: int = 0, *,
+        full: bool = False,
+    ) -> int:  # fmt: skip
+        """Print a report, or a mapping with its `text`, as JSON if --json asks for it, else as text; returns the exit
+        code. `full`: with what a report has in bulk."""
+        text = text or found.text  # type: ignore[union-attr]  # of a report
         if self.tell is not None:
-            self.tell(data, text())
+            self.tell(plain(found, strict=False, full=full), text())
         elif self.json:
-            print_json(data)
+            print_json(plain(found, full=full))
         else:
             print(printable(text()))
         return code
@@ -190,6 +196,22 @@ class Reporting(Command):
     def progress(self, plan: Mapping[str, float] | None = None) -> Progress:
         """Return the command's progress; `plan` gives the expected seconds of stages."""
         return Progress(plan, quiet=self.quiet)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures(Reporting):
+    """A command whose answer is figures, which --csv writes as tables, too."""
+
+    csv: Path | None = setting(
+        None, "write the figures to this folder as CSV, a file for each table, a row a case; headings carry their unit",
+        metavar="FOLDER", kind=Path, written=True, last=4,
+    )  # fmt: skip
+
+    def answer(self, found: Report | Mapping[str, Any], *rest: Any, **more: Any) -> int:
+        """Write the tables that are asked for, and print as any command; returns the exit code."""
+        if self.csv is not None:
+            write_tables(self.csv, found, self.called.split()[-1])
+        return super().answer(found, *rest, **more)
 
 
 @contextmanager
@@ -405,9 +427,9 @@ def check_written(path: Path, option: str, metavar: str) -> None:
 
 
 def print_json(data: Mapping[str, Any]) -> None:
-    """Print one JSON object on stdout."""
+    """Print one JSON object, which is plain, on stdout."""
     ascii_only = not str(sys.stdout.encoding).lower().startswith("utf")
-    print(printable(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=ascii_only)))
+    print(printable(json.dumps(data, indent=1, allow_nan=False, ensure_ascii=ascii_only)))
 
 
 def number(value: Any, digits: int = 4) -> str:

@@ -75,7 +75,7 @@ def _gain(text: str) -> tuple[str, list[float]]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flare(cli.Reporting):
+class Flare(cli.Figures):
     """Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the film, with the
     reflectance of Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. The
     brightest are printed with energy, position and size, on the film itself, which pictures show turned by 180 degrees.

@@ -21,7 +21,7 @@ _Sort = Literal["maker", "focal-length", "speed", "year", "cats-eye", "swirl", "
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lens(cli.Reporting):
+class Lens(cli.Figures):
     """Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
     image circle, how much of the light gets through and what stops the rest, and anything
     doubtful about it. Several files, or folders (of all formats that "neurolens convert" reads), are
@@ -89,7 +89,7 @@ examples:
         else:
             modes, allowed = "with --derive-rims", {*changed(self.state), "--layout", "--breathing"}
         for option in changed(self):
-            if option not in allowed | {"--glass", "--json", "--quiet"}:
+            if option not in allowed | {"--csv", "--glass", "--json", "--quiet"}:
                 where = 'with "list", a folder or several files' if option == "--sort" else modes
                 self.refuse(option, "(given)", f"this option only {where}")
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Models(cli.Reporting):
+class Models(cli.Figures):
     """List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
     nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
     star is the best model of a lens: the fastest of those within 2 um (or --within) that their card does
@@ -176,7 +176,7 @@ def _remarks(model: dict[str, Any]) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(cli.Reporting):
+class Evaluate(cli.Figures):
     """Measure an exported model on fresh rays of its card's domain, traced through the exact lens in float64 and
     through the ONNX model in onnxruntime. Prints each figure beside the card's promise, of the whole film, stopped down
     ("2_stops.false_pass") and of its thirds by radius ("full.edge.rms_um"); exits with code 1 if one does not hold.

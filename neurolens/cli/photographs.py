@@ -3,10 +3,12 @@ and clear apertures fitted to the light that they show."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
 
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verify(cli.Reporting):
+class Verify(cli.Figures):
     """Compare a lens file with photographs: lensfun's measured profiles of 1,300 lenses, found by maker, focal length,
     f-number and name (what the file says it is believed to be, its name, the file's own name).
 
@@ -54,18 +56,30 @@ examples:
 
             write_lens(replace(tabled, measured=tuple(found.measured.items())), self.lens_file)
         files = [str(path) for path in (self.out, self.lens_file) if path is not None]
-        data = {"file": str(self.file), "name": tabled.name, **found.to_dict(), "measured": found.measured}
-        return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, [FREE, *files]))
+        return self.answer(Compared(str(self.file), tabled.name, found, found.measured, FREE, files))
 
 
-def _text(found: Verified, name: str, last: list[str]) -> str:
-    other = f"; also possible: {', '.join(found.also)}" if found.also else ""
-    head = f"against lensfun's {found.profile}, crop {found.crop:g} (match of names: {found.certainty}{other})"
-    lines = [f"{name}\n{head}"]
-    header = "mm|distortion %|red µm|measured|blue µm|measured|f/8 stops|measured|widest|measured".split("|")
-    lines.append(cli.table(header, [_row(c) for c in found.comparisons]))
-    lines.append("distortion: residual of its shape; colour and light: computed and measured at the largest height")
-    return "\n".join([*lines, *(f"- {sentence}" for sentence in found.verdict), *last])
+@dataclass(frozen=True)
+class Compared(Report):
+    """What photographs say of a lens file, what its table [measured] keeps, and the files that were written."""
+
+    file: str
+    name: str
+    found: Verified = field(metadata=PART)
+    measured: Mapping[str, str | float]
+    free: str
+    files: list[str]
+
+    def text(self) -> str:
+        """A row a focal length, and the verdict."""
+        found = self.found
+        other = f"; also possible: {', '.join(found.also)}" if found.also else ""
+        head = f"against lensfun's {found.profile}, crop {found.crop:g} (match of names: {found.certainty}{other})"
+        header = "mm|distortion %|red µm|measured|blue µm|measured|f/8 stops|measured|widest|measured".split("|")
+        table = cli.table(header, [_row(c) for c in found.comparisons])
+        note = "distortion: residual of its shape; colour and light: computed and measured at the largest height"
+        verdict = [f"- {sentence}" for sentence in found.verdict]
+        return "\n".join([self.name, head, table, note, *verdict, self.free, *self.files])
 
 
 def _row(c: Comparison) -> list[str]:
@@ -82,7 +96,7 @@ def _row(c: Comparison) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rims(cli.Reporting):
+class Rims(cli.Figures):
     """Fit the rims of a lens file to photographs: on each side of the stop either the rims are scaled, or a ring of the
     mount is added, so that the light over image height is the measured one at all apertures together.
 
@@ -120,22 +134,39 @@ examples:
                 said += " A ring in front is surface 0: numbers of surfaces that are named before are now one higher."
             lens = with_fitted_rims(tabled, found)
             write_lens(replace(lens, notes=" ".join(filter(None, (lens.notes, said)))), self.out)
-        data = {"file": str(self.file), "profile": match.profile.model, "match": match.certainty, **found.to_dict()}
-        data["output"] = None if self.out is None else str(self.out)
-        return self.answer(data, lambda: _rims_text(found, f"{tabled.name}: {match.profile.model} ({match.certainty})"))
+        output = None if self.out is None else str(self.out)
+        return self.answer(Fitted(str(self.file), tabled.name, match.profile.model, match.certainty, found, output))
 
 
-def _rims_text(found: FittedRims, head: str) -> str:
-    rows = []
-    for f, before in found.before_stops.items():
-        left_out = "left out" if f in found.unused else ""
-        rows.append([f"f/{f:g}", f"{before:.3f}", f"{found.after_stops[f]:.3f}", left_out])
-    lines = [head, cli.table(("aperture", "before", "after (stops RMS)", ""), rows)]
-    for name, factor in (("in front of the stop", found.front), ("behind it", found.rear)):
-        lines.append(f"rims {name}: {'as they are' if factor == 1 else f'times {factor:.3f}'}")
-    for ring in found.rings:
-        place = "in front of the lens" if ring.before == 0 else f"behind surface {ring.before - 1}"
-        lines.append(f"ring {ring.distance_mm:.1f} mm {place}, {2 * ring.radius_mm:.2f} mm wide")
-    left, closed = max(found.after_stops.values()), found.after_stops[found.closed]
-    lines.append(f"the light still differs by at most {left:.2f} stops; no rim explains the {closed:.2f} stops at f/8")
-    return "\n".join(lines)
+@dataclass(frozen=True)
+class Fitted(Report):
+    """Rims that were fitted to the photographs of a profile, and the lens file that has them."""
+
+    file: str
+    name: str
+    profile: str
+    match: str
+    found: FittedRims = field(metadata=PART)
+    output: str | None
+
+    def text(self) -> str:
+        """The light that is left by aperture, and what was changed."""
+        found = self.found
+        rows = []
+        for f, before in found.before_stops.items():
+            left_out = "left out" if f in found.unused else ""
+            rows.append([f"f/{f:g}", f"{before:.3f}", f"{found.after_stops[f]:.3f}", left_out])
+        lines = [
+            f"{self.name}: {self.profile} ({self.match})",
+            cli.table(("aperture", "before", "after (stops RMS)", ""), rows),
+        ]
+        for name, factor in (("in front of the stop", found.front), ("behind it", found.rear)):
+            lines.append(f"rims {name}: {'as they are' if factor == 1 else f'times {factor:.3f}'}")
+        for ring in found.rings:
+            place = "in front of the lens" if ring.before == 0 else f"behind surface {ring.before - 1}"
+            lines.append(f"ring {ring.distance_mm:.1f} mm {place}, {2 * ring.radius_mm:.2f} mm wide")
+        left, closed = max(found.after_stops.values()), found.after_stops[found.closed]
+        lines.append(
+            f"the light still differs by at most {left:.2f} stops; no rim explains the {closed:.2f} stops at f/8"
+        )
+        return "\n".join(lines)

@@ -36,7 +36,7 @@ def _budget(text: str) -> tuple[str, float]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(cli.Reporting):
+class Plan(cli.Figures):
     """Look through the exact lens at a scene, say what each of its effects is worth there in pixels, and choose
     the cheapest camera whose error stays within the budget: a pinhole, with or without its picture warped
     afterwards, a thin or thick lens, a model that ships, a polynomial fitted for this shot alone, or the

@@ -358,7 +358,7 @@ def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) ->
 
 
 @dataclass(frozen=True, kw_only=True)
-class Projection(FieldCommand):
+class Projection(FieldCommand, cli.Figures):
     """Fit a lens (or model, or any other camera) with a projection of other programs, and say what it leaves in
     pixels:
 

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import NeurolensError, warned
 from neurolens.base.lensname import maker_of, year_of
+from neurolens.base.report import Report
 from neurolens.models.model import Domain
 from neurolens.models.pairs import sample_domain
 from neurolens.optics.analysis import layout
 from neurolens.optics.analysis.bundles import Filled
-from neurolens.optics.analysis.fields import Array, Result, Scene
+from neurolens.optics.analysis.fields import Array, Scene
 from neurolens.optics.analysis.spots import spots, working_f_number
 from neurolens.optics.lens.glass import glass_of
 from neurolens.optics.lens.paraxial import first_order, light_of
@@ -263,7 +264,7 @@ _WIDEST = 1.5  # where a disc counts as at most so many times as wide as that on
 
 
 @dataclass(frozen=True)
-class Character(Result):
+class Character(Report):
     """What a lens is known for. A figure that cannot be had is NaN.
 
     In the first three figures, discs that are small in the picture count less, in proportion: they count in full when

@@ -7,8 +7,6 @@ on where it stopped. A page that sorts and filters by itself, CSV and JSON show 
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import time
@@ -29,7 +27,6 @@ from neurolens.base.errors import (
     NeurolensError,
     NeurolensWarning,
     one_line,
-    printable,
 )
 from neurolens.base.files import (
     TemporaryFolder,
@@ -44,6 +41,7 @@ from neurolens.base.files import (
 from neurolens.base.html import html_parts
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, versions
+from neurolens.base.report import csv_text
 from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import Failed, run_each
 from neurolens.cameras.model import load_model
@@ -425,27 +423,13 @@ def _remarks(record: Mapping[str, Any]) -> list[str]:
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> str:
-    """Write a row for each record: texts, figures by their keys, then lists, whose items " | " separates."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
+    """Texts, then the figures by their keys, then lists, their items parted by " | ", a row for each record."""
     inner = [{**(r.get("photographs") or {}), **(r.get("fit") or {})} for r in records]
     keys = sorted({key for found in inner for key, v in found.items() if not isinstance(v, list | dict)})
     plain = [c.key for c in COLUMNS if "." not in c.key]
-    writer.writerow([*_TEXTS, *plain, *keys, *_LISTS, "broken"])
+    rows = []
     for r, found in zip(records, inner, strict=True):
-        lists = [*(r.get(key) or () for key in _LISTS), found.get("broken", ())]
-        figures = [*(r.get(key) for key in plain), *(found.get(key) for key in keys)]
-        row = [*(r.get(key, "") for key in _TEXTS), *figures, *(" | ".join(items) for items in lists)]
-        writer.writerow([_plain_cell(value) for value in row])
-    return stream.getvalue()
-
-
-def _plain_cell(value: Any) -> Any:
-    """A cell whose text is one line and no formula of a spreadsheet: names and reasons come from strangers' files.
-
-    Source: OWASP, CSV Injection.
-    """
-    if not isinstance(value, str):
-        return value
-    text = printable(value.translate(dict.fromkeys(map(ord, "\t\r\n"), " ")))
-    return f"'{text}" if text.lstrip().startswith(("=", "+", "-", "@")) else text
+        row = {key: r.get(key, "") for key in _TEXTS} | {key: r.get(key) for key in plain}
+        lists = {key: r.get(key) or () for key in _LISTS} | {"broken": found.get("broken", ())}
+        rows.append(row | {key: found.get(key) for key in keys} | {key: " | ".join(v) for key, v in lists.items()})
+    return csv_text(rows)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
+from neurolens.base.report import Report, over
 from neurolens.base.settings import EYE_NM
 from neurolens.optics.analysis.bundles import bundle, hexapolar, points
-from neurolens.optics.analysis.fields import Array, OverField, Result, Scene, on_plane
+from neurolens.optics.analysis.fields import Array, OverField, Scene, on_plane
 from neurolens.optics.analysis.plots import FIELD_COLOURS, drawing, plain_log_ticks
 from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, LINE_G_NM
 from neurolens.optics.lens.paraxial import PathOfRay, System, chief_reach_mm, first_order, system_of
@@ -32,7 +33,7 @@ _ZONES = (PARAXIAL, 0.5**0.5, 1 - 1e-7)
 
 
 @dataclass(frozen=True)
-class Colour(Result):
+class Colour(Report):
     """Colour of a lens. Focus counts from the film; shifts are positive away from the lens.
 
     Attributes:
@@ -46,11 +47,11 @@ class Colour(Result):
 
     spectrum_nm: Array
     zone: Array
-    focus_shift_mm: Array
+    focus_shift_mm: Array = field(metadata=over("spectrum_nm", "zone"))
     field_deg: Array
-    height_mm: Array
+    height_mm: Array = field(metadata=over("field_deg"))
     line_nm: Array
-    lateral_um: Array
+    lateral_um: Array = field(metadata=over("field_deg", "line_nm"))
 
 
 def colour(
@@ -96,9 +97,9 @@ class Curvature(OverField):
     """
 
     wavelength_nm: float
-    tangential_mm: Array
-    sagittal_mm: Array
-    petzval_mm: Array
+    tangential_mm: Array = field(metadata=over("field_deg"))
+    sagittal_mm: Array = field(metadata=over("field_deg"))
+    petzval_mm: Array = field(metadata=over("field_deg"))
     petzval_radius_mm: float
 
 
@@ -155,7 +156,7 @@ class Distortion(OverField):
 
     wavelength_nm: float
     scale_mm: float
-    error_percent: dict[str, Array]
+    error_percent: dict[str, Array] = field(metadata=over("field_deg"))
     best: str
     reference: str
     edge_percent: float
@@ -207,11 +208,11 @@ class Illumination(OverField):
     """
 
     wavelength_nm: float
-    relative: Array
-    unvignetted: Array
-    passed: Array
-    cos4: Array
-    spread: dict[str, Array]
+    relative: Array = field(metadata=over("field_deg"))
+    unvignetted: Array = field(metadata=over("field_deg"))
+    passed: Array = field(metadata=over("field_deg"))
+    cos4: Array = field(metadata=over("field_deg"))
+    spread: dict[str, Array] = field(metadata=over())
 
 
 def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
@@ -263,7 +264,7 @@ SUMS = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortio
 
 
 @dataclass(frozen=True)
-class Seidel(Result):
+class Seidel(Report):
     """Third-order (Seidel) sums and the two of colour, in mm, for the present stop and one image height.
 
     As wavefront aberrations at the edge of pupil and field they are W040 = S1/8, W131 = S2/2, W222 = S3/2, W220 = (S3 +
@@ -283,8 +284,8 @@ class Seidel(Result):
     image_height_mm: float
     lagrange_mm: float
     petzval_radius_mm: float
-    surfaces: Array
-    total: Array
+    surfaces: Array = field(metadata=over("surface", "names"))
+    total: Array = field(metadata=over("names"))
     names: tuple[str, ...]
     odd_powers: tuple[int, ...]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.base.records import plain
+from neurolens.base.report import Report, over
 from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
 from neurolens.optics.lens.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.optics.lens.prescription import Lens
@@ -31,21 +31,14 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Result:
-    """Base of the results. Arrays are numpy float64, NaN where undefined; names carry their unit."""
+class OverField(Report):
+    """Base of results over F fields, `field_deg` [F], whose chief rays meet the film at `height_mm` [F].
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain lists, numbers and strings by field name; NaN and infinities stay floats."""
-        found: dict[str, Any] = plain(asdict(self), strict=False)
-        return found
-
-
-@dataclass(frozen=True)
-class OverField(Result):
-    """Base of results over F fields, `field_deg` [F], whose chief rays meet the film at `height_mm` [F]."""
+    Arrays are numpy float64, NaN where undefined.
+    """
 
     field_deg: Array
-    height_mm: Array
+    height_mm: Array = field(metadata=over("field_deg"))
 
 
 DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
@@ -82,7 +75,7 @@ class ChiefRays(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FieldEdge(Result):
+class FieldEdge(Report):
     """The widest field that is analysed.
 
     Attributes:

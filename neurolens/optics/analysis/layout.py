@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from neurolens.base.errors import InputError
+from neurolens.base.report import BULK, Report
 from neurolens.optics.analysis.bundles import Pattern, bundle, fan
-from neurolens.optics.analysis.fields import Array, Result, Scene
+from neurolens.optics.analysis.fields import Array, Scene
 from neurolens.optics.analysis.plots import FAINT, FIELD_COLOURS, INK, drawing
 from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.trace.rays import trace
@@ -71,7 +72,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Layout(Result):
+class Layout(Report):
     """The section of a lens, scene to film; lens frame, mm.
 
     Attributes:
@@ -81,8 +82,8 @@ class Layout(Result):
         InputError: a surface has a semi-diameter that is not positive and finite.
     """
 
-    surfaces: tuple[Section, ...]
-    rays: tuple[Line, ...]
+    surfaces: tuple[Section, ...] = field(metadata=BULK)
+    rays: tuple[Line, ...] = field(metadata=BULK)
     film_z_mm: float
     film_half_height_mm: float
     height: str
@@ -105,12 +106,12 @@ def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
     lens = scene.lens
     radius = scene.image_radius_mm if film_radius_mm is None else film_radius_mm
     rays: list[Line] = []
-    for number, (share, field) in enumerate(zip(FIELDS, scene.fields_at([f * radius for f in FIELDS]), strict=True)):
-        if math.isnan(field):
+    for number, (share, angle) in enumerate(zip(FIELDS, scene.fields_at([f * radius for f in FIELDS]), strict=True)):
+        if math.isnan(angle):
             continue
         where = "axis" if share == 0 else "edge" if share == 1 else f"{100 * share:.0f}% of the film radius"
-        label = where if share == 0 else f"{where}, {field:.1f}°"
-        rays += [Line(points, label, number) for points in _fan_lines(scene, field)]
+        label = where if share == 0 else f"{where}, {angle:.1f}°"
+        rays += [Line(points, label, number) for points in _fan_lines(scene, angle)]
     sections = (
         Section(
             *(float(z), float(s.radius_mm), s.semi_diameter_mm, float(s.n_d), s.stop),

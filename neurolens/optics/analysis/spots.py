@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from neurolens.base.report import BULK, Report, over
 from neurolens.optics.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
-from neurolens.optics.analysis.fields import Array, OverField, Result, Scene
+from neurolens.optics.analysis.fields import Array, OverField, Scene
 from neurolens.optics.lens.paraxial import is_pinhole
 from neurolens.optics.setting.pupil_nodes import LEVELS, converged
 
@@ -38,21 +39,21 @@ class Spots(OverField):
     """
 
     wavelength_nm: Array
-    tangential_um: Array
-    sagittal_um: Array
-    slope_tangential: Array
-    slope_sagittal: Array
-    rms_um: Array
-    geometric_um: Array
-    rms_by_wavelength_um: Array
-    passed: Array
+    tangential_um: Array = field(metadata=BULK)
+    sagittal_um: Array = field(metadata=BULK)
+    slope_tangential: Array = field(metadata=BULK)
+    slope_sagittal: Array = field(metadata=BULK)
+    rms_um: Array = field(metadata=over("field_deg"))
+    geometric_um: Array = field(metadata=over("field_deg"))
+    rms_by_wavelength_um: Array = field(metadata=over("field_deg", "wavelength_nm"))
+    passed: Array = field(metadata=over("field_deg"))
     working_f_number: float
     airy_um: float
     shift_mm: Array
-    through_focus_um: Array
-    best_shift_mm: Array
-    best_rms_um: Array
-    spread: dict[str, Array]
+    through_focus_um: Array = field(metadata=over("field_deg", "shift_mm"))
+    best_shift_mm: Array = field(metadata=over("field_deg"))
+    best_rms_um: Array = field(metadata=over("field_deg"))
+    spread: dict[str, Array] = field(metadata=over())
 
 
 def spots(
@@ -178,8 +179,8 @@ class Fans(OverField):
 
     wavelength_nm: Array
     pupil: Array
-    tangential_um: Array
-    sagittal_um: Array
+    tangential_um: Array = field(metadata=over("field_deg", "wavelength_nm", "pupil"))
+    sagittal_um: Array = field(metadata=over("field_deg", "wavelength_nm", "pupil"))
 
 
 def fans(
@@ -211,12 +212,12 @@ class Mtf(OverField):
 
     wavelength_nm: Array
     frequency_per_mm: Array
-    tangential: Array
-    sagittal: Array
-    diffraction_limit: Array
+    tangential: Array = field(metadata=over("field_deg", "frequency_per_mm"))
+    sagittal: Array = field(metadata=over("field_deg", "frequency_per_mm"))
+    diffraction_limit: Array = field(metadata=over("frequency_per_mm"))
     working_f_number: float
     shift_mm: float
-    spread: dict[str, Array]
+    spread: dict[str, Array] = field(metadata=over())
 
 
 _SHOWN_PER_MM = 50.0  # where no frequencies are given, those up to here must be converged
@@ -290,7 +291,7 @@ _ENCIRCLED = 0.98  # share of the geometric spot's energy inside the window
 
 
 @dataclass(frozen=True)
-class Psf(Result):
+class Psf(Report):
     """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid.
 
     Attributes:
@@ -308,13 +309,13 @@ class Psf(Result):
 
     field_deg: Array
     wavelength_nm: Array
-    half_width_um: Array
-    geometric: Array
-    diffraction: Array
-    strehl: Array
-    pupil_points: Array
+    half_width_um: Array = field(metadata=over("field_deg"))
+    geometric: Array = field(metadata=BULK)
+    diffraction: Array = field(metadata=BULK)
+    strehl: Array = field(metadata=over("field_deg"))
+    pupil_points: Array = field(metadata=over("field_deg"))
     airy_um: float
-    spread: dict[str, Array]
+    spread: dict[str, Array] = field(metadata=over())
 
 
 def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None) -> Psf:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.optics.analysis.fields import Result
+from neurolens.base.report import Report, over
 from neurolens.optics.lens.paraxial import stop_radius_mm
 from neurolens.optics.lens.prescription import LINE_D_NM, Configuration, Lens, Surface
 from neurolens.optics.photographs.profiles import Light, Profile
@@ -212,7 +212,7 @@ class Ring(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FittedRims(Result):
+class FittedRims(Report):
     """Rims that were fitted to photographs.
 
     Attributes:
@@ -228,8 +228,8 @@ class FittedRims(Result):
     rear: float
     rings: tuple[Ring, ...]
     rims_mm: Array
-    before_stops: dict[float, float]
-    after_stops: dict[float, float]
+    before_stops: dict[float, float] = field(metadata=over("f_number"))
+    after_stops: dict[float, float] = field(metadata=over("f_number"))
     unused: tuple[float, ...]
 
     @property

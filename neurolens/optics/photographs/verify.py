@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -18,8 +18,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
+from neurolens.base.report import Report, over
 from neurolens.optics.analysis.field_curves import PROJECTIONS, RECTILINEAR
-from neurolens.optics.analysis.fields import Result, Scene
+from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
@@ -48,7 +49,7 @@ FREE = "free in a profile, and taken out: the scale, the light on the axis; unkn
 
 
 @dataclass(frozen=True)
-class Curve(Result):
+class Curve(Report):
     """One figure over image height, measured and computed; what the profile leaves free is taken out.
 
     Attributes:
@@ -56,8 +57,8 @@ class Curve(Result):
     """
 
     height_mm: Array
-    measured: Array
-    computed: Array
+    measured: Array = field(metadata=over("height_mm"))
+    computed: Array = field(metadata=over("height_mm"))
 
     @property
     def rms(self) -> float:
@@ -73,7 +74,7 @@ class Curve(Result):
 
 
 @dataclass(frozen=True)
-class Comparison(Result):
+class Comparison(Report):
     """A lens, at one focal length, beside one profile.
 
     Attributes:
@@ -88,7 +89,7 @@ class Comparison(Result):
     distortion_percent: Curve | None
     red_um: Curve | None
     blue_um: Curve | None
-    light_stops: dict[float, Curve]
+    light_stops: dict[float, Curve] = field(metadata=over("f_number"))
     size: float = 1.0
 
 
@@ -218,7 +219,7 @@ def compare(lens: Lens, profile: Profile, focal_mm: float) -> Comparison:
 
 
 @dataclass(frozen=True)
-class Verified(Result):
+class Verified(Report):
     """A lens beside a profile.
 
     Attributes:
