@@ -227,8 +227,8 @@ class LensCamera:
         self, outline: PupilOutline | None, scene: LensScene, shot: Shot, about: Mapping[str, Any],
         progress: Progress | None,
     ) -> None:  # fmt: skip
-        """Put film and pupil in place, start what runs the camera, and keep in `settings` `about`, the settings of the
-        shot, and the place of the film and the size of the stop; raises InputError as `LensFilm` and `start`."""
+        """Place film and pupil for a shot, and start what runs the camera. Its `settings` are `about`, what it takes of
+        the shot, the film's place and the stop. Raises InputError as `LensFilm` and `start` do."""
         self.film = LensFilm(outline, self._light_nm, scene)
         shape = scene.aperture and scene.aperture.settings()
         film = {"film_z_mm": scene.film_z_mm, "stop_radius_mm": scene.stop_radius_mm, "aperture": shape}

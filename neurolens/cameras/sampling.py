@@ -169,7 +169,7 @@ def beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, the
 
 
 def focus_m(camera: Camera, shot: Shot) -> float:
-    """Film to object in metres: as a shot has it, else as its camera has chosen."""
+    """Return the distance from film to object in metres: that of the shot, else the one that its camera has chosen."""
     chosen = camera.settings.get("focus_m") if shot.focus_m is None else shot.focus_m
     return math.inf if chosen is None else float(chosen)
 

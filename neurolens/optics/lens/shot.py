@@ -134,7 +134,7 @@ class Shot:
 
     @property
     def given(self) -> dict[str, Any]:
-        """The settings that are not None, by name."""
+        """The settings that are given, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def whole(self) -> Self:
@@ -142,7 +142,7 @@ class Shot:
         return type(self)(**self.given)
 
     def check_taken(self, camera: str, takes: Collection[str]) -> None:
-        """Raise InputError for a setting that a kind of camera does not take.
+        """Refuse settings that a kind of camera does not take.
 
         `takes` names what it takes besides `BY_ALL`; "internal" is that focus mode.
         """

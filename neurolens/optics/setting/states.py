@@ -33,9 +33,7 @@ from neurolens.optics.setting.pupils import image_radius_mm, on_plane
 from neurolens.optics.setting.rims import check_clearance
 
 
-def set_lens(
-    lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "paraxial", **settings: Any
-) -> Lens:  # fmt: skip
+def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "paraxial", **settings: Any) -> Lens:
     """Return the lens set for a shot: its zoom, size, aperture, f-number, focus, cover glass and film offset::
 
         lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=2.0, f_number=4.0)
