@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -188,8 +188,8 @@ class _Writer:
                 frame, (_, state) = self.frames[rows[n]], states[rows[n]]
                 plane_m = frame.focus_m if command.distance is None else command.distance
 
-                def at_stop(f_number: float | None, state: Any = state) -> Camera:
-                    return command.make(replace(state, f_number=f_number), progress)[0]
+                def at_stop(f_number: float | None, state: cli.LensState = state) -> Camera:
+                    return command.make(state.at(f_number=f_number), progress)[0]
 
                 entry = standards.lensfun_entry(frame.fields[""], frame.camera, plane_m, self.shot, red_blue, at_stop)
                 found.append(entry)
