@@ -26,6 +26,7 @@ from neurolens.optics.lens.glass import index_of
 
 ROOT = Path(__file__).parents[1]
 GAUSS, MODEL = "laikin_double_gauss_50", "laikin_double_gauss_50.ols-36"
+TRIPLET = "cooke_triplet_50"
 COMMANDS = next(a for a in build_parser()._actions if isinstance(a, _SubParsersAction)).choices
 CALLS = [name for name in COMMANDS if issubclass(command(name), Reporting)]
 UNITS = "(_(mm|m|deg|nm|px|s|per_mm))?_?"  # at the end of a parameter; a word of Python has a further _
@@ -186,15 +187,15 @@ def test_a_lens_brings_its_settings_and_a_call_overrules_them() -> None:
 
 def test_rays_have_the_settings_of_a_lens_or_camera_unless_the_call_has_its_own() -> None:
     film, small = (36, 24), {"width": 12, "samples": 2}
-    lens = nl.lens(GAUSS, focus_m=2, f_number=8)
-    set_, plain = nl.rays(lens, film, **small), nl.rays(GAUSS, film, focus_m=2, f_number=8, **small)
-    own, far = nl.rays(lens, film, focus_m=5, **small), nl.rays(GAUSS, film, focus_m=5, f_number=8, **small)
+    lens = nl.lens(TRIPLET, focus_m=2, f_number=8)
+    set_, plain = nl.rays(lens, film, **small), nl.rays(TRIPLET, film, focus_m=2, f_number=8, **small)
+    own, far = nl.rays(lens, film, focus_m=5, **small), nl.rays(TRIPLET, film, focus_m=5, f_number=8, **small)
     for ours, theirs in ((set_, plain), (own, far)):
         np.testing.assert_array_equal(ours["direction"], theirs["direction"])
     assert (set_["direction"] != far["direction"]).any()
     assert (nl.rays(lens.set(blades=3), film, **small)["direction"] != set_["direction"]).any()
-    camera = nl.camera(GAUSS, film=(24, 16), focus_m=2, vignetting="none")
-    ours, theirs = nl.rays(camera, **small), nl.rays(GAUSS, (24, 16), focus_m=2, vignetting="none", **small)
+    camera = nl.camera(TRIPLET, film=(24, 16), focus_m=2, vignetting="none")
+    ours, theirs = nl.rays(camera, **small), nl.rays(TRIPLET, (24, 16), focus_m=2, vignetting="none", **small)
     for name in ("direction", "weight"):
         np.testing.assert_array_equal(ours[name], theirs[name])
 

@@ -19,7 +19,7 @@ from neurolens.cli import main
 from neurolens.cli import models as models_command
 from neurolens.models.file import read_model
 from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays, PairSettings, make_pairs, sample_domain
+from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
@@ -74,7 +74,7 @@ def rays_of(file: str) -> FreshRays:
 def _rays_of(domain: str, *state: Any) -> FreshRays:
     known, seed = Domain.from_dict(json.loads(domain)), 424_243
     lens = exact(*state).with_stop_radius(known.stop_radius_mm)
-    held_out = make_pairs(lens, known, PairSettings(train=1, held_out=4000, rim=1, seed=seed)).held_out
+    held_out = passing_rays(lens, known, 4000, seed)
     return fresh_rays(lens, known, held_out, count=16_000, seed=seed)
 
 

@@ -233,7 +233,7 @@ def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[sourc
 def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
     """Write a model as ONNX, with the errors of its card, or with new ones where something was fixed (None)."""
     from neurolens.models.export import export_onnx
-    from neurolens.models.pairs import PairSettings, make_pairs
+    from neurolens.models.pairs import passing_rays
     from neurolens.studies.measure import FRESH, fresh_rays, measure_on
 
     if len(models) > 1:
@@ -244,7 +244,7 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
         export_onnx(model, out, card["errors"], derivatives=derivatives)
         return
     seed = int(model.settings.get("rays_seed") or 0) + FRESH
-    held_out = make_pairs(model.lens, model.domain, PairSettings(1, _HELD_OUT, 1, seed)).held_out
+    held_out = passing_rays(model.lens, model.domain, _HELD_OUT, seed)
     with atomic_path(out) as measured:  # a file without its errors never has the final name
         export_onnx(model, measured, {})
         rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)

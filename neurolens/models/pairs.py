@@ -6,7 +6,7 @@ Ray pairs are sampled from a domain and traced in float64, in five splits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -375,10 +375,8 @@ def make_pairs(
     for name in ("train", "held_out", "rim"):
         if getattr(settings, name) < 1:
             raise InputError("pairs", name, getattr(settings, name), "at least one ray")
-    wanted = {"train": settings.train, "held_out": settings.held_out}
     splits: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
-    counts = dict.fromkeys(splits, 0)
-    drawn, tested = 0, 0.0
+    counts, tested, total = dict.fromkeys(splits, 0), 0.0, settings.train + settings.held_out
 
     def keep(batch: PairSet, *names: str) -> None:
         """Add the blocked rays of a batch to these splits, as far as those are not full."""
@@ -390,29 +388,62 @@ def make_pairs(
 
     if lit_share(domain) < SPARSE:  # then `draw` leaves far rays out
         keep(trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm), "far")
-    total = sum(wanted.values())
-    while counts["train"] < wanted["train"] or counts["held_out"] < wanted["held_out"]:
-        split = "train" if counts["train"] < wanted["train"] else "held_out"
-        inputs, stands_for = draw(domain, _BATCH, settings.seed, drawn)
-        batch = trace_pairs(lens, inputs, domain.pupil_z_mm)
-        passed = batch.status == st.PASSED
-        if split == "train":
-            needed = wanted["train"] - counts["train"]
-            order = torch.nonzero(passed)[:, 0]
-            used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
-            tested += stands_for * used / max(len(batch), 1)
-            keep(batch, "rim", "edge", "far")
-        splits[split].append(batch.select(torch.nonzero(passed)[: wanted[split] - counts[split], 0]))
-        counts[split] += len(splits[split][-1])
-        del batch, passed  # before the next one: they are large
-        drawn += _BATCH
-        if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
-            shown = f"({drawn} rays, {sum(counts.values())} passed)"
-            raise InputError(lens.path, "domain", shown, "a domain that the lens can reach")
-        progress((counts["train"] + counts["held_out"]) / total)
+    for batch, order, stands_for in _batches(lens, domain, settings.seed, 0):
+        needed = settings.train - counts["train"]
+        used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
+        tested += stands_for * used / max(len(batch), 1)
+        keep(batch, "rim", "edge", "far")
+        splits["train"].append(batch.select(order[:needed]))
+        counts["train"] += len(splits["train"][-1])
+        progress(counts["train"] / total)
+        if counts["train"] == settings.train:
+            break
+        del batch  # before the next one: they are large
+    drawn = _BATCH * len(splits["train"])
+    splits["held_out"].append(
+        passing_rays(
+            lens, domain, settings.held_out, settings.seed, drawn, lambda n: progress((settings.train + n) / total)
+        )
+    )
     joined = {name: join_pairs(splits.pop(name)) for name in SPLITS}
     joined |= {name: _unreached_as_zero(joined[name]) for name in ("edge", "far")}
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))
+
+
+def _batches(lens: Lens, domain: Domain, seed: int, first: int) -> Iterator[tuple[PairSet, Tensor, float]]:
+    """Trace a domain from the ray of the number `first` on: batches, which of their rays pass, how many rays of the
+    domain each stands for."""
+    drawn = found = 0
+    while drawn <= 10000 * (found + 10):
+        inputs, stands_for = draw(domain, _BATCH, seed, first + drawn)
+        batch = trace_pairs(lens, inputs, domain.pupil_z_mm)
+        order = torch.nonzero(batch.status == st.PASSED)[:, 0]
+        drawn, found = drawn + _BATCH, found + len(order)
+        yield batch, order, stands_for
+        del batch
+    raise InputError(lens.path, "domain", f"({drawn} rays, {found} passed)", "a domain that the lens can reach")
+
+
+def passing_rays(
+    lens: Lens, domain: Domain, count: int, seed: int, first: int = _BATCH,
+    report: Callable[[int], object] = lambda found: None,
+) -> PairSet:  # fmt: skip
+    """So many rays of a domain that the lens passes, from the number `first` on; a fit takes those of the first batch.
+
+    `report` is told how many there are.
+
+    Raises:
+        InputError: fewer than one ray in 10,000 of the domain passes.
+    """
+    parts, found = list[PairSet](), 0
+    for batch, order, _ in _batches(lens, domain, seed, first):
+        parts.append(batch.select(order[: count - found]))
+        found += len(parts[-1])
+        report(found)
+        if found == count:
+            break
+        del batch
+    return join_pairs(parts)
 
 
 def _blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:

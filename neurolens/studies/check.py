@@ -20,6 +20,7 @@ from neurolens.cameras.model import OnnxLens
 from neurolens.models.axes import Axis
 from neurolens.models.fit import State, StateSpace
 from neurolens.models.model import Domain
+from neurolens.models.pairs import passing_rays
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import read_any
@@ -33,7 +34,6 @@ from neurolens.studies.measure import (
     fresh_rays,
     measure,
     onnx_predictor,
-    passing_rays,
     rms_deviation,
     well_known,
     with_more,

@@ -28,9 +28,8 @@ from neurolens.models.network import clear_training
 from neurolens.models.pairs import (
     FilmRays,
     PairSet,
-    PairSettings,
     join_pairs,
-    make_pairs,
+    passing_rays,
     sample_domain,
     trace_pairs,
 )
@@ -106,16 +105,11 @@ def with_more(fresh: FreshRays, seed: int) -> FreshRays:
     lens, count = fresh.lens, len(fresh.held_out)
     sets, squares, wanted = [without_crossings(fresh.held_out)], [fresh.held_square], min((MORE - 1) * count, MOST)
     while wanted > 0:
-        pairs = passing_rays(lens, fresh.domain, min(count, wanted), seed + len(sets))
+        pairs = passing_rays(lens, fresh.domain, min(max(count, _BATCH), wanted), seed + len(sets))
         sets.append(without_crossings(pairs))
         squares.append(_stop_square(lens, pairs))
         wanted -= len(pairs)
     return replace(fresh, held_out=join_pairs(sets), held_square=torch.cat(squares))
-
-
-def passing_rays(lens: Lens, domain: Domain, count: int, seed: int) -> PairSet:
-    """Draw `count` rays of a domain that the exact lens passes."""
-    return make_pairs(lens, domain, PairSettings(train=1, held_out=count, rim=1, seed=seed)).held_out
 
 
 def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:

@@ -23,7 +23,7 @@ from neurolens.models.axes import Axis, product, weights
 from neurolens.models.export import export_states
 from neurolens.models.fit import StateModel, StateSettings, StateSpace, fit_states, focus_axis, zoom_axis
 from neurolens.models.model import LensModel, mix
-from neurolens.models.pairs import FilmRays, PairSettings, make_pairs, sample_domain
+from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
@@ -159,8 +159,8 @@ def test_errors_between_nodes(state: float) -> None:
     part = model().at(state)
     (near, far), exact = part.domain.film_z_mm, set_lens(part.lens, zoom=state)
     assert near < exact.film_z_mm < far and near < best_focus_z_mm(exact) < far
-    pairs = make_pairs(part.lens, part.domain, PairSettings(train=1, held_out=4000, rim=1, seed=9))
-    errors = ray_errors(part.lens, part.domain, pairs.held_out, part.predict)
+    rays = passing_rays(part.lens, part.domain, 4000, 9)
+    errors = ray_errors(part.lens, part.domain, rays, part.predict)
     assert errors.rms_um < 1.7 and errors.transmittance_rms < 1e-4
     shares = vignetting_errors(part.lens, part.domain, part.predict, count=30_000)
     assert shares["false_pass"] < 0.003 and shares["false_block"] < 0.003

@@ -15,9 +15,8 @@ from shipped import whole
 from vignetting_oracle import vignetting_errors
 
 from neurolens.cameras.model import load_model
-from neurolens.models.pairs import PairSettings, make_pairs
+from neurolens.models.pairs import passing_rays
 from neurolens.studies import check
-from neurolens.studies import measure as measured
 from neurolens.studies.check import check_model, promises_of, share_promise
 from neurolens.studies.measure import (
     STOPS,
@@ -26,7 +25,6 @@ from neurolens.studies.measure import (
     measure,
     measure_on,
     onnx_predictor,
-    passing_rays,
     with_more,
 )
 from neurolens.studies.rays import ZONES
@@ -37,7 +35,7 @@ RAYS = 6000
 @pytest.fixture(autouse=True, scope="module")
 def traced_once() -> Iterator[None]:
     """Fresh rays of one lens and domain, by their number and seed: tracing them takes most of a check's time."""
-    passing = cache(lambda count, seed: measured.passing_rays(lens(), domain(), count, seed))
+    passing = cache(lambda count, seed: passing_rays(lens(), domain(), count, seed))
     fresh = cache(lambda known, count, seed: fresh_rays(lens(), domain(), passing(known, seed), count=count, seed=seed))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(check, "passing_rays", lambda _, __, count, seed: count)
@@ -48,9 +46,9 @@ def traced_once() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def errors() -> dict[str, Any]:
     """The errors that the exported polynomial's card would promise."""
-    pairs = make_pairs(lens(), domain(), PairSettings(train=1, held_out=RAYS, rim=1, seed=3))
+    held_out = passing_rays(lens(), domain(), RAYS, 3)
     return measure_on(
-        fresh_rays(lens(), domain(), pairs.held_out, count=4 * RAYS, seed=55), load_model(exported("invariants"))
+        fresh_rays(lens(), domain(), held_out, count=4 * RAYS, seed=55), load_model(exported("invariants"))
     )
 
 
@@ -107,8 +105,8 @@ def test_an_error_that_few_rays_decide_is_found_again_on_others() -> None:
         return out
 
     model_ = SimpleNamespace(card=known.card, rays=rays)
-    pairs = make_pairs(lens(), domain(), PairSettings(train=1, held_out=RAYS // 8, rim=1, seed=3))
-    few = fresh_rays(lens(), domain(), pairs.held_out, count=RAYS, seed=55)
+    held_out = passing_rays(lens(), domain(), RAYS // 8, 3)
+    few = fresh_rays(lens(), domain(), held_out, count=RAYS, seed=55)
     rms = []
     for seed in (4, 5):
         many = with_more(few, 100 * seed)
@@ -157,7 +155,7 @@ def test_a_model_that_blocks_what_the_card_says_it_passes_fails(errors: dict[str
 @pytest.mark.parametrize("state", ["4_stops", *whole("full", "2_stops")])
 def test_one_trace_serves_every_stop(state: str) -> None:
     """The shares of a stopped-down lens, traced by itself, are those that the crossings with the stop tell."""
-    held_out = make_pairs(lens(), domain(), PairSettings(1, 500, 1, 9)).held_out
+    held_out = passing_rays(lens(), domain(), 500, 9)
     fresh = fresh_rays(lens(), domain(), held_out, count=30_000, seed=21)
     found = measure(fresh, model("invariants").predict)
     apart = vignetting_errors(

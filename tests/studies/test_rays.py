@@ -16,9 +16,8 @@ from neurolens.models.model import Domain
 from neurolens.models.pairs import (
     FilmRays,
     PairSet,
-    PairSettings,
     domain_of,
-    make_pairs,
+    passing_rays,
     sample_domain,
     trace_pairs,
 )
@@ -50,7 +49,7 @@ def lens_and_domain(
 
 
 def held_out(lens: Lens, domain: Domain, count: int = 2000) -> PairSet:
-    return make_pairs(lens, domain, PairSettings(train=1, held_out=count, rim=1)).held_out
+    return passing_rays(lens, domain, count, seed=1)
 
 
 def says(rays: Rays, transmittance: torch.Tensor) -> SimpleNamespace:
@@ -258,7 +257,7 @@ def test_where_the_image_folds_an_error_counts_for_ten_times_first_order_at_most
     domain, f = domain_of(lens, film_radius_mm=80.0), first_order(lens).efl_mm
     rms = []
     for seed in (1, 2):
-        rays = make_pairs(lens, domain, PairSettings(train=1, held_out=3000, rim=1, seed=seed)).held_out
+        rays = passing_rays(lens, domain, 3000, seed)
         errors = ray_errors(lens, domain, rays, lambda _, r=rays: says(turned(r.scene, 1e-6), r.transmittance))
         rms.append(errors.rms_infinity_um)
         assert errors.max_infinity_um < 1000 * 10 * f * 1e-6 / math.cos(math.radians(60)) ** 2

@@ -305,16 +305,17 @@ def _aimed(
 ) -> _Aimed:
     """Find the rays of all points of the pupil that see a point of the plate, at each of some wavelengths."""
     pupil, waves = np.tile(table.pupil, len(nm)), np.repeat(nm, table.pupil.shape[1])
-    wanted = np.array(target)[:, None]
+    wanted, axes = np.array(target)[:, None], np.eye(2)[..., None]
 
-    def seen(place: Array) -> tuple[Array, Array, Array]:
-        lines = table.at(place, pupil, waves).T.astype(np.float64)
-        return lines[:2] + w * lines[2:4], lines[4], lines[2:4]
+    def seen(*places: Array) -> list[tuple[Array, Array, Array]]:
+        """What rays from each of some places see, in one call of the camera: there are few rays."""
+        count = len(places)
+        lines = table.at(np.concatenate(places, 1), np.tile(pupil, count), np.tile(waves, count)).astype(np.float64)
+        return [(part[:2] + w * part[2:4], part[4], part[2:4]) for part in np.split(lines.T, count, axis=1)]
 
     place = np.repeat(np.array(guess, np.float64)[:, None], len(waves), axis=1)
     step = 0.01 * max(table.size)
-    at, weight, slope = seen(place)
-    moved = [seen(place + step * np.eye(2)[:, [k]]) for k in (0, 1)]
+    (at, weight, slope), *moved = seen(place, *(place + step * axis for axis in axes))
     good = (weight > 0) & (moved[0][1] > 0) & (moved[1][1] > 0)
     if not good.any():
         return _Aimed(place, np.zeros(len(waves)), slope, np.eye(2))
@@ -324,14 +325,14 @@ def _aimed(
         # Rays that do not pass do not tell where the point's light is: they move as the others do.
         off[:, weight <= 0] = off[:, weight > 0].mean(axis=1, keepdims=True) if (weight > 0).any() else 0.0
         place = place + film_by_plate @ off
-        at, weight, slope = seen(place)
+        [(at, weight, slope)] = seen(place)
         if np.hypot(*(wanted - at))[weight > 0].max(initial=0.0) < _CLOSE:
             break
     # Each ray has its own area: near the end of the light the pupil's outline moves fast with the film point.
-    ahead, behind = ([seen(place + d * np.eye(2)[:, [k]]) for k in (0, 1)] for d in (0.5, -0.5))
-    (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(ahead, behind, strict=True))
+    around = seen(*(place + d * axis for d in (0.5, -0.5) for axis in axes))
+    (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(around[:2], around[2:], strict=True))
     stretch = np.abs(xx * yy - xy * yx)
-    known = np.all([found[1] > 0 for found in (*ahead, *behind)], axis=0) & (stretch > 0)
+    known = np.all([found[1] > 0 for found in around], axis=0) & (stretch > 0)
     area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(film_by_plate))))
     close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
     light, kept = weight * area, np.where(close, weight, 0) * area

@@ -39,12 +39,13 @@ from tests.command_line import failure, run_json
 ROOT = Path(__file__).parents[3]
 GAUSS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
 FILM, SIZE = (36.0, 20.25), (384, 216)
+STRIP = (384, 72)  # for pictures whose rows are alike
 FOCUS_M = 2.0
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="defocus takes a C compiler")
 
 
-def thin(f_number: float = 1.4, focus_m: float = FOCUS_M) -> ThinLens:
-    return ThinLens(50.0, f_number, focus_m, FILM)
+def thin(f_number: float = 1.4, focus_m: float = FOCUS_M, size: tuple[int, int] = SIZE) -> ThinLens:
+    return ThinLens(50.0, f_number, focus_m, (FILM[0], FILM[0] * size[1] / size[0])).compiled()
 
 
 def plate_of(camera: Camera, *layers: tuple[np.ndarray, np.ndarray], size: tuple[int, int] = SIZE) -> Plate:
@@ -156,8 +157,8 @@ def test_a_blurred_edge_lets_the_light_behind_it_through_as_the_part_of_the_disc
 @pytest.mark.parametrize("post", [1.0, *whole(0.1)])
 def test_blurred_edges_are_as_clean_as_the_samples_that_are_asked_for(post: float) -> None:
     """Posts nearer than what is in focus: every number of samples is taken, and the default has little noise."""
-    camera = thin()
-    rgb, w = flat(0.5, in_focus(camera))
+    camera = thin(size=STRIP)
+    rgb, w = flat(0.5, in_focus(camera), STRIP)
     posts = np.arange(SIZE[0]) % 128 < 32
     rgb[:, posts], w[:, posts] = post, 2.0
     clean = blurred(camera, rgb, w, samples=512)
@@ -196,13 +197,14 @@ def test_what_lies_behind_an_edge_comes_from_the_layer_behind() -> None:
 
 def test_the_light_of_hidden_highlights_is_counted_as_lost(recwarn: pytest.WarningsRecorder) -> None:
     """Posts before a far night full of lights: beside the same with the layer that the posts hide."""
-    camera = thin()
-    rgb, w = flat(0.05, 0.0)
+    camera = thin(size=STRIP)
+    rgb, w = flat(0.05, 0.0, STRIP)
     rgb[5::11, 3::13] = 20.0
     front, near = rgb.copy(), w.copy()
     posts = np.arange(SIZE[0]) % 64 < 32
     front[:, posts], near[:, posts] = 0.0, 2.0
-    one, two = (defocus(plate_of(camera, (front, near), *behind), camera, samples=32) for behind in ((), ((rgb, w),)))
+    plates = (plate_of(camera, (front, near), *behind, size=STRIP) for behind in ((), ((rgb, w),)))
+    one, two = (defocus(plate, camera, samples=32) for plate in plates)
     assert one.lost == pytest.approx(1 - one.rgb.sum() / two.rgb.sum(), rel=0.15) and one.lost > 0.05
     assert two.lost < 0.01 and f"{100 * one.lost:.1f}% of the light is lost" in str(recwarn[0].message)
 
@@ -210,16 +212,17 @@ def test_the_light_of_hidden_highlights_is_counted_as_lost(recwarn: pytest.Warni
 def test_only_highlights_that_no_layer_shows_are_counted_as_lost() -> None:
     """Posts before a far night. The layer behind shows lights behind the lower halves of the posts, or a night without
     any: of the light of all, what is missing is as stated, or nothing is."""
-    camera = thin()
-    rgb, w = flat(0.05, 0.0)
-    rgb[5::54, 3::13] = 20.0
+    size = (384, 108)
+    camera = thin(size=size)
+    rgb, w = flat(0.05, 0.0, size)
+    rgb[14::54, 3::13] = rgb[41::54, 10::13] = 20.0
     front, near = rgb.copy(), w.copy()
     posts = np.arange(SIZE[0]) % 64 < 32
     front[:, posts], near[:, posts] = 0.0, 2.0
-    half, dark = w.copy(), flat(0.05, 0.0)
-    half[: SIZE[1] // 2] = -1.0
+    half, dark = w.copy(), flat(0.05, 0.0, size)
+    half[: size[1] // 2] = -1.0
     behind = {"whole": (rgb, w), "half": (rgb, half), "dark": dark}
-    found = {k: defocus(plate_of(camera, (front, near), v), camera, samples=8) for k, v in behind.items()}
+    found = {k: defocus(plate_of(camera, (front, near), v, size=size), camera, samples=8) for k, v in behind.items()}
     true = 1 - found["half"].rgb.sum() / found["whole"].rgb.sum()
     assert found["half"].lost == pytest.approx(true, rel=0.2) and true > 0.03
     assert found["dark"].lost < 1e-3
@@ -241,12 +244,14 @@ def exact() -> Camera:
 
 def test_a_lens_moves_things_as_its_distortion_says_and_dims_them_as_its_pupil_does(exact: Camera) -> None:
     field = field_of(exact, FOCUS_M, "rectilinear", frame=frame_of(exact))
-    w = 1 / (FOCUS_M - frame_of(exact).pupil_mm[0] / 1000)
-    for place in ((320, 108), (360, 200)):
-        rgb, depth = flat(0.0, w)
-        rgb[place[1] - 2 : place[1] + 3, place[0] - 2 : place[0] + 3] = 1.0
-        found = blurred(exact, rgb, depth, samples=256)[..., 1]
-        y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    rgb, depth = flat(0.0, 1 / (FOCUS_M - frame_of(exact).pupil_mm[0] / 1000))
+    places = (320, 108), (360, 200)
+    for i, j in places:
+        rgb[j - 2 : j + 3, i - 2 : i + 3] = 1.0
+    picture = blurred(exact, rgb, depth, samples=256)[..., 1]
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    for place in places:
+        found = np.where(np.hypot(x - place[0], y - place[1]) < 40, picture, 0)
         centre = [(found * v).sum() / found.sum() for v in (x, y)]
         mm = complex(centre[0] - SIZE[0] / 2, SIZE[1] / 2 - centre[1]) * FILM[0] / SIZE[0]
         ideal = field.ideal(np.array([mm]))[0] * SIZE[0] / FILM[0]
@@ -441,7 +446,7 @@ def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
     picture = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
     spread_highlights(picture, taken, plate, camera)
     # The same light within a film that is as much larger.
-    wide = ThinLens(50.0, 1.4, FOCUS_M, (FILM[0] * w.shape[1] / SIZE[0], FILM[1] * w.shape[0] / SIZE[1]))
+    wide = ThinLens(50.0, 1.4, FOCUS_M, (FILM[0] * w.shape[1] / SIZE[0], FILM[1] * w.shape[0] / SIZE[1])).compiled()
     whole = blurred(wide, rgb_before, w, highlights=True)[border:-border, border:-border]
     np.testing.assert_allclose(picture, whole, atol=0.01 * whole.max())
     rows = np.flatnonzero(picture[..., 1].sum(axis=1) > 1)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
@@ -143,7 +144,7 @@ def test_lenses_without_aspheres_and_grooves_too_fine_are_refused() -> None:
         aspheres(ExactCamera(read_any(ROOT / "lenses" / "laikin_double_gauss_50.toml"), Shot((36.0, 24.0), 2.0)))
 
 
-@pytest.mark.parametrize("away", [0.0, 444.5])
+@pytest.mark.parametrize("away", [0.0, *whole(444.5)])
 def test_grooves_finer_than_a_pixel_leave_no_checkerboard_but_rings_where_those_of_two_aspheres_beat(
     away: float,
 ) -> None:

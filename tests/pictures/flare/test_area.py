@@ -227,7 +227,7 @@ def test_a_picture_of_all_ghosts_has_no_bands(name: str, coating: str) -> None:
     """
     lens = lens_of(name, f_number=8.0).with_aperture(Aperture(blades=6))
     lens = coated(lens, coating)
-    job = FlareJob(lens, [Light(13.7, 10.0)], Raster((36.0, 24.0), 180, 120), FlareSettings(bins=4))
+    job = FlareJob(lens, [Light(13.7, 10.0)], Raster((36.0, 24.0), 120, 80), FlareSettings(bins=4))
     picture = ghost_picture(job)[0]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("neurolens.pictures.flare.layers.FEWEST", 16)
