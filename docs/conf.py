@@ -60,7 +60,7 @@ def _commands() -> str:
     def help_of(*words: str) -> str:
         text = StringIO()
         with redirect_stdout(text), suppress(SystemExit):
-            main([*words, "--help"])
+            main([*words, "--help-all" if words else "--help"])
         return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue())
 
     names = re.findall(r"^    ([a-z]+)\s", help_of(), re.MULTILINE)

@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from lens_models import edited
 from shipped import whole
 
 from neurolens.cli import build_parser, main
+from neurolens.cli.arguments import first_example
 from neurolens.cli.train import Train
 from neurolens.models.card import read_card
 from neurolens.pictures.render.pictures import read_exr
@@ -579,3 +581,40 @@ def test_words_of_a_name_in_any_order_find_the_lens(words: str, lens: str, capsy
 
 def test_words_of_no_lens_find_none(capsys: pytest.CaptureFixture[str]) -> None:
     assert "did you mean" not in failure(capsys, "lens", "cooke look") + failure(capsys, "lens", " ")
+
+
+# Help
+
+COMMANDS = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_has_the_options_that_most_need_and_an_example_and_help_all_the_others(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parser, said = COMMANDS[name], {}
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as ended:
+            main([name, word])
+        said[word] = capsys.readouterr().out
+        assert ended.value.code == 0
+    options = {a.option_strings[-1]: a for a in parser._actions if a.option_strings and a.help != argparse.SUPPRESS}
+    shown = {o for o in options if re.search(rf"^  (-\w[^,]*, )?{o}\b", said["--help"], re.MULTILINE)} - {"--help"}
+    assert len(shown) <= 10 and {o for o, a in options.items() if a.required} <= shown
+    assert all(re.search(rf"^  (-\w[^,]*, )?{o}\b", said["--help-all"], re.MULTILINE) for o in options)
+    assert len(said["--help"].splitlines()) <= 60
+    if name not in ("blender", "demo"):
+        example = first_example(parser.epilog)
+        assert example.splitlines()[0] in said["--help"]
+        monkeypatch.chdir(ROOT)
+        program, *words = shlex.split(example.replace("\\\n", " "), comments=True)
+        assert program == "neurolens" and build_parser().parse_args(words)
+
+
+@pytest.mark.parametrize("name", ["find", "glass", "lens", "models"])
+def test_the_example_of_the_help_runs(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)  # they write nothing; those that write run in the README, in test_page_commands.py
+    assert main(shlex.split(first_example(COMMANDS[name].epilog))[1:]) == 0
+    assert capsys.readouterr().out

@@ -91,6 +91,7 @@ class Option:
         positional: whether it is an argument without a name. apart: options with the same word exclude each other.
         title: that of its group of options in the help.
         last: above 0 for what help shows after all other options, in this order.
+        common: whether it is among the options that the short help of a command shows.
         written: whether it is a path that a command writes.
     """
 
@@ -107,6 +108,7 @@ class Option:
     apart: str = ""
     title: str = ""
     last: int = 0
+    common: bool = False
     written: bool = False
 
 
@@ -247,6 +249,7 @@ def add_options(
             default = defaults.get(f.name, None if unset else f.default)
             names_of, details = _details(f, option, hints[f.name], default, texts.get(f.name))
             action = place.add_argument(*names_of, **details)
+            action.common = option.common  # type: ignore[attr-defined]  # of `cli.arguments.Parser.format_help`
             if not isinstance(option.old, Mapping):
                 parser._option_string_actions.update({f"--{word}": action for word in option.old})
                 continue

@@ -40,7 +40,9 @@ class Analysis(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Analyse(cli.Figures):
-    """Trace a lens from the scene and analyse its image. WHAT is any of:
+    """Print every analysis of a lens as its file has it, focused at infinity, up to the edge of its film.
+
+    Rays are traced from the scene. WHAT is any of:
 
       layout      the section of the lens with rays
       spots       spot diagrams over field and focus, RMS and geometric radius, Airy disc
@@ -71,16 +73,16 @@ examples:
     state: cli.LensState = cli.lens_state()
     field_points: tuple[float, ...] | None = setting(
         None, "angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",
-        kind=between(0, 179, "degrees"), nargs="+", metavar="DEG", old=("fields",),
+        kind=between(0, 179, "degrees"), nargs="+", metavar="DEG", old=("fields",), common=True,
     )  # fmt: skip
     wavelengths: tuple[tuple[float, ...], ...] | None = setting(
         None, f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
         "(default: d, F and C, or the file's own where its range lacks the d line)",
-        kind=wavelengths_nm, nargs="+", metavar="NM",
+        kind=wavelengths_nm, nargs="+", metavar="NM", common=True,
     )  # fmt: skip
     frequencies: tuple[float, ...] | None = setting(
         None, "of mtf-height (default: 10 20 40)", kind=between(0, 1000, "cycles per mm"), nargs="+",
-        metavar="PER_MM",
+        metavar="PER_MM", common=True,
     )  # fmt: skip
     axis: Literal["x", "y"] = setting("y", "plane of the field, for anamorphic lenses (default: y)")
     out: Path | None = cli.output_path("FOLDER", "draw a picture of each in this folder", None)

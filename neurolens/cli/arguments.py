@@ -53,6 +53,25 @@ _SUFFIXES = {
 }  # of files that a placeholder stands for
 
 
+_FEW = 10  # options; the help of more shows those that are marked as common
+
+
+class WholeHelp(argparse.Action):
+    """An option that prints the help with all options, and ends."""
+
+    def __call__(self, parser: Any, *rest: Any) -> None:
+        """Print the help of a `Parser`."""
+        parser.whole = True
+        parser.print_help()
+        parser.exit()
+
+
+def first_example(epilog: str) -> str:
+    """Return the first command line under "examples:" at the end of a help, with its continuation lines."""
+    found = re.search(r"examples:\n  ((?:.*\\\n)*.*)", epilog)
+    return found[1] if found else ""
+
+
 class Help(argparse.RawDescriptionHelpFormatter):
     """Shows texts of help as they are written: line breaks stay, and % is a percent sign."""
 
@@ -65,6 +84,7 @@ class Parser(argparse.ArgumentParser):
 
     Attributes:
         intermixed: whether options may stand before and between the arguments of a list.
+        whole: whether help shows all options.
         renamed: words at the start of a command line, and the words that have replaced them.
     """
 
@@ -73,7 +93,7 @@ class Parser(argparse.ArgumentParser):
         # Abbreviations are refused, because one may become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # numbers are no options: -12,3 is a value, as -12 is
-        self.intermixed = False
+        self.intermixed = self.whole = False
         self.renamed: Mapping[str, Sequence[str]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -104,6 +124,24 @@ class Parser(argparse.ArgumentParser):
             args = [*args[:at], f"--width={found[1]}", f"--height={found[2]}", *args[at + 1 + (word != words) :]]
         return args
 
+    def format_help(self) -> str:
+        """Format the help. Where there are many options, it shows the common ones, unless --help-all asks for more."""
+        options = [a for a in self._actions if a.option_strings and a.help != argparse.SUPPRESS]
+        rare = [a for a in options if not (a.required or getattr(a, "common", True))]
+        if self.whole or not rare or len(options) <= _FEW + 1:  # with --help itself
+            return super().format_help()
+        shown = [a for a in self._actions if a not in rare]
+        formatter = self._get_formatter()
+        formatter.add_usage(self.usage, shown, [])
+        formatter.add_text(re.split(":?\n\n", self.description or "")[0].rstrip(".") + ".")
+        for part in self._action_groups:
+            formatter.start_section(part.title)
+            formatter.add_arguments([a for a in part._group_actions if a in shown])
+            formatter.end_section()
+        formatter.add_text(f"example:\n  {first_example(self.epilog or '')}")
+        formatter.add_text(f"All {len(options)} options, and more examples: {self.prog} --help-all")
+        return formatter.format_help()
+
     def error(self, message: str) -> NoReturn:
         self.exit(
             2, f"{self.prog}: {one_line(message, 1000)} (see {self.prog.replace('neurolens', program(), 1)} --help)\n"
@@ -119,7 +157,7 @@ class Command:
 
     Attributes:
         called: the command as errors name it.
-        epilog: the end of the help.
+        epilog: the end of the help, whose first example the short help has, too.
         kept: tells what an interrupted command leaves (see also `keeps`).
         intermixed: whether options may stand before and between the arguments of a list.
     """
@@ -144,6 +182,8 @@ class Command:
         """Give the command's parser the texts of its help, its arguments and its options."""
         parser.description, parser.epilog, parser.intermixed = inspect.getdoc(cls), cls.epilog, cls.intermixed
         cls.add_options(parser)
+        if parser.add_help:  # a call has none
+            parser.add_argument("--help-all", action=WholeHelp, nargs=0, dest="help", help=argparse.SUPPRESS)
         parser.set_defaults(run=lambda args: cls.of(args).run(), kept=cls.kept)
 
     @classmethod
@@ -204,7 +244,7 @@ class Figures(Reporting):
 
     csv: Path | None = setting(
         None, "write the figures to this folder as CSV, a file for each table, a row a case; headings carry their unit",
-        metavar="FOLDER", kind=Path, written=True, last=4,
+        metavar="FOLDER", kind=Path, written=True, last=4, common=True,
     )  # fmt: skip
 
     def answer(self, found: Report | Mapping[str, Any], *rest: Any, **more: Any) -> int:
@@ -284,24 +324,25 @@ def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: b
     taken = ", model (.onnx), or name of either" if models else ", or its name in lenses/"
     taken += ", thick:LENS, thin, pinhole or fisheye-PROJECTION" if cameras else ""
     details = {"metavar": "CAMERA" if cameras else "LENS", "kind": partial(named_lens, models, cameras)} | details
-    return setting(default, f"lens file of any format{taken}{also}", **details)
+    return setting(default, f"lens file of any format{taken}{also}", common=True, **details)
 
 
 def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
     """Return -o and --output, the file or folder that a command writes."""
     return setting(
-        default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title, written=True
-    )
+        default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title,
+        written=True, common=True,
+    )  # fmt: skip
 
 
 def plot_path(about: str) -> Any:
     """Return an option that names the file of a plot."""
-    return setting(None, f"{about} (.png, .pdf, .svg)", metavar="OUT.png", kind=Path, written=True)
+    return setting(None, f"{about} (.png, .pdf, .svg)", metavar="OUT.png", kind=Path, written=True, common=True)
 
 
 def film(default: Any = ..., about: str = "size of the film in mm", title: str = "") -> Any:
     """Return --film, a film's width and height."""
-    return setting(default, about, option="film", kind=film_size, metavar="WxH", title=title)
+    return setting(default, about, option="film", kind=film_size, metavar="WxH", title=title, common=True)
 
 
 def within(about: str, default: Any = None, title: str = "") -> Any:

@@ -33,14 +33,14 @@ class Convert(cli.Reporting):
 
     epilog = """\
 examples:
-  neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
+  neurolens convert experiments/fuzz_seeds/lens.zmx -o my_lens.toml
   neurolens convert wide.22mm.dat -o wide.toml --name "Wide angle 22 mm" --source "Smith p. 360"
   neurolens convert triplet.seq -o triplet.toml --half-field 20 --json"""
     kept = "only a finished lens file is written"
 
     file: Path = setting(..., "lens file of another program", positional=True, metavar="FILE")
     out: Path = cli.output_path("OUT.toml", "lens file to write")
-    force: bool = setting(False, "replace an existing file")
+    force: bool = setting(False, "replace an existing file", common=True)
     unsaid: ReadOptions = group("what the file does not say")
 
     def run(self) -> int:

@@ -27,8 +27,8 @@ _MOST = 64  # fields along a side, at most
 
 @dataclass(frozen=True, kw_only=True)
 class Defocus(cli.Reporting):
-    """Give a sharp picture with depth the blur of a lens, by field, depth and colour, with its distortion and
-    vignetting.
+    """Give a sharp picture with depth the blur of a lens with its widest stop: by field, depth and colour, with its
+    distortion and vignetting.
 
     PLATE.exr is a pinhole's picture: R, G, B and a channel Z with the distance along the axis in metres (0, 1e9
     and more, inf: sky), without motion blur; depth without antialiasing is best. Its pinhole stands where
@@ -50,8 +50,9 @@ examples:
     film: tuple[float, float] = cli.film()
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     behind: tuple[Path, ...] = setting(
-        (), "OpenEXR file of what is behind the things of the plate, with depth (repeatable)", metavar="FILE.exr"
-    )
+        (), "OpenEXR file of what is behind the things of the plate, with depth (repeatable)", metavar="FILE.exr",
+        common=True,
+    )  # fmt: skip
     depth: str = setting("", "name of the channel with the depth (default: Z, or Depth.Z)", metavar="CHANNEL")
     depth_scale: float | None = setting(None, "metres of a unit of depth (default: 1)", within=(-1e6, 1e6), metavar="M")
     depth_along: Literal["axis", "ray"] = setting("axis", "whether depth is along the axis or each ray (default: axis)")
@@ -109,7 +110,8 @@ def _defocus_text(data: dict[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Bokeh(PictureCommand):
-    """Write the kernels of a lens's blur, float32 OpenEXR, for ZDefocus and Bokeh in Nuke and for programs of your own:
+    """Write the kernels of the blur of a lens with its widest stop, at 5 x 3 places of the picture, float32 OpenEXR,
+    for ZDefocus and Bokeh in Nuke and for programs of your own:
 
       OUT.0.8m.exr     for things 0.8 m from the film, one kernel a field, in columns and rows as in the picture
       OUT.0.8m.png     the same, each kernel as bright as the others, to be looked at
@@ -130,14 +132,12 @@ examples:
     out: Path = cli.output_path("OUT", "start of the files' names")
     distance: tuple[float, ...] = setting(
         ..., "of things from the film in metres, or inf (repeatable)",
-        kind=positive("a distance in metres", infinite=True), metavar="M",
+        kind=positive("a distance in metres", infinite=True), metavar="M", common=True,
     )  # fmt: skip
     grid: tuple[int, int] = setting(
-        (5, 3),
-        "columns and rows of places in the picture (default: 5x3)",
-        kind=whole_pair("COLUMNSxROWS", _MOST),
-        metavar="CxR",
-    )
+        (5, 3), "columns and rows of places in the picture (default: 5x3)", kind=whole_pair("COLUMNSxROWS", _MOST),
+        metavar="CxR", common=True,
+    )  # fmt: skip
     wavelengths: tuple[float, float, float] | None = setting(
         None, "one wavelength for red, green and blue each (default: those that make each channel's light)",
         kind=channels_nm, metavar="NM",

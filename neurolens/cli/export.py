@@ -40,6 +40,7 @@ _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 class Export(cli.Reporting):
     """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for arrays
     that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an ONNX file.
+
     Domain guard, stop, rims, transmittance and status codes are those of the model; the card is a comment at the top,
     and constants and the film's position for a focus stand beside it. Of a model of a zoom's whole range (or of
     internal focus) the state is an argument. A lens file gives the exact lens, with c-double within 1e-12 mm of the
@@ -71,7 +72,7 @@ examples:
         ..., "form to write"
     )
     out: Path = cli.output_path("FILE", "file to write")
-    fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE")
+    fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE", common=True)
     only: tuple[str, str, str, str] = setting(
         _PARTS, f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
         kind=cli.words_of(_PARTS, "ray"), metavar="PARTS",
@@ -81,7 +82,7 @@ examples:
     inverse: bool = setting(
         False, "of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked"
     )
-    whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA)
+    whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA, common=True)
     film: tuple[float, float] = cli.film((36.0, 24.0), "film in mm (default: 36x24)", _CAMERA)
     state: cli.LensState = group(_CAMERA, names={*BY_LENSES, *LensCamera.takes}, unset=True)
 

@@ -76,9 +76,11 @@ def _gain(text: str) -> tuple[str, list[float]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Flare(cli.Figures):
-    """Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the film, with the
-    reflectance of Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. The
-    brightest are printed with energy, position and size, on the film itself, which pictures show turned by 180 degrees.
+    """Print the brightest ghosts of a lens that is focused at infinity, and with -o write a picture of its flare.
+
+    Ghosts are traced exactly: light that two surfaces reflect on its way to the film, with the reflectance of
+    Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. They are
+    printed with energy, position and size, on the film itself, which pictures show turned by 180 degrees.
 
     With -o they are an OpenEXR picture that can be added to a render of the same lens, film and focus: R, G and B are
     the sum of the layers (ghosts.R, .G, .B, and so on); the --layers ghosts with the greatest values on the film have
@@ -102,7 +104,7 @@ examples:
         (), "degrees to the right of and above the axis, as the camera sees it; irradiance at the lens, radiance "
         "times solid angle in sr, as a number or R/G/B, of a point (default: the sun's disc with pi, which lights a "
         "white card to radiance 1); and distance in metres (default: inf); repeatable",
-        metavar="AZ,EL[,E[,M]]", title=OF_LIGHTS,
+        metavar="AZ,EL[,E[,M]]", title=OF_LIGHTS, common=True,
     )  # fmt: skip
     lights: tuple[Path, ...] = setting(
         (), "a scene (.toml), whose shapes that shine, points, spots and sun the camera of the scene sees; or a list, "
@@ -127,7 +129,9 @@ examples:
         kind=str, nargs=2, metavar=("GHOST", "OUT"),
     )  # fmt: skip
     film: tuple[float, float] = cli.film((36.0, 24.0), "in mm (default: 36x24)", OF_PICTURE)
-    width: int = setting(960, "of the picture (default: 960)", within=(1, 16384), metavar="PIXELS", title=OF_PICTURE)
+    width: int = setting(
+        960, "of the picture (default: 960)", within=(1, 16384), metavar="PIXELS", title=OF_PICTURE, common=True
+    )
     exposure: float | None = cli.exposure(
         None, "99% of the lit pixels become no brighter than 0.8; frames share one value", title=OF_PICTURE
     )

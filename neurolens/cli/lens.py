@@ -22,9 +22,11 @@ _Sort = Literal["maker", "focal-length", "speed", "year", "cats-eye", "swirl", "
 
 @dataclass(frozen=True, kw_only=True)
 class Lens(cli.Figures):
-    """Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
-    image circle, how much of the light gets through and what stops the rest, and anything
-    doubtful about it. Several files, or folders (of all formats that "neurolens convert" reads), are
+    """Print what follows from a lens file as it stands, focused at infinity with its widest stop: focal length,
+    pupils, film plane, image circle, how much of the light gets through and what stops the rest, and anything
+    doubtful about it.
+
+    Several files, or folders (of all formats that "neurolens convert" reads), are
     a table with one line for each lens, in milliseconds a lens; after the word "list" each of them is
     checked, too. --derive-rims computes the rim diameters that a patent does not print.
 
@@ -54,11 +56,11 @@ examples:
     breathing: Path | None = cli.plot_path("draw field of view, focal length, magnification against the focus distance")
     sort: _Sort | None = setting(
         None, "of several files: the order; the last five are figures of bokeh and flare, the strongest first, which "
-        "take seconds a lens that is not of lenses/",
+        "take seconds a lens that is not of lenses/", common=True,
     )  # fmt: skip
     derive_rims: bool = setting(
         False, "compute the diameters from the f-number and the field, and print them beside those of the file",
-        title="rims",
+        title="rims", common=True,
     )  # fmt: skip
     edge_pupil: float | None = setting(
         None, "share of the pupil's height that is kept at the edge of the field (default: 0.5)", within=(0.01, 1),

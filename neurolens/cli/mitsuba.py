@@ -26,7 +26,7 @@ class Mitsuba(cli.Reporting):
 
     epilog = """\
 examples:
-  neurolens mitsuba cornell-box --camera models/NAME.onnx --film 28x28 --focus 3.6 -o box.exr
+  neurolens mitsuba cornell-box --camera laikin_double_gauss_50.ols-36 --film 28x28 --focus 3.6 -o box.exr
   neurolens mitsuba scene.xml --camera thin --f-number 2 --focus 4 --variant llvm_ad_rgb -o thin.exr"""
     kept = "no picture was written; older files of that name are untouched"
 
@@ -34,7 +34,7 @@ examples:
     camera: str = cli.lens(models=True, cameras=True)
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     variant: str | None = setting(None, "of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)")
-    samples: int | None = setting(None, "a pixel (default: the scene's)", within=(1, 1 << 20))
+    samples: int | None = setting(None, "a pixel (default: the scene's)", within=(1, 1 << 20), common=True)
     film: tuple[float, float] | None = cli.film(None, "size in mm (default: 36 wide, the picture's shape)")
     seed: int = setting(0, "default: 0", kind=whole(0, 1 << 15))
     units_per_m: float = setting(

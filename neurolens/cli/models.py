@@ -189,7 +189,7 @@ class Evaluate(cli.Figures):
 
     epilog = """\
 examples:
-  neurolens evaluate models/NAME.onnx
+  neurolens evaluate models/laikin_double_gauss_50.ols-36.onnx
   neurolens evaluate runs/quickstart/models/ols-60.onnx --rays 100000 --seed 5
   neurolens evaluate my.onnx --lens my_lens.toml --json
 

@@ -63,7 +63,7 @@ model of the shot from it, from scratch. --trade leaves trade.html besides, a pa
     lens: Path = cli.lens()
     budget: tuple[str, float] = setting(
         ("px", 0.25), "error allowed, as 0.25px (default); or time, as 20s: of one thread, for the scene's size and "
-        "samples, for which the most faithful camera is chosen", kind=_budget, metavar="BUDGET",
+        "samples, for which the most faithful camera is chosen", kind=_budget, metavar="BUDGET", common=True,
     )  # fmt: skip
     target: Literal["render", "c", "onnx", "osl", "glsl"] = setting(
         "render", "what runs the camera: our renderer, compiled C, onnxruntime, Blender's Cycles (osl), or a renderer "
@@ -77,12 +77,12 @@ model of the shot from it, from scratch. --trade leaves trade.html besides, a pa
     dispersion: Dispersion = setting_of(Shot, "dispersion")
     denoise: bool = setting(False, "noise is taken out later: charge no camera for it")
     zoom: str | None = setting(
-        None, "state of the lens by name, or a focal length in mm between its states", metavar="STATE"
+        None, "state of the lens by name, or a focal length in mm between its states", metavar="STATE", common=True
     )
     explain: bool = setting(False, "time and list every camera, and look for flare, however long that takes")
     trade: bool = setting(
         False, "the same, and draw every camera by its error in pixels and by its seconds to equal noise on one page, "
-        "with pictures"
+        "with pictures", common=True,
     )  # fmt: skip
     samples: int | None = setting(None, "per pixel, of the pictures of --trade (default: 16)", within=(1, 4096))
     no_fit: bool = setting(False, "fit nothing for the shot")

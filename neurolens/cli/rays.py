@@ -31,9 +31,10 @@ _MOST_LAYERS = 64  # samples that an EXR may have as layers
 @dataclass(frozen=True, kw_only=True)
 class Rays(PictureCommand):
     """Write the rays of a lens (or model, or any other camera): origin, direction, weight and wavelength of every
-    sample of every pixel, in the frame and the arrays of the program that takes them. The value of a pixel is the mean
-    of weight times radiance over its samples. Film, pupil and light are sampled together, and one seed gives the same
-    rays to every program.
+    sample of every pixel, in the frame and the arrays of the program that takes them.
+
+    The value of a pixel is the mean of weight times radiance over its samples. Film, pupil and light are sampled
+    together, and one seed gives the same rays to every program.
 
       OUT.npz          arrays of numpy (numpy.load); about.json in it says how they were made
       OUT.safetensors  the same for torch and jax, without a copy; needs the extra "rays"

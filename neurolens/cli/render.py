@@ -46,8 +46,10 @@ def _tile(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class Render(cli.Reporting):
-    """Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
-    a PNG preview beside it. The settings, the camera and the card of a model are kept in the EXR's
+    """Path-trace a scene with the size, film, focus and samples that it states, through a lens with its widest stop
+    and all its dispersion, and write OpenEXR in linear sRGB with a PNG preview beside it.
+
+    The settings, the camera and the card of a model are kept in the EXR's
     metadata, attribute "neurolens", as JSON.
 
     The same seed gives the same picture for any number of threads; all cameras share its

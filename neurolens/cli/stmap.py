@@ -77,7 +77,7 @@ class PictureCommand(cli.Reporting):
     camera: str = cli.lens(also=", see below", models=True, cameras=True, positional=True)
     width: int | None = setting(
         None, "width of the lens's picture (default: from --height and the film's shape)", within=(1, _LARGEST),
-        metavar="PIXELS",
+        metavar="PIXELS", common=True,
     )  # fmt: skip
     height: int | None = setting(
         None, "height of the lens's picture (default: from --width and the film's shape)", within=(1, _LARGEST),
@@ -123,7 +123,7 @@ class FieldCommand(PictureCommand):
     near: float | None = setting(
         None, "distance from the film to the nearest thing that is seen, of which is told what one centre leaves "
         f"(default: {_NEAR_M:g}, or 1.5 times the entrance pupil's)",
-        kind=positive("a distance in metres"), metavar="M",
+        kind=positive("a distance in metres"), metavar="M", common=True,
     )  # fmt: skip
 
     def near_m(self, frame: Frame) -> float:
@@ -159,7 +159,8 @@ class TracedFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class StMap(FieldCommand):
-    """Write ST maps of a lens (or model, or any other camera) for compositing, float32 OpenEXR:
+    """Write ST maps of a lens (or model, or any other camera), focused at infinity with its widest stop, for
+    compositing, float32 OpenEXR:
 
       SHOT.undistort.exr     makes the undistorted picture from that of the lens (the plate)
       SHOT.redistort.exr     makes the picture of the lens from an undistorted one, as CG is rendered
@@ -186,13 +187,14 @@ examples:
     projection: Literal["rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"] = setting(
         "rectilinear",
         "of the undistorted picture (default: rectilinear, a plane: fields up to 85 degrees from the axis)",
-    )
+        common=True,
+    )  # fmt: skip
     distance: float | None = setting(
         None, "distance from the film to what shall be in place, in metres, or inf (default: what is in focus)",
         kind=positive("a distance in metres", infinite=True), metavar="M",
     )  # fmt: skip
     lateral_colour: bool = setting(
-        False, "maps for each channel too, SHOT.undistort.red.exr and so on, of the --wavelengths"
+        False, "maps for each channel too, SHOT.undistort.red.exr and so on, of the --wavelengths", common=True
     )
     wavelengths: tuple[float, float, float] = setting(
         _CHANNELS_NM, "those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
@@ -359,8 +361,8 @@ def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Projection(FieldCommand, cli.Figures):
-    """Fit a lens (or model, or any other camera) with a projection of other programs, and say what it leaves in
-    pixels:
+    """Fit a lens (or model, or any other camera), focused at infinity with its widest stop, with a projection of
+    other programs, and say what it leaves in pixels:
 
       opencv            fx fy cx cy, k1 k2 p1 p2 k3      opencv-rational   and k4 k5 k6
       kannala-brandt    OpenCV's fisheye, k1 k2 k3 k4    f-theta           NVIDIA's polynomials, both ways

@@ -24,8 +24,9 @@ from neurolens.studies.pages import advice, ns_text
 
 @dataclass(frozen=True, kw_only=True)
 class Train(cli.Reporting):
-    """Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX, measure errors and
-    speed against the exact tracer, render the scenes, and write one report. Needs the extra "train" (torch).
+    """Run an experiment, or with --lens the default one for a lens: trace ray pairs of the lens, fit the surrogates,
+    export them as ONNX, measure errors and speed against the exact tracer, render the scenes, and write one report.
+    Needs the extra "train" (torch).
 
     Without an experiment file, --lens fits a polynomial and a network to that lens in its default state: full aperture,
     its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated for less; one where no
@@ -181,8 +182,10 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
 
     folder: Path = setting(..., "folder of lens files", positional=True, metavar="FOLDER")
     out: Path = cli.output_path("DIR", "default: runs/survey", Path("runs/survey"))
-    no_fit: bool = setting(False, "read and check only")
-    verify: bool = setting(False, "hold each lens against photographs (neurolens verify; extra photographs)")
+    no_fit: bool = setting(False, "read and check only", common=True)
+    verify: bool = setting(
+        False, "hold each lens against photographs (neurolens verify; extra photographs)", common=True
+    )
     terms: int = setting(64, "coefficients (default 64)", within=(1, 400))
     rays: int = setting(30_000, "to fit and to measure (default 30000)", within=(1000, 10**6))
     seed: int = setting(1, "of the rays (default 1)", kind=whole(0))
@@ -190,9 +193,11 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
         15.0, "assumed where a file gives neither rims nor a field (default 15)", within=(1e-3, 179.0),
         unit="degrees", metavar="DEG",
     )  # fmt: skip
-    jobs: int = setting(cores(), "files at a time, about 1 GB of memory each (default: all cores)", within=(1, 256))
+    jobs: int = setting(
+        cores(), "files at a time, about 1 GB of memory each (default: all cores)", within=(1, 256), common=True
+    )
     dask: str | None = cli.dask()
-    restart: bool = setting(False, "do finished files again", old=("again",))
+    restart: bool = setting(False, "do finished files again", old=("again",), common=True)
 
     def run(self) -> int:
         """Survey a folder; return 1 where a file met a fault of neurolens."""

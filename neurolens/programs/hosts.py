@@ -109,10 +109,13 @@ def _place(text: str) -> Vector:
 class RaySettings:
     """What `rays` takes besides a camera, its shot and the size of the picture; options of `neurolens rays`."""
 
-    samples: int = setting(16, "a pixel; powers of two are spread most evenly (default: 16)", within=(1, 1 << 16))
+    samples: int = setting(
+        16, "a pixel; powers of two are spread most evenly (default: 16)", within=(1, 1 << 16), common=True
+    )
     to: Literal["opengl", "opencv", "mitsuba", "newton", "gsplat", "3dgrut"] = setting(
         "opengl", "who takes the rays: opengl and newton (x right, y up, the camera looks along -z), opencv and 3dgrut "
         "(x right, y down, along z), mitsuba (x left, y up, along z), gsplat (in the world) (default: opengl)",
+        common=True,
     )  # fmt: skip
     weights: Literal["kept", "importance", "rgb"] = setting(
         "kept", "kept: one a ray; rgb: three a ray, for the colours that a host returns; importance: samples are drawn "

@@ -37,16 +37,18 @@ class ReadOptions:
     source: str | None = setting(None, "where the figures come from (default: the file's name)", metavar="SOURCE")
     f_number: float | None = setting(
         None, "nominal f-number of a file without one (default: as the stop's diameter gives it)",
-        kind=positive("an f-number"), metavar="N",
+        kind=positive("an f-number"), metavar="N", common=True,
     )  # fmt: skip
     stop: str | None = setting(
         None, "number in the file of the surface that is the stop (default: the one marked, else the limiting rim)",
-        metavar="N",
+        metavar="N", common=True,
     )  # fmt: skip
-    units: Literal["mm", "cm", "in", "m"] | None = setting(None, "unit of lengths (default: the file's own, mm)")
+    units: Literal["mm", "cm", "in", "m"] | None = setting(
+        None, "unit of lengths (default: the file's own, mm)", common=True
+    )
     half_field_deg: float | None = setting(
         None, "edge of the field from the axis, for rims that the file does not give (default: the file's own)",
-        within=(1e-3, 179.0), unit="degrees", option="half-field", metavar="DEG",
+        within=(1e-3, 179.0), unit="degrees", option="half-field", metavar="DEG", common=True,
     )  # fmt: skip
     gap_before: bool = setting(False, "plain table: thickness is that in front of each surface (Kolb 1995)")
     semi_diameters: bool = setting(False, "plain table: the last column holds rim radii")

@@ -71,8 +71,9 @@ class Picture:
     width: int | None = setting_of(CameraSettings, "width")
     height: int | None = setting_of(CameraSettings, "height")
     film_mm: tuple[float, float] | None = setting(
-        None, "width and height of the film in mm (default: the scene's)", option="film", kind=film_size, metavar="WxH"
-    )
+        None, "width and height of the film in mm (default: the scene's)", option="film", kind=film_size, metavar="WxH",
+        common=True,
+    )  # fmt: skip
     seed: int = setting(0, "of the random numbers (default: 0)", kind=whole(0))
     max_depth: int | None = setting_of(CameraSettings, "max_depth")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")

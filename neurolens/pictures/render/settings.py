@@ -168,6 +168,7 @@ class FlareSettings:
         None,
         "of every surface between glass and air that the lens file leaves bare: single-layer (1940s to 60s), "
         "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
+        common=True,
     )
     bins: int = setting(
         15,
