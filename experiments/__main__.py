@@ -78,6 +78,7 @@ QUESTIONS = {
         "models": ("make_models", "make the models that ship"),
         "lens-index": ("lens_index", "the index of lenses/: their data and character for `neurolens lens list`"),
         "named-lenses": ("named_lenses", "write the lens files of real lenses by name from that collection"),
+        "patent-lenses": ("patent_lenses", "write the lens files of real lenses by name from another collection"),
         "library": ("library_pages", "a page for each lens, with every analysis drawn, and an index of all"),
         "usd-lights": ("usd_lights", "the lights of a USD stage as a list for `neurolens flare --lights`"),
         "answers": ("answers", "write the pages of results from what measurements have written"),

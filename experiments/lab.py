@@ -45,9 +45,18 @@ def lens_of(name: str | Path, **state: Any) -> Lens:
     return set_lens(read_lens(name if isinstance(name, Path) else LENSES / f"{name}.toml"), **state)
 
 
+COLLECTIONS = ("OpticsDatabase", "LensVisualizer")  # `named_lenses` and `patent_lenses` make lenses by name from them
+
+
+def of_collection(file: Path) -> str:
+    """The collection that a lens by name was made from; "" for the historical lenses, whose figures we typed."""
+    text = file.read_text(encoding="utf-8")
+    return next((name for name in COLLECTIONS if name in text), "")
+
+
 def historical() -> list[Path]:
-    """The lens files over which tables range: those of lenses/ but the lenses by name (`named_lenses`)."""
-    return [file for file in sorted(LENSES.glob("*.toml")) if "OpticsDatabase" not in file.read_text(encoding="utf-8")]
+    """The lens files over which tables range: those of lenses/ but the lenses by name."""
+    return [file for file in sorted(LENSES.glob("*.toml")) if not of_collection(file)]
 
 
 # ---- Options. --------------------------------------------------------------------------------------------------------

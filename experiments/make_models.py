@@ -95,9 +95,14 @@ class More:
 
 @dataclass(frozen=True)
 class WholeFolder:
-    """Every lens file of a folder in its default state, unless an entry has it: best polynomial, best network."""
+    """Every lens file of a folder in its default state, unless an entry has it: best polynomial, best network.
+
+    Attributes:
+        without: lenses made from this collection are left out; they are fitted where somebody asks for them.
+    """
 
     folder: Path
+    without: str = ""
     models: tuple[ModelSettings, ...] = field(default_factory=_default_models)
     more: More | None = None
 
@@ -107,7 +112,7 @@ class WholeFolder:
         Raises:
             InputError: a lens with more models that the folder does not have.
         """
-        files = lens_files(root / self.folder)
+        files = [f for f in lens_files(root / self.folder) if not self.without or lab.of_collection(f) != self.without]
         more = self.more or More((), ())
         unknown = {*more.lenses} - {file.stem for file in files}
         if unknown:

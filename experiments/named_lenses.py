@@ -15,6 +15,7 @@ import warnings
 from bisect import bisect
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import torch
 
 from experiments import lab
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.optics.lens import glass
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.photographs.rims import fit_rims, with_fitted_rims
@@ -134,6 +136,70 @@ def with_beam_of_rims(lens: Lens) -> Lens:
     return replace(closed, f_number=f_number, configurations=tuple(states))
 
 
+_LINE_E_NM, _LINES_E_NM = 546.0740, (479.9914, 643.8469)  # mercury, and cadmium's F' and C'
+_SAME_N, _SAME_V = 1.5e-5, 0.2  # within which printed figures are a catalogue glass's
+
+
+LINE_E = "The source states indices of the e line; n_d and V_d are computed from them."
+
+
+@cache
+def _catalogue() -> list[tuple[float, float, float, float]]:
+    """n_d, V_d, n_e and V_e of all glasses that are known at these lines."""
+    found = []
+    for g in glass.all_glasses():
+        n_e, n_F, n_C = (g.index(nm) for nm in (_LINE_E_NM, *_LINES_E_NM))
+        if n_F > n_C:
+            found.append((g.n_d, g.V_d, n_e, (n_e - 1) / (n_F - n_C)))
+    return found
+
+
+def at_line_d(lens: Lens, known: bool = False) -> Lens:
+    """The lens with n_d and V_d where its source states n_e: more of its indices are n_e of catalogue glasses than n_d.
+
+    `known`: whether the source is known to state n_e. The Abbe numbers beside them are V_e or V_d, which fits better.
+    """
+    if LINE_E in lens.notes:
+        return lens
+    stated = {(float(s.n_d), s.V_d) for s in lens.surfaces if s.V_d and s.glass is None}
+    d = [p for p in stated if any(abs(p[0] - g[0]) < _SAME_N and abs(p[1] - g[1]) < _SAME_V for g in _catalogue())]
+    at_e = [(p, g) for p in stated if p not in d for g in _catalogue() if abs(p[0] - g[2]) < _SAME_N]
+    by_V = [[p for p, g in at_e if abs(p[1] - g[k]) < _SAME_V] for k in (1, 3)]
+    e = {*by_V[0], *by_V[1]}
+    if not known and (len(e) < 2 or len(e) <= len(d)):
+        return lens
+    abbe_d = len(by_V[0]) > len(by_V[1])
+    rows = []
+    for s in lens.surfaces:
+        n_d, V_d = (s.n_d, s.V_d) if s.glass or not s.V_d else _from_line_e(float(s.n_d), s.V_d, abbe_d)
+        rows.append(replace(s, n_d=n_d, V_d=V_d))
+    return replace(lens, surfaces=tuple(rows), notes=f"{lens.notes} {LINE_E}".strip())
+
+
+def _from_line_e(n_e: float, V: float, abbe_d: bool) -> tuple[float, float]:
+    """n_d and V_d by the dispersion that the library takes for a glass without a name."""
+    n_d, V_d = n_e, V
+    for _ in range(50):
+        at, blue, red = (glass.index_at(n_d, V_d, nm) for nm in (_LINE_E_NM, *_LINES_E_NM))
+        V_d *= 1 if abbe_d else V * (blue - red) / (at - 1)
+        n_d += n_e - at
+    return round(n_d, 6), round(V_d, 3)
+
+
+def cemented(lens: Lens) -> Lens:
+    """The lens without air of no thickness between equal radii, which some tables have where elements are cemented."""
+    rows, places = list(lens.surfaces), list(range(len(lens.surfaces)))
+    for k in range(len(rows) - 2, 0, -1):
+        s, after = rows[k], rows[k + 1]
+        glued = s.n_d == 1 != after.n_d and s.thickness_mm == 0 and s.radius_mm == after.radius_mm
+        if glued and rows[k - 1].n_d != 1 and not s.stop and not after.stop:
+            rows[k] = replace(after, diameter_mm=min(s.diameter_mm, after.diameter_mm))
+            del rows[k + 1], places[k]
+    at = {old: new for new, old in enumerate(places)}
+    states = (replace(c, thickness_mm=tuple((at[k], t) for k, t in c.thickness_mm)) for c in lens.configurations)
+    return replace(lens, surfaces=tuple(rows), configurations=tuple(states))
+
+
 def with_state_names(lens: Lens) -> Lens:
     """The lens with its states named by focal length and distance: "70mm", "0.96m", "70mm 0.96m"."""
     states, names = [], list[str]()
@@ -181,7 +247,7 @@ def against_photographs(lens: Lens) -> tuple[Lens, Verified | None]:
 
 def described(want: Wanted, listed: Mapping[str, Any]) -> tuple[str, Lens, Verified | None]:
     """The id and the lens of a file with its names, source, evidence, and the verdict of photographs."""
-    lens = read_any(want.file)
+    lens = cemented(at_line_d(read_any(want.file)))
     parts = _NAMED.match(lens.name.strip())
     if parts is None:
         raise InputError(want.file, "NAME", lens.name, "PATENT Example N (PRODUCT)")
@@ -194,6 +260,7 @@ def described(want: Wanted, listed: Mapping[str, Any]) -> tuple[str, Lens, Verif
     notes = [
         f"Figures of the patent as OpticsDatabase transcribes them (MIT licence; file {want.file.name}).",
         f"Believed to be the product: the collection names it, and the example has {efl} and f/{lens.f_number:.3g}.",
+        *([LINE_E] if LINE_E in lens.notes else ()),
     ]
     if found is None:
         notes.append("There are no photographs to hold it against.")

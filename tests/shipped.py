@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.lab import historical
 from neurolens.base.errors import NeurolensWarning
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.readers.lensfile import read_lens
@@ -19,9 +20,9 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import Rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
-# The lenses by name, made by `python -m experiments named-lenses`, have tests of their own: test_named_lenses.py.
-NAMED = [path.stem for path in sorted(LENSES.glob("*.toml")) if "OpticsDatabase" in path.read_text(encoding="utf-8")]
-PATHS = [path for path in sorted(LENSES.glob("*.toml")) if path.stem not in NAMED]
+# The lenses by name, from two collections, have tests of their own: test_named_lenses.py.
+PATHS = historical()
+NAMED = sorted({path.stem for path in LENSES.glob("*.toml")} - {path.stem for path in PATHS})
 NAMES = [path.stem for path in PATHS]
 # What is tested lens by lens is tested on these, which stand at the ends of the library; on all with NEUROLENS_WHOLE=1.
 ENDS = {

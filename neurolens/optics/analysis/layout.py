@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -202,13 +202,14 @@ def _limits(layout: Layout) -> tuple[tuple[float, float], float]:
     return ends, max(height * 1.18, 1.06 * layout.film_half_height_mm)
 
 
-def element_outline(front: Section, back: Section) -> Array:
+def element_outline(front: Section, back: Section, step: int = 1) -> Array:
     """Return the closed outline [K, 2] of the glass between two surfaces.
 
     It has both arcs, flats out to the wider rim, and the cylindrical edge. Where the flats would cross (a thin-edged
-    lens with unlike rims) the edge runs straight from rim to rim.
+    lens with unlike rims) the edge runs straight from rim to rim. One point of an arc in `step` is taken, a divisor of
+    64, so that its ends are among them.
     """
-    a, b = front.arc(), back.arc()
+    a, b = front.arc()[::step], back.arc()[::step]
     edge = max(front.semi_diameter_mm, back.semi_diameter_mm)
     z_front, z_back = a[-1, 0], b[-1, 0]
     if z_back <= z_front:
@@ -242,38 +243,44 @@ def _draw_rims(axes: Any, surfaces: Sequence[Section]) -> None:
 
 
 _WIDTH, _LEAST, _MOST = 240.0, 60.0, 200.0  # pixels of a thumbnail: width, least and largest height
+_EVERY = 8  # points of an arc of which one is drawn
 _SVG_RAYS = ("#3b6fb6", "#3d9a50", "#c2502e")
 
 
 def thumbnail(layout: Layout) -> str:
-    """Return the section as a small SVG element (a few kB, no ids), for tables of many lenses."""
+    """Return the section as a small SVG element (some 3 kB, no ids), for tables of many lenses."""
     (left, right), top = _limits(layout)
     scale = min(_WIDTH / (right - left), _MOST / (2 * top))
     width, height = scale * (right - left), max(2 * scale * top, _LEAST)
 
-    def path(points: Array, look: str, close: str = "") -> str:
-        x = np.clip(scale * (points[:, 0] - left), -9 * _WIDTH, 9 * _WIDTH)
-        y = np.clip(height / 2 - scale * points[:, 1], -9 * _WIDTH, 9 * _WIDTH)
-        (start, *ends) = np.round(np.stack([x, y], axis=1), 1)
-        steps = " ".join(f"{a:g} {b:g}" for a, b in np.round(np.diff([start, *ends], axis=0), 1) + 0.0)
-        return f"<path d='M{start[0]:g} {start[1]:g}l{steps}{close}' {look}/>"
+    def path(lines: Iterable[Array], look: str, close: str = "") -> str:
+        """Lines as steps in tenths of a pixel, which take half of the letters of places."""
+        text = ""
+        for points in lines:
+            x = np.clip(scale * (points[:, 0] - left), -9 * _WIDTH, 9 * _WIDTH)
+            y = np.clip(height / 2 - scale * points[:, 1], -9 * _WIDTH, 9 * _WIDTH)
+            places = np.rint(10 * np.stack([x, y], 1)).astype(int)
+            first, *steps = [places[0], *np.diff(places, axis=0)]
+            text += f"M{first[0]} {first[1]}l" + " ".join(f"{a} {b}" for a, b in steps) + close
+        return f"<path d='{text.replace(' -', '-')}' {look}/>" if text else ""
 
-    parts = []
-    for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False):
-        if front.n_after >= _AIR:
-            outline = element_outline(front, back)[::4]
-            parts.append(path(outline, "fill='#a9cbe4' stroke='#3d5a75' stroke-width='.7'", "Z"))
-    look = "fill='none' stroke='#3d5a75' stroke-width='1.2'"
-    parts += [path(s.arc()[[0, -1]], look) for s in layout.surfaces if s.ideal]
-    for ray in layout.rays[:: max(1, RAYS_A_FIELD // 3)]:
-        parts.append(path(ray.points, f"fill='none' stroke='{_SVG_RAYS[ray.field % 3]}' stroke-width='.6'"))
+    glass = [
+        element_outline(front, back, _EVERY)
+        for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False)
+        if front.n_after >= _AIR
+    ]
+    parts = [path(glass, "fill='#a9cbe4' stroke='#3d5a75' stroke-width='7'", "Z")]
+    parts.append(path((s.arc()[[0, -1]] for s in layout.surfaces if s.ideal), "stroke='#3d5a75' stroke-width='12'"))
+    rays = layout.rays[:: RAYS_A_FIELD // 2]
+    for field, colour in enumerate(_SVG_RAYS):
+        drawn = (r.points for r in rays if r.field % len(_SVG_RAYS) == field)
+        parts.append(path(drawn, f"fill='none' stroke='{colour}' stroke-width='6'"))
     for s in layout.surfaces:
         if s.stop:
             h, reach = s.semi_diameter_mm, max(1.15 * s.semi_diameter_mm, s.semi_diameter_mm + 0.14 * top)
-            for sign in (1, -1):
-                bar = np.array([[s.z_mm, sign * h], [s.z_mm, sign * reach]])
-                parts.append(path(bar, "stroke='currentColor' stroke-width='2'"))
+            bars = (np.array([[s.z_mm, sign * h], [s.z_mm, sign * reach]]) for sign in (1, -1))
+            parts.append(path(bars, "stroke='currentColor' stroke-width='20'"))
     film, half = layout.film_z_mm, layout.film_half_height_mm
-    parts.append(path(np.array([[film, -half], [film, half]]), "stroke='#b02a2a' stroke-width='1.6'"))
-    box = f"viewBox='0 0 {width:.0f} {height:.0f}' width='{width:.0f}' height='{height:.0f}'"
+    parts.append(path([np.array([[film, -half], [film, half]])], "stroke='#b02a2a' stroke-width='16'"))
+    box = f"viewBox='0 0 {10 * width:.0f} {10 * height:.0f}' width='{width:.0f}' height='{height:.0f}'"
     return f"<svg xmlns='http://www.w3.org/2000/svg' {box}>{''.join(parts)}</svg>"

@@ -118,6 +118,7 @@ class Lens:
     Attributes:
         name, designer, source, notes: as stated in the lens file.
         believed_to_be: the product that the source's example is believed to be, or "".
+        mount: the mounts that the product is made for, separated by commas, for people and searches only.
         measured: what photographs of that product tell (`optics.photographs.verify`), as pairs of key and value.
         rims: where the rim diameters come from: the "source", somebody who "estimated" them, a rule that "derived"
             them, or "photographs".
@@ -147,6 +148,7 @@ class Lens:
     designer: str = ""
     notes: str = ""
     believed_to_be: str = ""
+    mount: str = ""
     measured: tuple[tuple[str, Any], ...] = ()
     rims: str = "source"
     film_z_mm: float | None = None

@@ -37,7 +37,7 @@ RIMS = ("source", "estimated", "derived", "photographs")
 MAX_WAVELENGTHS = 100
 # The keys of the head with the fields of `Lens` that they are, in the order of writing.
 HEAD = {
-    **{key: key for key in ("name", "believed_to_be", "designer", "source", "f_number")},
+    **{key: key for key in ("name", "believed_to_be", "designer", "mount", "source", "f_number")},
     **{"efl_mm": "stated_efl_mm", "efl_x_mm": "stated_efl_x_mm"},
     **{key: key for key in ("image_radius_mm", "half_field_deg", "rims", "wavelengths_nm")},
 }
@@ -81,7 +81,7 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
         expected = 'where the diameters come from: "source", "estimated", "derived" or "photographs"'
         raise table.error("rims", data.get("rims", "(missing)"), expected)
     stated: dict[str, Any] = {key: table.text(key) for key in ("name", "source", "rims")}
-    stated |= {key: table.text(key, required=False) for key in ("believed_to_be", "designer", "notes")}
+    stated |= {key: table.text(key, required=False) for key in ("believed_to_be", "designer", "mount", "notes")}
     stated |= {HEAD[key]: table.optional(key) for key in ("image_radius_mm", "efl_mm", "efl_x_mm")}
     lens = Lens(
         surfaces=surfaces,

@@ -124,7 +124,7 @@ BAD_HEADS = [
     ),
     ("schema = 1", "", ["schema", "(missing)", "1"]),
     ("schema = 1", "schema = 2", ["schema", "got 2", "expected 1"]),
-    ("schema = 1", "schema = 1\nmount = 'K'", ["mount", "unknown key", "schema, name"]),
+    ("schema = 1", "schema = 1\nmaker = 'K'", ["maker", "unknown key", "schema, name"]),
     ("schema = 1", "schema = 1\nhalf_field = 20", ["half_field", "did you mean 'half_field_deg'?"]),
     ("schema = 1", "schema = 1\nhalf_field_deg = 200", ["half_field_deg", "got 200", "180"]),
     ("schema = 1", "schema = 1\nimage_radius_mm = -1", ["image_radius_mm", "got -1", "above 0"]),
