@@ -14,7 +14,7 @@ from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
-from neurolens.pictures.flare.ghosts import GhostTracer, coated, entrances, ghost_graphs
+from neurolens.pictures.flare.ghosts import GhostTracer, coated, entrances, ghost_graphs, ghost_pairs
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.flare.steps import entering
 
@@ -26,12 +26,15 @@ def lens_of(name: str) -> Lens:
     return set_lens(read_lens(LENSES / f"{name}.toml"), focus_m=math.inf)
 
 
-@pytest.mark.parametrize("name", ["brendel_tessar_100", "phone_lens_6", *whole("cooke_anamorphic_42")])
-def test_graphs_are_the_traced_ghosts(name: str) -> None:
-    """At wavelengths between those of the series, also through a stop that is closed; coatings and aspheres, too."""
+@pytest.mark.parametrize(
+    ("name", "every"), [("brendel_tessar_100", 1), ("phone_lens_6", 3), *whole(("cooke_anamorphic_42", 1))]
+)
+def test_graphs_are_the_traced_ghosts(name: str, every: int) -> None:
+    """At wavelengths between those of the series, also through a stop that is closed; coatings and aspheres, too. The
+    three that put the most light on the film, of all ghosts or of one in `every`."""
     lens = lens_of(name)
     lens = coated(lens, "multi-layer") if name == "brendel_tessar_100" else lens
-    found = entrances(GhostTracer(lens), SINE, 22.0, 550.0)[:3]
+    found = entrances(GhostTracer(lens, ghost_pairs(lens)[::every]), SINE, 22.0, 550.0)[:3]
     graphs = ghost_graphs(lens, [ghost.pair for ghost in found], (400.0, 700.0))
     rng = np.random.default_rng(1)
     for share in (1.0, 0.6):
