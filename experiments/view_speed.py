@@ -20,6 +20,7 @@ from typing import Any
 
 from experiments import lab
 from neurolens.base.errors import InputError
+from neurolens.base.files import library
 from neurolens.cli import main
 
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -68,13 +69,13 @@ def run(args: argparse.Namespace) -> int:
 
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
         files = [Path(folder) / f"{name}.html" for name in "alf"]
-        for words, file in zip(([args.lens], [], [args.flare, "--ghosts"]), files, strict=True):
-            main(["view", *words, *(["--downloads", "glsl"] if words else []), "-o", str(file)])
+        every = [str(lens) for lens in sorted((library() / "lenses").glob("*.toml"))]
+        for words, file in zip(([args.lens], every, [args.flare, "--ghosts"]), files, strict=True):
+            main(["view", *words, *(["--downloads", "glsl"] if words is not every else []), "-o", str(file)])
         opened = play.chromium.launch(executable_path=browser, args=list(FLAGS))
-        library = f"first picture, library ({files[1].stat().st_size / 1e6:.2f} MB)"
+        whole = f"first picture, library ({files[1].stat().st_size / 1e6:.2f} MB)"
         rows = [
-            _first(opened, file, name, args.repeats)
-            for file, name in ((files[0], "first picture"), (files[1], library))
+            _first(opened, file, name, args.repeats) for file, name in ((files[0], "first picture"), (files[1], whole))
         ]
         page = _opened(opened, files[0])
         rows += [_change(page, name, script, args.repeats) for name, script in CHANGES.items()]

@@ -10,7 +10,7 @@ import math
 import os
 from base64 import b64encode
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from neurolens.base import lensname
 from neurolens.base.errors import InputError, installed, one_line
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.progress import Progress
+from neurolens.base.settings import setting_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens
 from neurolens.cli import arguments as cli
 from neurolens.cli import command
@@ -150,6 +151,7 @@ class _ReadLens(cli.Command):
 
     called: ClassVar[str] = "nl.lens"
     file: Path = cli.lens(positional=True)
+    glass: tuple[Path, ...] = setting_of(cli.Reporting, "glass", ())
     state: cli.LensState = cli.lens_state()
 
 
@@ -159,7 +161,7 @@ class _ReadCamera(cli.Command):
 
     called: ClassVar[str] = "nl.camera"
     camera: str = cli.lens(models=True, cameras=True, positional=True)
-    film: tuple[float, float] = cli.film((36.0, 24.0), "in mm (default: 36x24)")
+    film: tuple[float, float] = cli.film()
     state: cli.LensState = cli.camera_state()
 
 
@@ -180,20 +182,29 @@ class Lens(_Chosen):
     def _tabled(self) -> Prescription:
         from neurolens.optics.readers.any_format import read_any
 
-        return read_any(self._read.file)
+        with self._glasses():
+            return read_any(self._read.file)
+
+    def _glasses(self) -> AbstractContextManager[None]:
+        """A block in which its own glasses are known."""
+        return cli.more_glasses(self._read.glass)
 
     @cached_property
     def prescription(self) -> Prescription:
         """The surfaces, gaps and glasses of the lens in this state."""
         from neurolens.optics.setting.states import set_lens
 
-        return set_lens(self._tabled, self._read.state.shot())
+        tabled = self._tabled
+        with self._glasses():
+            return set_lens(tabled, self._read.state.shot())
 
     @cached_property
     def _figures(self) -> Mapping[str, float]:
         from neurolens.cameras.exact import state_of
 
-        return state_of(self.prescription, Shot.wavelength_nm)
+        lens = self.prescription
+        with self._glasses():
+            return state_of(lens, Shot.wavelength_nm)
 
     @property
     def focal_length_mm(self) -> float:
@@ -215,7 +226,9 @@ class Lens(_Chosen):
         """The distance from the film to the object in focus, or inf."""
         from neurolens.optics.setting.states import focus_of
 
-        return focus_of(self.prescription, self._read.state.shot())
+        lens = self.prescription
+        with self._glasses():
+            return focus_of(lens, self._read.state.shot())
 
     @installed()
     def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
@@ -237,7 +250,8 @@ class Lens(_Chosen):
         if (array := np.array(rays, np.float64)).ndim != 2 or len(array) != 6:
             raise InputError("Lens.trace", "rays", f"({array.shape})", "an array (6, N)")
         lens, start, stop = self.prescription, Rays(*torch.from_numpy(array)), self.prescription.stop_index
-        done = trace(lens, start, wavelength_nm, towards=towards, transmittance=True, record=(stop,))
+        with self._glasses():
+            done = trace(lens, start, wavelength_nm, towards=towards, transmittance=True, record=(stop,))
         crossing, through = done.crossings[stop], done.transmittance
         assert through is not None
         columns = (torch.stack(list(done.rays)), through, torch.stack([crossing.x, crossing.y]), done.status)

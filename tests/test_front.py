@@ -93,7 +93,6 @@ def test_a_call_writes_what_its_command_writes(capsys: pytest.CaptureFixture[str
         ({"f_number": 0.1}, {"--f-number": "0.1"}),  # wider than the model
         ({"focus_mode": "worst"}, {"--focus-mode": "worst"}),
         ({"output": Path("no/such/folder/a")}, {"--output": "no/such/folder/a"}),
-        ({"output": None}, {"--output": ""}),
         ({"aperture_mask": "no.png"}, {"--aperture-mask": "no.png"}),
     ],
 )

@@ -61,7 +61,7 @@ LEAN_MODULES = {
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
     "__init__": 25, "__main__": 4, "base": 2000, "graph": 2629, "optics": 8980, "models": 3753, "cameras": 4126,
-    "pictures": 7636, "programs": 2493, "studies": 3405, "cli": 3536, "front": 200,
+    "pictures": 7636, "programs": 2493, "studies": 3405, "cli": 3680, "front": 210,
 }  # fmt: skip
 SLACK = 1.03
 

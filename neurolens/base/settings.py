@@ -93,6 +93,7 @@ class Option:
         last: above 0 for what help shows after all other options, in this order.
         common: whether it is among the options that the short help of a command shows.
         written: whether it is a path that a command writes.
+        assumed: whether a command finds a value, and says so, where none is given.
     """
 
     about: str
@@ -110,6 +111,7 @@ class Option:
     last: int = 0
     common: bool = False
     written: bool = False
+    assumed: bool = False
 
 
 def setting(default: Any, about: str, **details: Any) -> Any:

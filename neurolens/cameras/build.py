@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from neurolens.cameras.ideal import PROJECTIONS, Fisheye, Pinhole, ThickLens, Th
 from neurolens.cameras.reduced import ReducedDispersion, Vignetted
 from neurolens.cameras.sampling import beyond_circle
 from neurolens.graph.compiler import has_compiler
-from neurolens.optics.lens.shot import BY_LENSES, Shot
+from neurolens.models.card import read_card
+from neurolens.optics.lens.shot import BY_LENSES, Shot, film_size, film_within
 
 if TYPE_CHECKING:
     from neurolens.optics.lens.prescription import Lens
@@ -42,6 +43,23 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
     camera, shot = as_c(_camera(str(spec), shot, progress)), shot.whole()
     camera = with_dispersion(camera, shot)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
+
+
+def film_of(spec: str | Path, **size: Any) -> tuple[tuple[float, float], str]:
+    """The film that a camera's lens covers, and its name (`film_within`); of a camera without a lens full frame.
+
+    `size`: what zooms or scales a lens file, as of `Shot`. Raises InputError as `make_camera`.
+    """
+    kind, path = resolve(spec)
+    if path is None:
+        return film_size("fullframe"), "fullframe"
+    if is_model(path):
+        return film_within(float(read_card(path)["domain"]["film_radius_mm"]))
+    from neurolens.optics.readers.any_format import read_any
+    from neurolens.optics.setting.pupils import image_radius_mm
+    from neurolens.optics.setting.states import set_lens
+
+    return film_within(image_radius_mm(set_lens(read_any(path), **size))[0])
 
 
 def as_c(camera: Camera) -> Camera:

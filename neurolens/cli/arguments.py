@@ -15,9 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
-from neurolens.base.errors import InputError, one_line, printable, warn
+from neurolens.base.errors import InputError, note, one_line, printable, warn
 from neurolens.base.files import check_writable
-from neurolens.base.lensname import lens_id_of, resolve
+from neurolens.base.lensname import lens_id_of, resolve, split_kind
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, program
 from neurolens.base.report import Report, write_tables
@@ -194,7 +194,55 @@ class Command:
     @classmethod
     def of(cls, args: argparse.Namespace) -> Self:
         """Return the command that parsed arguments describe."""
-        return from_options(cls, args)
+        return from_options(cls, args).completed()
+
+    def completed(self) -> Self:
+        """Return the command with what `assumed` finds where nothing is given; a `Note` tells of it."""
+        told, whole = list[str](), self
+        for name, (option, found) in self.assumed().items():
+            if getattr(self, name) in (None, ()):
+                value, said = found()
+                whole, told = replace(whole, **{name: value}), [*told, f"{option} {said}"]
+        if told:
+            note(f"assumed: {', '.join(told)}")
+        return whole
+
+    def assumed(self) -> dict[str, tuple[str, Callable[[], tuple[Any, str]]]]:
+        """Return by field, where none is given: its option, and what finds a value and the words that tell it."""
+        found: dict[str, tuple[str, Callable[[], tuple[Any, str]]]]
+        found = {"film": ("--film", self._film), "out": ("--output", self._output)}
+        options = {f.name: f.metadata["option"] for f in fields(self) if "option" in f.metadata}
+        return {name: how for name, how in found.items() if name in options and options[name].assumed}
+
+    def _film(self) -> tuple[tuple[float, float], str]:
+        """Return the film that the lens covers."""
+        from neurolens.cameras.build import film_of
+
+        film, name = film_of(self._inputs()[-1], **self._size())
+        return film, f"{film[0]:g}x{film[1]:g} ({name + ', which' * bool(name) or 'what'} the lens covers)"
+
+    def _size(self) -> dict[str, Any]:
+        """Return what zooms or scales the lens."""
+        shot = self.state.shot() if hasattr(self, "state") else None
+        size = {name: getattr(shot, name, None) for name in ("zoom", "focal_length_mm", "field_deg")}
+        return {name: value for name, value in size.items() if value is not None}
+
+    def _output(self, suffix: str | None = None) -> tuple[Path, str]:
+        """Return a name in this folder: INPUT-LENS-COMMAND with a suffix, else that of the option's placeholder."""
+        option = self.__dataclass_fields__["out"].metadata["option"]
+        kind = f".{option.metavar.partition('.')[2]}".rstrip(".") if suffix is None else suffix
+        names = [lens_id_of(split_kind(text)[1]) for text in self._inputs()]
+        path = Path("-".join([*names, self.called.split()[-1]]) + kind)
+        return path, str(path)
+
+    def _inputs(self) -> list[str]:
+        """Return what it reads first, as a scene, and then its lens."""
+        values = {f.name: getattr(self, f.name) for f in fields(self) if "option" in f.metadata}
+        options = {name: self.__dataclass_fields__[name].metadata["option"] for name in values}
+        lenses = {n for n, o in options.items() if isinstance(o.kind, partial) and o.kind.func is named_lens}
+        first = [name for name, option in options.items() if option.positional and name not in lenses]
+        texts = [values[name] for name in (*first[:1], *sorted(lenses)[:1])]
+        return [str(text[0] if isinstance(text, tuple) else text) for text in texts if text]
 
     def run(self) -> int:
         """Run the command and return its exit code."""
@@ -328,10 +376,12 @@ def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: b
 
 
 def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
-    """Return -o and --output, the file or folder that a command writes."""
+    """Return -o and --output, the file or folder that a command writes; it is named where there is no default."""
+    if assumed := default is ...:
+        default, about = None, f"{about} (default: a name of what is read, in this folder)"
     return setting(
         default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title,
-        written=True, common=True,
+        written=True, common=True, assumed=assumed,
     )  # fmt: skip
 
 
@@ -341,8 +391,12 @@ def plot_path(about: str) -> Any:
 
 
 def film(default: Any = ..., about: str = "size of the film in mm", title: str = "") -> Any:
-    """Return --film, a film's width and height."""
-    return setting(default, about, option="film", kind=film_size, metavar="WxH", title=title, common=True)
+    """Return --film, a film's width and height; without a default it is what the lens covers."""
+    if assumed := default is ...:
+        default, about = None, f"{about}, or its name, as super35 (default: what the lens covers, as 36x24)"
+    return setting(
+        default, about, option="film", kind=film_size, metavar="WxH", title=title, common=True, assumed=assumed
+    )
 
 
 def within(about: str, default: Any = None, title: str = "") -> Any:
@@ -386,8 +440,8 @@ def camera(name: str, shot: Shot, progress: Progress) -> Camera:
     from neurolens.cameras.build import make_camera
 
     made = make_camera(name, shot, progress)
-    for note in made.settings.get("notes", ()):
-        warn(note)
+    for text in made.settings.get("notes", ()):
+        warn(text)
     return made
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens.base.errors import InputError, pip_install, warned
 from neurolens.base.files import atomic_path
+from neurolens.base.lensname import lens_id_of
 from neurolens.base.settings import group, setting
 from neurolens.cli import arguments as cli
 from neurolens.optics.readers.source import ReadOptions
@@ -42,6 +43,10 @@ examples:
     out: Path = cli.output_path("OUT.toml", "lens file to write")
     force: bool = setting(False, "replace an existing file", common=True)
     unsaid: ReadOptions = group("what the file does not say")
+
+    def _output(self, suffix: str | None = None) -> tuple[Path, str]:
+        path = Path(f"{lens_id_of(self.file)}.toml")
+        return path, str(path)
 
     def run(self) -> int:
         """Convert one file and print what was read."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neurolens import __version__
+from neurolens.base.errors import note
 from neurolens.base.settings import group, positive, setting, whole
 from neurolens.cameras.field import frame_of
 from neurolens.cameras.sampling import focus_m
@@ -18,7 +19,7 @@ from neurolens.pictures.defocus.kernels import Cell, Grooves, as_picture, as_pre
 from neurolens.pictures.defocus.picture import SAMPLES, check_field, defocus
 from neurolens.pictures.defocus.plate import DepthSettings, read_plate
 from neurolens.pictures.frames import Files
-from neurolens.pictures.render.pictures import standard_attributes, write_channels, write_exr, write_png
+from neurolens.pictures.render.pictures import header_of, standard_attributes, write_channels, write_exr, write_png
 from neurolens.pictures.render.sensor import about, expose
 from neurolens.pictures.render.settings import SensorSettings
 
@@ -70,6 +71,15 @@ examples:
     seed: int = setting(0, "seed of the sensor's noise, for each frame another (default: 0)", kind=whole(0))
     state: cli.LensState = cli.camera_state()
     threads: int = cli.threads()
+
+    def _film(self) -> tuple[tuple[float, float], str]:
+        """The largest film of the plate's shape on that which the lens covers."""
+        (left, top), (last, bottom) = header_of(self.plate)["displayWindow"]
+        (width, height), said = super()._film()
+        across, down = max(1, last - left + 1), max(1, bottom - top + 1)
+        scale = min(width / across, height / down)
+        film = float(f"{scale * across:.6g}"), float(f"{scale * down:.6g}")
+        return film, f"{film[0]:g}x{film[1]:g} (the plate's shape within {said})"
 
     def run(self) -> int:
         """Read the plate, blur it, write the picture."""
@@ -131,7 +141,8 @@ examples:
 
     out: Path = cli.output_path("OUT", "start of the files' names")
     distance: tuple[float, ...] = setting(
-        ..., "of things from the film in metres, or inf (repeatable)",
+        (), "of things from the film in metres, or inf (repeatable; default: inf, where that is in focus 20 focal "
+        "lengths)",
         kind=positive("a distance in metres", infinite=True), metavar="M", common=True,
     )  # fmt: skip
     grid: tuple[int, int] = setting(
@@ -153,12 +164,16 @@ examples:
         progress = self.progress()
         camera, shot = self.make(self.state, progress, None)
         check_field(camera)
+        near_m = 20 * float(camera.settings["efl_mm"]) / 1000
+        distances = self.distance or (near_m if math.isinf(shot.focus_m) else math.inf,)
+        if not self.distance:
+            note(f"assumed: --distance {distances[0]:g}")
         grooves = Grooves(self.ring_height, self.ring_spacing) if self.ring_height else None
         if grooves:
             aspheres(camera)
         with progress.stage("find the kernels") as report:
             found = kernels_over(
-                camera, self.picture, tuple(dict.fromkeys(self.distance)), self.grid, self.wavelengths, grooves, report
+                camera, self.picture, tuple(dict.fromkeys(distances)), self.grid, self.wavelengths, grooves, report
             )
         side = max(cell.width_px for cells in found for cell in cells)
         facts: dict[str, Any] = {"version": __version__, "camera": camera.settings, "picture_px": list(self.picture)}

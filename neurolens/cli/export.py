@@ -69,7 +69,7 @@ examples:
         metavar="MODEL",
     )  # fmt: skip
     to: Literal["c", "c-double", "glsl", "slang", "hlsl", "wgsl", "cuda", "vex", "osl", "onnx"] = setting(
-        ..., "form to write"
+        "c", "form to write (default: c)"
     )
     out: Path = cli.output_path("FILE", "file to write")
     fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE", common=True)
@@ -83,8 +83,14 @@ examples:
         False, "of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked"
     )
     whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA, common=True)
-    film: tuple[float, float] = cli.film((36.0, 24.0), "film in mm (default: 36x24)", _CAMERA)
+    film: tuple[float, float] = cli.film(title=_CAMERA)
     state: cli.LensState = group(_CAMERA, names={*BY_LENSES, *LensCamera.takes}, unset=True)
+
+    def assumed(self) -> Any:
+        """A film for a whole camera alone, and the suffix of the language."""
+        suffix = {"c": ".h", "c-double": ".h", "cuda": ".cuh", "vex": ".h"}.get(self.to, f".{self.to}")
+        film = {"film": super().assumed()["film"]} if self.whole_camera else {}
+        return film | {"out": ("--output", lambda: self._output(suffix))}
 
     def run(self) -> int:
         """Check the options, then load, fix and write."""

@@ -27,6 +27,7 @@ from neurolens.cameras.field import Field, field_of
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.optics.analysis.layout import lens_layout
+from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.states import set_lens
@@ -128,7 +129,7 @@ examples:
         None, "draw the rays of one ghost of the first light (PNG, PDF, SVG)",
         kind=str, nargs=2, metavar=("GHOST", "OUT"),
     )  # fmt: skip
-    film: tuple[float, float] = cli.film((36.0, 24.0), "in mm (default: 36x24)", OF_PICTURE)
+    film: tuple[float, float] = cli.film(title=OF_PICTURE)
     width: int = setting(
         960, "of the picture (default: 960)", within=(1, 16384), metavar="PIXELS", title=OF_PICTURE, common=True
     )
@@ -209,8 +210,16 @@ examples:
             Files.of(self.out)
         if self.path is not None:
             cli.check_written(Path(self.path[1]), "--path", "OUT.png")
-        if not (self.light or self.lights or self.image):
-            self.refuse("--light", "(missing)", "--light, --lights or --image")
+
+    def assumed(self) -> Any:
+        """A light, too."""
+        return super().assumed() | ({} if self.lights or self.image else {"light": ("--light", self._a_light)})
+
+    def _a_light(self) -> tuple[tuple[str], str]:
+        """The sun, half-way to the right edge of the film that the lens covers and a quarter of the way up."""
+        (width, height), efl_mm = self._film()[0], first_order(set_lens(read_any(self.file), **self._size())).efl_mm
+        right, up = (math.degrees(math.atan(share / float(efl_mm))) for share in (width / 4, height / 4))
+        return (f"{right:.3g},{up:.3g}",), f"{right:.3g},{up:.3g}"
 
     def run(self) -> int:
         """Trace the ghosts, print their table, and write the picture."""

@@ -109,6 +109,12 @@ examples:
     state: cli.LensState = cli.camera_state()
     threads: int = cli.threads("workers, each pinned to a core if there are as many as cores")
 
+    def assumed(self) -> Any:
+        """Nothing for tiles, whose picture has the name that it was rendered to."""
+        if self.merge and self.out is None:
+            self.refuse("--output", "(missing)", "-o OUT.exr beside --merge")
+        return super().assumed()
+
     def run(self) -> int:
         """Render frames, or merge tiles; return the exit code of the first frame that fails."""
         if not self.merge and (len(self.scene) != 1 or self.camera is None):

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -73,11 +73,12 @@ class PictureCommand(cli.Reporting):
     """A command about the picture of a lens."""
 
     kept = "files that were written are whole"
+    usual_px: ClassVar[int] = 1920
 
     camera: str = cli.lens(also=", see below", models=True, cameras=True, positional=True)
     width: int | None = setting(
-        None, "width of the lens's picture (default: from --height and the film's shape)", within=(1, _LARGEST),
-        metavar="PIXELS", common=True,
+        None, "width of the lens's picture (default: from --height and the film's shape, else as said)",
+        within=(1, _LARGEST), metavar="PIXELS", common=True,
     )  # fmt: skip
     height: int | None = setting(
         None, "height of the lens's picture (default: from --width and the film's shape)", within=(1, _LARGEST),
@@ -89,11 +90,14 @@ class PictureCommand(cli.Reporting):
     film: tuple[float, float] = cli.film()
     state: cli.LensState = cli.camera_state()
 
+    def assumed(self) -> Any:
+        """The width, too."""
+        width = "--width", lambda: (self.usual_px, str(self.usual_px))
+        return super().assumed() | ({} if self.height or self.size else {"width": width})
+
     @property
     def picture(self) -> tuple[int, int]:
         """Width and height of the lens's picture in pixels."""
-        if not (self.size or self.width or self.height):
-            self.refuse("--width", "(missing)", "--width or --height of the lens's picture")
         return self.size or size_by_shape(self.film[0] / self.film[1], self.width, self.height)
 
     def make(
@@ -383,7 +387,7 @@ examples:
   neurolens projection models/NAME.onnx --width 1920 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
 
     projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta"] = setting(
-        ..., "the projection to fit", old=("model",)
+        "opencv", "the projection to fit (default: opencv)", old=("model",)
     )
     noncentral: bool = setting(
         False, "write the ray of each pixel, too, however little one centre leaves (default: above half a pixel)"

@@ -19,7 +19,7 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.shaders.lens_source import write_lens
 from neurolens.cameras.shaders.source import model_extras
 from neurolens.cli import arguments as cli
-from neurolens.cli.blender import Build, forms_of, key_of, kind_of, library, squeeze_of
+from neurolens.cli.blender import Build, forms_of, kind_of, library, squeeze_of
 from neurolens.models.card import read_card
 from neurolens.models.source import Written, export_source
 from neurolens.optics.analysis.fields import Scene
@@ -37,6 +37,10 @@ _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmit
 _NEAR_EFL = 10.0  # an exact lens's nearest focus in focal lengths
 _SAME = 1e-3  # of the focal length: models and a lens file of one id may differ by this share
 _GHOSTS = 24  # ghosts of a lens at most, the brightest
+_SIX = (  # without any lens
+    "laikin_double_gauss_50", "petzval_portrait_100", "cooke_triplet_50", "isshiki_fisheye_10", "phone_lens_6",
+    "merte_biotar_100",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +51,8 @@ class View(cli.Reporting):
     their error and what a ray costs there.
 
     LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
-    model, shown with the lens of its name. Without any, every lens of lenses/ with the best polynomial and
-    the best network of models/."""
+    model, shown with the lens of its name. Without any, six lenses with
+    the best polynomial and the best network of each."""
 
     epilog = """\
 examples:
@@ -61,25 +65,34 @@ examples:
     lenses: tuple[Path, ...] = cli.lens((), models=True, positional=True, metavar="LENS|MODEL", nargs="*")
     out: Path = cli.output_path("FILE.html", "page (default: view.html)", Path("view.html"))
     downloads: Sequence[str] = setting(
-        _DOWNLOADS, "of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds "
-        "a form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, or 40 kB a lens, "
-        "exact lenses' first", kind=cli.words_of(_DOWNLOADS, "glsl"), metavar="KINDS",
+        (), "of glsl, onnx, c, osl what the page brings as files of each form (default: all; without a lens all but "
+        "osl, which takes seconds a form, a minute of a zoom, once); the last are left out where the page grows beyond "
+        "3 MB, or 40 kB a lens, exact lenses' first", kind=cli.words_of(_DOWNLOADS, "glsl"), metavar="KINDS",
     )  # fmt: skip
     ghosts: bool = setting(
         False, "a lamp that can be dragged draws its ghosts, the 24 brightest of each LENS; needs a C compiler"
     )
     jobs: int = setting_of(Build, "jobs", Build.jobs)
 
+    def assumed(self) -> Any:
+        """Six lenses, in the forms that take no minute."""
+        few = tuple(shipped() / "lenses" / f"{name}.toml" for name in _SIX)
+        quick = tuple(kind for kind in _DOWNLOADS if kind != "osl")
+        found = {"downloads": ("--downloads", lambda: (quick, ",".join(quick)))} if not self.lenses else {}
+        return super().assumed() | found | {"lenses": ("LENS", lambda: (few, ", ".join(_SIX)))}
+
     def run(self) -> int:
         """Write the page."""
-        if self.ghosts and not self.lenses:
-            self.refuse("--ghosts", "(no lens)", "the lenses whose ghosts are wanted beside it")
-        entries = list(_named(self.lenses) if self.lenses else _library())
+        entries = list(_named(self.lenses))
         for entry in entries:
             own = [kind_of(read_card(file)) for file in entry.models]
             if len(set(own)) < len(own):
                 raise InputError("neurolens view", entry.key, f"({' and '.join(own)})", "one model of each kind")
-        kinds, progress, made = ["glsl", *(k for k in self.downloads if k != "glsl")], self.progress(), list[ViewLens]()
+        kinds, progress, made = (
+            ["glsl", *(k for k in self.downloads or _DOWNLOADS if k != "glsl")],
+            self.progress(),
+            list[ViewLens](),
+        )
         with TemporaryFolder() as place, warnings.catch_warnings():
             # The lens's own file has warned already.
             warnings.filterwarnings("ignore", re.escape(place), NeurolensWarning)
@@ -125,17 +138,6 @@ def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mappin
     for file, why in left.items():
         warnings.warn(f"no OSL: {why.replace(str(file), file.name)}", NeurolensWarning, stacklevel=2)
     return {file: form.osl for file, form in forms.items()}
-
-
-def _library() -> Iterator[_Entry]:
-    """Yield every lens of lenses/ with its best models; a zoom over its range, where a model has it."""
-    root = shipped()
-    for models, file in library(root / "models", root / "lenses", ()):
-        base, _, state = key_of(models[0]).partition("-")
-        if state in ("", "range"):  # other states are second models of a lens that is here already
-            file = file or root / "lenses" / f"{base}.toml"
-            lens = read_any(file) if file.is_file() else None
-            yield _Entry(key_of(models[0]), models, lens, RANGE if state else None)
 
 
 def _named(paths: Sequence[Path]) -> Iterator[_Entry]:

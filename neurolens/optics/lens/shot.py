@@ -27,7 +27,12 @@ BY_LENSES = (
     "focus_m", "f_number", "focal_length_mm", "zoom", "field_deg", "focus_mode", "internal", "aperture",
     "cover_glass_mm",
 )  # fmt: skip
-FILMS = {"super35": "24.89x18.66", "fullframe": "36x24", "apsc": "23.6x15.7", "mft": "17.3x13", "super16": "12.52x7.41"}
+FILMS = {  # by name, the largest first: options take these, and a lens has the first that it covers
+    "largeformat": "120x96", "645": "56x41.5", "mediumformat": "43.8x32.9", "fullframe": "36x24",
+    "super35": "24.89x18.66", "apsc": "23.6x15.7", "apsccanon": "22.3x14.9", "mft": "17.3x13", "1inch": "13.2x8.8",
+    "super16": "12.52x7.41", "phone": "5.6x4.2",
+}  # fmt: skip
+_COVERS = 1.02  # the circle of a film over that of a lens that is made for it: makers round
 
 
 @dataclass(frozen=True)
@@ -179,6 +184,15 @@ def film_size(text: str) -> tuple[float, float]:
         return side(width.strip()), side(height.strip())
     except ArgumentTypeError as error:
         raise ArgumentTypeError(f"{text!r}: {error}") from None
+
+
+def film_within(radius_mm: float) -> tuple[tuple[float, float], str]:
+    """The film that an image circle covers: the largest of `FILMS` but for narrow ones, and its name; else 3:2, ""."""
+    films = {name: film_size(text) for name, text in FILMS.items()}
+    fitting = {name: film for name, film in films.items() if math.hypot(*film) / 2 <= _COVERS * radius_mm}
+    named = max(fitting, key=lambda name: math.hypot(*fitting[name]), default="")
+    share = 2 * radius_mm / math.hypot(3, 2)
+    return fitting.get(named) or (float(f"{3 * share:.3g}"), float(f"{2 * share:.3g}")), named
 
 
 def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:

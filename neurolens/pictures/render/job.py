@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, note
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.reduced import film_shift
 from neurolens.graph.compiler import c_source, has_compiler, load_compiled
@@ -404,6 +404,8 @@ def mode_for(
 ) -> Literal["one", "hero", "companions"]:
     """Choose how paths carry wavelengths: see `Job`.
 
+    A `Note` says so where one wavelength a path is all that can be had.
+
     Raises:
         InputError: the settings ask for "hero", and the camera disperses but cannot place companions in whole pixels,
             or there is no C compiler for the sums of their light.
@@ -413,13 +415,15 @@ def mode_for(
     shift = dispersion_px(camera, grid, limits_nm) if camera.dispersive else 0.0
     if shift <= _LITTLE_PX:
         return "hero"
-    asked = film.wavelengths == "hero"
     placed = film.fill_factor == 1 and getattr(camera, "companion_reach_mm", None) is not None
     if placed and has_compiler():
         return "companions"
-    if asked:
-        why = f"camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
-        raise InputError("render", "film.wavelengths", "hero", f"one: {'there is no C compiler' if placed else why}")
+    why = f"camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
+    why = "there is no C compiler" if placed else why
+    if film.wavelengths == "hero":
+        raise InputError("render", "film.wavelengths", "hero", f"one: {why}")
+    follows = "" if placed or film.fill_factor != 1 else ", which no polynomial follows"
+    note(f"one wavelength a path, which is noisier: {why}{follows}")
     return "one"
 
 

@@ -4,9 +4,11 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import failure, run_json
 
+import neurolens as nl
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lens import glass as catalogue
 from neurolens.optics.lens.glass import index_at, index_of
@@ -94,6 +96,10 @@ def test_a_lens_is_traced_with_its_own_catalogue_or_by_its_figures(
     assert "XY1" in failure(capsys, "lens", lens)
     assert run_json(capsys, "lens", lens, "--glass", file)["efl_mm"] == pytest.approx(49.0, abs=0.2)
     assert run_json(capsys, "glass", "XY1", "--glass", file)["glasses"][0]["glass"] == "mine:XY1"
+    own = nl.lens(lens, glass=file)
+    assert own.focal_length_mm == pytest.approx(49.0, abs=0.2) and own.set(f_number=8).focus_m == math.inf
+    ray = own.trace(np.array([[0.0], [1.0], [30.0], [0.0], [0.0], [-1.0]]), 450.0)
+    assert ray.status[0] == 0 and own.describe()["efl_mm"] == pytest.approx(own.focal_length_mm)
     lens.write_text(head + row % ", n_d = 1.62, V_d = 36.4" + "\n" + back + "\n]\n")
     with pytest.warns(NeurolensWarning, match=r"surface 0, glass: glass XY1 is not in the catalogue.*Cauchy"):
         front = read_lens(lens).surfaces[0]

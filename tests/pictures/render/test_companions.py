@@ -15,6 +15,7 @@ from render_helpers import FILM, WHITE, scene
 from shipped import whole
 
 from neurolens.base import status as st
+from neurolens.base.errors import InputError, Note
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.graph import compiler
@@ -128,6 +129,16 @@ def test_lenses_and_models_carry_companions_unless_asked_for_one() -> None:
     }
     for made in (exact, model):
         assert [modes[made, w] for w in WAYS] == ["companions", "one", "companions"]
+
+
+def test_one_wavelength_a_path_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = lens_camera("laikin_double_gauss_50")
+    monkeypatch.setattr(type(camera), "companion_reach_mm", None)  # as where no polynomial follows the shift
+    grid, limits = PixelGrid(720, 480, FILM), (400.0, 700.0)
+    with pytest.warns(Note, match="one wavelength a path, .* moves its picture by .* which no polynomial follows"):
+        assert mode_for(camera, grid, limits, FilmSettings()) == "one"
+    with pytest.raises(InputError, match="moves its picture"):
+        mode_for(camera, grid, limits, FilmSettings(wavelengths="hero"))
 
 
 def blocks(picture: np.ndarray) -> np.ndarray:

@@ -1,0 +1,148 @@
+"""The plain line: each command with nothing but what it is about gives its result, and says what it assumed."""
+
+from argparse import _SubParsersAction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import failure
+
+from neurolens.cli import build_parser, main
+from neurolens.optics.lens.shot import FILMS, film_size, film_within
+from neurolens.pictures.render.pictures import write_channels
+
+ROOT = Path(__file__).parents[1]
+COMMANDS = next(a for a in build_parser()._actions if isinstance(a, _SubParsersAction)).choices
+MODEL, LENS = "laikin_double_gauss_50.ols-36", "cooke_triplet_50"
+FULL = "--film 36x24 (fullframe, which the lens covers)"
+TRIPLET = "--film 24.89x18.66 (super35, which the lens covers)"
+# The line, smaller by its own options; what is said to be assumed; a file that is written.
+TRIPLET_SEQ = """\
+RDM
+TITLE 'Triplet'
+EPD 10
+DIM M
+WL 587.56
+YAN 0 14
+SO 0 1e20
+S 22.01359 3.25896 SK16_SCHOTT
+S -435.76044 6.00755
+S -22.21328 0.99997 F2_SCHOTT
+S 20.29192 4.75041
+  STO
+S 79.6836 2.95208 SK16_SCHOTT
+S -18.39533 42.20778
+SI 0 0
+GO
+"""
+PLAIN: dict[str, tuple[str, str, str]] = {
+    "find": ("petzval", "", ""),
+    "lens": (LENS, "", ""),
+    "analyse": (f"{LENS} distortion", "", ""),
+    "glass": ("N-BK7", "", ""),
+    "models": ("", "", ""),
+    "convert": ("triplet.seq", "--output triplet.toml", "triplet.toml"),
+    "view": (f"{LENS} --downloads glsl", "", "view.html"),
+    "render": (
+        f"scenes/room.toml --camera {MODEL} --width 8 --samples 1",
+        "--output room-laikin_double_gauss_50_ols-36-render.exr",
+        "room-laikin_double_gauss_50_ols-36-render.png",
+    ),
+    "flare": (f"{LENS} --quick", f"{TRIPLET}, --light 7.09,5.33", ""),
+    "defocus": (
+        f"plate.exr --lens {MODEL} --samples 8",
+        "--film 36x18 (the plate's shape within 36x24 (fullframe, which the lens covers)), "
+        "--output plate-laikin_double_gauss_50_ols-36-defocus.exr",
+        "plate-laikin_double_gauss_50_ols-36-defocus.png",
+    ),
+    "bokeh": (f"{MODEL} --grid 1x1", f"{FULL}, --output laikin_double_gauss_50_ols-36-bokeh, --width 1920", ""),
+    "stmap": (
+        f"{MODEL} --width 48",
+        f"{FULL}, --output laikin_double_gauss_50_ols-36-stmap",
+        "laikin_double_gauss_50_ols-36-stmap.redistort.exr",
+    ),
+    "projection": (MODEL, f"{FULL}, --width 1920", ""),
+    "handover": (
+        f"{MODEL} --width 48",
+        f"{FULL}, --output laikin_double_gauss_50_ols-36-handover",
+        "laikin_double_gauss_50_ols-36-handover/README.md",
+    ),
+    "rays": (
+        f"{MODEL} --samples 1",
+        f"{FULL}, --output laikin_double_gauss_50_ols-36-rays.npz, --width 480",
+        "laikin_double_gauss_50_ols-36-rays.npz",
+    ),
+    "export": (MODEL, "--output laikin_double_gauss_50_ols-36-export.h", "laikin_double_gauss_50_ols-36-export.h"),
+}
+# Their plain lines are held where they are tested: they take a minute, or a program from elsewhere.
+ELSEWHERE = {"demo", "survey", "train", "evaluate", "plan", "verify", "rims", "blender", "mitsuba"}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_command_has_a_plain_line() -> None:
+    assert PLAIN.keys() | ELSEWHERE == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_the_plain_line_works_and_says_what_it_assumed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words, assumed, written = PLAIN[name]
+    Path("scenes").symlink_to(ROOT / "experiments" / "scenes")
+    Path("triplet.seq").write_text(TRIPLET_SEQ)
+    grey, far = np.full((6, 12), 0.5, np.float32), np.full((6, 12), 3.0, np.float32)
+    write_channels(Path("plate.exr"), {**dict.fromkeys("RGB", grey), "Z": far}, None, {})
+    assert main([name, *words.split()]) == 0
+    said = capsys.readouterr().err.splitlines()
+    lines = [line for line in said if "assumed: " in line and "--distance" not in line]
+    assert lines == ([f"neurolens: assumed: {assumed}"] if assumed else [])
+    assert not written or Path(written).stat().st_size
+
+
+def test_view_alone_shows_six_lenses(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whose page takes half a minute, without shaders for Cycles, which take an hour."""
+    seen = []
+    monkeypatch.setattr("neurolens.cli.view.View.run", lambda self: seen.append(self) or 0)
+    assert main(["view"]) == 0
+    assert len(seen[0].lenses) == 6 and all(file.is_file() for file in seen[0].lenses)
+    assert seen[0].downloads == ("glsl", "onnx", "c")
+    assert capsys.readouterr().err.count("assumed: ") == 1
+
+
+def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", MODEL, "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("made", ["laikin_double_gauss_50_ols-36-export.h"])
+def test_a_folder_of_that_name_is_not_written_over(made: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path(made).mkdir()
+    assert made in failure(capsys, "export", MODEL)
+
+
+@pytest.mark.parametrize(
+    ("radius_mm", "film"),
+    [
+        (21.6, (36, 24)), (21.64, (36, 24)), (14.2, (23.6, 15.7)), (13.66, (22.3, 14.9)), (10.815, (17.3, 13)),
+        (27.35, (43.8, 32.9)), (15.57, (24.89, 18.66)), (3.5, (5.6, 4.2)), (1e6, (120, 96)),
+    ],
+)  # fmt: skip
+def test_a_lens_covers_the_format_that_it_is_made_for(radius_mm: float, film: tuple[float, float]) -> None:
+    """Full frame, APS-C of Fujifilm, Sony and of Canon, Four Thirds, 44 x 33 mm, Super 35, a phone."""
+    assert film_within(radius_mm)[0] == film
+
+
+@pytest.mark.parametrize("radius_mm", [1e-3, 0.5, 3.4])
+def test_a_smaller_circle_gets_a_film_of_3_to_2_inside_it(radius_mm: float) -> None:
+    (width, height), name = film_within(radius_mm)
+    assert name == "" and np.hypot(width, height) / 2 == pytest.approx(radius_mm, rel=1e-2)
+    assert width / height == pytest.approx(1.5, rel=1e-2)
+
+
+def test_films_fall_in_size() -> None:
+    """And each is within the circle of the one before, so that the largest that fits is the first that does."""
+    sizes = [np.hypot(*film_size(name)) for name in FILMS]
+    assert sizes == sorted(sizes, reverse=True)
