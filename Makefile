@@ -16,6 +16,8 @@
 #                 are tried (5 CPU minutes; NEUROLENS_WHOLE=1 runs what takes long in how-tos, too);
 #                 NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to in C++,
 #                 NEUROLENS_MITSUBA=1 renders that in Mitsuba (extra "mitsuba", and LLVM 17 or later)
+#   make release  build the source distribution and the wheel into dist/, check both with twine, and run the wheel alone in a new
+#                 environment without torch: the README's first picture, then `neurolens demo` (265 MB, 2 CPU minutes)
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
@@ -31,6 +33,7 @@ INSTALLED := $(VENV)/.installed
 CHROMIUM ?= $(shell command -v chromium || command -v chromium-browser || command -v google-chrome)
 ORT_WEB := 1.30.0
 TORCH_CPU ?= https://download.pytorch.org/whl/cpu
+RELEASE_TOOLS := build==1.6.1 twine==7.0.0
 BLENDER ?= 5.0.0
 BLENDER_VENV := .venv-blender$(if $(filter 5.0.0,$(BLENDER)),,-$(BLENDER))
 BLENDER_INSTALLED := $(BLENDER_VENV)/.installed
@@ -49,7 +52,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # A machine of one run compiles what it imports, which is a fraction of what pip would compile for a minute.
 PIP_INSTALL := $(BIN)/python -m pip install $(if $(CI),--no-compile) -c constraints.txt
 
-.PHONY: demo test test-whole test-blender test-web test-shading docs bench models gallery lint format clean
+.PHONY: demo test test-whole test-blender test-web test-shading docs bench models gallery release lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -98,6 +101,18 @@ models: $(INSTALLED)
 
 gallery: $(INSTALLED)
 	$(BIN)/python -m experiments gallery
+
+# Tools and the wheel's environment are made anew: what is left of an earlier one must not help it. No extra of pyproject.toml
+# names them, for nothing else needs them.
+release:
+	rm -rf dist build/release && mkdir -p build/release/away
+	"$(PYTHON)" -m venv build/release/tools && "$(PYTHON)" -m venv build/release/alone
+	build/release/tools/bin/python -m pip install -q $(RELEASE_TOOLS)
+	build/release/tools/bin/python -m build --outdir dist .
+	build/release/tools/bin/python -m twine check --strict dist/*
+	build/release/alone/bin/python -m pip install -q -c constraints.txt dist/*.whl
+	cd build/release/away && ../alone/bin/neurolens render experiments/scenes/room.toml --camera laikin_double_gauss_50.ols-36 \
+	    --width 96 -o first.exr && ../alone/bin/neurolens demo --width 96 --samples 4 && test -s first.png
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
 from neurolens.base.errors import InputError, note, one_line, printable, warn
-from neurolens.base.files import check_writable
+from neurolens.base.files import check_writable, library
 from neurolens.base.lensname import lens_id_of, resolve, split_kind
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, program
@@ -354,6 +354,13 @@ def named_lens(models: bool, cameras: bool, text: str) -> Any:
         return str(found) if cameras else found.file
     except InputError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def scene_file(text: str) -> Path:
+    """Read an argument that names a scene file: its path, else its path in a checkout or its name, as it ships."""
+    path, shipped = Path(text), library()
+    places = path, shipped / path, shipped / "experiments" / "scenes" / f"{text}.toml"
+    return next((place for place in places if place.is_file()), path)
 
 
 def floats(text: str, between: str = ",") -> list[float]:

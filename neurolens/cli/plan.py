@@ -59,7 +59,10 @@ models/ with what was fitted, and plan.toml: 'render' and 'export' take it for t
 model of the shot from it, from scratch. --trade leaves trade.html besides, a page with trade.png and pictures.png."""
     kept = "models fitted so far are kept, the plan is not written"
 
-    scene: Path = setting(..., "scene file (.toml)", positional=True, metavar="SCENE")
+    scene: Path = setting(
+        ..., "scene file (.toml), or its name in experiments/scenes", positional=True, metavar="SCENE",
+        kind=cli.scene_file,
+    )  # fmt: skip
     lens: Path = cli.lens()
     budget: tuple[str, float] = setting(
         ("px", 0.25), "error allowed, as 0.25px (default); or time, as 20s: of one thread, for the scene's size and "

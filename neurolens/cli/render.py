@@ -74,8 +74,9 @@ examples:
     kept = "no picture was written; older files of that name are untouched"
 
     scene: tuple[Path, ...] = setting(
-        (), "scene file (.toml), or tiles of --merge", positional=True, metavar="SCENE", nargs="*"
-    )
+        (), "scene file (.toml) or its name in experiments/scenes, or tiles of --merge", positional=True,
+        metavar="SCENE", nargs="*", kind=cli.scene_file,
+    )  # fmt: skip
     camera: str | None = cli.lens(None, models=True, cameras=True)
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
