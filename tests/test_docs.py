@@ -54,6 +54,23 @@ def test_links_lead_to_files(page: Path) -> None:
         assert target.exists() or not MADE.isdisjoint({target, target.parent}), link
 
 
+def test_the_way_in_names_files_and_what_they_hold() -> None:
+    """`FOLDER/FILE: NAME` of the page for those who change the package, from its folder or the repository's root."""
+    text = (ROOT / "neurolens" / "README.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:[\w-]+/)+[\w.-]*)(?:: ([\w.]+))?`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    assert len(named) > 200
+    for file, name in named:
+        found = next((f for f in (ROOT / "neurolens" / file, ROOT / file) if f.exists()), None)
+        assert found is not None, file
+        if name:
+            code = found.read_text(encoding="utf-8")
+            assert all(re.search(rf"\b{word}\b", code) for word in name.split(".")), f"{file}: {name}"
+    headings = {
+        re.sub(r"[^a-z ]", "", h.lower()).replace(" ", "-") for h in re.findall(r"^#+ (.*)", text, re.MULTILINE)
+    }
+    assert set(re.findall(r"\]\(#([\w-]+)\)", text)) <= headings
+
+
 # A name, or the first of several, and a year; of texts, these are no papers.
 AUTHORS = re.compile(r"\b([A-Z][a-z]+)(?:, [A-Z][a-z]+)*(?:,? and [A-Z][\w-]+| et al\.)?,? \(?((?:19|20)\d\d)[ab]?\b")
 NO_PAPERS = {

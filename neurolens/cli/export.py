@@ -22,12 +22,17 @@ from neurolens.cameras.shaders.blender_shader import shader_of
 from neurolens.cameras.shaders.source import CAMERA_FRAME, camera_program, model_extras
 from neurolens.cli import arguments as cli
 from neurolens.graph.c import Extras
+from neurolens.graph.shading import LANGUAGES
 from neurolens.models import source
 from neurolens.optics.lens.paraxial import film_z_mm
 from neurolens.optics.lens.shot import BY_LENSES
 
 if TYPE_CHECKING:
     from neurolens.models.model import LensModel
+
+    _Form = str
+else:
+    _Form = Literal[(*source.WRITERS, source.OSL, "onnx")]
 
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _CAMERA = "camera: what a whole camera is set to"
@@ -39,14 +44,14 @@ _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 @dataclass(frozen=True, kw_only=True)
 class Export(cli.Reporting):
     """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for arrays
-    that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an ONNX file.
+    that compilers vectorise), a function in a shading language, or an ONNX file.
 
     Domain guard, stop, rims, transmittance and status codes are those of the model; the card is a comment at the top,
     and constants and the film's position for a focus stand beside it. Of a model of a zoom's whole range (or of
     internal focus) the state is an argument. A lens file gives the exact lens, with c-double within 1e-12 mm of the
     tracer. OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades, zoom and more are its inputs.
     With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted ray
-    out, its pupil's outline as a table in the file (of shading languages but CUDA, data beside it).
+    out, its pupil's outline as a table in the file, or as data beside it for most shading languages.
     Needs the extra "train" (torch); without it source code is written from the model's file, whole, nothing fixed."""
 
     epilog = """\
@@ -68,9 +73,7 @@ examples:
         also="; or a file of neurolens plan; of --to onnx models alone", models=True, cameras=True, positional=True,
         metavar="MODEL",
     )  # fmt: skip
-    to: Literal["c", "c-double", "glsl", "slang", "hlsl", "wgsl", "cuda", "vex", "osl", "onnx"] = setting(
-        "c", "form to write (default: c)"
-    )
+    to: _Form = setting("c", "form to write (default: c)")
     out: Path = cli.output_path("FILE", "file to write")
     fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE", common=True)
     only: tuple[str, str, str, str] = setting(
@@ -166,8 +169,7 @@ examples:
         lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
         name = source.checked_name(self.to, f"{lens['id']}_camera", self.name)
         graph = camera.lens_graph()
-        # For an array of 43,000 constants shader compilers take minutes: there the caller brings the table.
-        own_table = self.to in ("c", source.DOUBLE, "cuda")
+        own_table = self.to not in LANGUAGES or LANGUAGES[self.to].own_table
         program = camera_program(camera.film, graph, self.derivatives, own_table=own_table)
         numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
         constants = {"film_width_mm": self.film[0], "film_height_mm": self.film[1], **numbers}

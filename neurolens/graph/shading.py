@@ -44,6 +44,8 @@ class Glsl(Writer):
             structure.
         within: whether arrays may stand only within functions. loops: whether a state is made in loops over an array,
             which compilers of some languages copy for each ray; else by statements.
+        own_table: whether a camera's file holds the outline of the pupil. For an array of 43,000 constants shader
+            compilers take minutes: there the caller brings it.
     """
 
     about = "For GLSL 3.30, GLSL ES 3.00 (with highp floats) and later."
@@ -60,7 +62,7 @@ class Glsl(Writer):
     whole, truth, let_whole = "int", "bool", "int"
     to_whole, band = "int({})", "clamp(band, 0, {} - 1)"
     number, array = "const float {} = {};", "float {0}[{1}] = float[{1}]({2});"
-    constant, local, within, loops = "const ", "", False, True
+    constant, local, within, loops, own_table = "const ", "", False, True, False
 
     @property
     def known(self) -> dict[str, str]:
@@ -205,7 +207,7 @@ class Cuda(Glsl):
         "fma": "fmaf({0}, {1}, {2})",
     }  # fmt: skip
     table_of, lookup, own_lookup = "const float *{0}, int {0}_cells", Writer.lookup, Writer.lookup
-    header, given, ray = "{macro}_DEVICE {2} {0}({1})", "{}", True
+    header, given, ray, own_table = "{macro}_DEVICE {2} {0}({1})", "{}", True, True
     band, to_whole = "{name}_cell(float(band), {})", "int({})"
     number, array, constant = "#define {} {}", "float {0}[{1}] = {{\n    {2}\n}};", "{macro}_TABLE "
 
