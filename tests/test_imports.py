@@ -135,7 +135,7 @@ def test_no_imports_go_in_a_circle() -> None:
     """Those inside functions count, too; those for types alone do not."""
     graph, known = {}, imports().keys()
     for path in MODULES:
-        text = TYPES_ALONE.sub("", path.read_text(encoding="utf-8"))
+        text = TYPES_ALONE.sub("if 0:\n    pass\n", path.read_text(encoding="utf-8"))
         found = set()
         for node in statements(ast.parse(text).body):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("neurolens"):

@@ -111,7 +111,7 @@ class Entry:
             return _WHOLE
         if not word.isalpha() or len(word) < 3:
             return 0
-        begun = any(own.startswith(word) or (len(own) > 3 and word.startswith(own)) for own in self.words)
+        begun = any(own.startswith(word) or (len(own) > 3 and word in (own + "s", own + "es")) for own in self.words)
         return _BEGUN * begun or _INSIDE * (len(word) > 4 and word in "".join(words_of(self.name)))
 
 
