@@ -30,10 +30,6 @@ from neurolens.optics.lens.shot import BY_LENSES
 if TYPE_CHECKING:
     from neurolens.models.model import LensModel
 
-    _Form = str
-else:
-    _Form = Literal[(*source.WRITERS, source.OSL, "onnx")]
-
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _CAMERA = "camera: what a whole camera is set to"
 # Rays that measure the errors of an ONNX file with fixed inputs.
@@ -73,7 +69,9 @@ examples:
         also="; or a file of neurolens plan; of --to onnx models alone", models=True, cameras=True, positional=True,
         metavar="MODEL",
     )  # fmt: skip
-    to: _Form = setting("c", "form to write (default: c)")
+    to: Literal[(*source.WRITERS, source.OSL, "onnx")] = setting(  # type: ignore[valid-type]
+        "c", "form to write (default: c)"
+    )
     out: Path = cli.output_path("FILE", "file to write")
     fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE", common=True)
     only: tuple[str, str, str, str] = setting(
