@@ -19,7 +19,7 @@ from lens_models import edited
 from shipped import whole
 
 from neurolens.cli import build_parser, main
-from neurolens.cli.arguments import first_example
+from neurolens.cli.arguments import first_example, scene_file
 from neurolens.cli.train import Train
 from neurolens.models.card import read_card
 from neurolens.pictures.render.pictures import read_exr
@@ -600,3 +600,13 @@ def test_the_example_of_the_help_runs(
     monkeypatch.chdir(ROOT)  # they write nothing; those that write run in the README, in test_page_commands.py
     assert main(shlex.split(first_example(PARSERS[name].epilog))[1:]) == 0
     assert capsys.readouterr().out
+
+
+def test_a_scene_that_ships_is_found_by_name_or_path_and_a_file_here_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = ROOT / "experiments" / "scenes" / "room.toml"
+    assert scene_file("room") == scene_file("experiments/scenes/room.toml") == shipped
+    (tmp_path / "room").touch()
+    assert scene_file("room") == Path("room") and scene_file("no-such") == Path("no-such")
