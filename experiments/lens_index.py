@@ -1,7 +1,7 @@
 """The library's index: of each lens its row of `neurolens lens list`, with its character, which take 2 CPU s a lens,
 and its section as a small picture.
 
-Lenses whose figures have not changed keep their rows (notes may change) and pictures, unless --restart is given, as after
+Lenses whose figures have not changed keep rows and pictures (notes may change), unless --restart is given, as after
 changes of the code. Writes lenses/index.jsonl, a line a lens, and lenses/thumbnails/NAME.svg.
 """
 

@@ -272,8 +272,8 @@ def thumbnail(layout: Layout) -> str:
     parts = [path(glass, "fill='#a9cbe4' stroke='#3d5a75' stroke-width='7'", "Z")]
     parts.append(path((s.arc()[[0, -1]] for s in layout.surfaces if s.ideal), "stroke='#3d5a75' stroke-width='12'"))
     rays = layout.rays[:: RAYS_A_FIELD // 2]
-    for field, colour in enumerate(_SVG_RAYS):
-        drawn = (r.points for r in rays if r.field % len(_SVG_RAYS) == field)
+    for place, colour in enumerate(_SVG_RAYS):
+        drawn = (r.points for r in rays if r.field % len(_SVG_RAYS) == place)
         parts.append(path(drawn, f"fill='none' stroke='{colour}' stroke-width='6'"))
     for s in layout.surfaces:
         if s.stop:
