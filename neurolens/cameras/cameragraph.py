@@ -6,6 +6,7 @@ pupil and the weights.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -85,6 +86,38 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     turn = g.select(g.constant(_HAIR) <= radius, film * (1.0 / radius.maximum(_HAIR)), g.constant([1.0, 0.0]))
     pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
     g.outputs = {"pupil_mm": pupil, "area_mm2": area}
+    return g
+
+
+@lru_cache(maxsize=16)
+def tilt_graph(tilt: float, radius_mm: float, derivatives: tuple[str, ...] = ()) -> Graph:
+    """Write the graph from rays of a film that is turned by `tilt` (rad) about the x axis to rays of the film plane.
+
+    A lens knows lines alone: the line from a point of the turned film through a pupil point meets the plane elsewhere.
+
+    Args:
+        radius_mm: the last film radius of the outline.
+        derivatives: names of derivatives of `scene_ray` by a point of the plane, along x and y: inputs and outputs.
+
+    Inputs are `film_mm` [2] on the film, `pupil_mm` [2], `area_mm2` and, for a whole call, `per_distance`. Outputs are
+    `plane_mm` [2], where the ray meets the plane; `area_mm2`, by which its weight on the plane is that on the film; and
+    `central_mm` [2], where the line through the middle of the pupil meets the plane, within the radius.
+    """
+    g, sin, cos = Graph(), math.sin(tilt), math.cos(tilt)
+    film, pupil, area = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2")
+    per_distance = g.input("per_distance", per_call=True)
+    place, depth = film * [1.0, cos], film[1] * sin * per_distance
+    nearer = 1.0 / (1.0 + depth)  # distance of the plane over that of the point, from the pupil
+    way, central = pupil - place, place * nearer
+    within = (0.9999 * radius_mm / g.square(central).sqrt().maximum(_HAIR)).minimum(1.0)
+    g.outputs["central_mm"] = central * within
+    g.outputs["plane_mm"] = place + way * (depth * nearer)
+    g.outputs["area_mm2"] = area * nearer * nearer * (way[1] * (sin * per_distance) * nearer + cos)
+    if derivatives:
+        by_x, by_y = (g.input(name, 6) for name in derivatives)
+        moved = way * (sin * per_distance * nearer * nearer) + g.concat(0.0 * nearer, nearer * cos)
+        g.outputs[derivatives[0]] = by_x * nearer
+        g.outputs[derivatives[1]] = by_x * moved[0] + by_y * moved[1]
     return g
 
 
@@ -229,10 +262,15 @@ def whole_camera(
     graph tests a mask in the stop; else `stop_xy_mm` is an output, and the caller tests it.
     """
     g = Graph()
-    pupil = g.inline(film.outline.graph, {})
-    film_mm, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
+    own, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
+    film_mm, pupil = film.on_plane(g, own)
     found, aperture = lens_inside(g, lens, g.concat(film_mm, pupil["pupil_mm"], wavelength), mask_too)
     derivatives = tuple(name for name in found if "_by_" in name)
+    if film.tilt and derivatives:
+        turned = g.inline(tilt_graph(film.tilt, film.outline.film_radius_mm, derivatives), {
+            "film_mm": own, **pupil, **{name: found[name] for name in derivatives}
+        })  # fmt: skip
+        found = found | {name: turned[name] for name in derivatives}
     given = {"film_mm": film_mm, **pupil, **found, "lens_status": unrounded(found["status"])}
     g.outputs |= g.inline(weight_graph(derivatives, aperture, lens.stopped, lens.unit), given)
     g.outputs |= {name: value for name, value in (pupil | found).items() if name in also}

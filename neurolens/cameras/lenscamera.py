@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -23,7 +23,15 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays, status_graph, weight_graph, whole_camera
+from neurolens.cameras.cameragraph import (
+    D_FILM,
+    LensGraph,
+    camera_rays,
+    status_graph,
+    tilt_graph,
+    weight_graph,
+    whole_camera,
+)
 from neurolens.cameras.companions import Shift, companion_graph, fit_shift, lanes_graph
 from neurolens.cameras.contract import (
     MANY_RAYS_A_CALL,
@@ -39,7 +47,7 @@ from neurolens.cameras.sampling import FrontDiscs, arrived, stratified
 from neurolens.graph.c import Signature, padded_columns, write_blocks
 from neurolens.graph.compiler import has_compiler, load_compiled
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import Program, row_names
@@ -148,11 +156,15 @@ class LensFilm:
         InputError: no ray passes from the film's centre.
     """
 
-    def __init__(self, outline: PupilOutline | None, wavelength_nm: tuple[float, float], scene: LensScene) -> None:
+    def __init__(
+        self, outline: PupilOutline | None, wavelength_nm: tuple[float, float], scene: LensScene, tilt: float = 0.0
+    ) -> None:
         if outline is None:
             raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
-        self.film_z_mm, self.scene, self.outline = scene.film_z_mm, scene, outline
+        self.film_z_mm, self.scene, self.tilt = scene.film_z_mm, scene, tilt
         self.distance_mm = scene.film_z_mm - outline.pupil_z_mm
+        wider = np.float32(1 + abs(outline.film_radius_mm * math.sin(tilt) / self.distance_mm))
+        self.outline = replace(outline, x=outline.x * wider, y=outline.y * wider) if tilt else outline
         self.exposure = 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
 
@@ -161,6 +173,16 @@ class LensFilm:
         """Return the inputs of `cameragraph.weight_graph` for a whole call."""
         scale = 1 / (self.distance_mm**2 * self.exposure)
         return {"per_distance": 1 / self.distance_mm, "scale": scale, "film_z_mm": self.film_z_mm}
+
+    def on_plane(self, g: Graph, film_mm: Value) -> tuple[Value, dict[str, Value]]:
+        """Write the pupil of film points into a graph; return where its rays meet the plane of an upright film, too."""
+        if not self.tilt:
+            return film_mm, g.inline(self.outline.graph, {"film_mm": film_mm})
+        turn = tilt_graph(self.tilt, self.outline.film_radius_mm)
+        unknown = {"film_mm": film_mm, "pupil_mm": film_mm * 0.0, "area_mm2": film_mm[0]}
+        pupil = g.inline(self.outline.graph, {"film_mm": g.inline(turn, unknown)["central_mm"]})
+        turned = g.inline(turn, {"film_mm": film_mm, **pupil})
+        return turned["plane_mm"], pupil | {"area_mm2": turned["area_mm2"]}
 
     def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """Return cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
@@ -173,6 +195,14 @@ class LensFilm:
         square, wavelength = stratified(_QUADRATURE, wavelength_nm)
         film = np.zeros_like(square)
         pupil, area = self.outline.sample(film, square, wavelength)
+        if self.tilt:
+            given = {
+                "film_mm": film,
+                "pupil_mm": pupil,
+                "area_mm2": area[None],
+                "per_distance": np.array([[1 / self.distance_mm]]),
+            }
+            area = evaluate(tilt_graph(self.tilt, self.outline.film_radius_mm), given)["area_mm2"][0]
         out = self.scene(film, pupil, wavelength)
         given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
         given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
@@ -221,7 +251,7 @@ class LensCamera:
     _asked: bool
     differentials_error: float | None = None
 
-    takes = frozenset({"zoom", "focus_mode", "internal", "aperture", "film_offset_mm"})
+    takes = frozenset({"zoom", "focus_mode", "internal", "aperture", "film_offset_mm", "film_tilt_deg"})
 
     def place(
         self, outline: PupilOutline | None, scene: LensScene, shot: Shot, about: Mapping[str, Any],
@@ -229,7 +259,7 @@ class LensCamera:
     ) -> None:  # fmt: skip
         """Place film and pupil for a shot, and start what runs the camera. Its `settings` are `about`, what it takes of
         the shot, the film's place and the stop. Raises InputError as `LensFilm` and `start` do."""
-        self.film = LensFilm(outline, self._light_nm, scene)
+        self.film = LensFilm(outline, self._light_nm, scene, math.radians(shot.film_tilt_deg))
         shape = scene.aperture and scene.aperture.settings()
         film = {"film_z_mm": scene.film_z_mm, "stop_radius_mm": scene.stop_radius_mm, "aperture": shape}
         self.settings = {**shot.record(self.takes), **about, **film}
@@ -258,6 +288,8 @@ class LensCamera:
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Return film points for scene points [3, N] in m, through points of the front surface that `pupil` chooses."""
+        if self.film.tilt:
+            raise InputError(self.path, "film_tilt_deg", math.degrees(self.film.tilt), "0 for light from the scene")
         shape, up = self.front, np.array([[0.0], [0.0], [self.film.film_z_mm]])
         with np.errstate(all="ignore"):
             point = 1e3 * point_m.astype(np.float64) + up
@@ -349,7 +381,7 @@ class LensCamera:
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
         """The bound of `SpectralCamera`; None if too few rays pass, or no polynomial follows the shift."""
-        return self._shift.reach_mm if self._shift else None
+        return self._shift.reach_mm if self._shift and not self.film.tilt else None
 
     def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
         wavelength = np.ascontiguousarray(wavelength_nm, np.float32)

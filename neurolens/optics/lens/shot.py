@@ -59,6 +59,8 @@ class Shot:
         aperture: an `Aperture`, the shape of the stop's opening; None is that of the lens file, else round.
         wavelength_nm: shortest and longest wavelength of the light, which sets exposure and best focus.
         film_offset_mm: moves the film away from the lens after focusing; a pinhole has none.
+        film_tilt_deg: turns the film about the x axis through its centre (Scheimpflug): positive moves points of the
+            film with y > 0, the picture's lower half, away from the lens.
         cover_glass_mm: thickness of a plate of N-BK7 that is put before the film of a lens file, which is focused anew.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error for a model, and
             opens the stop of a lens file as far as the rims let light through.
@@ -103,6 +105,10 @@ class Shot:
     film_offset_mm: float = setting(
         0.0, "move the film away from the lens after focusing (default: 0)", within=(-1e3, 1e3), unit="mm"
     )
+    film_tilt_deg: float = setting(
+        0.0, "turn the film about the horizontal axis through its centre, the picture's lower half away from the lens "
+        "(default: 0)", within=(-45, 45), unit="degrees",
+    )  # fmt: skip
     cover_glass_mm: float = setting(
         0.0, "put a plane plate of N-BK7 of this thickness before the film, and focus anew (default: none beyond the "
         "lens file's)", within=(0, 100), unit="mm",
