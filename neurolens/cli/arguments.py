@@ -166,6 +166,7 @@ class Command:
     epilog: ClassVar[str] = ""
     kept: ClassVar[str] = "nothing is written"
     intermixed: ClassVar[bool] = False
+    told: str = field(default="", compare=False, repr=False)  # what was assumed, which a `Note` says with the answer
 
     def __init_subclass__(cls) -> None:
         """Name the command by its class."""
@@ -197,15 +198,13 @@ class Command:
         return from_options(cls, args).completed()
 
     def completed(self) -> Self:
-        """Return the command with what `assumed` finds where nothing is given; a `Note` tells of it."""
+        """Return the command with what `assumed` finds where nothing is given; its answer tells."""
         told, whole = list[str](), self
         for name, (option, found) in self.assumed().items():
             if getattr(self, name) in (None, ()):
                 value, said = found()
                 whole, told = replace(whole, **{name: value}), [*told, f"{option} {said}"]
-        if told:
-            note(f"assumed: {', '.join(told)}")
-        return whole
+        return replace(whole, told=f"assumed: {', '.join(told)}") if told else whole
 
     def assumed(self) -> dict[str, tuple[str, Callable[[], tuple[Any, str]]]]:
         """Return by field, where none is given: its option, and what finds a value and the words that tell it."""
@@ -273,6 +272,8 @@ class Reporting(Command):
         """Print a report, or a mapping with its `text`, as JSON if --json asks for it, else as text; returns the exit
         code. `full`: with what a report has in bulk."""
         text = text or found.text  # type: ignore[union-attr]  # of a report
+        if self.told:
+            note(self.told)
         if self.tell is not None:
             self.tell(plain(found, strict=False, full=full), text())
         elif self.json:

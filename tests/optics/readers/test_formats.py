@@ -262,7 +262,6 @@ def test_nothing_is_written_for_a_bad_file(table: Path, tmp_path: Path, capsys: 
     [
         (("-o", "lens.json"), "--output: got '.json', expected .toml"),
         (("-o", "nowhere/lens.toml"), "a folder that exists"),
-        ((), "required: -o"),
         (("-o", "lens.toml", "--f-number", "0"), "an f-number above 0"),
         (("-o", "lens.toml", "--units", "ell"), "invalid choice: 'ell'"),
         (("-o", "lens.toml", "--half-field", "200"), "from 0.001 to 179"),

@@ -251,7 +251,6 @@ def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
         (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "0 beside layers"),
         (["--light", "0,0", "--coating", "velvet"], "velvet"),
         (["--light", "1,2", "--reflections", "4"], "--photons or --glare"),
-        ([], "--light, --lights or --image"),
         (["--light", "0,0", "--key", "focus=1:2"], "--frames"),
         (["--light", "0,0", "--frames", "1:2"], "-o beside it"),
         (["--light", "0,0", "-o", "x.exr", "--gain", "s05=2"], "of this lens"),
