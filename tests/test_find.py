@@ -159,6 +159,8 @@ def test_the_command_lists_lenses_and_the_nearest(capsys: pytest.CaptureFixture[
     }
     assert (data["found"], data["chosen"]) == (len(lenses), None)
     for row in data["lenses"]:
+        if row["thumbnail"] is None:  # until `experiments lens-index` has drawn it
+            continue
         assert Path(row["file"]).is_file() and Path(row["thumbnail"]).read_text().startswith("<svg")
     answer = nl.find("sumilux")
     assert answer.code == 1 and answer["found"] == 0 and len(answer["lenses"]) == 3
