@@ -407,6 +407,17 @@ def film(default: Any = ..., about: str = "size of the film in mm", title: str =
     )
 
 
+def film_like(picture: Path, film_mm: tuple[float, float], said: str) -> tuple[tuple[float, float], str]:
+    """Return the largest film of the shape of a picture (EXR) on another film, and what tells of it."""
+    from neurolens.pictures.render.pictures import header_of
+
+    (left, top), (last, bottom) = header_of(picture)["displayWindow"]
+    across, down = max(1, last - left + 1), max(1, bottom - top + 1)
+    scale = min(film_mm[0] / across, film_mm[1] / down)
+    film = float(f"{scale * across:.6g}"), float(f"{scale * down:.6g}")
+    return film, f"{film[0]:g}x{film[1]:g} (the shape of {picture.name} within {said})"
+
+
 def within(about: str, default: Any = None, title: str = "") -> Any:
     """Return --within, an RMS error with its unit, of the type `rms_error`."""
     old = {f"target-{unit}": partial(lambda unit, text: rms_error(text + unit), unit) for unit in ("um", "px")}

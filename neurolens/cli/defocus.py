@@ -74,12 +74,7 @@ examples:
 
     def _film(self) -> tuple[tuple[float, float], str]:
         """The largest film of the plate's shape on that which the lens covers."""
-        (left, top), (last, bottom) = header_of(self.plate)["displayWindow"]
-        (width, height), said = super()._film()
-        across, down = max(1, last - left + 1), max(1, bottom - top + 1)
-        scale = min(width / across, height / down)
-        film = float(f"{scale * across:.6g}"), float(f"{scale * down:.6g}")
-        return film, f"{film[0]:g}x{film[1]:g} (the plate's shape within {said})"
+        return cli.film_like(self.plate, *super()._film())
 
     def run(self) -> int:
         """Read the plate, blur it, write the picture."""

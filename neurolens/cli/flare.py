@@ -215,6 +215,11 @@ examples:
         """A light, too."""
         return super().assumed() | ({} if self.lights or self.image else {"light": ("--light", self._a_light)})
 
+    def _film(self) -> tuple[tuple[float, float], str]:
+        """The film that the lens covers, with --image of its shape."""
+        film = super()._film()
+        return film if self.image is None else cli.film_like(self.plate, *film)
+
     def _a_light(self) -> tuple[tuple[str], str]:
         """The sun, half-way to the right edge of the film that the lens covers and a quarter of the way up."""
         (width, height), efl_mm = self._film()[0], first_order(set_lens(read_any(self.file), **self._size())).efl_mm

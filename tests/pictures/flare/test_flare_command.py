@@ -30,7 +30,7 @@ from neurolens.pictures.render.pictures import read_colour_space, read_exr, read
 from neurolens.pictures.render.settings import FlareSettings
 from tests.ghost_pictures import ghost_picture
 
-COOKE = ["flare", "cooke_triplet_50", "--width", "36", "--bins", "2"]
+COOKE = ["flare", "cooke_triplet_50", "--film", "36x24", "--width", "36", "--bins", "2"]
 
 
 def layers_of(file: Path) -> dict[str, np.ndarray]:

@@ -28,7 +28,7 @@ from neurolens.pictures.flare.photons import PhotonTracer
 from neurolens.pictures.render.pictures import read_exr, write_exr
 from neurolens.pictures.render.settings import FlareSettings
 
-COOKE = ["flare", "cooke_triplet_50", "--bins", "2", "--cell", "4", "--width", "36", "--quiet"]
+COOKE = ["flare", "cooke_triplet_50", "--film", "36x24", "--bins", "2", "--cell", "4", "--width", "36", "--quiet"]
 
 
 @pytest.mark.parametrize(
