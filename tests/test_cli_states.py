@@ -217,7 +217,6 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.Captur
         (["export", bare, "--to", "c", "-o", out], ["card", "refractions"]),
         (["export", file, "--to", "c", "-o", tmp_path / "no" / "a.h"], ["a.h"]),
         (["export", file, "--to", "fortran", "-o", out], ["fortran"]),
-        (["export", file, "--to", "c"], ["-o"]),
     ]
     for args, words in cases:
         line = failure(capsys, *args)

@@ -95,7 +95,7 @@ BROKEN = {
     "plan": ["plan", "broken.toml", "--lens", "broken.toml", "-o"],
     "render": ["render", "broken.toml", "--camera", "broken.toml", "-o"],
     "flare": ["flare", "broken.toml", "--light", "0,0", "-o"],
-    "ghost": ["flare", "broken.toml", "--light", "0,0", "--path", "g01-00"],
+    "ghost": ["flare", "broken.toml", *_FILM, "--light", "0,0", "--path", "g01-00"],
     "defocus": ["defocus", "broken.exr", "--lens", "broken.toml", *_FILM, "-o"],
     "bokeh": ["bokeh", "broken.toml", "--distance", "2", *_FILM, "-o"],
     "handover": ["handover", "broken.toml", *_FILM, "-o"],

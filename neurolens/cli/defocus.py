@@ -19,7 +19,7 @@ from neurolens.pictures.defocus.kernels import Cell, Grooves, as_picture, as_pre
 from neurolens.pictures.defocus.picture import SAMPLES, check_field, defocus
 from neurolens.pictures.defocus.plate import DepthSettings, read_plate
 from neurolens.pictures.frames import Files
-from neurolens.pictures.render.pictures import header_of, standard_attributes, write_channels, write_exr, write_png
+from neurolens.pictures.render.pictures import standard_attributes, write_channels, write_exr, write_png
 from neurolens.pictures.render.sensor import about, expose
 from neurolens.pictures.render.settings import SensorSettings
 

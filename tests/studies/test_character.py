@@ -79,7 +79,8 @@ def test_known_lenses_swirl_and_slow_wide_or_clean_ones_do_not() -> None:
     """Petzval's portrait lens, Meyer's Primoplan and Zeiss's Biotar are known for it."""
     order = list(indexed("swirl"))
     known = {"petzval_portrait_100", "schaefter_primoplan_100", "merte_biotar_100"}
-    assert known < set(order[:4]) and "schneider_xenon_50mm_f2" in order[:20]
+    few = len(order) // 100  # one in a hundred
+    assert known < set(order[:few]) and "schneider_xenon_50mm_f2" in order[: 4 * few]
     for clean in ("canon_rf_50mm_f1_8_stm", "nikon_nikkor_z_50mm_f1_8_s", "sony_fe_90mm_f2_8_macro_g_oss"):
         assert order.index(clean) > 35
     assert order.index("pentax_smc_m_28mm_f3_5") > 100
@@ -90,7 +91,7 @@ def test_known_lenses_make_bubbles_and_soft_or_slow_wide_ones_do_not() -> None:
     Angenieux, a slow 28 mm, led before discs were weighed by their size."""
     bubble = indexed("bubble")
     known = {"schaefter_primoplan_100", "merte_biotar_100", "meyer_optik_gorlitz_135mm_f2_8_orestor"}
-    assert known < set(list(bubble)[:20]) and list(bubble).index("angenieux_28mm_f3_5_r11") > 30
+    assert known < set(list(bubble)[: len(bubble) // 20]) and list(bubble).index("angenieux_28mm_f3_5_r11") > 30
     assert bubble["minolta_135mm_f2_8_t4_5_stf"] < 0.95 and bubble["pentax_smc_f_85mm_f2_8_soft"] < 0.5
 
 

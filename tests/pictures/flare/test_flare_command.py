@@ -85,7 +85,19 @@ def seen_once() -> Iterator[None]:
 def test_starburst_is_a_layer(tmp_path: Path) -> None:
     """What the module makes, added to the ghosts under its gain."""
     out = tmp_path / "star.exr"
-    words = ["cooke_triplet_50", "--light", "4,2,3", "--f-number", "11", "--blades", "5", "--width", "48"]
+    words = [
+        "cooke_triplet_50",
+        "--film",
+        "36x24",
+        "--light",
+        "4,2,3",
+        "--f-number",
+        "11",
+        "--blades",
+        "5",
+        "--width",
+        "48",
+    ]
     few = ["--bins", "2", "--cell", "20", "--quiet", "--starburst", "--gain", "starburst=2"]
     assert main(["flare", *words, *few, "-o", str(out)]) == 0
     layers, rgb = read_layers(out), read_exr(out)[0]
@@ -97,7 +109,7 @@ def test_starburst_is_a_layer(tmp_path: Path) -> None:
     np.testing.assert_allclose(layers["ghosts.G"] + layers["starburst.G"], rgb[..., 1], rtol=1e-5)
 
 
-SMALL = ["cooke_triplet_50", "--width", "36", "--cell", "4", "--bins", "2", "--quiet"]
+SMALL = ["cooke_triplet_50", "--film", "36x24", "--width", "36", "--cell", "4", "--bins", "2", "--quiet"]
 
 
 def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
@@ -205,7 +217,7 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
     assert len(found) == 12 and not read_exr(out)[0].any()
     words = ["--lights", str(scene), "--coating", "single-layer", "--focus", "2", "--bins", "3"]
     words += ["--width", "36", "--colour-space", "ACEScg", "-o", str(out), "--quiet"]  # which holds these colours
-    assert main(["flare", "cooke_triplet_50", *words]) == 0
+    assert main(["flare", "cooke_triplet_50", "--film", "36x24", *words]) == 0
     ghosts = np.stack([found[f"ghosts.{c}"] for c in "RGB"], -1)
     plain = read_exr(out)[0]
     assert plain.any()
