@@ -51,7 +51,7 @@ PLAIN: dict[str, tuple[str, str, str]] = {
     "flare": (f"{LENS} --quick", f"{TRIPLET}, --light 7.09,5.33", ""),
     "defocus": (
         f"plate.exr --lens {MODEL} --samples 8",
-        "--film 36x18 (the plate's shape within 36x24 (fullframe, which the lens covers)), "
+        "--film 36x18 (the shape of plate.exr within 36x24 (fullframe, which the lens covers)), "
         "--output plate-laikin_double_gauss_50_ols-36-defocus.exr",
         "plate-laikin_double_gauss_50_ols-36-defocus.png",
     ),
