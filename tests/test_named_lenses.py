@@ -43,8 +43,8 @@ def test_the_table_has_what_is_engraved_on_the_product(name: str) -> None:
 
 
 def test_no_lens_is_softer_than_a_product_can_be() -> None:
-    """A wrong figure blurs the axis of most tables; fast lenses of the fifties keep 45 um RMS on a full frame, and three
-    are sold to be soft."""
+    """A wrong figure blurs the axis of most tables; fast lenses of the fifties keep 45 um RMS on a full frame, and
+    three are sold to be soft."""
     rows = [json.loads(line) for line in (LENSES / "index.jsonl").read_text(encoding="utf-8").splitlines()]
     rows = [row for row in rows if row["file"][:-5] in NAMED]
     assert len(rows) == len(NAMED)
