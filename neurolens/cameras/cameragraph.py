@@ -262,8 +262,9 @@ def whole_camera(
     graph tests a mask in the stop; else `stop_xy_mm` is an output, and the caller tests it.
     """
     g = Graph()
-    own, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
+    own = g.input("film_mm", 2)
     film_mm, pupil = film.on_plane(g, own)
+    wavelength = g.input("wavelength_nm")  # last, as the functions in C and in shaders have their arguments
     found, aperture = lens_inside(g, lens, g.concat(film_mm, pupil["pupil_mm"], wavelength), mask_too)
     derivatives = tuple(name for name in found if "_by_" in name)
     if film.tilt and derivatives:
