@@ -218,7 +218,7 @@ examples:
     def _film(self) -> tuple[tuple[float, float], str]:
         """The film that the lens covers, with --image of its shape."""
         film = super()._film()
-        return film if self.image is None else cli.film_like(self.plate, *film)
+        return film if self.plate is None else cli.film_like(self.plate, *film)
 
     def _a_light(self) -> tuple[tuple[str], str]:
         """The sun, half-way to the right edge of the film that the lens covers and a quarter of the way up."""
