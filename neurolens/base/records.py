@@ -54,7 +54,7 @@ class Results:
             picture), coefficients_per_vector (A and B terms both count), parameters (of the whole model, rims
             included), bytes, fit_s, load_s, ns_per_ray (`Timing`) in onnxruntime, fused_ns_per_ray as C, fused_speedup
             and break_even_rays (as C, against the exact lens as C), note.
-        target: what `target_record` gives, where an error was asked for.
+        target: the record that `target_record` returns; None where no error was asked for.
         settings: the resolved configuration.
         exact: timed exact tracers.
         cameras: renders of a scene, each with name, scene, render_s, camera_s (inside the camera) and its share,

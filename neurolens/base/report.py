@@ -43,8 +43,8 @@ class Report:
         return found
 
 
-# The metadata of fields. In bulk is a number per ray or pixel, which JSON has where it is asked for, and no table; the
-# keys of a part, a dataclass or a mapping, stand among those of the answer.
+# Metadata of fields. A field in bulk holds a number for each ray or pixel: JSON has it where it is asked for, tables
+# never. The keys of a part, which is a dataclass or a mapping, stand among those of the answer.
 BULK, PART = {"bulk": True}, {"part": True}
 
 

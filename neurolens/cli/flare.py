@@ -221,8 +221,9 @@ examples:
         return film if self.plate is None else cli.film_like(self.plate, *film)
 
     def _a_light(self) -> tuple[tuple[str], str]:
-        """The sun, half-way to the right edge of the film that the lens covers and a quarter of the way up."""
-        (width, height), efl_mm = self._film()[0], first_order(set_lens(read_any(self.file), **self._size())).efl_mm
+        """Return the sun where its image lies half-way from the film's centre to its right and its upper edge."""
+        width, height = self.film or self._film()[0]
+        efl_mm = first_order(set_lens(read_any(self.file), **self._size())).efl_mm
         right, up = (math.degrees(math.atan(share / float(efl_mm))) for share in (width / 4, height / 4))
         return (f"{right:.3g},{up:.3g}",), f"{right:.3g},{up:.3g}"
 
