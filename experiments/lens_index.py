@@ -56,6 +56,7 @@ def run(args: argparse.Namespace) -> None:
     """Write the index."""
     folder, files = library() / "lenses", lens_files(library() / "lenses")
     kept = {} if args.restart else read_index()
+    lines: list[dict[str, Any]]
     lines = [{"file": f.name, "sha256": sha256_of(f), "figures": figures_of(f)} for f in files]
     same = [line["figures"] == kept.get(line["file"], {}).get("figures") for line in lines]
     with ProcessPoolExecutor(args.workers, mp_context=get_context("fork")) as pool:

@@ -217,7 +217,7 @@ def check_efl(row: Row, efl_mm: float, stated_mm: float) -> None:
         raise InputError(row["key"], "focal length", f"{efl_mm:.5g} mm", expected)
 
 
-def image_of(row: Row, listed: Row) -> dict[str, float]:
+def image_of(row: Row, listed: Row) -> dict[str, Any]:
     """Radius of the image circle and, of a fisheye, the half field."""
     seen, formats = row.get("projection") or {}, listed["image_radius_mm"]
     mounts = row.get("lensMounts") or ["none"]
