@@ -183,7 +183,7 @@ def coated(lens: Lens, names: str) -> Lens:
     rows, before = [], float(lens.object_medium.n_d)
     for key, s in zip(known, lens.surfaces, strict=True):
         stated, n_d = s.coating is not None and s.coating.origin == "source", float(s.n_d)
-        name, coating = single.get(key, *rest[:1] or [None]), s.coating
+        name, coating = single.get(key, rest[0] if rest else None), s.coating
         if key not in single and name in ("bare", "stated"):
             coating = s.coating if stated and name == "stated" else None
         elif name is not None and (key in single or (not stated and before != n_d and 1.0 in (before, n_d))):

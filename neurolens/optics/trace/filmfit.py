@@ -70,11 +70,9 @@ def fitted(
     along = _entire(p, q1 / (n1 * n1), q2 / (n2 * n2)) * (n1 * n2) ** 2
     flux, both, split = 2 * q1 * q2, across + along, along - across
     mean = _mean(both, split, flux)
-    fits = (
-        _least(both, lambda tried: np.abs(tried - both) / (both + 2 * flux)),
-        _least(split, lambda tried: np.abs(_mean(both, tried, flux) - mean)),
-    )
-    return None if fits[0] is None or fits[1] is None else FilmFit(most, *fits)
+    fit_both = _least(both, lambda tried: np.abs(tried - both) / (both + 2 * flux))
+    fit_split = _least(split, lambda tried: np.abs(_mean(both, tried, flux) - mean))
+    return None if fit_both is None or fit_split is None else FilmFit(most, fit_both, fit_split)
 
 
 def _entire(m: tuple[Any, ...], before: Array, after: Array) -> Array:

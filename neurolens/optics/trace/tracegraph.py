@@ -163,13 +163,14 @@ class GraphPassage(Passage):
         before, after, n1, n2 = met.q, q, g.value(one.n), g.value(two.n)
         inverse_um = 1000.0 / self.wavelength_nm
         if not self._o.polish:
-            ends = 1000.0 / self.range_nm[1], 1000.0 / self.range_nm[0]
-            indices = [tuple(float(index_of(m, 1000.0 / u)) for u in inverse_um_at(ends)) for m in reversed(sides)]
-            fit = fitted(tuple(reversed(coating.layers)), *indices, ends)
+            low, high = self.range_nm
+            around = 1000.0 / high, 1000.0 / low
+            indices = [tuple(float(index_of(m, 1000.0 / u)) for u in inverse_um_at(around)) for m in reversed(sides)]
+            fit = fitted(tuple(reversed(coating.layers)), *indices, around)
             if fit is not None:
                 medium, cosine = (two, after) if is_number(two.n) else (one, before)
                 square = (medium.n2 - cosine * cosine) * (2 / fit.most) - 1.0
-                return self._by_fit(fit, square, inverse_um, ends, before * after * 2.0)
+                return self._by_fit(fit, square, inverse_um, around, before * after * 2.0)
         s: tuple[Value | float, ...] = (1.0, 0.0, 0.0, 1.0)
         p = s
         for n_d, thickness_nm, *V_d in reversed(coating.layers):
