@@ -108,8 +108,7 @@ def test_the_image_is_the_sum_of_waves_over_exact_rays(f_number: float, field: f
     found = psf(given, [field], [D])
     rays = bundle(given, [field], [D], grid(200))
     t, s = (
-        float((rays.weight * v.nan_to_num()).sum() / rays.weight.sum())
-        for v in (rays.tangential_mm, rays.sagittal_mm)
+        float((rays.weight * v.nan_to_num()).sum() / rays.weight.sum()) for v in (rays.tangential_mm, rays.sagittal_mm)
     )
     pupil = pupil_of(given, field)
     half, points = found.half_width_um[0] / 1000, found.diffraction.shape[1]
