@@ -6,7 +6,7 @@ The same graph, in onnxruntime, serves the search for the outline of the light t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -89,6 +89,7 @@ class ExactCamera(LensCamera):
         data = first_order(self.lens)
         about = {"camera": "exact", "lens": tabled.identity, "efl_mm": float(data.efl_mm)}
         about |= {"f_number": float(data.f_number), "derived": self.lens.derived, "rims": lens.rims}
+        about["coatings"] = self.lens.coatings
         about["lens_state"] = state_of(self.lens, used, float(first_order(tabled).efl_mm))
         self.place(self._outline(scene, plane, bounds, shot, progress), scene, shot, about, progress)
 
@@ -183,22 +184,33 @@ def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float |
     """The table `lens_state` of a lens that `set_lens` has placed; `nominal_mm` is its focal length at infinity."""
     data, film_z = first_order(lens), lens.film_z_mm
     assert film_z is not None
-    nm = float(np.clip(LINE_D_NM, *wavelength_nm))
-    call = {"film_z_mm": np.array([[film_z]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
-    graph = exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm)
-    axial = evaluate(graph, {"rays": np.array([[0.0, 0.0, 0.0, 0.0, nm]]).T} | call)
-    through = axial["transmittance"].item()
-    open_ = lens.aperture is None or bool(lens.aperture.inside(np.zeros(1), np.zeros(1), 1.0))
-    passed = open_ and axial["status"].item() == st.PASSED and 0 < through <= 1
+    through = axial_transmittance(lens, [float(np.clip(LINE_D_NM, *wavelength_nm))], wavelength_nm).item()
     return lens_state(
         nominal_mm=nominal_mm,
         efl_mm=data.efl_mm,
         pinhole_mm=chief_reach_mm(lens),
         entrance_pupil_mm=film_z - data.entrance_pupil_z_mm,
         f_number=data.f_number,
-        transmittance=through if passed else None,
+        transmittance=through or None,
         squeeze=abs(data.efl_mm / first_order(lens, meridian="x").efl_mm) if lens.anamorphic else 1.0,
     )
+
+
+def axial_transmittance(lens: Lens, at_nm: Sequence[float], wavelength_nm: tuple[float, float]) -> FloatArray:
+    """Return the share [N] of the light at these wavelengths that the axial ray keeps; 0 where it does not pass.
+
+    Args:
+        lens: placed by `set_lens`. wavelength_nm: the range in which the wavelengths lie.
+    """
+    assert lens.film_z_mm is not None
+    call = {"film_z_mm": np.array([[lens.film_z_mm]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
+    graph, rays = exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm), np.zeros((5, len(at_nm)))
+    rays[4] = at_nm
+    axial = evaluate(graph, {"rays": rays} | call)
+    through = np.broadcast_to(axial["transmittance"], (1, len(at_nm)))[0]
+    open_ = lens.aperture is None or bool(lens.aperture.inside(np.zeros(1), np.zeros(1), 1.0))
+    passed = (axial["status"][0] == st.PASSED) & (through > 0) & (through <= 1) & open_
+    return np.where(passed, through, 0.0)
 
 
 def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) -> dict[str, Any]:

@@ -66,7 +66,7 @@ examples:
         shot = standards.Handed(
             standard_attributes(frames[0].camera.settings), __version__, (self.fps.numerator, self.fps.denominator),
             tuple(standards.Pinhole.of(f.number, f.fields[""], f.camera.settings, f.focus_m) for f in frames), plates,
-            tuple(name for name in frames[0].fields if name),
+            tuple(name for name in frames[0].fields if name), str(frames[0].camera.settings.get("coatings", "")),
         )  # fmt: skip
         writer = _Writer(self, frames, shot)
         files = self.maps(frames, plates, progress, self.out / "shot") + writer.files(data, progress)

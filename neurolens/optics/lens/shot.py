@@ -25,7 +25,7 @@ BY_ALL = (
 )  # fmt: skip
 BY_LENSES = (
     "focus_m", "f_number", "focal_length_mm", "zoom", "field_deg", "focus_mode", "internal", "aperture",
-    "cover_glass_mm",
+    "cover_glass_mm", "coating",
 )  # fmt: skip
 POSES = ("film_tilt_deg", "film_swing_deg", "film_shift_mm", "film_rise_mm")  # how the film stands
 FILMS = {  # by name, the largest first: options take these, and a lens has the first that it covers
@@ -68,6 +68,7 @@ class Shot:
         film_rise_mm: moves it in that plane along -y, so that the picture shows more above, as where the front of a
             view camera rises. The axis of the lens then meets the film at (film_shift_mm, film_rise_mm).
         cover_glass_mm: thickness of a plate of N-BK7 that is put before the film of a lens file, which is focused anew.
+        coating: of the surfaces between glass and air, see `optics.lens.designs.coated`; None leaves the lens's own.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error for a model, and
             opens the stop of a lens file as far as the rims let light through.
         vignetting: the part that is kept; see `neurolens.cameras.reduced`.
@@ -130,6 +131,12 @@ class Shot:
     cover_glass_mm: float = setting(
         0.0, "put a plane plate of N-BK7 of this thickness before the film, and focus anew (default: none beyond the "
         "lens file's)", within=(0, 100), unit="mm",
+    )  # fmt: skip
+    coating: str | None = setting(
+        None, "of every surface between glass and air whose coating the lens file does not state: single-layer (1940s "
+        "to 60s), three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; bare or stated: of no "
+        "surface, or of none but these; of one: three-layer,s07=bare (default: the lens's own)",
+        metavar="NAME",
     )  # fmt: skip
     clamp_f_number: bool = False
     vignetting: Vignetting = setting(
