@@ -53,6 +53,9 @@ class PsfTask:
     Attributes:
         places_mm: (right, up) in the picture, row by row; the axis must come last.
         channels: wavelengths of each channel, of equal weight. side: pixels; None takes what holds the light.
+
+    Raises:
+        InputError: the lens is not round about its axis, or the objects are not in front of it.
     """
 
     lens: Lens
@@ -61,6 +64,13 @@ class PsfTask:
     channels: tuple[tuple[float, ...], ...]
     pixel_mm: float
     side: int | None
+
+    def __post_init__(self) -> None:
+        lens, front_m = self.lens, float(self.lens.film_z_mm or 0) / 1000
+        if not lens.round:
+            raise InputError(lens.path, "surfaces", "(not round about the axis)", "a lens of rotational symmetry")
+        if not self.distance_m > front_m:
+            raise InputError(lens.path, "distance_m", self.distance_m, f"above {front_m:.4g}, the front of the lens")
 
 
 def channels_of(kind: str, lens: Lens) -> Channels:
@@ -86,6 +96,9 @@ def point_spread(task: PsfTask) -> Arrays:
     """Return the arrays of a task as a file has them, [places, ...] without the axis.
 
     Places that are mirror images of each other are computed once, where the stop is round.
+
+    Raises:
+        InputError: no light of the axis reaches the film.
     """
     from neurolens.optics.analysis.diffraction import pupils_at, reach_of, spread
     from neurolens.optics.analysis.fields import Scene
@@ -107,11 +120,12 @@ def point_spread(task: PsfTask) -> Arrays:
         turned.append(found[k].light[:, ::y, ::-x])  # columns of the picture run against x
         centres.append(-found[k].centre_mm * (x, y))
     every = [found[k] for k in number.reshape(-1)]
-    axis = every[-1].pupil.sum()
+    if not (axis := every[-1].pupil.sum()) > 0:
+        raise InputError(task.lens.path, "distance_m", task.distance_m, "one whose light reaches the film")
     whole = {
         "psf": np.array(turned, np.float32), "centre_mm": np.array(centres),
         "inside": np.array([s.inside for s in every]),
-        "light": np.array([s.pupil.sum() / axis if axis > 0 else 0.0 for s in every]),
+        "light": np.array([s.pupil.sum() / axis for s in every]),
         "by_rays": np.array([s.by_rays for s in every]), "differs": np.array([s.differs for s in every]),
     }  # fmt: skip
     return {name: array[:-1] for name, array in whole.items()}

@@ -27,6 +27,11 @@ LENS = "laikin_double_gauss_50"
 WORDS = ("psf", LENS, "--film", "30x20", "--pixel-um", "8", "--grid", "3x2", "--focus", "2", "--quiet")
 
 
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("psf") / "gauss.npz"
@@ -119,11 +124,16 @@ def test_an_exr_holds_the_atlas_of_each_state(tmp_path: Path, capsys: pytest.Cap
         (("--side", "8"), "an odd number"),
         (("--distance", "-1"), "a distance in metres above 0"), (("--grid", "0x3"), "COLUMNSxROWS"),
         (("-o", "a.safetensors"), ".npz or .exr"), (("--wavelengths", "5"), "wavelengths in nm"),
-        (("--focus", "0.01"), "focus"),
+        (("--focus", "0.01"), "focus"), (("--distance", "2,0.07"), "the front of the lens"),
     ],
 )  # fmt: skip
 def test_bad_values_are_one_line(words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert said in failure(capsys, *WORDS[:-1], *words)
+
+
+def test_a_lens_that_is_not_round_is_refused_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "a lens of rotational symmetry" in failure(capsys, "psf", "cooke_anamorphic_42", "--quiet")
+    assert not Path("cooke_anamorphic_42-psf.npz.parts").exists()
 
 
 def test_a_file_of_other_arrays_is_refused(tmp_path: Path) -> None:

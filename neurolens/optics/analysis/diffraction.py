@@ -22,7 +22,6 @@ import torch
 from numpy.polynomial import chebyshev
 from scipy.signal import CZT  # type: ignore[import-untyped]
 
-from neurolens.base.errors import InputError
 from neurolens.optics.analysis.bundles import Aim, Filled
 from neurolens.optics.analysis.exit_pupil import Array, Arrived, ExitPupil, arrived, fitted_pupil
 from neurolens.optics.analysis.fields import Scene
@@ -102,13 +101,12 @@ def pupils_at(scene: Scene, places_mm: Array, wavelengths_nm: Sequence[float]) -
     The chief ray of the first wavelength meets the film at the place. Places at one distance from the axis share rays.
 
     Args:
+        scene: its lens must be round about the axis.
         places_mm: [P, 2] x and y on the film.
 
     Raises:
-        InputError: the lens has no rotational symmetry, or no power.
+        InputError: the lens has no power.
     """
-    if not scene.lens.round:
-        raise InputError(scene.lens.path, "surfaces", "(not round about the axis)", "a lens of rotational symmetry")
     height, number = np.unique(np.hypot(*places_mm.T).round(9), return_inverse=True)
     fields = np.array(scene.fields_at(height.tolist()))
     known = np.nonzero(np.isfinite(fields))[0]
