@@ -43,6 +43,7 @@ _COMMANDS = {
         "verify": ("photographs.Verify", "hold a lens file against photographs of the product"),
         "rims": ("photographs.Rims", "fit the rims of a lens file to photographs of the product"),
         "convert": ("convert.Convert", "read a lens file of another program"),
+        "copies": ("copies.Copies", "copies of a lens as made: decentred, tilted, radii and gaps off"),
         "glass": ("convert.Glass", "look glasses up by name or code"),
         "survey": ("train.Survey", "every lens file of a folder: read, checked, fitted, measured"),
         "view": ("view.View", "write a page that runs lenses and models in a browser"),

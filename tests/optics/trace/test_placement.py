@@ -158,6 +158,27 @@ def test_fifty_digits() -> None:
     np.testing.assert_allclose(np.stack(array.rays), exact, rtol=0, atol=2e-12)
 
 
+def test_ray_optics_traces_the_same() -> None:
+    """Ray-optics 0.9.8 on the same surfaces ("dec and return"; its turns about x and y are left-handed): x, y on the
+    film and direction of rays that start at (x, y, -10) towards (a, b, 30)."""
+    theirs = {
+        (0.0, 0.0, 0.0, 0.0): (0.8213197697612221, -0.3586718907727619, 0.01716308267966542, -0.017230656532383325),
+        (2.0, -3.0, 5.0, 4.0): (5.093684274531879, 7.526745425647766, 0.0537930441035776, 0.18391345428436068),
+        (-4.0, 1.0, -7.0, 2.0): (-3.977419507186886, 1.1664098962980805, 0.010868077880304017, -0.009819968352702721),
+        (3.0, 3.0, 1.0, -8.0): (-0.8892582675880039, -13.313363910906201, -0.07191889584664539, -0.3027625119269151),
+    }
+    for (x, y, a, b), wanted in theirs.items():
+        way = np.array([a - x, b - y, 40.0])
+        way /= np.linalg.norm(way)
+        done = trace(
+            placed_lens(), Rays(*torch.tensor([x, y, -10.0, *way], dtype=torch.float64)[:, None]), towards="film"
+        )
+        reach = (48.0 - done.rays.z) / done.rays.dz
+        r = done.rays
+        found = [v.item() for v in (r.x + reach * r.dx, r.y + reach * r.dy, r.dx, r.dy)]
+        assert found == pytest.approx(wanted, abs=1e-12)
+
+
 def test_the_graph_is_the_tracer_both_ways() -> None:
     """Camera rays of the graph leave as the tracer says, with their power, and the way back leads to the film point."""
     lens, count = placed_lens(), 300
