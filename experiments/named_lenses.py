@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from experiments import lab
@@ -34,9 +35,9 @@ from neurolens.optics.setting.check import DARK, axial_beam, corner_illumination
 from neurolens.optics.setting.rims import derive_rims, narrowed_rims
 from neurolens.optics.setting.states import set_lens
 
-_LIST = lab.ROOT / "experiments" / "named_lenses.toml"
+NAMES = lab.ROOT / "experiments" / "named_lenses.toml"
 _NAMED = re.compile(r"(?P<patent>[^(]+?),?\s*(?P<example>Example\s+\w+)?(?P<master>\s+ML)?\s*\((?P<product>.+)\)$")
-_US = re.compile(r"US (\d),(\d{3}),(\d{3})")
+_US = re.compile(r"US (\d\d?),(\d{3}),(\d{3})")
 
 _SAME_BEAM = 0.99  # share of the tabled beam above which it is not worth another f-number
 _RIMS = {
@@ -70,7 +71,7 @@ def wanted(folder: Path, listed: Mapping[str, Any], names: list[str]) -> Iterato
     for maker, stems in listed["makers"].items():
         for stem in stems:
             if stem not in files:
-                raise InputError(_LIST, "makers", stem, f"a file of {folder}")
+                raise InputError(NAMES, "makers", stem, f"a file of {folder}")
             if not names or any(stem.startswith(name) for name in names):
                 yield Wanted(files[stem], listed["names"].get(maker, maker.capitalize()))
 
@@ -93,13 +94,18 @@ def lens_id(product: str, maker: str) -> str:
     return first + "_" + words.removeprefix(f"{first}_").replace(f"_{first}_", "_")
 
 
-def source_of(patent: str, example: str | None, master: str | None, first_of_year: Mapping[str, Any]) -> str:
-    """The patent with its year, and the example; the number of a United States patent tells its year."""
-    patent = re.sub(r"^US00(\d)(\d{3})(\d{3})$", r"US \1,\2,\3", patent)
-    number = _US.match(patent)
+def with_year(patent: str, listed: Mapping[str, Any]) -> str:
+    """The patent with its year, which the number of one of the United States tells; others are listed."""
+    first, number = listed["first_us_patents"], _US.match(patent)
     if number:
-        patent += f" ({first_of_year['from'] - 1 + bisect(first_of_year['numbers'], int(''.join(number.groups())))})"
-    parts = [patent, example and example[0].lower() + example[1:], master and "master lens"]
+        return f"{patent} ({first['from'] - 1 + bisect(first['numbers'], int(''.join(number.groups())))})"
+    return f"{patent} ({listed['years'][patent]})" if patent in listed["years"] else patent
+
+
+def source_of(patent: str, example: str | None, master: str | None, listed: Mapping[str, Any]) -> str:
+    """The patent with its year, and the example."""
+    patent = re.sub(r"^US00(\d)(\d{3})(\d{3})$", r"US \1,\2,\3", patent)
+    parts = [with_year(patent, listed), example and example[0].lower() + example[1:], master and "master lens"]
     return ", ".join(part for part in parts if part)
 
 
@@ -137,41 +143,50 @@ def with_beam_of_rims(lens: Lens) -> Lens:
 
 
 _LINE_E_NM, _LINES_E_NM = 546.0740, (479.9914, 643.8469)  # mercury, and cadmium's F' and C'
-_SAME_N, _SAME_V = 1.5e-5, 0.2  # within which printed figures are a catalogue glass's
+_SAME_N, _SAME_V = 3e-5, 0.1  # half of a unit of the last digit printed counts, but at least these
+_SAME = 1.5  # of them together, within which printed figures are a catalogue glass's
+_FEWEST, _TIMES = 3, 2  # glasses that must fit at the e line, and how many times those that fit at the d line
 
 
 LINE_E = "The source states indices of the e line; n_d and V_d are computed from them."
 
 
 @cache
-def _catalogue() -> list[tuple[float, float, float, float]]:
-    """n_d, V_d, n_e and V_e of all glasses that are known at these lines."""
+def _catalogue() -> Any:
+    """n_d, V_d, n_e and V_e of all glasses that are known at these lines: [G, 4]."""
     found = []
     for g in glass.all_glasses():
         n_e, n_F, n_C = (g.index(nm) for nm in (_LINE_E_NM, *_LINES_E_NM))
         if n_F > n_C:
             found.append((g.n_d, g.V_d, n_e, (n_e - 1) / (n_F - n_C)))
-    return found
+    return np.array(found)
+
+
+def fitting(lens: Lens) -> tuple[int, int, int]:
+    """How many glasses of a lens are the catalogue's if their figures are (n_d, V_d), (n_e, V_e) or (n_e, V_d)."""
+    counts = [0, 0, 0]
+    for n, V in {(float(s.n_d), float(s.V_d)) for s in lens.surfaces if s.V_d and s.glass is None}:
+        units = (10.0 ** -len(repr(v).partition(".")[2]) / 2 for v in (n, V))
+        by_n, by_V = (max(unit, least) for unit, least in zip(units, (_SAME_N, _SAME_V), strict=True))
+        for k, (at, abbe) in enumerate(((0, 1), (2, 3), (2, 1))):
+            away = np.hypot((_catalogue()[:, at] - n) / by_n, (_catalogue()[:, abbe] - V) / by_V)
+            counts[k] += bool(away.min() < _SAME)
+    return counts[0], counts[1], counts[2]
 
 
 def at_line_d(lens: Lens, known: bool = False) -> Lens:
-    """The lens with n_d and V_d where its source states n_e: more of its indices are n_e of catalogue glasses than n_d.
+    """The lens with n_d and V_d where its source states n_e: far more of its glasses are the catalogue's at that line.
 
     `known`: whether the source is known to state n_e. The Abbe numbers beside them are V_e or V_d, which fits better.
     """
     if LINE_E in lens.notes:
         return lens
-    stated = {(float(s.n_d), s.V_d) for s in lens.surfaces if s.V_d and s.glass is None}
-    d = [p for p in stated if any(abs(p[0] - g[0]) < _SAME_N and abs(p[1] - g[1]) < _SAME_V for g in _catalogue())]
-    at_e = [(p, g) for p in stated if p not in d for g in _catalogue() if abs(p[0] - g[2]) < _SAME_N]
-    by_V = [[p for p, g in at_e if abs(p[1] - g[k]) < _SAME_V] for k in (1, 3)]
-    e = {*by_V[0], *by_V[1]}
-    if not known and (len(e) < 2 or len(e) <= len(d)):
+    d, e, mixed = fitting(lens)
+    if not known and max(e, mixed) < max(_FEWEST, _TIMES * d + 1):
         return lens
-    abbe_d = len(by_V[0]) > len(by_V[1])
     rows = []
     for s in lens.surfaces:
-        n_d, V_d = (s.n_d, s.V_d) if s.glass or not s.V_d else _from_line_e(float(s.n_d), s.V_d, abbe_d)
+        n_d, V_d = (s.n_d, s.V_d) if s.glass or not s.V_d else _from_line_e(float(s.n_d), s.V_d, mixed > e)
         rows.append(replace(s, n_d=n_d, V_d=V_d))
     return replace(lens, surfaces=tuple(rows), notes=f"{lens.notes} {LINE_E}".strip())
 
@@ -252,7 +267,7 @@ def described(want: Wanted, listed: Mapping[str, Any]) -> tuple[str, Lens, Verif
     if parts is None:
         raise InputError(want.file, "NAME", lens.name, "PATENT Example N (PRODUCT)")
     product = product_of(parts["product"])
-    source = source_of(parts["patent"], parts["example"], parts["master"], listed["first_us_patents"])
+    source = source_of(parts["patent"], parts["example"], parts["master"], listed)
     path = f"{lens_id(product, want.maker)}.toml"
     lens = replace(lens, name=product, believed_to_be=product, designer=want.maker, source=source, path=path)
     lens, found = against_photographs(with_whole_beam(rounded(replace(lens, rims="estimated", wavelengths_nm=()))))
@@ -275,7 +290,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the files; 1 where one could not be read."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", NeurolensWarning)
-    listed, failed, written = tomllib.loads(_LIST.read_text(encoding="utf-8")), 0, 0
+    listed, failed, written = tomllib.loads(NAMES.read_text(encoding="utf-8")), 0, 0
     for want in wanted(args.folder, listed, args.names):
         try:
             name, lens, found = described(want, listed)

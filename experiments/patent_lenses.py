@@ -32,6 +32,7 @@ import torch
 
 from experiments import lab
 from experiments.named_lenses import (
+    NAMES,
     against_photographs,
     at_line_d,
     cemented,
@@ -39,21 +40,24 @@ from experiments.named_lenses import (
     rounded,
     with_beam_of_rims,
     with_whole_beam,
+    with_year,
 )
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
+from neurolens.base.lensname import year_of
 from neurolens.optics.lens import glass
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.figures import Figure
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Configuration, Lens, Surface
-from neurolens.optics.photographs.verify import DOUBTFUL_PERCENT
+from neurolens.optics.photographs.verify import DOUBTFUL_PERCENT, verify
 from neurolens.optics.readers.lensfile import read_lens, write_lens
-from neurolens.optics.setting.check import axial_beam, check_lens, doubts
+from neurolens.optics.setting.check import axial_beam, axial_blur_mm, check_lens, doubts
 from neurolens.optics.setting.rims import check_states, derive_rims
 from neurolens.optics.setting.states import set_lens
 
 Row = dict[str, Any]
+Double = tuple[Row, list[str]]
 _LIST = lab.ROOT / "experiments" / "patent_lenses.toml"
 _RIMS = {
     "source": "The rims are the patent's effective diameters.",
@@ -124,6 +128,14 @@ def glass_of(element: Row, index: float) -> dict[str, Any]:
                 if abs(found.n_d - index) < 2e-4:
                     return known | {"V_d": found.V_d, "glass": str(found)}
     return known
+
+
+def conics_of(row: Row, listed: Row) -> Row:
+    """The row with conic constants where it is listed as having them plus 1, as many patents state them."""
+    if row["key"] not in listed["conics"]:
+        return row
+    asph = {label: a | {"K": a.get("K", 0) - 1} for label, a in row["asph"].items()}
+    return row | {"asph": asph, "conics": listed["conics"][row["key"]]}
 
 
 def stated_at_e(row: Row) -> bool:
@@ -310,7 +322,7 @@ def described(row: Row, listed: Row) -> Lens:
         f"{row['file']}, which states no licence).",
         f"Believed to be the product: the collection names it, and the example has {first.efl_mm:.4g} mm and "
         f"f/{lens.f_number:.3g}.",
-        *filter(None, [lens.notes]),
+        *filter(None, [lens.notes, row.get("conics")]),
         _LATER,
         _RIMS[lens.rims],
     ]
@@ -360,6 +372,7 @@ def differences(ours: Lens, theirs: tuple[Surface, ...]) -> list[str] | None:
             ("radius", p.radius_mm, q.radius_mm * scale, 2e-3 * abs(p.radius_mm)),
             ("n_d", p.n_d, q.n_d, 2e-3),
             ("V_d", p.V_d or q.V_d or 0, q.V_d or p.V_d or 0, 1.0),
+            ("conic", p.figure.conic, q.figure.conic, 0.01),
             *((f"A{n}", a.get(n, 0), b.get(n, 0), 0.02 * max(abs(a.get(n, 0)), abs(b.get(n, 0)))) for n in a | b),
         ]
         if q.n_d != 1:
@@ -368,15 +381,15 @@ def differences(ours: Lens, theirs: tuple[Surface, ...]) -> list[str] | None:
     return found if sum(text.startswith("radius") for text in found) <= 1 else None
 
 
-def double_of(row: Row, ours: dict[str, Lens]) -> tuple[str, list[str]] | None:
-    """Our file of the same table and what differs; None where there is none."""
+def double_of(row: Row, ours: dict[str, Lens], product: str) -> tuple[str, list[str]] | None:
+    """Our file of the same table, by patent or product and radii, and what differs; None where there is none."""
 
     def numbers(text: str) -> set[str]:
         return {re.sub(r"\D", "", n).lstrip("0") for n in re.findall(r"\d[\d,/\-\s]{4,}\d", text)}
 
     wanted = numbers(row.get("patentNumber", ""))
     for name, lens in ours.items():
-        if any(
+        if _plain(name) == _plain(product) or any(
             a == b or (len(a) > 6 < len(b) and (a.endswith(b) or b.endswith(a)))
             for a in wanted
             for b in numbers(lens.source)
@@ -388,6 +401,10 @@ def double_of(row: Row, ours: dict[str, Lens]) -> tuple[str, list[str]] | None:
     return None
 
 
+def _plain(name: str) -> str:
+    return re.sub(r"\W|_", "", name)
+
+
 def settled(name: str, lens: Lens, listed: Row, row: Row | None, found: list[str]) -> None:
     """Mend our file where its kind of mistake is known, and write into its notes whether two transcriptions agree.
 
@@ -395,32 +412,81 @@ def settled(name: str, lens: Lens, listed: Row, row: Row | None, found: list[str
         InputError: they differ, and no decision is listed.
     """
     decided = listed["decisions"].get(name, {})
-    mended = at_line_d(cemented(lens), decided.get("line_e", False))
+    notes = re.sub(r" (Two transcriptions of|Another transcription|Another table) .*", "", lens.notes)
+    mended = at_line_d(cemented(replace(lens, notes=notes)), decided.get("line_e", False))
     mended = mended.with_gaps({int(k): v for k, v in decided.get("thickness_mm", {}).items()})
-    notes = re.sub(r" (Two transcriptions of|Another transcription) .*", "", mended.notes)
-    if row and found:
-        if "why" not in decided:
-            raise InputError(_LIST, f"decisions, {name}", "(missing)", f"a decision: {'; '.join(found[:6])}")
-        notes += f" Another transcription differs, LensVisualizer ({row['file']}). {decided['why']}"
-    elif row:
-        notes += f" Two transcriptions of the patent agree: OpticsDatabase and LensVisualizer ({row['file']})."
-    mended = replace(mended, notes=notes)
+    rows = list(mended.surfaces)
+    for k, radius_mm in decided.get("radius_mm", {}).items():
+        rows[int(k)] = replace(rows[int(k)], radius_mm=radius_mm)
+    for k, figure in decided.get("figure", {}).items():
+        powers = tuple((int(n), v) for n, v in figure["asphere"].items()) if "asphere" in figure else None
+        old = rows[int(k)].figure
+        rows[int(k)] = replace(rows[int(k)], figure=replace(old, conic=figure["conic"], asphere=powers or old.asphere))
+    mended = replace(mended, surfaces=tuple(rows))
+    if mended.surfaces != lens.surfaces:
+        mended = held_again(mended)
+    if row and decided:
+        what = decided.get("kind", "transcription")
+        said = f" Another {what} differs, LensVisualizer ({row['file']}). {decided['why']}"
+    elif row and found:
+        raise InputError(_LIST, f"decisions, {name}", "(missing)", f"a decision: {'; '.join(found[:6])}")
+    else:
+        agree = "Two transcriptions of the patent agree: OpticsDatabase and LensVisualizer"
+        said = f" {agree} ({row['file']})." if row else ""
+    patent, comma, example = lens.source.rpartition(", ")
+    source = lens.source if year_of(lens.source) else with_year(patent, listed) + comma + example
+    mended = replace(mended, notes=mended.notes + said, source=source)
     if mended != lens:
         write_lens(mended, lab.LENSES / f"{name}.toml")
 
 
-def page(left_out: dict[str, str], doubles: dict[str, tuple[Row, list[str]]], count: int) -> str:
-    """The table of lenses that do not ship, and of those of which two transcriptions exist."""
+def held_again(lens: Lens) -> Lens:
+    """A lens whose figures have changed, with the focal length and what photographs say of it in its notes."""
+    lens, found = against_photographs(lens)
+    efl_mm = float(first_order(set_lens(lens)).efl_mm)
+    notes = re.sub(r"(has )[\d.]+ mm and f/[\d.]*\d", rf"\g<1>{efl_mm:.1f} mm and f/{lens.f_number:.3g}", lens.notes)
+    if found:
+        said = f"Against photographs ({found.profile}): {'; '.join(found.verdict)}. The rims"
+        notes = re.sub(r"Against photographs \(.*?\. The rims", lambda _: said, notes)
+        lens = replace(lens, measured=tuple(found.measured.items()))
+    return rounded(replace(lens, notes=notes))
+
+
+def evidence(lens: Lens) -> str:
+    """Focal length, back focus and blur of the axis at full aperture, and the distortion beside certain photographs."""
+    try:
+        data, blur_um = first_order(lens), 1000 * axial_blur_mm(set_lens(lens))
+        text = f"{data.efl_mm:.5g} mm, {data.back_focus_mm:.5g} mm, {blur_um:.2g} um"
+        found = verify(lens)
+        return text + (f", {found.distortion_percent:.2g}%" if found.certainty == "certain" else "")
+    except NeurolensError:
+        return text
+
+
+def theirs_of(row: Row, ours: Lens, listed: Row) -> Lens:
+    """The collection's table as it would ship; as it stands, with our stop and names, where it could not."""
+    try:
+        return lens_of(row, listed)
+    except NeurolensError:
+        lens = at_line_d(Lens("", "", surfaces_of(row), 1.0), stated_at_e(row))
+        lens = replace(ours, surfaces=lens.surfaces, configurations=())
+        return lens.with_stop_radius(lens.stop_radius_mm * first_order(lens).f_number / ours.f_number)
+
+
+def page(left_out: dict[str, str], doubles: dict[str, Double], count: int, decided: list[list[str]]) -> str:
+    """The table of lenses that do not ship, of those of which two transcriptions exist, and what was decided."""
+    agree = sorted(doubles.keys() - {row[0] for row in decided})
     return lab.page(
         "# Lenses of patents by a public collection",
         f"`python -m experiments patent-lenses`: {count} files of lenses/ are made from it.",
         f"## Left out: {len(left_out)}",
         lab.table("lens|cause", [[key, why] for key, why in left_out.items()]),
         f"## In lenses/ already, from the same table: {len(doubles)}",
-        lab.table(
-            "file|the two transcriptions",
-            [[key, "; ".join(what[:4]) or "agree"] for key, (_, what) in sorted(doubles.items())],
-        ),
+        f"{len(agree)} agree in every figure: {', '.join(agree)}.",
+        "## Decided",
+        "Focal length, back focus and RMS blur of the axis at full aperture of both tables, and, where the match with "
+        "a profile is certain, how far the distortion is from photographs. The reasons stand in the files.",
+        lab.table("file|what differs|ours now|theirs|decided", decided),
     )
 
 
@@ -429,19 +495,24 @@ def run(args: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", NeurolensWarning)
     listed = tomllib.loads(_LIST.read_text(encoding="utf-8"))
-    rows = lab.chosen(json.loads(args.json.read_text(encoding="utf-8")), lambda r: r["key"], args.only, "patent-lenses")
+    named = tomllib.loads(NAMES.read_text(encoding="utf-8"))
+    listed |= {key: named[key] for key in ("years", "first_us_patents")}
+    rows = json.loads(args.json.read_text(encoding="utf-8"))
+    rows = lab.chosen([conics_of(r, listed) for r in rows], lambda r: r["key"], args.only, "patent-lenses")
     ours = {file.stem: read_lens(file) for file in lab.LENSES.glob("*.toml") if "OpticsDatabase" in file.read_text()}
-    names = {re.sub(r"\W|_", "", name) for name in ours}
-    left_out, doubles, wanted = dict[str, str](), dict[str, tuple[Row, list[str]]](), dict[Path, Row]()
+    names = {_plain(name): name for name in ours}
+    left_out, doubles, wanted = dict[str, str](), dict[str, Double](), dict[Path, Row]()
     for row in rows:
         name = lens_id(product_of(row["name"]), maker_of(row, listed))
         try:
             if row["key"] in listed["left_out"]:
                 left_out[row["key"]] = listed["left_out"][row["key"]]
-            elif double := double_of(row, ours):
+            elif double := double_of(row, ours, name):
                 doubles[double[0]] = row, double[1]
-            elif re.sub(r"\W|_", "", name) in names or args.out / f"{name}.toml" in wanted:
+            elif _plain(name) in names or args.out / f"{name}.toml" in wanted:
                 left_out[row["key"]] = "the product is there from another table"
+                if file := names.get(_plain(name)):
+                    doubles[file] = row, ["another table"]
             else:
                 wanted[args.out / f"{name}.toml"] = row
         except NeurolensError as error:
@@ -454,10 +525,16 @@ def run(args: argparse.Namespace) -> None:
                 left_out[row["key"]] = cause
     if args.only:
         return
-    for name, lens in ours.items():
-        settled(name, lens, listed, *doubles.get(name, (None, [])))
+    decided = []
+    for name, lens in sorted(ours.items()):
+        row, what = doubles.get(name, (None, []))
+        settled(name, lens, listed, row, what)
+        if row and (decision := listed["decisions"].get(name)):
+            now = read_lens(lab.LENSES / f"{name}.toml")
+            beside = evidence(theirs_of(row, now, listed))
+            decided.append([name, decision["differs"], evidence(now), beside, decision["decided"]])
     count = len([file for file in wanted if file.is_file()])
-    atomic_write_text(lab.RESULTS / "patent_lenses.md", page(left_out, doubles, count))
+    atomic_write_text(lab.RESULTS / "patent_lenses.md", page(left_out, doubles, count, decided))
     print(f"{count} lens files in {args.out}, {len(left_out)} left out, {len(doubles)} there already")
 
 

@@ -3,7 +3,8 @@
 The collection is OpticsDatabase (github.com/amegahed/OpticsDatabase, MIT licence): clone it, and name its folder. The
 photographs are lensfun's profiles (package lensfunpy; CC BY-SA 3.0). A file counts where the match of its name with a
 profile is certain or likely; `neurolens verify` says the same of one file. Writes photographs.md, photographs.json and
-photographs.csv (a row for each file).
+photographs.csv (a row for each file). Of a folder of our own lens files, which state what photographs said of each, it
+writes photographs_library.md and .json: medians of the library.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from neurolens.optics.photographs.profiles import Profile, database
 from neurolens.optics.photographs.rims import at_focal_length, fit_rims
 from neurolens.optics.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, light_curves, verify
 from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.focusing import infinity_states
 from neurolens.optics.setting.rims import RimRule, derive_rims
 
 PERCENTILES = (10, 25, 50, 75, 90)
@@ -38,7 +40,7 @@ WORSE = 0.02  # stops by which an aperture that was left out gets worse
 SHARES = (0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7)  # of the pupil's height at the edge of the field, for derived rims
 
 OPTIONS = (
-    lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase"),
+    lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase, or lenses/"),
     lab.count("workers", 1, "processes of a thread each (default: 1)"), lab.ONLY, lab.out(),
 )  # fmt: skip
 
@@ -247,8 +249,51 @@ COLUMNS = lab.columns(
 )  # fmt: skip
 
 
+STATED = {
+    "distortion_percent": "distortion, % of the height",
+    "light_f8_stops": "light near f/8, stops",
+    "light_widest_stops": "light at the widest aperture",
+}
+
+
+def of_library(lenses: Sequence[Lens]) -> dict[str, dict[str, list[float]]]:
+    """What the files state of certain matches: of primes and zooms, the figures of `STATED`."""
+    found: dict[str, dict[str, list[float]]] = {kind: {key: [] for key in STATED} for kind in ("primes", "zooms")}
+    for lens in lenses:
+        measured = dict(lens.measured)
+        zoom = len({c.efl_mm for c in infinity_states(lens)}) > 1
+        for key in STATED if measured.get("match") == "certain" else ():
+            if key in measured:
+                found["zooms" if zoom else "primes"][key].append(float(measured[key]))
+    return found
+
+
+def library_page(found: dict[str, dict[str, list[float]]], count: int) -> str:
+    """The percentiles of what the files state."""
+    header = "what|lenses|" + "|".join(f"{q}%" for q in PERCENTILES)
+    parts = [
+        (f"## {kind.capitalize()}", lab.table(header, [_line(STATED[key], v) for key, v in figures.items()]))
+        for kind, figures in found.items()
+    ]
+    return lab.page(
+        "# The library against photographs",
+        f"`python -m experiments photographs lenses`: what {count} lens files state of photographs, where the match "
+        "with a profile of lensfun is certain. Differences are root mean squares over heights; of a zoom, medians "
+        "over focal lengths. Lenses that their photographs contradict are left out of the library, and many rims are "
+        "fitted to the same photographs.",
+        *(text for part in parts for text in part),
+    )
+
+
 def run(args: argparse.Namespace) -> None:
     """Compare every file that has a profile, and write."""
+    if own := sorted(args.folder.glob("*.toml")):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NeurolensWarning)
+            lenses = [read_any(file) for file in own]
+        stated = of_library(lenses)
+        print(lab.write_results(args.out, "photographs_library", library_page(stated, len(own)), {"figures": stated}))
+        return
     files = sorted(p for p in args.folder.rglob("*") if p.suffix.lower() == ".zmx")
     if not files:
         raise InputError(args.folder, "files", "(no .zmx)", "a clone of OpticsDatabase")

@@ -59,7 +59,7 @@ LENSES = Path(__file__).parents[1] / "lenses"
         ("swirl", "petzval_portrait_100"),
         ("swirly lens", "petzval_portrait_100"),
         ("85mm soft", "pentax_smc_f_85mm_f2_8_soft"),
-        ("canon 50 bubbles", "canon_fd_50mm_f1_2l"),
+        ("canon 50 bubbles", "canon_50mm_f1_2"),
         ("laikin double gauss 50", "laikin_double_gauss_50"),
     ],
 )
