@@ -68,7 +68,8 @@ OPTIONS = (
 )
 
 
-_PROGRESS = re.compile(r": (done in|stopped after|\d+%)")  # of a command whose --quiet was damaged
+# of a command whose --quiet was damaged, and of one that assumes what is not given
+_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: )")
 
 
 @dataclass(frozen=True)

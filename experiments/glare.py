@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from experiments import lab
 from neurolens.base.progress import Progress
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
-from neurolens.pictures.flare.ghosts import coated
 from neurolens.pictures.flare.layers import axis_irradiance
 from neurolens.pictures.flare.lights import front_sphere
 from neurolens.pictures.flare.photons import Photons, PhotonTracer

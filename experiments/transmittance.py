@@ -18,10 +18,10 @@ from experiments import lab
 from neurolens.base import status as st
 from neurolens.models.model import Domain
 from neurolens.models.pairs import domain_of, sample_domain
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.trace.rays import follow
-from neurolens.pictures.flare.ghosts import coated
 
 COATINGS = {"bare": None, "coated": "quarter-wave"}
 

@@ -14,15 +14,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tmm
 from command_line import described, failure, run_json
 
 import neurolens as nl
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.cameras.build import make_camera
 from neurolens.cli import _FIRST, build_parser, command, main
 from neurolens.cli.arguments import Reporting
 from neurolens.cli.calls import signature_of
 from neurolens.front import EXAMPLES
-from neurolens.optics.lens.glass import index_of
+from neurolens.optics.lens.glass import LINE_D_NM, index_at, index_of
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render import colour
 
 ROOT = Path(__file__).parents[1]
 GAUSS, MODEL = "laikin_double_gauss_50", "laikin_double_gauss_50.ols-36"
@@ -164,6 +168,40 @@ def test_the_t_stop_of_bare_glass_follows_from_fresnels_reflectance() -> None:
         before, through = after, through * (1 - ((before - after) / (before + after)) ** 2)
     assert through < 0.95
     assert lens.t_stop == pytest.approx(lens.f_number / math.sqrt(through), rel=0.01)
+
+
+@pytest.mark.parametrize("coating", ["bare", "multi-layer"])
+def test_a_coating_is_one_setting_of_python_commands_and_cameras(coating: str) -> None:
+    """The T-stop and the white card by the matrices of the package tmm for each surface, in 24 wavelengths."""
+    lens = nl.lens("brendel_tessar_100").set(coating=coating)
+    tables = {k: colour.table(k) for k in ("wavelength_nm", "x", "y", "z", "d65")}
+    inside = (tables["wavelength_nm"] >= 400) & (tables["wavelength_nm"] <= 700)
+
+    def kept(nm: float) -> float:
+        share, before = 1.0, 1.0
+        for s in lens.prescription.surfaces:
+            after = float(index_of(s, nm))
+            films = [(index_at(n, *v, nm), d) for n, d, *v in (s.coating.layers if s.coating else ())]
+            if before != after:
+                indices, sizes = [before, *(n for n, _ in films), after], [math.inf, *(d for _, d in films), math.inf]
+                share *= tmm.coh_tmm("s", indices, sizes, 0, nm)["T"]
+            before = after
+        return share
+
+    told = lens.describe()
+    assert lens.t_stop == pytest.approx(lens.f_number / math.sqrt(kept(LINE_D_NM)), rel=1e-4)
+    assert (told["t_stop"], told["coatings"]) == (pytest.approx(lens.t_stop), coating)
+    nm = tables["wavelength_nm"][inside]
+    light = np.array([kept(at) for at in nm]) * np.where((nm == 400) | (nm == 700), 0.5, 1)
+    rgb, white = (
+        np.linalg.solve(colour.SRGB.to_xyz, [(tables[k] * tables["d65"])[inside] @ one for k in "xyz"])
+        for one in (light, np.where((nm == 400) | (nm == 700), 0.5, 1))
+    )
+    wanted = (rgb / white)[[0, 2]] * white[1] / rgb[1]
+    assert told["white_rb"] == pytest.approx(wanted.tolist(), abs=5e-4)
+    camera = make_camera(ROOT / "lenses/brendel_tessar_100.toml", Shot((12.0, 8.0), coating=coating))
+    assert camera.settings["lens_state"]["t_stop"] == pytest.approx(lens.t_stop)
+    assert camera.settings["coatings"] == coating
 
 
 def test_set_makes_another_lens_and_leaves_the_first() -> None:

@@ -6,7 +6,7 @@ The same graph, in onnxruntime, serves the search for the outline of the light t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -24,6 +24,7 @@ from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensScene
 from neurolens.cameras.onnxlens import LensRun
+from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTable, outline_of, wavelength_between
 from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
@@ -88,8 +89,9 @@ class ExactCamera(LensCamera):
         data = first_order(self.lens)
         about = {"camera": "exact", "lens": tabled.identity, "efl_mm": float(data.efl_mm)}
         about |= {"f_number": float(data.f_number), "derived": self.lens.derived, "rims": lens.rims}
+        about["coatings"] = self.lens.coatings
         about["lens_state"] = state_of(self.lens, used, float(first_order(tabled).efl_mm))
-        self.place(self._outline(scene, plane, bounds, progress), scene, shot, about, progress)
+        self.place(self._outline(scene, plane, bounds, shot, progress), scene, shot, about, progress)
 
     @property
     def front(self) -> Surface:
@@ -110,11 +112,12 @@ class ExactCamera(LensCamera):
             done = trace(self.lens, Rays(*light), wavelength, towards="film", transmittance=True)
         assert done.transmittance is not None
         x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
-        film = np.stack([x, y]) + (self.film.film_z_mm - z) / dz * np.stack([dx, dy])
+        planes = (self.film.film_z_mm, self.film.outline.pupil_z_mm)
+        places = np.concatenate([np.stack([x, y]) + (at - z) / dz * np.stack([dx, dy]) for at in planes])
         # The lens's graph takes light of the camera's range alone; so does this.
         low, high = light_limits(self.lens, self._range_nm)
         inside = (low <= wavelength_nm) & (wavelength_nm <= high)
-        return film, through, np.where(inside, done.status.numpy(), st.OUTSIDE_DOMAIN).astype(np.int32)
+        return places, through, np.where(inside, done.status.numpy(), st.OUTSIDE_DOMAIN).astype(np.int32)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """Return the graph of the lens with its stop."""
@@ -147,10 +150,11 @@ class ExactCamera(LensCamera):
         return index[-1] * way[:2], np.stack([radius, added], 1)
 
     def _outline(
-        self, scene: LensScene, pupil_z_mm: float, bounds: PupilBounds | None, progress: Progress | None
+        self, scene: LensScene, pupil_z_mm: float, bounds: PupilBounds | None, shot: Shot, progress: Progress | None
     ) -> PupilOutline | None:
         """The outline of what passes the lens with a round stop, from the cache where an earlier run has kept it."""
         lens, planes, light = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm), self._light_nm
+        covered = FilmPose.of(shot).covers_mm(self.film_mm, scene.film_z_mm - pupil_z_mm)
         # A lens with cylinders takes a search at many azimuths, for one outline that fits none closely: so it is
         # coarser.
         detail, rows, points = (COARSE, 13, 48) if self.lens.anamorphic else (FINE, 17, 128)
@@ -161,18 +165,18 @@ class ExactCamera(LensCamera):
             # At most azimuths most points are dark. Traced as arrays, lost rays take no more work.
             radius, x, y = (c.astype(np.float64) for c in (film[0], *pupil))
             film_z = np.full_like(radius, scene.film_z_mm)
-            return passes_at_any_azimuth(self.lens, radius, film_z, x, y, pupil_z_mm, nm, self.film_mm)
+            return passes_at_any_azimuth(self.lens, radius, film_z, x, y, pupil_z_mm, nm, covered)
 
         def search() -> PupilOutline | None:
             with (progress or Progress(quiet=True)).stage(f"search the pupil of {self.name}") as report:
-                corner = 1.0001 * math.hypot(*self.film_mm) / 2
+                corner = 1.0001 * math.hypot(*covered) / 2
                 boxes = bounds or pupil_bounds(
-                    self.lens, corner, planes, light, rows=rows, points=points, film_mm=self.film_mm
+                    self.lens, corner, planes, light, rows=rows, points=points, film_mm=covered
                 )
                 table = PupilTable.of(asdict(boxes))
                 return outline_of(table, passes, light, detail, lambda share: report(0.2 + 0.8 * share))
 
-        read = [pupil_z_mm, self.film_mm, detail, bounds and asdict(bounds)]
+        read = [pupil_z_mm, covered, detail, bounds and asdict(bounds)]
         return kept_outline(search_key(self.lens, light, detail.wavelengths, *read), search)
 
 
@@ -180,22 +184,33 @@ def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float |
     """The table `lens_state` of a lens that `set_lens` has placed; `nominal_mm` is its focal length at infinity."""
     data, film_z = first_order(lens), lens.film_z_mm
     assert film_z is not None
-    nm = float(np.clip(LINE_D_NM, *wavelength_nm))
-    call = {"film_z_mm": np.array([[film_z]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
-    graph = exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm)
-    axial = evaluate(graph, {"rays": np.array([[0.0, 0.0, 0.0, 0.0, nm]]).T} | call)
-    through = axial["transmittance"].item()
-    open_ = lens.aperture is None or bool(lens.aperture.inside(np.zeros(1), np.zeros(1), 1.0))
-    passed = open_ and axial["status"].item() == st.PASSED and 0 < through <= 1
+    through = axial_transmittance(lens, [float(np.clip(LINE_D_NM, *wavelength_nm))], wavelength_nm).item()
     return lens_state(
         nominal_mm=nominal_mm,
         efl_mm=data.efl_mm,
         pinhole_mm=chief_reach_mm(lens),
         entrance_pupil_mm=film_z - data.entrance_pupil_z_mm,
         f_number=data.f_number,
-        transmittance=through if passed else None,
+        transmittance=through or None,
         squeeze=abs(data.efl_mm / first_order(lens, meridian="x").efl_mm) if lens.anamorphic else 1.0,
     )
+
+
+def axial_transmittance(lens: Lens, at_nm: Sequence[float], wavelength_nm: tuple[float, float]) -> FloatArray:
+    """Return the share [N] of the light at these wavelengths that the axial ray keeps; 0 where it does not pass.
+
+    Args:
+        lens: placed by `set_lens`. wavelength_nm: the range in which the wavelengths lie.
+    """
+    assert lens.film_z_mm is not None
+    call = {"film_z_mm": np.array([[lens.film_z_mm]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
+    graph, rays = exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm), np.zeros((5, len(at_nm)))
+    rays[4] = at_nm
+    axial = evaluate(graph, {"rays": rays} | call)
+    through = np.broadcast_to(axial["transmittance"], (1, len(at_nm)))[0]
+    open_ = lens.aperture is None or bool(lens.aperture.inside(np.zeros(1), np.zeros(1), 1.0))
+    passed = (axial["status"][0] == st.PASSED) & (through > 0) & (through <= 1) & open_
+    return np.where(passed, through, 0.0)
 
 
 def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) -> dict[str, Any]:

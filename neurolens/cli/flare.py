@@ -33,7 +33,7 @@ from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
-from neurolens.pictures.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
+from neurolens.pictures.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of
 from neurolens.pictures.flare.lights import (
     SUN,
     KeptLights,
@@ -314,7 +314,7 @@ class Shots:
         self._tracks = [t for path in command.lights if path.suffix.lower() != ".toml" for t in read_lights(path)]
         scenes = [(path, load_scene(path)) for path in command.lights if path.suffix.lower() == ".toml"]
         self._scenes = [(path, scene, SceneLights(scene)) for path, scene in scenes]
-        self._lens = cache(lambda state: with_coating(set_lens(tabled, state.shot()), command.settings))
+        self._lens = cache(lambda state: set_lens(tabled, state.shot()))
         self._progress, self._fields = progress, dict[cli.LensState, Field]()
         self._last: tuple[Flare, Shot] | None = None
 

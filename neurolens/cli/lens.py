@@ -266,7 +266,12 @@ def _light(data: dict[str, Any]) -> str:
         *((("", half_x, "along x"),) if anamorphic else ()),
         ("rays that pass", f"{100 * data['passing_share']:.1f}%", share_of),
         *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
+        ("T-stop", "-" if data["t_stop"] is None else f"T{cli.number(data['t_stop'])}", "of the axial ray, d line"),
+        ("coatings", data["coatings"] or "-", "of the surfaces between glass and air"),
     ]
+    if data["white_rb"]:
+        red, blue = data["white_rb"]
+        rows.append(("white card", f"R/G {red:.3f}, B/G {blue:.3f}", "on the axis, in daylight D65"))
     return _columns(rows)
 
 

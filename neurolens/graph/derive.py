@@ -238,7 +238,7 @@ def _with_gradient(g: Graph, node: Node, x: Value) -> tuple[Value, Callable[...,
 
 def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
     coefficients = node.arrays[0][1:] * np.arange(1, len(node.arrays[0]))
-    return _times(d[0], y.graph.series(x[0], coefficients if len(coefficients) > 1 else [*coefficients, 0.0]))
+    return _times(d[0], y.graph.series(x[0], coefficients))
 
 
 def _product(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:

@@ -298,7 +298,9 @@ class Graph:
         return self.add("polynomial", (x,), len(w), arrays=(np.asarray(exponents, np.int64), w))
 
     def series(self, x: Value, coefficients: ArrayLike) -> Value:
-        return self.add("series", (x,), x.rows, arrays=(np.asarray(coefficients, np.float64),))
+        numbers = np.asarray(coefficients, np.float64)
+        numbers = np.append(numbers, 0.0) if len(numbers) == 1 else numbers  # readers begin with a slope
+        return self.add("series", (x,), x.rows, arrays=(numbers,))
 
     def select(self, truth: Value, then: Operand, otherwise: Operand) -> Value:
         other = self.value(otherwise)

@@ -380,7 +380,7 @@ def packed_lens(lens: Lens) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Coating):
-        return [value.name, [list(layer) for layer in value.layers]]
+        return [value.name, [list(layer) for layer in value.layers], value.origin]
     if isinstance(value, tuple):
         return [_plain(v) for v in value]
     if not isinstance(value, (str, bool, int, float, list, dict, type(None))):
@@ -404,7 +404,7 @@ def unpacked_lens(packed: dict[str, Any]) -> Lens:
             raise ValueError(f"an asphere of more than {_MAX_TERMS} terms, or of powers beyond {_MAX_POWER}")
         values["figure"] = figure_of(row)
         if values.get("coating"):
-            name, layers = values["coating"]
-            values["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers))
+            name, layers, *origin = values["coating"]
+            values["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers), *origin)
         surfaces.append(Surface(**values))
     return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS})

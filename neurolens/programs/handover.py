@@ -102,6 +102,7 @@ class Handed:
         attributes: the first camera's, see `pictures.render.pictures.standard_attributes`; its texts may come from
             strangers.
         rate: frames a second, as numerator and denominator. colours: names of the colours that have maps of their own.
+        coatings: of the lens, as `Lens.coatings`; "" of cameras that have none.
     """
 
     attributes: Mapping[str, Any]
@@ -110,6 +111,7 @@ class Handed:
     frames: tuple[Pinhole, ...]
     plates: Plates
     colours: tuple[str, ...]
+    coatings: str = ""
 
     @property
     def lens(self) -> str:

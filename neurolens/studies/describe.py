@@ -22,6 +22,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import NeurolensError, warned
 from neurolens.base.lensname import maker_of, year_of
 from neurolens.base.report import Report
+from neurolens.base.settings import LIGHT_NM
+from neurolens.cameras.exact import axial_transmittance, state_of
 from neurolens.models.model import Domain
 from neurolens.models.pairs import sample_domain
 from neurolens.optics.analysis import layout
@@ -39,8 +41,10 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import trace
 from neurolens.pictures.flare.ghosts import GhostTracer, ghost_table
 from neurolens.pictures.flare.lights import Light
+from neurolens.pictures.render.colour import SpectralRange
 
 _RAYS = 65536
+_BINS = 60  # wavelengths of a white card
 _NEGLIGIBLE = 1e-4  # a surface that blocks a smaller share of the rays is not listed
 
 
@@ -55,6 +59,10 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         half_field_deg: as the file states it.
         half_field_reached_deg: mean angle of the rays that reach the edge of the domain's film (for an anamorphic lens
             along y); None where none does. half_field_reached_x_deg is None for a round lens, too.
+        coatings: as `Lens.coatings`.
+        t_stop: f-number over the root of the share of light at the d line that the axial ray keeps; None where that ray
+            does not pass.
+        white_rb: R/G and B/G (linear sRGB) of a white card on the axis in daylight D65; None without visible light.
         passing_share: share of rays uniform over the domain's film and pupil discs that pass.
         ended: what stops the others, a list of {status, text, share}, largest share first.
         warnings: sentences.
@@ -89,9 +97,24 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "half_field_reached_deg": reached,
         "half_field_reached_x_deg": reached_x if squeezed else None,
         "passing_share": passing,
+        "coatings": lens.coatings,
+        "t_stop": state_of(lens, lens.light_nm)["t_stop"],
+        "white_rb": white_rb(lens),
         "ended": ended,
         "warnings": notes,
     }
+
+
+def white_rb(lens: Lens) -> tuple[float, float] | None:
+    """Return R/G and B/G of a white card on the axis in daylight D65, in linear sRGB, of a lens placed by `set_lens`.
+
+    None where the axial ray does not pass, or the lens is made for other light.
+    """
+    if not lens.visible:
+        return None
+    light = SpectralRange(*LIGHT_NM, _BINS)
+    red, green, blue = light.film_rgb(axial_transmittance(lens, light.centres_nm.tolist(), LIGHT_NM))
+    return (float(red / green), float(blue / green)) if green > 0 else None
 
 
 _AS_FILED = ("diameter_mm", "material", "stop", "glass", "absorption_per_mm")

@@ -23,10 +23,10 @@ from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import WORST, with_low_order_derivatives
 from neurolens.models.export import export_onnx
 from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Runtime, Shot
 from neurolens.optics.readers.lensfile import read_lens
-from neurolens.pictures.flare.ghosts import coated
 
 FILM = (36.0, 24.0)
 BAND = np.abs(np.add.outer(np.arange(64), -np.arange(64))) < 16  # about half of the stop

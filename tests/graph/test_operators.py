@@ -50,6 +50,7 @@ CASES: dict[str, Callable[[Graph, Value, Value, Value], Value]] = {
     "polynomial": lambda g, x, y, s: g.polynomial(EXPONENTS, COEFFICIENTS, x * y),
     "series": lambda g, x, y, s: g.series(x * y, [1.0, -2.0, 0.5, 0.25]),
     "series of one": lambda g, x, y, s: g.series(x, [1.0, -2.0]),
+    "series of a constant": lambda g, x, y, s: g.series(x * y, [0.75]) + x,
     "add": lambda g, x, y, s: x + y * x,
     "sub": lambda g, x, y, s: s - x * y,
     "mul": lambda g, x, y, s: x * y * s,

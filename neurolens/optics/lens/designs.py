@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.glass import index_at
-from neurolens.optics.lens.prescription import Coating
+from neurolens.optics.lens.prescription import Coating, Lens
 
 # Where a design is best over the visible by default: the triple layer falls off faster towards violet.
 DESIGN_NM = 550.0
@@ -104,17 +105,17 @@ def _three_layer(low: float, high: float, at_nm: float) -> Films:
 
 
 def _multi_layer(low: float, high: float, at_nm: float) -> Films:
-    """Seven films on glass of index 1.43 to 2.05: today's broadband coatings.
+    """Seven films on glass against air: today's broadband coatings.
 
     Fluoride over tantalum oxide and silica in turn; thicknesses by least squares of the reflected amplitude from 400 to
-    700 nm at 0 and 30 degrees, for six glasses, linear between them, and scaled by `at_nm` / 550.
+    700 nm at 0 and 30 degrees, for six glasses, linear between them, and scaled by `at_nm` / 550. Rarer and denser
+    glasses have the films of the nearest of the six.
 
     Raises:
-        InputError: a surface that is not between air and such glass.
+        InputError: a surface that has no air on either side.
     """
-    if low != 1 or not min(MULTI_LAYER) <= high <= max(MULTI_LAYER):
-        expected = f"air and glass of index {min(MULTI_LAYER)} to {max(MULTI_LAYER)}"
-        raise InputError("multi-layer", "media", f"({low:g} to {high:g})", expected)
+    if low != 1:
+        raise InputError("multi-layer", "media", f"({low:g} to {high:g})", "air on one side")
     films = (FLUORIDE, *(TANTALUM_OXIDE, SILICA) * 3)
     table = zip(*MULTI_LAYER.values(), strict=True)
     thick = [float(np.interp(high, list(MULTI_LAYER), row)) * at_nm / DESIGN_NM for row in table]
@@ -160,6 +161,37 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     except InputError as error:
         raise InputError(file, where, name, f"another design: {error}") from None
     return Coating(name, films if n_before < n_after else films[::-1])
+
+
+def coated(lens: Lens, names: str) -> Lens:
+    """Return a lens with the coatings that somebody chooses for its surfaces between glass and air.
+
+    Args:
+        names: a design, for all surfaces whose coating the source of the lens does not state; "bare" takes every
+            coating away, "stated" all but those of the source. After commas come designs of single surfaces, whatever
+            these have: "three-layer,s07=bare".
+
+    Raises:
+        InputError: a design or surface is unknown, or a design cannot match the media.
+    """
+    single = {place: name for place, is_one, name in (word.partition("=") for word in names.split(",")) if is_one}
+    rest = [word for word in names.split(",") if "=" not in word]
+    known = [f"s{k:02d}" for k in range(len(lens.surfaces))]
+    if len(rest) > 1 or not set(single) <= set(known):
+        expected = f'one design, "bare" or "stated", and others as {known[0]}=NAME to {known[-1]}=NAME'
+        raise InputError(lens.path, "coating", names, expected)
+    rows, before = [], float(lens.object_medium.n_d)
+    for key, s in zip(known, lens.surfaces, strict=True):
+        stated, n_d = s.coating is not None and s.coating.origin == "source", float(s.n_d)
+        name, coating = single.get(key, rest[0] if rest else None), s.coating
+        if key not in single and name in ("bare", "stated"):
+            coating = s.coating if stated and name == "stated" else None
+        elif name is not None and (key in single or (not stated and before != n_d and 1.0 in (before, n_d))):
+            made = design(name, before, n_d, lens.path, f"surface {key[1:]}, coating")
+            coating = replace(made, origin="shot")
+        rows.append(replace(s, coating=coating))
+        before = n_d
+    return replace(lens, surfaces=tuple(rows))
 
 
 def is_design(coating: Coating, n_before: float, n_after: float) -> bool:

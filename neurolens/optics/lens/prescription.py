@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Any, Literal
 
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import lens_id_of
@@ -27,10 +27,12 @@ class Coating:
         name: of the design, for people and files.
         layers: (refractive index, thickness in nm), from the scene's side to the film's; films that disperse have
             their Abbe number, too, and the index is then n_d (dispersion as of glasses: `glass.index_at`).
+        origin: who says so: the "source" of the lens, or the "shot" (`Shot.coating`).
     """
 
     name: str
     layers: tuple[tuple[float, ...], ...]
+    origin: Literal["source", "shot"] = "source"
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,14 @@ class Lens:
     def dispersive(self) -> bool:
         """Whether the index of any glass is known to change with the wavelength."""
         return any(m.V_d is not None or m.glass is not None for m in self.media)
+
+    @property
+    def coatings(self) -> str:
+        """The coatings of the surfaces between glass and air, by name from the scene on; "bare" is glass without."""
+        rows = zip(self.media, self.surfaces, strict=False)
+        at_air = (s for m, s in rows if float(m.n_d) != float(s.n_d) and 1.0 in (float(m.n_d), float(s.n_d)))
+        names = (s.coating.name if s.coating and s.coating.layers else "bare" for s in at_air)
+        return ", ".join(dict.fromkeys(names))
 
     @property
     def refractions(self) -> int:

@@ -343,7 +343,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
         return lens.image_radius_mm, "the lens file"
     f = first_order(lens).front_efl_mm  # of angles in the medium in front
     if lens.half_field_deg is not None and lens.half_field_deg < 60:
-        return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
+        return abs(f) * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
     radii = np.linspace(0, 3 * abs(f), 481)
     points = 48
     if not _illumination(lens, radii[:1])[0] > 0:  # a nearly closed stop lies between the points of the grid

@@ -1,4 +1,4 @@
-"""A lens set as a photographer does, in this order: zoom, size, aperture, f-number, focus, cover glass, film offset.
+"""A lens set as a photographer does: zoom, size, aperture, f-number, focus, cover glass, coating, film offset in turn.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
 focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens import paraxial
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.prescription import Configuration, Lens
 from neurolens.optics.lens.shot import FocusMode, Shot
 from neurolens.optics.setting.focusing import (
@@ -34,7 +35,7 @@ from neurolens.optics.setting.rims import check_clearance
 
 
 def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "paraxial", **settings: Any) -> Lens:
-    """Return the lens set for a shot: its zoom, size, aperture, f-number, focus, cover glass and film offset::
+    """Return the lens set for a shot: its zoom, size, aperture, f-number, focus, cover glass, coating and film offset::
 
         lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=2.0, f_number=4.0)
 
@@ -77,6 +78,7 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
     if mode != "paraxial":
         lens = best_focused(lens, focus_of(lens, shot), light_nm)
     lens = with_cover_glass(lens, shot.cover_glass_mm or 0.0, focus_of(lens, shot), mode, light_nm)
+    lens = lens if shot.coating is None else coated(lens, shot.coating)
     assert lens.film_z_mm is not None
     return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from neurolens.optics.lens.glass import (
 )
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.arithmetic import Graphs, is_number, times
+from neurolens.optics.trace.filmfit import FilmFit, Rows, fitted, inverse_um_at
 from neurolens.optics.trace.shapes import traced_curve
 from neurolens.optics.trace.surfaces import Hit, Medium, Rays, Test, cross, media, radius2
 from neurolens.optics.trace.transmission import Passage, Shares, times_film
@@ -160,6 +162,15 @@ class GraphPassage(Passage):
         sine = min(max(float(index_of(m, nm)) for nm in self.range_nm) for m in sides)
         before, after, n1, n2 = met.q, q, g.value(one.n), g.value(two.n)
         inverse_um = 1000.0 / self.wavelength_nm
+        if not self._o.polish:
+            low, high = self.range_nm
+            around = 1000.0 / high, 1000.0 / low
+            indices = [tuple(float(index_of(m, 1000.0 / u)) for u in inverse_um_at(around)) for m in reversed(sides)]
+            fit = fitted(tuple(reversed(coating.layers)), *indices, around)
+            if fit is not None:
+                medium, cosine = (two, after) if is_number(two.n) else (one, before)
+                square = (medium.n2 - cosine * cosine) * (2 / fit.most) - 1.0
+                return self._by_fit(fit, square, inverse_um, around, before * after * 2.0)
         s: tuple[Value | float, ...] = (1.0, 0.0, 0.0, 1.0)
         p = s
         for n_d, thickness_nm, *V_d in reversed(coating.layers):
@@ -178,6 +189,21 @@ class GraphPassage(Passage):
         real, imaginary = real_s * real_p + other_s * other_p, other_s * real_p - real_s * other_p
         both = size_s * size_p
         return Shares(size_p + size_s, size_p - size_s, real * 2.0, imaginary * 2.0, before * after * 2.0, both)
+
+    def _by_fit(self, fit: FilmFit, square: Value, inverse_um: Value, ends: tuple[float, float], flux: Value) -> Shares:
+        """Return the shares by polynomials; the phase between s and p, which films keep small, is left out."""
+        x = square.clip(-1.0, 1.0)
+        y = ((inverse_um - sum(ends) / 2) * (2 / max(ends[1] - ends[0], 1e-9))).clip(-1.0, 1.0)
+
+        def value(rows: Rows) -> Value:
+            total: Any = None
+            for row in reversed(rows):
+                term = x.graph.series(y, row)
+                total = term if total is None else self._o.fma(total, x, term)
+            return total
+
+        total, split = value(fit.both) + flux * 2.0, value(fit.split)
+        return Shares(total, split, total, None, flux * 4.0, total * total - split * split)
 
 
 def transmitted(depth: Value) -> Value:

@@ -26,7 +26,6 @@ from neurolens.graph.compiler import c_source
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.layout import Layout, Line, layout_profile
-from neurolens.optics.lens.designs import design
 from neurolens.optics.lens.glass import inverse_square_um
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.rays import Rays, follow, turning
@@ -64,30 +63,6 @@ def ghost_pairs(lens: Lens) -> tuple[Pair, ...]:
     """All ghosts of two reflections: pairs of surfaces that reflect."""
     at = [k for k in range(len(lens.surfaces)) if reflects(lens, k)]
     return tuple(Pair(i, j) for j in at for i in at if i < j)
-
-
-def coated(lens: Lens, names: str) -> Lens:
-    """The lens with a coating of `optics.lens.designs` on each bare surface between glass and air.
-
-    Args:
-        names: a design, and others for single surfaces, which replace what these have: "three-layer,s07=bare".
-
-    Raises:
-        InputError: a design or surface is unknown, or a design cannot match the media.
-    """
-    single = {place: name for place, is_one, name in (word.partition("=") for word in names.split(",")) if is_one}
-    rest = [word for word in names.split(",") if "=" not in word]
-    known = [f"s{k:02d}" for k in range(len(lens.surfaces))]
-    if len(rest) > 1 or not set(single) <= set(known):
-        raise InputError(lens.path, "coating", names, f"one design, and others as {known[0]}=NAME to {known[-1]}=NAME")
-    rows, before = [], float(lens.object_medium.n_d)
-    for k, s in enumerate(lens.surfaces):
-        bare = not (s.coating and s.coating.layers) and reflects(lens, k) and 1.0 in (before, float(s.n_d))
-        name = single.get(known[k], rest[0] if bare and rest else None)
-        coating = design(name, before, float(s.n_d), lens.path, f"surface {k}") if name is not None else s.coating
-        rows.append(replace(s, coating=coating))
-        before = float(s.n_d)
-    return replace(lens, surfaces=tuple(rows))
 
 
 class GhostRays(NamedTuple):

@@ -30,7 +30,7 @@ from neurolens.optics.trace.rays import Rays, trace
 from neurolens.pictures.flare import canvas
 from neurolens.pictures.flare.canvas import Doubles, Floats, Raster, Smear
 from neurolens.pictures.flare.diffraction import starburst_picture
-from neurolens.pictures.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
+from neurolens.pictures.flare.ghosts import GhostTracer, Pair, ghost_pairs
 from neurolens.pictures.flare.grids import REACH, Grid, ghost_moves, grids_of
 from neurolens.pictures.flare.lights import Light, Patch, SceneLights, disc, keep, light_rays, patches, rays_across
 from neurolens.pictures.flare.photons import LEVELS, Photons, PhotonTracer
@@ -66,7 +66,7 @@ class FlareJob:
     """Everything that decides the flare of one picture.
 
     Attributes:
-        lens: its film must be placed (`set_lens`), and it must have the coating of the settings (`with_coating`).
+        lens: its film must be placed (`set_lens`).
         wavelength_nm: range of light. threads: for the work.
         ghosts: traces the ghosts of the same lens and stop; left out, all ghosts of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".
@@ -447,11 +447,6 @@ def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
     return layers
 
 
-def with_coating(lens: Lens, settings: FlareSettings) -> Lens:
-    """Return the lens with the coating of the settings; raises InputError as `coated`."""
-    return lens if settings.coating is None else coated(lens, settings.coating)
-
-
 class Choice(NamedTuple):
     """What the flare of all a scene's frames shares: ghosts that become layers; whether lights fade (`keep`)."""
 
@@ -465,9 +460,6 @@ def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: 
     Args:
         frames: the scene with its camera in the frame's place, and the lens in its state.
         fade: whether lights fade before they are left out, as in an animation.
-
-    Raises:
-        InputError: as `coated`.
     """
     sources = SceneLights(frames[0][0])
     return Choice(brightest([_scene_job(sources, *frame, raster, threads, fade) for frame in frames]), fade)
@@ -479,7 +471,7 @@ def _scene_job(sources: SceneLights, scene: Scene, lens: Lens, raster: Raster, t
     assert settings is not None and lens.film_z_mm is not None
     lights = keep(sources.seen(scene, lens.film_z_mm), settings.most, fade).lights
     light_nm = scene.settings.camera.wavelength_nm
-    return FlareJob(with_coating(lens, settings), lights, raster, settings, light_nm, threads)
+    return FlareJob(lens, lights, raster, settings, light_nm, threads)
 
 
 def scene_flare(
@@ -492,7 +484,7 @@ def scene_flare(
         choice: that of all frames; None chooses by this picture alone.
 
     Raises:
-        InputError: as `flare_layers` and `coated`.
+        InputError: as `flare_layers`.
     """
     choice, sources = choice or scene_choice([(scene, lens)], raster, threads), SceneLights(scene)
     job = replace(_scene_job(sources, scene, lens, raster, threads, choice.fade), single=choice.single)

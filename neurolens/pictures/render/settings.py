@@ -164,12 +164,6 @@ class FlareSettings:
         InputError: a value out of bounds, an unknown layer, or photons together with single ghosts.
     """
 
-    coating: str | None = setting(
-        None,
-        "of every surface between glass and air that the lens file leaves bare: single-layer (1940s to 60s), "
-        "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
-        common=True,
-    )
     bins: int = setting(
         15,
         "wavelengths of stars and photons, in equal steps over the range of light, 400 to 700 nm; ghosts take what "

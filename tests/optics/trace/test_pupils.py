@@ -111,6 +111,9 @@ def test_image_radius_rules() -> None:
     assert image_radius_mm(stated) == (33.0, "the lens file")
     by_field = replace(tessar, image_radius_mm=None, half_field_deg=20.0)
     assert image_radius_mm(by_field)[0] == pytest.approx(f * math.tan(math.radians(20)))
+    first, *others = by_field.surfaces
+    diverging = replace(by_field, surfaces=(replace(first, radius_mm=-100.0), *others))
+    assert first_order(diverging).efl_mm < 0 < image_radius_mm(diverging)[0]
     dark, why = image_radius_mm(replace(tessar, image_radius_mm=None, half_field_deg=None))
     assert "illumination" in why and dark > f * math.tan(math.radians(20))
     fisheye = focused("muller_fisheye_100")

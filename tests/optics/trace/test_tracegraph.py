@@ -64,7 +64,7 @@ def test_transmittance_is_that_of_the_tracer(name: str, coat: bool, absorb: bool
     lens = with_losses(set_lens(read_lens(LENSES / f"{name}.toml")), coat, absorb)
     inputs, plane = corner_rays(lens, wavelength_nm)
     fx, fy, px, py, nm = (torch.from_numpy(row) for row in inputs["rays"])
-    film_z, graph = float(inputs["film_z_mm"][0, 0]), exact_graph(lens, plane, LIGHT_NM)
+    film_z, graph = float(inputs["film_z_mm"][0, 0]), exact_graph(lens, plane, LIGHT_NM, double=coat)
     rays = camera_rays(fx, fy, film_z, px, py, plane)
     wanted = trace(lens, rays, nm, transmittance=True)
     found = evaluate(graph, inputs)

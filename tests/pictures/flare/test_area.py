@@ -10,10 +10,11 @@ from shipped import whole
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster, draw_edges, edges_of
-from neurolens.pictures.flare.ghosts import GhostTracer, coated, ghost_pairs
+from neurolens.pictures.flare.ghosts import GhostTracer, ghost_pairs
 from neurolens.pictures.flare.grids import REACH, grids_of
 from neurolens.pictures.flare.layers import FlareJob
 from neurolens.pictures.flare.lights import Light, light_rays, rays_across

@@ -11,10 +11,11 @@ from shipped import whole
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
-from neurolens.pictures.flare.ghosts import GhostTracer, coated, entrances, ghost_graphs, ghost_pairs
+from neurolens.pictures.flare.ghosts import GhostTracer, entrances, ghost_graphs, ghost_pairs
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.flare.steps import entering
 

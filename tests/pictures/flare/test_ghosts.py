@@ -12,13 +12,14 @@ from film_light import film_light
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.figures import Biconic, Qcon, Toroid
-from neurolens.optics.lens.prescription import Coating, Lens, Surface
+from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import Rays, follow, trace, turning
 from neurolens.pictures.flare.canvas import Raster
-from neurolens.pictures.flare.ghosts import GhostTracer, Pair, coated, ghost_layout, ghost_pairs
+from neurolens.pictures.flare.ghosts import GhostTracer, Pair, ghost_layout, ghost_pairs
 from neurolens.pictures.flare.layers import FlareJob, axis_irradiance
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.flare.photons import PhotonTracer
@@ -200,8 +201,6 @@ BAD = [
     (lambda: GhostTracer(plate(), [Pair(1, 2)]), "surfaces that reflect"),
     (lambda: GhostTracer(replace(plate(), film_z_mm=None)), "focused"),
     (lambda: GhostTracer(plate()).trace(np.zeros((3, 4)), 550.0), r"\[6, N\]"),
-    (lambda: coated(plate(), "velvet"), "velvet"),
-    (lambda: coated(plate(), "s02=three-layer"), "two different media"),
 ]
 
 
@@ -209,17 +208,6 @@ BAD = [
 def test_refusals(call: object, word: str) -> None:
     with pytest.raises(InputError, match=word):
         call()  # type: ignore[operator]
-
-
-def test_single_surfaces_have_coatings_of_their_own_and_those_of_the_file_stay() -> None:
-    def names(lens: Lens, design: str) -> list[str | None]:
-        return [s.coating and s.coating.name for s in coated(lens, design).surfaces]
-
-    lens = plate()
-    assert names(lens, "three-layer,s01=multi-layer 520") == ["three-layer", "multi-layer 520", None]
-    assert names(lens, "s00=bare") == ["bare", None, None]
-    own = replace(lens.surfaces[0], coating=Coating("own", ((1.7, 50.0),)))
-    assert names(replace(lens, surfaces=(own, *lens.surfaces[1:])), "quarter-wave") == ["own", "quarter-wave", None]
 
 
 @pytest.mark.parametrize(("distance_m", "depth"), [(math.inf, 0.0), (3.0, 0.0), (0.08, 0.0), (0.08, 4.0)])
