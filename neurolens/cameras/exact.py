@@ -155,12 +155,12 @@ class ExactCamera(LensCamera):
         """The outline of what passes the lens with a round stop, from the cache where an earlier run has kept it."""
         lens, planes, light = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm), self._light_nm
         covered = FilmPose.of(shot).covers_mm(self.film_mm, scene.film_z_mm - pupil_z_mm)
-        # A lens with cylinders takes a search at many azimuths, for one outline that fits none closely: so it is
+        # A lens that is not round takes a search at many azimuths, for one outline that fits none closely: so it is
         # coarser.
-        detail, rows, points = (COARSE, 13, 48) if self.lens.anamorphic else (FINE, 17, 128)
+        detail, rows, points = (FINE, 17, 128) if self.lens.round else (COARSE, 13, 48)
 
         def passes(film: FloatArray, pupil: FloatArray, nm: float) -> NDArray[np.bool_]:
-            if not self.lens.anamorphic:
+            if self.lens.round:
                 return lens.passes(film, pupil, nm)
             # At most azimuths most points are dark. Traced as arrays, lost rays take no more work.
             radius, x, y = (c.astype(np.float64) for c in (film[0], *pupil))
@@ -240,7 +240,7 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
     rows: list[Any] = [[float(index_of(lens.object_medium, w)) for w in sorted(waves)]]
     for s in lens.surfaces:
         numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, *(index_of(s, w) for w in sorted(waves)))
-        rows.append([[float(v) for v in numbers], s.stop, s.figure.record()])
+        rows.append([[float(v) for v in numbers], s.stop, s.figure.record(), s.placement.record()])
     return fingerprint_of([_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
 
 

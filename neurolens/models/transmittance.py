@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
@@ -88,7 +87,7 @@ def with_transmittance(models: Sequence[LensModel], samples: Sequence[Sample], m
         most: terms of the transmittance, at most.
     """
     opened = [_opened(model.core) for model in models]
-    needed = np.any([_needed(polynomial) for polynomial, _ in opened], axis=0)
+    needed = np.any([polynomial.serves for polynomial, _ in opened], axis=0)
     known = opened[0][0].exponents[needed]
     fields = [
         (model.encoding(rays).invariants(model.encoding.mirror), power, _weight(rays))
@@ -106,12 +105,6 @@ def with_transmittance(models: Sequence[LensModel], samples: Sequence[Sample], m
             core = closed(replace(polynomial, exponents=exponents, ab=ab, scalars=scalars))
             found.append(replace(model, core=core))
     return found
-
-
-def _needed(polynomial: Polynomial) -> NDArray[np.bool_]:
-    """Return which terms [M] serve another output than the transmittance."""
-    ab = polynomial.ab != 0
-    return np.asarray(ab.any(axis=tuple(range(ab.ndim - 1))) | (polynomial.scalars[1:] != 0).any(0))
 
 
 def _joined(coefficients: Array, more: Array) -> Array:
