@@ -126,13 +126,20 @@ def rows_of(page: str) -> dict[str, dict[str, Row]]:
 
 def test_the_page_of_lens_files_has_every_key_that_the_reader_takes_and_no_other() -> None:
     rows = rows_of("lens-file.md")
-    assert set(rows["Top level"]) == set(lensfile.LENS_KEYS) - {"coating", "configuration", "aperture", "measured"}
+    assert set(rows["Top level"]) == set(lensfile.LENS_KEYS) - {
+        "moved",
+        "coating",
+        "configuration",
+        "aperture",
+        "measured",
+    }
     surface = {
         key
-        for place in ("Shape and place", "Medium behind the surface", "Coating of the surface")
+        for place in ("Shape and place", "Place of the surface", "Medium behind the surface", "Coating of the surface")
         for key in rows[place]
     }
     assert surface == set(lensfile.SURFACE_KEYS)
+    assert set(rows["moved"]) == set(lensfile.GROUP_KEYS)
     assert set(rows["configuration"]) == set(lensfile.CONFIGURATION_KEYS)
     assert set(rows["coating"]) == {"name", "layers"}
     assert set(rows["measured"]) == {*lensfile.MEASURED_TEXTS, *lensfile.MEASURED_NUMBERS}

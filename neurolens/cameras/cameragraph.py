@@ -6,7 +6,6 @@ pupil and the weights.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.contract import CameraRays, RayDifferentials
+from neurolens.cameras.pose import to_plane
 from neurolens.graph.derive import derivative
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
@@ -39,7 +39,7 @@ _AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
 @lru_cache(maxsize=16)
-def pupil_graph(segments: int, wavelengths: int) -> Graph:
+def pupil_graph(segments: int, wavelengths: int, leaning: bool = False) -> Graph:
     """Write the graph from film point, point of the unit square and wavelength to a pupil point and its area.
 
     Concentric squares in the unit square become concentric copies of the polygon, as in Shirley and Chiu's map to the
@@ -48,6 +48,8 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     Args:
         segments: K, of the upper half of a polygon.
         wavelengths: of the outline, 1 or 2.
+        leaning: whether the outline is that of a turned film (`PupilOutline.lean`), with `lean` of `pose.to_plane`
+            as one more input.
 
     Inputs are `film_mm`, `square` [2] and `wavelength_nm`; for a whole call, the table `outline`
     (`PupilOutline.table`), `per_radius` (1 / the last film radius), `last_row`, and for two wavelengths `wave_first`
@@ -75,7 +77,10 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
         first, scale = (g.input(name, per_call=True) for name in ("wave_first", "wave_scale"))
         share = ((1.0 / (wavelength * wavelength) - first) * scale).clip(0.0, 1.0)
         weights = g.concat(weights, share, share * step)
-    vertex, side, centre = g.split(g.lookup(g.table("outline", 10 * wavelengths), cell, weights), (2, 2, 1))
+    if leaning:
+        lean = g.input("lean")
+        weights = g.concat(weights, lean, lean * step)
+    vertex, side, centre = g.split(g.lookup(g.table("outline", 10 * (wavelengths + leaning)), cell, weights), (2, 2, 1))
     products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
     area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # no area beyond the end
     sign = (b * 1e30).clip(-1.0, 1.0)
@@ -86,38 +91,6 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     turn = g.select(g.constant(_HAIR) <= radius, film * (1.0 / radius.maximum(_HAIR)), g.constant([1.0, 0.0]))
     pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
     g.outputs = {"pupil_mm": pupil, "area_mm2": area}
-    return g
-
-
-@lru_cache(maxsize=16)
-def tilt_graph(tilt: float, radius_mm: float, derivatives: tuple[str, ...] = ()) -> Graph:
-    """Write the graph from rays of a film that is turned by `tilt` (rad) about the x axis to rays of the film plane.
-
-    A lens knows lines alone: the line from a point of the turned film through a pupil point meets the plane elsewhere.
-
-    Args:
-        radius_mm: the last film radius of the outline.
-        derivatives: names of derivatives of `scene_ray` by a point of the plane, along x and y: inputs and outputs.
-
-    Inputs are `film_mm` [2] on the film, `pupil_mm` [2], `area_mm2` and, for a whole call, `per_distance`. Outputs are
-    `plane_mm` [2], where the ray meets the plane; `area_mm2`, by which its weight on the plane is that on the film; and
-    `central_mm` [2], where the line through the middle of the pupil meets the plane, within the radius.
-    """
-    g, sin, cos = Graph(), math.sin(tilt), math.cos(tilt)
-    film, pupil, area = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2")
-    per_distance = g.input("per_distance", per_call=True)
-    place, depth = film * [1.0, cos], film[1] * sin * per_distance
-    nearer = 1.0 / (1.0 + depth)  # distance of the plane over that of the point, from the pupil
-    way, central = pupil - place, place * nearer
-    within = (0.9999 * radius_mm / g.square(central).sqrt().maximum(_HAIR)).minimum(1.0)
-    g.outputs["central_mm"] = central * within
-    g.outputs["plane_mm"] = place + way * (depth * nearer)
-    g.outputs["area_mm2"] = area * nearer * nearer * (way[1] * (sin * per_distance) * nearer + cos)
-    if derivatives:
-        by_x, by_y = (g.input(name, 6) for name in derivatives)
-        moved = way * (sin * per_distance * nearer * nearer) + g.concat(0.0 * nearer, nearer * cos)
-        g.outputs[derivatives[0]] = by_x * nearer
-        g.outputs[derivatives[1]] = by_x * moved[0] + by_y * moved[1]
     return g
 
 
@@ -258,8 +231,9 @@ def whole_camera(
     """Write the graph of a camera, with the graph of its lens inside, and return it with its numbers of the call.
 
     Inputs are those of `pupil_graph` and `weight_graph`. Outputs are those of `weight_graph`, the derivatives of the
-    ray that the lens's graph has, and those named in `also`, of the pupil's graph or the lens's. With `mask_too` the
-    graph tests a mask in the stop; else `stop_xy_mm` is an output, and the caller tests it.
+    ray that the lens's graph has, and those named in `also`, of the pupil's graph or the lens's, or `plane_mm`, where
+    rays meet the plane of an upright film. With `mask_too` the graph tests a mask in the stop; else `stop_xy_mm` is an
+    output, and the caller tests it.
     """
     g = Graph()
     own = g.input("film_mm", 2)
@@ -267,14 +241,14 @@ def whole_camera(
     wavelength = g.input("wavelength_nm")  # last, as the functions in C and in shaders have their arguments
     found, aperture = lens_inside(g, lens, g.concat(film_mm, pupil["pupil_mm"], wavelength), mask_too)
     derivatives = tuple(name for name in found if "_by_" in name)
-    if film.tilt and derivatives:
-        turned = g.inline(tilt_graph(film.tilt, film.outline.film_radius_mm, derivatives), {
-            "film_mm": own, **pupil, **{name: found[name] for name in derivatives}
-        })  # fmt: skip
+    if film.pose.turned and derivatives:
+        turn = to_plane(film.pose, film.outline.film_radius_mm, derivatives)
+        turned = g.inline(turn, {"film_mm": own, **pupil, **{name: found[name] for name in derivatives}})
         found = found | {name: turned[name] for name in derivatives}
     given = {"film_mm": film_mm, **pupil, **found, "lens_status": unrounded(found["status"])}
     g.outputs |= g.inline(weight_graph(derivatives, aperture, lens.stopped, lens.unit), given)
-    g.outputs |= {name: value for name, value in (pupil | found).items() if name in also}
+    inner = pupil | found | {"plane_mm": film_mm}
+    g.outputs |= {name: value for name, value in inner.items() if name in also}
     return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
 
 

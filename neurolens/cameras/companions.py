@@ -8,7 +8,7 @@ pupil's edge the lens's own graph decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import product
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.cameragraph import LensGraph, lens_inside, status_graph, unrounded
+from neurolens.cameras.pose import FilmPose, to_film
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
@@ -46,8 +47,8 @@ class Shift(NamedTuple):
         of_hero: the part that all companions share; inputs `film_mm`, `pupil_mm` [2] and `wavelength_nm`, outputs
             `film_shift` and `pupil_shift` [6], and `tint`.
         graph: takes these inputs, the outputs of `of_hero` and `companion_nm`, and gives `film_there` and `pupil_there`
-            [2], the points (mm) of the same scene ray at the companion wavelength; the `ratio` of its light to the
-            hero's; and `known`, which is 0 beyond the film or the reach.
+            [2], the points (mm) of the same scene ray at the companion wavelength, and the `ratio` of its light to the
+            hero's. Here `film_mm` and `film_there` are points of the upright film plane.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
         edge: three numbers. A companion passes if the hero passes and crosses the pupil farther inside it than the
             first number (mm), than the second times d, and than the third times -d. Here d is by how much its 1 /
@@ -62,8 +63,9 @@ class Shift(NamedTuple):
 
 
 def fit_shift(
-    lens: Graph, samples: Mapping[str, Array], margin: Array, companion_nm: Array, film_mm: tuple[float, float]
-) -> Shift | None:
+    lens: Graph, samples: Mapping[str, Array], margin: Array, companion_nm: Array, film_mm: Pair,
+    from_plane: Callable[[Array, Array], Array],
+) -> Shift | None:  # fmt: skip
     """Fit the shift of a lens; return None if too few rays pass, or if the error on held-out rays is too large.
 
     Args:
@@ -71,7 +73,8 @@ def fit_shift(
         samples: its inputs for rays that cover film, pupil and wavelengths; half of them measure the error.
         margin: [N], how far inside the pupil these rays pass, as in `lanes_graph`.
         companion_nm: [N], wavelengths of the companions.
-        film_mm: width and height of the film.
+        film_mm: width and height of the film. from_plane: takes where rays cross the upright film plane and the pupil
+            to film points (`LensFilm.from_plane`).
     """
     found = _solved(lens, samples, companion_nm)
     if found.kept.sum() < _FEWEST:
@@ -87,9 +90,10 @@ def fit_shift(
             break
     if left > max(_WORST_MM, _WORST * float(np.sqrt(np.mean(np.sum(values[:2] ** 2, axis=0))))):
         return None
-    x, y = (_BEYOND * float(v) for v in np.abs(values[:2]).max(axis=1))
-    graphs = _shift_graphs(degrees, weights, tint, scale, (middle, spread), (x, y), film_mm)
-    on_film = (np.abs(rays[:2] + values[:2]) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
+    hero, there = (from_plane(*np.split(rays[:4] + moved, 2)) for moved in (0.0, values[:4]))
+    x, y = (_BEYOND * float(v) for v in np.abs(there - hero).max(axis=1))
+    graphs = _shift_graphs(degrees, weights, tint, scale, (middle, spread))
+    on_film = (np.abs(there) < 0.5 * np.array(film_mm)[:, None]).all(axis=0)
     surely, inside = float(np.quantile(margin, _SURELY)), margin[found.kept]
     lost = on_film & ~found.passed[found.kept] & (inside > surely)
     away = ((waves[1] - waves[0]) * np.where((rays[:2] * rays[2:4]).sum(axis=0) <= 0, -1, 1))[lost]
@@ -121,10 +125,8 @@ def _terms(columns: Array, values: Array, degrees: Degrees) -> tuple[Array, Arra
     return weights, np.polyfit(along, light, _TINT)[::-1], float(np.sqrt(np.mean(np.sum(left**2, axis=0))))
 
 
-def _shift_graphs(
-    degrees: Degrees, weights: Array, tint: Array, scale: Array, waves: Pair, *limits_mm: Pair
-) -> tuple[Graph, Graph]:
-    """Write the graphs of `Shift` from what `_terms` finds in scaled variables, the reach, and the film's size."""
+def _shift_graphs(degrees: Degrees, weights: Array, tint: Array, scale: Array, waves: Pair) -> tuple[Graph, Graph]:
+    """Write the graphs of `Shift` from what `_terms` finds in scaled variables."""
     exponents, of_hero, g = _monomials(degrees)[0], Graph(), Graph()
 
     def variable(g: Graph, name: str) -> Value:
@@ -143,40 +145,43 @@ def _shift_graphs(
     for what in ("film", "pupil"):
         constant, linear, quadratic = g.split(g.input(f"{what}_shift", 6), [2, 2, 2])
         moved = (constant + (linear + quadratic * other) * other) * (other - hero)
-        g.outputs[f"{what}_there"] = there = g.input(f"{what}_mm", 2) + moved
-        if what == "film":
-            reach, half = (np.array(limits) for limits in limits_mm)
-            near = moved.between(-reach, reach) & there.between(-0.5 * half, 0.5 * half)
-            g.outputs["known"] = near[0] & near[1]
+        g.outputs[f"{what}_there"] = g.input(f"{what}_mm", 2) + moved
     light = g.series(other, tint) / g.series(hero, tint)
     g.outputs["ratio"] = light.maximum(0.0) * ((other - hero) * g.input("tint") + 1.0)
     return of_hero, g
 
 
-def lanes_graph(shift: Shift, companions: int) -> Graph:
+def lanes_graph(shift: Shift, companions: int, film_mm: Pair, pose: FilmPose) -> Graph:
     """Write the graph of all wavelengths of a ray, as if the lens let every companion pass.
 
-    Inputs are those of `Shift.of_hero`, `companion_nm` [companions], and the hero ray's `square` [2], `area_mm2` and
-    `weight`. Outputs are `light` [companions], the weights that they would have alone, 0 where they are not `known`;
-    `places`, the film points of all wavelengths, the hero's where there is no light; and `sure` [companions], which is
-    above 0 where a companion passes if the hero does.
+    Inputs are those of `Shift.of_hero`, its film point as `plane_mm`, `companion_nm` [companions], and the hero ray's
+    `film_mm` and `square` [2], `area_mm2` and `weight`. Outputs are `light` [companions], the weights that they would
+    have alone, 0 beyond the reach or the film of size `film_mm`, which stands in its `pose`; `places`, the film points
+    of all wavelengths, the hero's where there is no light; and `sure` [companions], which is above 0 where a companion
+    passes if the hero does.
     """
     g = Graph()
     film, light, weight = g.input("film_mm", 2), g.input("companion_nm", companions), g.input("weight")
-    same = g.inline(pruned(shift.of_hero, {k: shift.of_hero.outputs[k] for k in ("film_shift", "tint")}), {})
-    wanted = {k: v for k, v in shift.graph.outputs.items() if k != "pupil_there"}
-    found = [
-        g.inline(pruned(shift.graph, wanted), same | {"companion_nm": light[k], "film_mm": film})
-        for k in range(companions)
-    ]
-    lanes = [g.select(f["known"], f["ratio"] * weight, 0.0) for f in found]
-    there = (g.select(lane <= 0.0, film, f["film_there"]) for lane, f in zip(lanes, found, strict=True))
+    plane, reach, half = g.input("plane_mm", 2), np.array(shift.reach_mm), np.array(film_mm) / 2
+    shifts = ("film_shift", "tint") if not pose.turned else tuple(shift.of_hero.outputs)
+    same = g.inline(pruned(shift.of_hero, {k: shift.of_hero.outputs[k] for k in shifts}), {"film_mm": plane})
+    wanted = {k: v for k, v in shift.graph.outputs.items() if k != "pupil_there" or pose.turned}
+    lanes, there = [], []
+    for k in range(companions):
+        found = g.inline(pruned(shift.graph, wanted), same | {"companion_nm": light[k], "film_mm": plane})
+        place = found["film_there"]
+        if pose:
+            given = {"plane_mm": place, "pupil_mm": found.get("pupil_there", place)}
+            place = g.inline(to_film(pose), given)["film_mm"]
+        near = (place - film).between(-reach, reach) & place.between(-half, half)
+        lanes.append(g.select(near[0] & near[1], found["ratio"] * weight, 0.0))
+        there.append(g.select(lanes[-1] <= 0.0, film, place))
     g.outputs |= {"light": g.concat(*lanes), "places": g.concat(film, *there)}
     inside = (g.input("square", 2) * 2.0 - 1.0).abs()
     margin = (1.0 - inside[0].maximum(inside[1])) * g.input("area_mm2").maximum(0.0).sqrt()  # about in mm
     surely, *slopes = shift.edge
     hero, *others = (g.square(1000.0 / nm) for nm in (g.input("wavelength_nm"), *g.split(light, [1] * companions)))
-    side = g.select(g.dot(film, g.input("pupil_mm", 2)) <= 0.0, -1.0, 1.0)
+    side = g.select(g.dot(plane, g.input("pupil_mm", 2)) <= 0.0, -1.0, 1.0)
     aways = [(other - hero) * side for other in others]
     edges = [(away * slopes[0]).maximum(away * -slopes[1]).maximum(surely) for away in aways]
     g.outputs["sure"] = g.concat(*(margin - edge for edge in edges))

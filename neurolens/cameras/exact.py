@@ -24,6 +24,7 @@ from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensScene
 from neurolens.cameras.onnxlens import LensRun
+from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTable, outline_of, wavelength_between
 from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
@@ -90,7 +91,7 @@ class ExactCamera(LensCamera):
         about |= {"f_number": float(data.f_number), "derived": self.lens.derived, "rims": lens.rims}
         about["coatings"] = self.lens.coatings
         about["lens_state"] = state_of(self.lens, used, float(first_order(tabled).efl_mm))
-        self.place(self._outline(scene, plane, bounds, progress), scene, shot, about, progress)
+        self.place(self._outline(scene, plane, bounds, shot, progress), scene, shot, about, progress)
 
     @property
     def front(self) -> Surface:
@@ -111,11 +112,12 @@ class ExactCamera(LensCamera):
             done = trace(self.lens, Rays(*light), wavelength, towards="film", transmittance=True)
         assert done.transmittance is not None
         x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
-        film = np.stack([x, y]) + (self.film.film_z_mm - z) / dz * np.stack([dx, dy])
+        planes = (self.film.film_z_mm, self.film.outline.pupil_z_mm)
+        places = np.concatenate([np.stack([x, y]) + (at - z) / dz * np.stack([dx, dy]) for at in planes])
         # The lens's graph takes light of the camera's range alone; so does this.
         low, high = light_limits(self.lens, self._range_nm)
         inside = (low <= wavelength_nm) & (wavelength_nm <= high)
-        return film, through, np.where(inside, done.status.numpy(), st.OUTSIDE_DOMAIN).astype(np.int32)
+        return places, through, np.where(inside, done.status.numpy(), st.OUTSIDE_DOMAIN).astype(np.int32)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """Return the graph of the lens with its stop."""
@@ -148,32 +150,33 @@ class ExactCamera(LensCamera):
         return index[-1] * way[:2], np.stack([radius, added], 1)
 
     def _outline(
-        self, scene: LensScene, pupil_z_mm: float, bounds: PupilBounds | None, progress: Progress | None
+        self, scene: LensScene, pupil_z_mm: float, bounds: PupilBounds | None, shot: Shot, progress: Progress | None
     ) -> PupilOutline | None:
         """The outline of what passes the lens with a round stop, from the cache where an earlier run has kept it."""
         lens, planes, light = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm), self._light_nm
-        # A lens with cylinders takes a search at many azimuths, for one outline that fits none closely: so it is
+        covered = FilmPose.of(shot).covers_mm(self.film_mm, scene.film_z_mm - pupil_z_mm)
+        # A lens that is not round takes a search at many azimuths, for one outline that fits none closely: so it is
         # coarser.
-        detail, rows, points = (COARSE, 13, 48) if self.lens.anamorphic else (FINE, 17, 128)
+        detail, rows, points = (FINE, 17, 128) if self.lens.round else (COARSE, 13, 48)
 
         def passes(film: FloatArray, pupil: FloatArray, nm: float) -> NDArray[np.bool_]:
-            if not self.lens.anamorphic:
+            if self.lens.round:
                 return lens.passes(film, pupil, nm)
             # At most azimuths most points are dark. Traced as arrays, lost rays take no more work.
             radius, x, y = (c.astype(np.float64) for c in (film[0], *pupil))
             film_z = np.full_like(radius, scene.film_z_mm)
-            return passes_at_any_azimuth(self.lens, radius, film_z, x, y, pupil_z_mm, nm, self.film_mm)
+            return passes_at_any_azimuth(self.lens, radius, film_z, x, y, pupil_z_mm, nm, covered)
 
         def search() -> PupilOutline | None:
             with (progress or Progress(quiet=True)).stage(f"search the pupil of {self.name}") as report:
-                corner = 1.0001 * math.hypot(*self.film_mm) / 2
+                corner = 1.0001 * math.hypot(*covered) / 2
                 boxes = bounds or pupil_bounds(
-                    self.lens, corner, planes, light, rows=rows, points=points, film_mm=self.film_mm
+                    self.lens, corner, planes, light, rows=rows, points=points, film_mm=covered
                 )
                 table = PupilTable.of(asdict(boxes))
                 return outline_of(table, passes, light, detail, lambda share: report(0.2 + 0.8 * share))
 
-        read = [pupil_z_mm, self.film_mm, detail, bounds and asdict(bounds)]
+        read = [pupil_z_mm, covered, detail, bounds and asdict(bounds)]
         return kept_outline(search_key(self.lens, light, detail.wavelengths, *read), search)
 
 
@@ -237,7 +240,7 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
     rows: list[Any] = [[float(index_of(lens.object_medium, w)) for w in sorted(waves)]]
     for s in lens.surfaces:
         numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, *(index_of(s, w) for w in sorted(waves)))
-        rows.append([[float(v) for v in numbers], s.stop, s.figure.record()])
+        rows.append([[float(v) for v in numbers], s.stop, s.figure.record(), s.placement.record()])
     return fingerprint_of([_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
 
 

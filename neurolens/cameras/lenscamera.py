@@ -23,16 +23,8 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.cameras.cameragraph import (
-    D_FILM,
-    LensGraph,
-    camera_rays,
-    status_graph,
-    tilt_graph,
-    weight_graph,
-    whole_camera,
-)
-from neurolens.cameras.companions import Shift, companion_graph, fit_shift, lanes_graph
+from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays, status_graph, weight_graph, whole_camera
+from neurolens.cameras.companions import Pair, Shift, companion_graph, fit_shift, lanes_graph
 from neurolens.cameras.contract import (
     MANY_RAYS_A_CALL,
     RAYS_A_CALL,
@@ -42,7 +34,8 @@ from neurolens.cameras.contract import (
     SpectralRays,
 )
 from neurolens.cameras.onnxlens import LensRays, LensRun, open_session, run_batches
-from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.cameras.pose import UPRIGHT, FilmPose, to_film, to_plane
+from neurolens.cameras.pupil_outline import PupilOutline, leaning
 from neurolens.cameras.sampling import FrontDiscs, arrived, stratified
 from neurolens.graph.c import Signature, padded_columns, write_blocks
 from neurolens.graph.compiler import has_compiler, load_compiled
@@ -56,7 +49,7 @@ from neurolens.models.assemble import ONNX, SCALARS, Form
 from neurolens.models.inverse import InverseRays
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.prescription import LINE_D_NM, Surface
-from neurolens.optics.lens.shot import Runtime, Shot
+from neurolens.optics.lens.shot import POSES, Runtime, Shot
 from neurolens.optics.setting.pupils import GROUPS
 from neurolens.optics.trace.shapes import sag_and_derivatives
 
@@ -151,21 +144,23 @@ class LensFilm:
         outline: the pupil of every film radius; None where no ray passes.
         wavelength_nm: range of the wavelengths in use.
         scene: the lens, set for this film.
+        film_mm: width and height of the film. pose: how it stands.
 
     Raises:
         InputError: no ray passes from the film's centre.
     """
 
     def __init__(
-        self, outline: PupilOutline | None, wavelength_nm: tuple[float, float], scene: LensScene, tilt: float = 0.0
-    ) -> None:
+        self, outline: PupilOutline | None, wavelength_nm: tuple[float, float], scene: LensScene, film_mm: Pair,
+        pose: FilmPose = UPRIGHT,
+    ) -> None:  # fmt: skip
         if outline is None:
             raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
-        self.film_z_mm, self.scene, self.tilt = scene.film_z_mm, scene, tilt
+        self.film_z_mm, self.scene, self.pose = scene.film_z_mm, scene, pose
         self.distance_mm = scene.film_z_mm - outline.pupil_z_mm
-        wider = np.float32(1 + abs(outline.film_radius_mm * math.sin(tilt) / self.distance_mm))
-        self.outline = replace(outline, x=outline.x * wider, y=outline.y * wider) if tilt else outline
-        self.exposure = 1.0
+        if lean := pose.lean(film_mm, self.distance_mm):
+            outline = leaning(outline, replace(scene, aperture=None).passes, lean)
+        self.outline, self.exposure = outline, 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
 
     @property
@@ -176,33 +171,48 @@ class LensFilm:
 
     def on_plane(self, g: Graph, film_mm: Value) -> tuple[Value, dict[str, Value]]:
         """Write the pupil of film points into a graph; return where its rays meet the plane of an upright film, too."""
-        if not self.tilt:
+        if not self.pose:
             return film_mm, g.inline(self.outline.graph, {"film_mm": film_mm})
-        turn = tilt_graph(self.tilt, self.outline.film_radius_mm)
+        turn = to_plane(self.pose, self.outline.film_radius_mm)
         unknown = {"film_mm": film_mm, "pupil_mm": film_mm * 0.0, "area_mm2": film_mm[0]}
-        pupil = g.inline(self.outline.graph, {"film_mm": g.inline(turn, unknown)["central_mm"]})
+        central = g.inline(turn, unknown)
+        pupil = g.inline(self.outline.graph, {"film_mm": central["central_mm"], "lean": central["lean"]})
         turned = g.inline(turn, {"film_mm": film_mm, **pupil})
         return turned["plane_mm"], pupil | {"area_mm2": turned["area_mm2"]}
 
+    def start(
+        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return where rays of film points cross the upright film plane and the pupil [2, N], and their area [N].
+
+        The area is that of `PupilOutline.sample`, times what turns a weight on the plane into that on the film.
+        """
+        g, given = Graph(), {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
+        plane, pupil = self.on_plane(g, g.input("film_mm", 2))
+        g.outputs = {"plane_mm": plane, **pupil}
+        numbers = self.outline.numbers | {"per_distance": 1 / self.distance_mm}
+        given |= {name: np.array([[value]], np.float32) for name, value in numbers.items()}
+        found = evaluate(g, given | {"outline": self.outline.table})
+        area = found["area_mm2"][0]
+        return found["plane_mm"], found["pupil_mm"], np.where(area > 0, area, np.float32(0))
+
+    def from_plane(self, plane_mm: Array, pupil_mm: Array) -> Array:
+        """Return the film points [2, N] of rays by where they cross the upright film plane and the pupil plane."""
+        given = {"plane_mm": plane_mm, "pupil_mm": pupil_mm, "per_distance": np.array([[1 / self.distance_mm]])}
+        return np.asarray(evaluate(to_film(self.pose), given)["film_mm"])
+
     def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """Return cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        slope = (self.outline.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
+        plane, pupil, _ = self.start(film_mm, square, wavelength_nm)
+        slope = (pupil - plane) * np.float32(1 / self.distance_mm)
         cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
         return cos4
 
     def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
-        """Return the integral of T cos over solid angle at the film's centre, as a mean over the wavelengths."""
+        """Return the integral of T cos over solid angle where the axis meets the film, as a mean over wavelengths."""
         square, wavelength = stratified(_QUADRATURE, wavelength_nm)
-        film = np.zeros_like(square)
-        pupil, area = self.outline.sample(film, square, wavelength)
-        if self.tilt:
-            given = {
-                "film_mm": film,
-                "pupil_mm": pupil,
-                "area_mm2": area[None],
-                "per_distance": np.array([[1 / self.distance_mm]]),
-            }
-            area = evaluate(tilt_graph(self.tilt, self.outline.film_radius_mm), given)["area_mm2"][0]
+        axis = np.zeros_like(square) + np.array(self.pose.moved_mm, np.float32)[:, None]
+        film, pupil, area = self.start(axis, square, wavelength)
         out = self.scene(film, pupil, wavelength)
         given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
         given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
@@ -224,6 +234,7 @@ GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 # and its time grows faster than their number.
 MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that derivatives of low order are fitted to
+_EDGES = (1e-4, 1e-3, 3e-3, 1e-2)  # distances from the square's edge of what counts as the pupil's edge
 _EDGE_RAYS = 2**16  # rays that find where light crosses the front surface
 
 
@@ -242,7 +253,7 @@ class LensCamera:
     name: str
     path: Path
     film: LensFilm
-    film_mm: tuple[float, float]
+    film_mm: Pair
     settings: dict[str, Any]
     runtime: Runtime
     _light_nm: tuple[float, float]
@@ -251,7 +262,7 @@ class LensCamera:
     _asked: bool
     differentials_error: float | None = None
 
-    takes = frozenset({"zoom", "focus_mode", "internal", "aperture", "film_offset_mm", "film_tilt_deg"})
+    takes = frozenset({"zoom", "focus_mode", "internal", "aperture", "film_offset_mm", *POSES})
 
     def place(
         self, outline: PupilOutline | None, scene: LensScene, shot: Shot, about: Mapping[str, Any],
@@ -259,7 +270,7 @@ class LensCamera:
     ) -> None:  # fmt: skip
         """Place film and pupil for a shot, and start what runs the camera. Its `settings` are `about`, what it takes of
         the shot, the film's place and the stop. Raises InputError as `LensFilm` and `start` do."""
-        self.film = LensFilm(outline, self._light_nm, scene, math.radians(shot.film_tilt_deg))
+        self.film = LensFilm(outline, self._light_nm, scene, self.film_mm, FilmPose.of(shot))
         shape = scene.aperture and scene.aperture.settings()
         film = {"film_z_mm": scene.film_z_mm, "stop_radius_mm": scene.stop_radius_mm, "aperture": shape}
         self.settings = {**shot.record(self.takes), **about, **film}
@@ -288,8 +299,6 @@ class LensCamera:
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Return film points for scene points [3, N] in m, through points of the front surface that `pupil` chooses."""
-        if self.film.tilt:
-            raise InputError(self.path, "film_tilt_deg", math.degrees(self.film.tilt), "0 for light from the scene")
         shape, up = self.front, np.array([[0.0], [0.0], [self.film.film_z_mm]])
         with np.errstate(all="ignore"):
             point = 1e3 * point_m.astype(np.float64) + up
@@ -300,7 +309,8 @@ class LensCamera:
             direction = way / np.sqrt((way * way).sum(0))
             # dA cos is dx dy (d . n) / |n_z|, where the outward normal is along (sx, sy, -1).
             facing = sx * direction[0] + sy * direction[1] - direction[2]
-            film, through, status = self._traced_back(position, direction, wavelength_nm)
+            places, through, status = self._traced_back(position, direction, wavelength_nm)
+            film = self.film.from_plane(places[:2], places[2:]) if self.film.pose else places[:2]
             origin = 1e-3 * (position - up)
             weight = through * area * facing / (self.film.exposure * ((point_m - origin) ** 2).sum(0))
         aimed = np.where(np.isfinite(point).all(0), st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
@@ -315,7 +325,8 @@ class LensCamera:
     def _traced_back(
         self, position: Array, direction: Array, wavelength_nm: FloatArray
     ) -> tuple[Array, FloatArray, NDArray[np.int32]]:
-        """Return film points [2, N], transmittance and status of light from `direction` to points of the front."""
+        """Return where light from `direction` to points of the front crosses the planes of an upright film and of the
+        pupil, [4, N], its transmittance and status."""
         raise NotImplementedError
 
     @cached_property
@@ -324,11 +335,14 @@ class LensCamera:
         rng, ray = np.random.default_rng(0), np.arange(_EDGE_RAYS)
         film = (rng.random((2, _EDGE_RAYS)) - 0.5) * np.array(self.film_mm)[:, None]
         film[:, ::2] *= 0.5 / np.abs(film[:, ::2] / np.array(self.film_mm)[:, None]).max(0)
-        film *= np.minimum(0.9999 * self.film.outline.film_radius_mm / np.hypot(*film), 1)
+        film = self._within(film, 0.9999)
         square = rng.random((2, _EDGE_RAYS), np.float32)
-        square[ray // 2 % 2, ray] = np.where(ray // 4 % 2, np.float32(1e-4), np.float32(1 - 1e-4))
+        # The outline of a turned film is less tight: rays at its very edge may all be lost.
+        edge = np.array(_EDGES if self.film.pose.turned else _EDGES[:1], np.float32)
+        edge = edge[ray // 8 % edge.size]
+        square[ray // 2 % 2, ray] = np.where(ray // 4 % 2, edge, 1 - edge)
         waves, points = rng.uniform(*self._light_nm, _EDGE_RAYS).astype(np.float32), film.astype(np.float32)
-        found = self.film.scene(points, self.film.outline.sample(points, square, waves)[0], waves)
+        found = self.film.scene(*self.film.start(points, square, waves)[:2], waves)
         return FrontDiscs.of(found.scene_ray[:, found.status == st.PASSED].astype(np.float64), self.front)
 
     def compiled(self) -> Self:
@@ -368,7 +382,7 @@ class LensCamera:
         light, places = hero["light"], hero["places"].reshape(lanes, 2, -1)
         doubt = np.flatnonzero((hero["sure"] < self._sure) & (light > 0))  # of all companions, one after the other
         ray = doubt % film.shape[1]
-        same = {"film_mm": film, "pupil_mm": hero["pupil_mm"], "wavelength_nm": nm[:1]}
+        same = {"film_mm": hero["plane_mm"], "pupil_mm": hero["pupil_mm"], "wavelength_nm": nm[:1]}
         near = {name: values.take(ray, axis=1) for name, values in same.items()}
         near["companion_nm"] = nm[1:].reshape(1, -1).take(doubt, axis=1)
         lost = self._run("companion")(near)["status"][0] != st.PASSED
@@ -381,7 +395,7 @@ class LensCamera:
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
         """The bound of `SpectralCamera`; None if too few rays pass, or no polynomial follows the shift."""
-        return self._shift.reach_mm if self._shift and not self.film.tilt else None
+        return self._shift.reach_mm if self._shift else None
 
     def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
         wavelength = np.ascontiguousarray(wavelength_nm, np.float32)
@@ -413,13 +427,14 @@ class LensCamera:
             assert self._shift is not None
             graph, numbers = companion_graph(lens, self._shift, mask_too), self._of_the_lens()
         else:
-            also = ("pupil_mm", "area_mm2") if kind == "hero" else ()
+            also = ("pupil_mm", "area_mm2", "plane_mm") if kind == "hero" else ()
             graph, numbers = whole_camera(self.film, lens, also, mask_too)
             if kind == "hero":
                 assert self._shift is not None
-                area = graph.outputs.pop("area_mm2")
-                same = {k: graph.outputs[k] for k in ("pupil_mm", "weight")} | {"area_mm2": area}
-                graph.outputs |= graph.inline(lanes_graph(self._shift, companions), same)
+                same = {k: graph.outputs[k] for k in (*also, "weight")}
+                del graph.outputs["area_mm2"]
+                lanes = lanes_graph(self._shift, companions, self.film_mm, self.film.pose)
+                graph.outputs |= graph.inline(lanes, same)
         if self.runtime == "c":
             try:
                 return _compiled(
@@ -439,7 +454,7 @@ class LensCamera:
         given, margin = self._film_samples()
         samples = {name: values.astype(np.float64) for name, values in given.items()}
         companions = np.random.default_rng(1).permutation(samples["rays"][4])
-        return fit_shift(self.lens_graph().graph, samples, margin, companions, self.film_mm)
+        return fit_shift(self.lens_graph().graph, samples, margin, companions, self.film_mm, self.film.from_plane)
 
     @cached_property
     def _sure(self) -> float:
@@ -479,14 +494,21 @@ class LensCamera:
         self.differentials_error = None if fitted is None else fitted.error
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
+    def _within(self, film: Array, share: float) -> Array:
+        """Return film points [2, N], those beyond a share of the outline's radius drawn in to it."""
+        axis, pose = np.array(self.film.pose.moved_mm)[:, None], self.film.pose
+        off = film - axis
+        place = off / (1 + pose.axes[2:, :2] @ off / self.film.distance_mm) if pose.turned else off
+        return axis + off * np.minimum(1, share * self.film.outline.film_radius_mm / np.hypot(*place))
+
     def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
         """Inputs of the lens's graph for rays all over film, pupil and light, and their margins (`lanes_graph`)."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
-        film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))
+        film = self._within(film, 0.99)
         wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
-        pupil, area = outline.sample(film, square, wavelength)
+        film, pupil, area = self.film.start(film, square, wavelength)
         margin = ((1 - np.abs(2 * square - 1).max(axis=0)) * np.sqrt(area)).astype(np.float64)
         call = {k: np.array([[value]], np.float32) for k, value in self._of_the_lens().items()}
         return {"rays": np.stack([*film, *pupil, wavelength])} | call, margin

@@ -19,6 +19,7 @@ from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensScene
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
+from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
 from neurolens.cameras.sampling import beyond_circle, common_light, lens_state
 from neurolens.models.assemble import ONNX, SCALARS, Form
@@ -88,7 +89,8 @@ class OnnxCamera(LensCamera):
             outline = outline.on_plane(float(domain["pupil_z_mm"]), film_z)
         else:
             outline = _outline_of(round_stop, used)
-        notes = beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
+        covered = FilmPose.of(shot).covers_mm(shot.film_mm, film_z - float(domain["pupil_z_mm"]))
+        notes = beyond_circle(covered, domain["film_radius_mm"], "the model's picture", "stay dark")
         poor = ", ".join(card["errors"].get("poor") or ())
         f_number = lens["f_number"] * lens["stop_radius_mm"] / stop
         about = {
@@ -124,7 +126,7 @@ class OnnxCamera(LensCamera):
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
         out = self._inverse.from_scene(position, direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
-        return out.rays[:2], np.maximum(out.transmittance, 0).astype(np.float32), scene.status_of(out)
+        return out.rays[:4], np.maximum(out.transmittance, 0).astype(np.float32), scene.status_of(out)
 
     @cached_property
     def _inverse(self) -> InverseModel:

@@ -43,6 +43,8 @@ class PupilOutline:
             wavelength^2.
         centre: [R], mm.
         x, y: [W, R, K + 1], mm; y is 0 at both ends.
+        lean: [R, K + 1], of the outline of a turned film (`leaning`): by which share a vertex of the first wavelength
+            moves away from the centre for a `lean` of 1 (`pose.to_plane`). None is the outline of an upright film.
     """
 
     pupil_z_mm: float
@@ -51,9 +53,10 @@ class PupilOutline:
     centre: FloatArray
     x: FloatArray
     y: FloatArray
+    lean: FloatArray | None = None
 
     def sample(
-        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
+        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, lean: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Return points that fill the polygons of film points evenly, by `graph`.
 
@@ -61,6 +64,7 @@ class PupilOutline:
             film_mm: [2, N].
             square: [2, N] in [0, 1).
             wavelength_nm: [N].
+            lean: [N], of rays of a turned film; None is 0.
 
             Returns:
                 The points [2, N] in mm, and for each the area [N], in mm^2 of pupil plane for each unit of area of the
@@ -69,6 +73,7 @@ class PupilOutline:
         """
         given = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None], "outline": self.table}
         given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
+        given["lean"] = 0 * film_mm[:1] if lean is None else lean[None]
         found = evaluate(self.graph, given)
         area = found["area_mm2"][0]
         return found["pupil_mm"], np.where(area > 0, area, np.float32(0))
@@ -83,7 +88,7 @@ class PupilOutline:
     @property
     def graph(self) -> Graph:
         """The outline's `pupil_graph`."""
-        return pupil_graph(self.x.shape[2] - 1, len(self.x))
+        return pupil_graph(self.x.shape[2] - 1, len(self.x), self.lean is not None)
 
     def radii(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the film radii in mm of (fractional) rows."""
@@ -100,16 +105,21 @@ class PupilOutline:
 
     @cached_property
     def table(self) -> FloatArray:
-        """Return the table of `pupil_graph`, [R * (K + 1), 10 W], with contiguous columns.
+        """Return the table of `pupil_graph`, [R * (K + 1), 10 W] or 10 more, with contiguous columns.
 
         Columns stand in groups, whose weights are 1, step, share, and share times step: first vertex and edge (x, y,
         dx, dy) and centre at a row; their steps to the next row; and for two wavelengths the change of both from the
-        first to the second. The last cell of a row is its end, which belongs to the last edge.
+        first to the second. Two groups more have the change with the lean of a turned film's rays. The last cell of a
+        row is its end, which belongs to the last edge.
         """
         edges = [np.diff(c, append=2 * c[..., -1:] - c[..., -2:-1]) for c in (self.x, self.y)]
         centre = np.broadcast_to(self.centre[:, None], self.x.shape)
         here = np.stack([self.x, self.y, *edges, centre], 1)  # [W, 5, R, K + 1]
+        leaning = [] if self.lean is None else [self.lean * self.x[0], self.lean * self.y[0]]
         here[1:] -= here[:1]
+        if leaning:
+            turned = [*leaning, *(np.diff(c, append=2 * c[:, -1:] - c[:, -2:-1]) for c in leaning), 0 * centre[0]]
+            here = np.concatenate([here, np.stack(turned)[None]])
         groups = np.stack([here, np.diff(here, axis=2, append=here[:, :, -1:])], 1)
         return np.ascontiguousarray(groups.reshape(10 * len(here), -1), np.float32).T
 
@@ -454,10 +464,7 @@ def _pushed_out(
         ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
         x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))
         for step, found in _excess(outline, (x, y), passing):
-            rows = len(found)
-            for row in (slice(0, rows), slice(1, 1 + rows)) if step else (slice(0, rows),):
-                for edge in (slice(0, -1), slice(1, None)):
-                    needed[ends, row, edge] = np.maximum(needed[ends, row, edge], found)
+            _keep_largest(needed[ends], found, step)
     scale = (needed + _HAIR).astype(np.float32)
     return replace(outline, x=outline.x * scale, y=outline.y * scale)
 
@@ -487,3 +494,47 @@ def _excess(
     shares = np.split(found, np.cumsum([len(part[0]) for part in parts])[:-1])
     steps_between = np.repeat(_BETWEEN_ROWS, len(_ALONG_EDGE))
     return [(step, share.reshape(-1, edges)) for step, share in zip(steps_between, shares, strict=True)]
+
+
+_LEANS, _LEAN_HALVINGS = np.linspace(0.5, 1.5, 11), 10  # where leaning outlines are sought, over upright ones
+
+
+def leaning(outline: PupilOutline, passes: Passes, reach: float) -> PupilOutline:
+    """Return the outline of the rays of a turned film (`PupilOutline.lean`), which holds what passes as the other does.
+
+    A ray of lean k with the central place c crosses the film plane of the outline at c + k q, for a point q of the
+    pupil. Each vertex is sought again at both ends of k, and moves linearly between.
+
+    Args:
+        outline: of the upright film. passes: see `outline_of`. reach: the largest k.
+    """
+    vertices = outline.x.astype(np.float64), outline.y.astype(np.float64)
+    rows = np.arange(outline.centre.size, dtype=np.float64)
+
+    def tested(lean: float, nm: float) -> PassTest:
+        return pass_test(lambda film, pupil, nm: passes(film + np.float32(lean) * pupil, pupil, nm), (nm,))
+
+    direction = np.stack([c[0] for c in vertices])
+    flat = _flat(outline.radii(rows), outline.centre.astype(np.float64), direction)
+    steps = np.repeat(_LEANS[:, None], flat[0].size, axis=1)
+    ends = [
+        _farthest(tested(k, outline.wavelength_nm[0]), *flat, steps, _LEAN_HALVINGS).reshape(direction.shape[1:])
+        for k in (-reach, reach)
+    ]
+    lean = (ends[1] - ends[0]) / (2 * reach)
+    needed = np.ones(vertices[0].shape[1:])
+    for nm, *upright in zip(outline.wavelength_nm, *vertices, strict=True):
+        for k in (-reach, -reach / 2, reach / 2, reach):
+            x, y = (c + k * lean * first for c, first in zip(upright, direction, strict=True))
+            for step, found in _excess(outline, (x, y), tested(k, nm)):
+                _keep_largest(needed, found, step)
+    wider = (needed + _HAIR).astype(np.float32)
+    return replace(outline, x=outline.x * wider, y=outline.y * wider, lean=lean.astype(np.float32))
+
+
+def _keep_largest(needed: Float64Array, found: Float64Array, step: float) -> None:
+    """Raise what vertices [..., R, K + 1] need to what was found [rows, edges], between rows where `step` is not 0."""
+    rows = len(found)
+    for row in (slice(0, rows), slice(1, 1 + rows)) if step else (slice(0, rows),):
+        for edge in (slice(0, -1), slice(1, None)):
+            needed[..., row, edge] = np.maximum(needed[..., row, edge], found)

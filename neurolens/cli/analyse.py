@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from neurolens.optics.analysis.field_curves import Colour, Curvature, Distortion, Illumination, Seidel
     from neurolens.optics.analysis.fields import FieldEdge, Scene
     from neurolens.optics.analysis.layout import Layout
-    from neurolens.optics.analysis.spots import Fans, Mtf, Psf, Spots
+    from neurolens.optics.analysis.psf import Psf
+    from neurolens.optics.analysis.spots import Fans, Mtf, Spots
 
 
 WHATS = (
@@ -202,7 +203,8 @@ def analysis_of(what: str) -> Analysis:
     from neurolens.optics.analysis import plots
     from neurolens.optics.analysis.field_curves import colour, curvature, distortion, illumination, seidel
     from neurolens.optics.analysis.layout import layout_profile, lens_layout
-    from neurolens.optics.analysis.spots import fans, mtf, mtf_over_height, psf, spots
+    from neurolens.optics.analysis.psf import psf
+    from neurolens.optics.analysis.spots import fans, mtf, mtf_over_height, spots
 
     return {
         "layout": Analysis(layout_profile, lens_layout, _layout_text),

@@ -18,6 +18,7 @@ from neurolens.base.settings import setting, setting_of
 from neurolens.cameras.contract import Camera
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import Maker, Projection, StMap, TracedFrame, one_centre
+from neurolens.optics.lens.shot import POSES
 from neurolens.pictures.render.pictures import read_channels, standard_attributes
 from neurolens.pictures.render.stmap import illumination_map
 from neurolens.programs import handover as standards
@@ -176,6 +177,11 @@ class _Writer:
         """Return the entries of lensfun's profile, by focal length; none for a lens with cylinders."""
         if self.shot.frames[0].squeeze != 1:
             self.notes.append("shot.lensfun.xml: lensfun knows no anamorphic lens")
+            return []
+        if posed := sorted({name for f in self.frames for name in POSES if f.camera.settings.get(name)}):
+            told = ", ".join(posed)
+            self.notes.append(f"shot.lensfun.xml: lensfun knows no film that is turned or moved ({told})")
+            self.notes.append(f"{told}: the pinholes of USD, Nuke and Blender have none; the maps hold them")
             return []
         command, states, found = self.command, self.command.states(), list[Any]()
         by_focal = dict(sorted((float(f"{p.focal_mm:.5g}"), k) for k, p in enumerate(self.shot.frames)))

@@ -364,10 +364,11 @@ def make_pairs(
     `rim`, `edge` and `far` are filled from the rays drawn for `train`, as far as these go.
 
     Raises:
-        InputError: a split is empty, the stop has blades or a mask (models give the crossing with it instead), or fewer
-            than one ray in 10,000 of the domain passes.
+        InputError: a split is empty, surfaces lie off the axis, the stop has blades or a mask (models give the crossing
+            with it instead), or fewer than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
+    lens.require_centred("a model")
     if lens.aperture is not None:
         raise InputError(
             lens.path, "aperture", "(blades or a mask)", "a round stop: cameras shape it outside the model"

@@ -197,6 +197,7 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
     def best(focus_m: float, stops_mm: Any) -> Any:
         return best_focus_of_stops_mm(lens, inside_m if far else focus_m, stops_mm, LIGHT_NM)
 
+    lens.require_centred("a shader")
     return ShaderLens(
         graph=exact_graph(lens, plane_mm, LIGHT_NM),
         table=PupilTable.of(asdict(bounds)),

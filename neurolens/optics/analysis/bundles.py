@@ -315,6 +315,12 @@ class Filled:
         weight = nodes.area * self._passes(*nodes[:2])
         return (weight.reshape(-1) * self._aim(nodes.u.shape[1]).spread(u, v)).reshape(len(self.fields), -1).sum(1)
 
+    def box(self) -> tuple[Tensor, Tensor]:
+        """Return the lowest and highest places u, v of light, [F * W, 2], to half a percent."""
+        nodes = lit_nodes(self._passes, self.part, 0)
+        places = torch.stack([nodes.u, nodes.v], 2)
+        return places.amin(1), places.amax(1)
+
     def _aim(self, count: int) -> Aim:
         return Aim(self.scene, self.chief, count, self.waves)
 

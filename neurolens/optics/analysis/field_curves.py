@@ -301,6 +301,7 @@ def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm:
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     scene.require_power()
+    lens.require_centred("Seidel's sum")
     lens.require_glass("Seidel sums")
     if image_height_mm is None:
         image_height_mm = float(scene.chief_rays([scene.edge.field_deg], wavelength_nm).height_mm[0])

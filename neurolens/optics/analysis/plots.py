@@ -15,7 +15,8 @@ from neurolens.base.files import atomic_path
 
 if TYPE_CHECKING:
     from neurolens.optics.analysis.field_curves import Colour, Curvature, Distortion, Illumination, Seidel
-    from neurolens.optics.analysis.spots import Fans, Mtf, Psf, Spots
+    from neurolens.optics.analysis.psf import Psf
+    from neurolens.optics.analysis.spots import Fans, Mtf, Spots
 
 # Okabe and Ito's colours, distinguishable by colour-blind readers.
 FIELD_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#7f7f7f")

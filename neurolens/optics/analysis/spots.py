@@ -1,4 +1,4 @@
-"""Spots over field and focus, ray fans, geometric MTF, and point spread by rays and by diffraction."""
+"""Spots over field and focus, ray fans and geometric MTF."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.base.report import BULK, Report, over
+from neurolens.base.report import BULK, over
 from neurolens.optics.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
 from neurolens.optics.analysis.fields import Array, OverField, Scene
 from neurolens.optics.lens.paraxial import is_pinhole
-from neurolens.optics.setting.pupil_nodes import LEVELS, converged
+from neurolens.optics.setting.pupil_nodes import converged
 
 _RINGS = 16
 _SHIFTS = 21
@@ -63,20 +63,20 @@ def spots(
     """Compute spots. Without fields they are `Scene.default_fields`, without shifts these span the best foci."""
     rays = bundle(scene, field_deg, wavelength_nm, hexapolar(rings))
     waves = rays.wavelength_nm
-    n, airy = _airy(scene, waves[0])
+    n, dark_um = airy(scene, waves[0])
     filled, stop = (Filled(scene, rays.field_deg, waves, to_stop=to_stop) for to_stop in (False, True))
 
     def figures(level: int, fields: list[int]) -> list[Array]:
         return _figures(filled.only(fields).bundle(level), stop.only(fields).energy(level))
 
-    found, spread = converged(figures, lambda f: _scaled(f, np.nan_to_num(airy)), len(rays.field_deg))
+    found, spread = converged(figures, lambda f: _scaled(f, np.nan_to_num(dark_um)), len(rays.field_deg))
     rms, geometric, by_wavelength, passed, best, best_rms, *moments = found
     shifts = np.asarray(_span(best, n, waves[0]) if shift_mm is None else shift_mm, dtype=np.float64)
     slope_t, slope_s = rays.slopes
     return Spots(
         np.array(rays.field_deg), rays.chief_height_mm.numpy(), np.array(waves),
         1000 * rays.tangential_mm.numpy(), 1000 * rays.sagittal_mm.numpy(), slope_t.numpy(), slope_s.numpy(),
-        rms, geometric, by_wavelength, passed, n, airy,
+        rms, geometric, by_wavelength, passed, n, dark_um,
         shifts, _rms_um(moments, shifts), best, best_rms, spread,
     )  # fmt: skip
 
@@ -153,7 +153,7 @@ def working_f_number(scene: Scene, wavelength_nm: float) -> float:
     return 1 / (2 * sine) if sine > 0 else math.nan
 
 
-def _airy(scene: Scene, wavelength_nm: float) -> tuple[float, float]:
+def airy(scene: Scene, wavelength_nm: float) -> tuple[float, float]:
     """Return the working f-number, and the radius in um of the first dark ring about a point on the axis."""
     n = working_f_number(scene, wavelength_nm)
     return n, 1.22e-3 * wavelength_nm * n
@@ -272,142 +272,3 @@ def diffraction_mtf(frequency_per_mm: Array, wavelength_nm: float, f_number: flo
 def _contrast(x_mm: Tensor, weight: Tensor, frequency: Array) -> Array:
     rows = [torch.polar(weight, 2 * np.pi * f * x_mm).sum(1).abs() for f in frequency.tolist()]
     return np.asarray(torch.stack(rows, 1).numpy())
-
-
-def path_to_chief_mm(rays: Bundle) -> Tensor:
-    """Return the optical path [F, W, P] to the plane across the ray through the chief ray's film point.
-
-    Raises:
-        InputError: the lens has ideal surfaces, which have a law of rays and none of phases.
-    """
-    rays.scene.lens.require_glass("optical path")
-    along_t, along_s = rays.cosines
-    return rays.path_mm - rays.tangential_mm * along_t - rays.sagittal_mm * along_s
-
-
-_BINS, _POINTS = 49, 97  # points a side of the geometric and the diffraction image; odd, so that one is in the centre
-_FINEST = 128  # the most points across the pupil that are traced
-_ENCIRCLED = 0.98  # share of the geometric spot's energy inside the window
-
-
-@dataclass(frozen=True)
-class Psf(Report):
-    """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid.
-
-    Attributes:
-        half_width_um: [F], from the centre of the image to its edge; NaN without light.
-        geometric: [F, 49, 49] share of all wavelengths' energy in each square, without what lies outside; NaN without
-            light.
-        diffraction: [F, 97, 97] at the first wavelength; 1 is the peak of the same pupil without aberrations. NaN where
-            the aberrations are too large for it (diffraction is then negligible against `geometric`) or almost no light
-            arrives.
-        strehl: [F] the greatest value of `diffraction`.
-        pupil_points: [F] how many points across the pupil the diffraction image needs; 0 without light.
-        airy_um: radius of the first dark ring on the axis.
-        spread: for each figure by name, [F, ...], how much two samplings of the pupil differ (`pupil_nodes.converged`).
-    """
-
-    field_deg: Array
-    wavelength_nm: Array
-    half_width_um: Array = field(metadata=over("field_deg"))
-    geometric: Array = field(metadata=BULK)
-    diffraction: Array = field(metadata=BULK)
-    strehl: Array = field(metadata=over("field_deg"))
-    pupil_points: Array = field(metadata=over("field_deg"))
-    airy_um: float
-    spread: dict[str, Array] = field(metadata=over())
-
-
-def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None) -> Psf:
-    """Compute the point spread of fields, in a window that holds the spot and six Airy radii.
-
-    Raises:
-        InputError: the lens is a pinhole, whose rays do not meet: there is no focus about which waves could be summed.
-    """
-    scene.require_power()
-    filled = Filled(scene, field_deg, wavelength_nm)
-    _, airy = _airy(scene, filled.waves[0])
-    least_mm = 6e-3 * float(np.nan_to_num(airy))
-
-    def images(level: int, fields: list[int]) -> list[Array]:
-        return _images(filled.only(fields).bundle(level, path=True), least_mm)
-
-    def scaled(found: list[Array]) -> dict[str, tuple[Array, Array | float]]:
-        return {"half_width_um": (found[0], 20 * found[0]), "strehl": (found[2].max((1, 2)), 1.0)}
-
-    (half, centre, diffraction, needed), spread = converged(images, scaled, len(filled.fields), first=1)
-    rays = filled.bundle(LEVELS - 1)  # a picture needs rays in every square, even where figures need fewer
-    each = zip(rays.tangential_mm, rays.sagittal_mm, rays.weight, centre, half, strict=True)
-    geometric = np.stack([_histogram(t - c[0], s - c[1], w, h / 1000) for t, s, w, c, h in each])
-    return Psf(
-        np.array(filled.fields), np.array(filled.waves), half, geometric, diffraction, diffraction.max((1, 2)), needed,
-        airy, spread,
-    )  # fmt: skip
-
-
-def _images(rays: Bundle, least_mm: float) -> list[Array]:
-    """Return half widths (um), centres (mm), diffraction images and the points across the pupil for these, [F, ...].
-
-    The windows have at least the half width `least_mm`.
-    """
-    rows = []
-    for k in range(len(rays.field_deg)):
-        t, s, w = (v[k].flatten() for v in (rays.tangential_mm, rays.sagittal_mm, rays.weight))
-        centre, radius = _spot(t, s, w)
-        window = max(least_mm, 1.1 * radius)
-        if not (window > 0 and w.sum() > 0):
-            window = math.nan
-        needed, image = _needed(rays, k, window), np.full((_POINTS, _POINTS), np.nan)
-        if 0 < needed <= _FINEST:
-            image = diffraction_image(rays, centre, window, field=k)
-        rows.append((1000 * window, centre, image, float(needed)))
-    return [np.array(column) for column in zip(*rows, strict=True)]
-
-
-def _spot(t: Tensor, s: Tensor, w: Tensor) -> tuple[tuple[float, float], float]:
-    """Return the centroid (mm), and the radius about it that holds most of the energy."""
-    if not w.sum() > 0:
-        return (0.0, 0.0), 0.0
-    t, s = torch.nan_to_num(t), torch.nan_to_num(s)
-    centre = (float((w * t).sum() / w.sum()), float((w * s).sum() / w.sum()))
-    away, order = torch.hypot(t - centre[0], s - centre[1]).sort()
-    within = w[order].cumsum(0) / w.sum()
-    return centre, float(away[min(int((within < _ENCIRCLED).sum()), len(away) - 1)])
-
-
-def _histogram(t: Tensor, s: Tensor, w: Tensor, half_mm: float) -> Array:
-    if math.isnan(half_mm):
-        return np.full((_BINS, _BINS), np.nan)
-    keep = w > 0
-    edges = np.linspace(-half_mm, half_mm, _BINS + 1)
-    counts, _, _ = np.histogram2d(t[keep].numpy(), s[keep].numpy(), bins=(edges, edges), weights=w[keep].numpy())
-    return np.asarray(counts / float(w.sum()))
-
-
-def _needed(rays: Bundle, field: int, half_mm: float) -> int:
-    """The points across the pupil with which the phase, anywhere in the window, turns by less than half a turn."""
-    if math.isnan(half_mm) or not rays.passed[field].any():
-        return 0
-    span = max(float(np.nanmax(v[field]) - np.nanmin(v[field])) for v in rays.cosines)
-    blur = float(torch.nan_to_num(torch.hypot(rays.tangential_mm[field], rays.sagittal_mm[field])).max())
-    return max(32, math.ceil(span * 2 * (math.sqrt(2) * half_mm + blur) / (rays.wavelength_nm[0] * 1e-6)))
-
-
-def diffraction_image(
-    rays: Bundle, centre_mm: tuple[float, float], half_mm: float, points: int = _POINTS, field: int = 0
-) -> Array:
-    """Return the diffraction image [points, points] of a field of a bundle, at its first wavelength (see `Psf`).
-
-    Its centre is given as tangential and sagittal distance from the chief ray's film point.
-    """
-    wave = 2 * math.pi / (rays.wavelength_nm[0] * 1e-6)
-    keep = rays.passed[field, 0]
-    t, s = (c[field, 0][keep] for c in rays.cosines)
-    path, weight = path_to_chief_mm(rays)[field, 0][keep], rays.weight[field, 0][keep]
-    # Paths are metres of waves: only their differences keep the digits of a phase.
-    lead = path - path.mean() + t * centre_mm[0] + s * centre_mm[1]
-    amplitude = torch.polar(weight / weight.sum(), wave * lead)
-    line = torch.linspace(-half_mm, half_mm, points, dtype=torch.float64)
-    one = torch.ones(1, dtype=torch.float64)
-    along, across = (torch.polar(one, wave * line[:, None] * c) for c in (t, s))
-    return np.asarray(((along * amplitude) @ across.T).abs().square().numpy())

@@ -15,6 +15,7 @@ from neurolens.base.lensname import lens_id_of
 from neurolens.base.settings import LIGHT_NM
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.figures import SPHERE, Figure
+from neurolens.optics.lens.placement import CENTRED, Placement
 
 LINE_D_NM = 587.5618  # helium, yellow: where first-order data stand
 
@@ -54,6 +55,7 @@ class Surface:
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
         coating: the thin films on the surface, None where bare.
+        placement: how the surface is moved and turned away from its place on the axis.
         followed_mm: distance from the axis from which on a figure continues smoothly instead of by its polynomial;
             only `aiming.without_rims` sets it, for questions that ignore rims (`shapes.followed_mm`).
 
@@ -73,6 +75,7 @@ class Surface:
     absorbs_as: str | None = None
     absorption_per_mm: float = 0.0
     coating: Coating | None = None
+    placement: Placement = CENTRED
     followed_mm: float = math.inf
 
     @property
@@ -87,6 +90,11 @@ class Surface:
     @property
     def semi_diameter_mm(self) -> float:
         return self.diameter_mm / 2
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is a sphere or plane about the lens's axis."""
+        return self.figure.plain and not self.placement
 
 
 @dataclass(frozen=True)
@@ -210,6 +218,16 @@ class Lens:
         return any(s.figure.axis for s in self.surfaces)
 
     @property
+    def decentred(self) -> list[int]:
+        """The indices of the surfaces that are moved or turned away from the axis."""
+        return [k for k, s in enumerate(self.surfaces) if s.placement]
+
+    @property
+    def round(self) -> bool:
+        """Whether the lens is round about its axis."""
+        return not self.anamorphic and not self.decentred
+
+    @property
     def ideal(self) -> list[int]:
         """The indices of the surfaces that are ideal thin lenses."""
         return [k for k, s in enumerate(self.surfaces) if s.figure.power]
@@ -221,6 +239,12 @@ class Lens:
             raise InputError(
                 self.path, f"surface {k}, focal_mm", self.surfaces[k].figure.record()["focal_mm"], expected
             )
+
+    def require_centred(self, what: str) -> None:
+        """Raise InputError where surfaces are moved or turned away from the axis: `what` needs centred ones."""
+        for k in self.decentred:
+            (key, value), *_ = self.surfaces[k].placement.record().items()
+            raise InputError(self.path, f"surface {k}, {key}", value, f"surfaces on the axis: {what} needs them")
 
     @property
     def dispersive(self) -> bool:
@@ -289,6 +313,7 @@ class Lens:
             replace(
                 s,
                 figure=s.figure.scaled(factor),
+                placement=s.placement.scaled(factor),
                 absorption_per_mm=s.absorption_per_mm / factor,
                 **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "followed_mm"),
             )
@@ -353,6 +378,7 @@ def _figures(s: Surface) -> list[Any]:
     stated = None if s.coating is None or s.coating.origin == "assumed" else s.coating
     more = {
         **s.figure.record(),
+        **s.placement.record(),
         "glass": s.glass,
         "cauchy": _terms(s),
         "absorption_per_mm": float(s.absorption_per_mm),

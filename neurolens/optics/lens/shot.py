@@ -27,6 +27,7 @@ BY_LENSES = (
     "focus_m", "f_number", "focal_length_mm", "zoom", "field_deg", "focus_mode", "internal", "aperture",
     "cover_glass_mm", "coating",
 )  # fmt: skip
+POSES = ("film_tilt_deg", "film_swing_deg", "film_shift_mm", "film_rise_mm")  # how the film stands
 FILMS = {  # by name, the largest first: options take these, and a lens has the first that it covers
     "largeformat": "120x96", "645": "56x41.5", "mediumformat": "43.8x32.9", "fullframe": "36x24",
     "super35": "24.89x18.66", "apsc": "23.6x15.7", "apsccanon": "22.3x14.9", "mft": "17.3x13", "1inch": "13.2x8.8",
@@ -61,6 +62,11 @@ class Shot:
         film_offset_mm: moves the film away from the lens after focusing; a pinhole has none.
         film_tilt_deg: turns the film about the x axis through its centre (Scheimpflug): positive moves points of the
             film with y > 0, the picture's lower half, away from the lens.
+        film_swing_deg: turns it about its y axis before that: positive moves points with x > 0, the picture's left
+            half, away from the lens.
+        film_shift_mm: moves the film in its own plane along -x, so that the picture shows more to its right.
+        film_rise_mm: moves it in that plane along -y, so that the picture shows more above, as where the front of a
+            view camera rises. The axis of the lens then meets the film at (film_shift_mm, film_rise_mm).
         cover_glass_mm: thickness of a plate of N-BK7 that is put before the film of a lens file, which is focused anew.
         coating: of the surfaces between glass and air, see `optics.lens.designs.coated`; None leaves the lens's own.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error for a model, and
@@ -109,6 +115,18 @@ class Shot:
     film_tilt_deg: float = setting(
         0.0, "turn the film about the horizontal axis through its centre, the picture's lower half away from the lens "
         "(default: 0)", within=(-45, 45), unit="degrees",
+    )  # fmt: skip
+    film_swing_deg: float = setting(
+        0.0, "turn the film about the vertical axis through its centre, the picture's left half away from the lens "
+        "(default: 0)", within=(-45, 45), unit="degrees",
+    )  # fmt: skip
+    film_shift_mm: float = setting(
+        0.0, "move the film sideways in its plane, so that the picture shows more to its right (default: 0)",
+        within=(-1e3, 1e3), unit="mm",
+    )  # fmt: skip
+    film_rise_mm: float = setting(
+        0.0, "move the film down in its plane, so that the picture shows more above (default: 0)",
+        within=(-1e3, 1e3), unit="mm",
     )  # fmt: skip
     cover_glass_mm: float = setting(
         0.0, "put a plane plate of N-BK7 of this thickness before the film, and focus anew (default: none beyond the "

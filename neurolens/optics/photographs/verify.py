@@ -311,6 +311,7 @@ def found_for(
         InputError: a lens with cylinders has two distortions; there is no profile, none of the name that is wanted, or
             none at a focal length of the lens.
     """
+    lens.require_centred("a profile")
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     if wanted is not None:

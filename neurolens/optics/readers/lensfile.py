@@ -23,6 +23,7 @@ from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.figures import KEYS as FIGURE_KEYS
 from neurolens.optics.lens.figures import read_figure
 from neurolens.optics.lens.glass import by_figures, check_against_table, index_at
+from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Coating, Configuration, Lens, Medium, Surface
 from neurolens.optics.readers.source import MAX_INDEX, MAX_SURFACES, Table
 from neurolens.optics.setting.rims import check_states, with_derived_rims
@@ -42,12 +43,15 @@ HEAD = {
     **{key: key for key in ("image_radius_mm", "half_field_deg", "rims", "wavelengths_nm")},
 }
 LENS_KEYS = (
-    "schema", *HEAD, "notes", "object_medium", "surfaces", "coating", "configuration", "aperture", "measured"
+    "schema", *HEAD, "notes", "object_medium", "surfaces", "moved", "coating", "configuration", "aperture", "measured"
 )  # fmt: skip
 MEDIUM_KEYS = ("n_d", "V_d", "glass", "material")
 # Numbers of a surface stand in columns; texts and tables go last, as a column of glass names needs no right edge.
 COLUMNS = ("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", *FIGURE_KEYS)
-SURFACE_KEYS = (*COLUMNS, "conic", "asphere", "glass", "material", "absorption_per_mm", "coating", "stop")
+PLACE_KEYS = ("decentre_mm", "tilt_deg")
+SURFACE_KEYS = (*COLUMNS, "conic", "asphere", *PLACE_KEYS, "glass", "material", "absorption_per_mm", "coating", "stop")
+GROUP_KEYS = ("surfaces", *PLACE_KEYS, "pivot_mm")
+MOST_TILT_DEG, MOST_DECENTRE_MM = 60.0, 1e4
 STATE_NUMBERS = ("efl_mm", "half_field_deg", "f_number", "stop_diameter_mm", "object_distance_mm")
 CONFIGURATION_KEYS = ("name", *STATE_NUMBERS, "thickness_mm")
 APERTURE_KEYS = ("blades", "rotation_deg", "curvature")
@@ -148,7 +152,37 @@ def _surfaces(table: Table, in_front: Medium) -> tuple[Surface, ...]:
         raise table.error("surfaces", found, "exactly one row with stop = true")
     if (terms := sum(len(s.figure.powers) for s in surfaces)) > MAX_TERMS:
         raise table.error("surfaces", f"({terms} aspheric coefficients)", f"at most {MAX_TERMS}")
+    for place, given in enumerate(table.tables("moved")):
+        _move_group(table.inner(f"moved {place}", given, GROUP_KEYS), surfaces)
     return tuple(surfaces)
+
+
+def _placement(row: Table) -> Placement:
+    """Return how keys move and turn a surface or a group."""
+    found = []
+    for key, most, unit in zip(PLACE_KEYS, (MOST_DECENTRE_MM, MOST_TILT_DEG), ("mm", "degrees"), strict=True):
+        given, numbers = row.data.get(key, [0.0, 0.0]), (int, float)
+        sound = isinstance(given, list) and len(given) in (2, 3)
+        if not sound or not all(type(v) in numbers and abs(v) <= most for v in given):
+            expected = f"[x, y] or [x, y, z] in {unit}, each from {-most:g} to {most:g}"
+            raise row.error(key, given, expected)
+        x, y, z = (*map(float, given), 0.0)[:3]
+        found.append((x, y, z))
+    return Placement(*found)
+
+
+def _move_group(group: Table, surfaces: list[Surface]) -> None:
+    """Move and turn a group of surfaces as a rigid body."""
+    ends, last = group.data.get("surfaces", "(missing)"), len(surfaces) - 1
+    if not isinstance(ends, list) or len(ends) != 2 or any(type(k) is not int for k in ends):
+        raise group.error("surfaces", ends, "[first, last], the numbers of surfaces that are moved together")
+    if not 0 <= ends[0] <= ends[1] <= last:
+        raise group.error("surfaces", ends, f"numbers from 0 to {last}, the first not above the last")
+    pivot, placement = group.number("pivot_mm") if "pivot_mm" in group else 0.0, _placement(group)
+    z = -pivot
+    for k in range(ends[0], ends[1] + 1):
+        surfaces[k] = replace(surfaces[k], placement=surfaces[k].placement.in_group(placement, z))
+        z += float(surfaces[k].thickness_mm)
 
 
 def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surface:
@@ -162,6 +196,7 @@ def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surfa
         diameter_mm=row.number("diameter_mm", unit="mm", above=0) if "diameter_mm" in row else math.nan,
         **_glass(row),
         figure=read_figure(row),
+        placement=_placement(row),
     )
     check_against_table(surface, row.file, row.where)
     if "coating" not in row:
@@ -336,6 +371,7 @@ def _cells(s: Surface) -> dict[str, str]:
         "n_d": None if bare else float(s.n_d),
         "V_d": None if s.V_d is None else float(s.V_d),
         **s.figure.cells(),
+        **s.placement.record(),
         "absorption_per_mm": s.absorption_per_mm or None,
         "coating": s.coating.name if s.coating and s.coating.origin != "assumed" else None,
         "stop": s.stop or None,

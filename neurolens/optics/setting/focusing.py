@@ -323,7 +323,7 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     Where lens and opening are round, one spoke stands for all. The point may lie at -inf.
     """
     data = paraxial.first_order(lens)
-    round_ = not lens.anamorphic and lens.aperture is None
+    round_ = lens.round and lens.aperture is None
     rings, spokes = (_RINGS, 1) if round_ else (_RINGS_OF_SPOKES, _SPOKES)
     ring = np.sqrt((np.arange(rings) + 0.5) / rings)
     spoke = 2 * math.pi * (np.arange(spokes) + 0.5) / spokes

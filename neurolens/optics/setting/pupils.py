@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,9 @@ _STEP_DEG = 5
 AZIMUTHS = tuple(math.radians(_STEP_DEG * k) for k in range(-18, 19))
 # The azimuths in groups, of which the first find most of what passes.
 GROUPS = (AZIMUTHS[18:19], AZIMUTHS[::9], tuple(a for k, a in enumerate(AZIMUTHS) if k % 9))
+# A lens with surfaces off its axis has no plane of symmetry: it is searched all around, on both sides of the pupil. A
+# lens with cylinders takes all of these azimuths, others every third: a decentre acts by the sine of the azimuth.
+AROUND = tuple(math.radians(_STEP_DEG * k) for k in range(72))
 # A film radius is searched at the azimuths of radii smaller by this share, too: outlines are interpolated between
 # radii.
 _BETWEEN_RADII = 0.03
@@ -76,7 +80,8 @@ def passes_at_any_azimuth(
     """Test whether light passes from film points on +x through pupil points, at any azimuth of the whole, bool [N].
 
     Blades and masks are left out: the round opening about them holds what they let through at every azimuth. Only
-    lenses with cylinders are traced at more than one azimuth, namely at `AZIMUTHS`.
+    lenses that are not round are traced at more than one azimuth: with cylinders at `AZIMUTHS`, with surfaces off the
+    axis at those `AROUND` and on both sides of the pupil.
 
     Args:
         film_radius, film_z, pupil_x, pupil_y: [N], mm.
@@ -84,13 +89,16 @@ def passes_at_any_azimuth(
         film_mm: width and height of a film. Only azimuths count at which it has points that far from its middle.
     """
     lens = replace(lens, aperture=None)
-    passed, round_ = np.zeros(len(film_radius), bool), not lens.anamorphic
+    passed, round_ = np.zeros(len(film_radius), bool), lens.round
+    around = (AROUND[::18], AROUND[:: 1 if lens.anamorphic else 3])
+    groups = ((0.0,),) if round_ else around if lens.decentred else GROUPS
     low, high = (-math.inf, math.inf) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
-    for group in ((0.0,),) if round_ else GROUPS:
+    for group, side in product(groups, (1.0, -1.0) if lens.decentred else (1.0,)):
         # Traced together, because few rays take nearly as long as many.
         azimuth = np.array(group)[:, None]
-        which, left = np.nonzero(~passed & (low <= abs(azimuth)) & (abs(azimuth) <= high))
-        r, u, v = film_radius[left], pupil_x[left], pupil_y[left]
+        first = np.arccos(np.abs(np.cos(azimuth))) if lens.decentred else abs(azimuth)  # in the first quadrant
+        which, left = np.nonzero(~passed & (low <= first) & (first <= high))
+        r, u, v = film_radius[left], pupil_x[left], side * pupil_y[left]
         c, s = np.cos(azimuth[which, 0]), np.sin(azimuth[which, 0])
         rays = camera_rays(c * r, s * r, film_z[left], c * u - s * v, s * u + c * v, pupil_z)
         passed[left[passing(lens, rays, wavelength_nm)]] = True
@@ -251,7 +259,7 @@ def pupil_bounds(
         InputError: no ray passes from any film point.
     """
     plane = pupil_plane_z_mm(lens) if pupil_z_mm is None else pupil_z_mm
-    if lens.anamorphic:
+    if not lens.round:
         points = min(points, _AT_MANY_AZIMUTHS)
     wavelengths = sorted(set(wavelength_nm))
     data = first_order(lens)

@@ -165,6 +165,7 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
         raise InputError(lens.path, "vignetting", rule.vignetting, "a share of the pupil above 0 and at most 1")
     if not 0 <= rule.clear_edge < 1:
         raise InputError(lens.path, "clear edge", rule.clear_edge, "a share of the diameter from 0 to below 1")
+    lens.require_centred("the rule of rims")
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     states = list(_states(lens))

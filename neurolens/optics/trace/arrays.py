@@ -72,7 +72,7 @@ def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bo
                 return tests
             return [*tests, (0.5, lens.aperture.inside(met.x, met.y, surface.semi_diameter_mm))]
 
-        met, bent, found = cross(
+        _, bent, found, own = cross(
             NUMPY, surface, traced_curve(surface, float), r, sense, before, after, entering=k == order[0], rim=rim
         )
         here = status[left]
@@ -80,7 +80,7 @@ def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bo
             for low, high in tests:
                 here = np.where((here == st.PASSED) & ~np.less_equal(low, high), st.blocked(k, reason), here)
         status[left], r = here, bent.rays
-        at_stop = (met.x, met.y) if surface.stop else at_stop
+        at_stop = (own.x, own.y) if surface.stop else at_stop
         if prune and (here == st.PASSED).sum() < _FEWER * len(left):
             alive = here == st.PASSED
             left, r = left[alive], Rays(*(c[alive] for c in r))

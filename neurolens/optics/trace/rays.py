@@ -321,12 +321,12 @@ def _trace_chunk(
     crossings: dict[int, Crossing] = {}
     passed: list[Rays] = []
     for k in order:
-        r, (met, bent, _), (before, after) = tracing.cross(k)
+        r, (met, bent, _, own), (before, after) = tracing.cross(k)
         if power is not None:
             power.pass_surface(k, r, met, bent.q, (before, after), sense)
         if k in record:
             margins = times(met.q2, before.inverse_n2), times(bent.q2, after.inverse_n2)
-            crossings[k] = Crossing(*_unfolded(lens.surfaces[k], met), *margins)
+            crossings[k] = Crossing(*_unfolded(lens.surfaces[k], own), *margins)
         if path:
             passed.append(tracing.in_lens_frame())
     arrived = None if power is None else tracing.tests.only(power.arrived(rays.x), 0.0)
@@ -452,7 +452,7 @@ def follow(
     points = []
     for k, action in steps:
         sense, reflected = tracing.sense, action == "R"
-        r, (met, bent, _), mediums = tracing.cross(k, reflected)
+        r, (met, bent, _, _), mediums = tracing.cross(k, reflected)
         points.append((met.x, met.y, met.z + tracing.vertex))
         passage.pass_surface(k, r, met, bent.q, mediums, sense, reflected)
     power = tracing.tests.only(passage.arrived(rays.x), 0.0)

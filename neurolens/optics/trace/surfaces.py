@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.optics.lens import glass, prescription
+from neurolens.optics.lens.placement import CENTRED
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
 from neurolens.optics.trace.shapes import (
@@ -356,11 +358,13 @@ class SurfaceStep(NamedTuple):
         met: where they meet it.
         bent: the rays behind it, in its vertex frame.
         tests: all tests at the surface in order, each with the reason that it stands for (`base.status`).
+        own: the meeting in the surface's own frame; another one than `met` where the surface is moved or turned.
     """
 
     met: Hit
     bent: Outgoing
     tests: list[tuple[list[Test], int]]
+    own: Hit
 
 
 def cross(
@@ -376,18 +380,42 @@ def cross(
     reflected: bool = False,
     rim: Callable[[Hit], list[Test]] | None = None,
 ) -> SurfaceStep:
-    """Take rays through a surface, or back from it where they are `reflected`; `rim` replaces the tests of the rim."""
+    """Take rays through a surface, or back from it where they are `reflected`; `rim` replaces the tests of the rim.
+
+    Rays are relative to the place on the axis where the vertex of a centred surface is, and parallel to the lens's
+    axes.
+    """
+    if surface.placement:
+        centred, p = replace(surface, placement=CENTRED), surface.placement
+        moved = [a - m if m else a for a, m in zip(r[:3], p.moved_mm, strict=True)]
+        rays = Rays(*_turned(p.axes.T, moved), *_turned(p.axes.T, r[3:]))
+        step = cross(o, centred, curve, rays, sense, before, after, entering=entering, reflected=reflected, rim=rim)
+        normal = _turned(p.axes, normal_at(o, step.own, curve.curvature))
+        place = [a + m if m else a for a, m in zip(_turned(p.axes, step.own[:3]), p.moved_mm, strict=True)]
+        x, y, z = place
+        met = step.own._replace(x=x, y=y, z=z, normal=(normal[0], normal[1], normal[2]))
+        bent = step.bent._replace(rays=Rays(*place, *_turned(p.axes, step.bent.rays[3:])))
+        return SurfaceStep(met, bent, step.tests, step.own)
     met = meet(o, r, curve, sense, before, entering)
     tests = [(met.tests, st.MISSED), ((rim or rim_tests(o, surface))(met), st.RIM)]
     if reflected:
-        return SurfaceStep(met, Outgoing(reflect(o, r, met, curve.curvature, sense), met.q, met.q2, []), tests)
+        return SurfaceStep(met, Outgoing(reflect(o, r, met, curve.curvature, sense), met.q, met.q2, []), tests, met)
     if surface.figure.power:
         bent = Outgoing(through_ideal(o, r, met, surface.figure.power), met.q, met.q2, [])
     elif before is after:
         bent = Outgoing(Rays(*met[:3], *r[3:]), met.q, met.q2, [])
     else:
         bent = refract(o, r, met, curve.curvature, sense, before, after)
-    return SurfaceStep(met, bent, [*tests, (bent.tests, st.TOTAL_REFLECTION)])
+    return SurfaceStep(met, bent, [*tests, (bent.tests, st.TOTAL_REFLECTION)], met)
+
+
+def _turned(axes: Array, vector: Sequence[Any]) -> list[Any]:
+    """Return the products of a matrix [3, 3] with vectors of tensors, arrays or values; terms of 0 are left out."""
+    found = []
+    for row in axes:
+        terms = [times(v, float(m)) for v, m in zip(vector, row, strict=True) if m]
+        found.append(sum(terms[1:], terms[0]))
+    return found
 
 
 def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Hit], list[Test]]:

@@ -80,10 +80,10 @@ def exact_graph(
         # Behind a plane z is the number 0; added to it, the gap would lose its label.
         r = r._replace(z=step if r.z.node.kind == "constant" else r.z + step)
         rim = opening if surface.stop or not whole else None
-        met, bent, found = cross(o, surface, traced_curve(surface, float), r, -1, before, after, rim=rim)
+        met, bent, found, own = cross(o, surface, traced_curve(surface, float), r, -1, before, after, rim=rim)
         tests += [(test, st.blocked(k, reason)) for some, reason in found for test in some]
         if surface.stop:
-            at_stop = g.concat(met.x, met.y)
+            at_stop = g.concat(own.x, own.y)
         if power is not None:
             power.pass_surface(k, r, met, bent.q, (before, after), -1)
         r = bent.rays

@@ -183,7 +183,7 @@ class Passage:
             depth = path_mm(self._o, r, met, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
         surface = self.lens.surfaces[k]
-        self._skew = self._skew if surface.figure.plain and not surface.figure.power else None
+        self._skew = self._skew if surface.plain and not surface.figure.power else None
         coated = bool(surface.coating and surface.coating.layers)
         if before is after and not coated and not reflected:
             return
@@ -207,7 +207,7 @@ class Passage:
         assert self._last is not None
         last, other, q = self._last
         pair = self.lens.surfaces[last], self.lens.surfaces[k]
-        if all(s.figure.plain for s in pair):
+        if all(s.plain for s in pair):
             gap = self.lens.vertices_mm[k] - self.lens.vertices_mm[last]
             near = nearest_approach(self._o, r, before.inverse_n2)
             curvatures = pair[0].curvature, pair[1].curvature

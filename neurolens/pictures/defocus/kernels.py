@@ -85,8 +85,8 @@ def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDAr
     the ray meets it, and by how many mm light moves on the film, in x and y, for a slope of 1 there, then for a height
     of 1 mm.
     """
-    surfaces, outline = aspheres(camera), camera.film.outline
-    pupil, _ = outline.sample(*(v.astype(np.float32) for v in (film_mm, square, nm)))
+    surfaces = aspheres(camera)
+    film_mm, pupil, _ = camera.film.start(*(v.astype(np.float32) for v in (film_mm, square, nm)))
 
     steps = _STEP_MM * np.array([[0, 0], [1, 0], [0, 1]])[..., None]
     (q, here), *moved = (camera.path_by_height(surfaces, film_mm, pupil + step, nm) for step in steps)

@@ -235,6 +235,7 @@ class Stack:
         if lens.film_z_mm is None:
             raise InputError(lens.path, "film_z_mm", None, "a focused lens (set_lens)")
         lens.require_glass("reflections, of which flare is made")
+        lens.require_centred("flare")
         self.lens = lens
         # All aspheres with the same sort of terms get the degree of the highest one, so that they share a function.
         self._curves = {k: traced_curve(s, float) for k, s in enumerate(lens.surfaces) if not s.figure.plain}

@@ -29,7 +29,7 @@ from neurolens.base.records import plain
 from neurolens.base.settings import setting, setting_of, whole, with_changes
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.optics.lens.shot import Shot, film_size
+from neurolens.optics.lens.shot import POSES, Shot, film_size
 from neurolens.optics.readers.glasses import more_glasses
 from neurolens.pictures.render.behind import Behind
 from neurolens.pictures.render.colour import (
@@ -313,9 +313,9 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
     """
     if prepared.scene.settings.flare is None:
         return {}
-    lens = getattr(prepared.camera, "lens", None)
+    lens = _flaring(prepared.camera)
     if lens is None:
-        warn(f"no flare of {prepared.camera.name}: that takes a lens file that is traced as it is")
+        warn(f"no flare of {prepared.camera.name}: that takes a lens file that is traced as it is, on an upright film")
         return {}
     from neurolens.pictures.flare.layers import scene_flare
 
@@ -325,13 +325,18 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
         )
 
 
+def _flaring(camera: Any) -> Lens | None:
+    """Return the lens of a camera whose flare can be followed: to an upright film alone."""
+    return None if any(camera.settings.get(name) for name in POSES) else getattr(camera, "lens", None)
+
+
 def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) -> Choice | None:
     """Choose the ghosts that become layers of the flare in all frames of an animation.
 
     At most 16 of the frames, evenly spread, decide which ghosts are brightest. `prepared` is one of the frames, or
     another of the same camera and scene. The choice is None where there is no flare.
     """
-    if prepared.scene.settings.flare is None or getattr(prepared.camera, "lens", None) is None:
+    if prepared.scene.settings.flare is None or _flaring(prepared.camera) is None:
         return None
     from neurolens.pictures.flare.layers import scene_choice
 

@@ -20,7 +20,8 @@ from neurolens.cli import analyse, main
 from neurolens.cli.analyse import WHATS
 from neurolens.optics.analysis import plots
 from neurolens.optics.analysis.plots import plot_psf, plot_spots
-from neurolens.optics.analysis.spots import mtf, psf, spots
+from neurolens.optics.analysis.psf import psf
+from neurolens.optics.analysis.spots import mtf, spots
 from neurolens.optics.readers.lensfile import write_lens
 
 GAUSS = LENSES / "laikin_double_gauss_50.toml"

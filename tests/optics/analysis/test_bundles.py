@@ -16,7 +16,8 @@ from neurolens.optics.analysis.bundles import bundle, hexapolar, points
 from neurolens.optics.analysis.field_curves import distortion, illumination
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.layout import layout_profile
-from neurolens.optics.analysis.spots import diffraction_image, diffraction_mtf, fans, mtf, psf, spots, working_f_number
+from neurolens.optics.analysis.psf import psf
+from neurolens.optics.analysis.spots import diffraction_mtf, fans, mtf, spots, working_f_number
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.figures import Cylinder
 from neurolens.optics.lens.prescription import Lens, Surface
@@ -213,18 +214,6 @@ def test_diffraction_limit() -> None:
     # Half way to the cut-off: 2/pi (pi/3 - sqrt(3)/4).
     half = diffraction_mtf(np.array([1e6 / D / 20]), D, 10.0)
     assert half[0] == pytest.approx(2 / math.pi * (math.pi / 3 - math.sqrt(3) / 4))
-
-
-def test_diffraction_image_of_a_perfect_lens_is_airys() -> None:
-    """(2 J1(x) / x)^2, x = pi r / (lambda N), and its first dark ring."""
-    given = cartesian(stop_mm=2.0)
-    n = working_f_number(given, D)
-    half = 3e-6 * D * n
-    image = diffraction_image(bundle(given, [0.0], [D], grid(64)), (0.0, 0.0), half, points=61)
-    r = torch.linspace(-half, half, 61, dtype=torch.float64).abs()
-    x = math.pi * r / (D * 1e-6 * n)
-    wanted = torch.where(x > 0, (2 * torch.special.bessel_j1(x) / x) ** 2, 1.0).numpy()
-    assert image[30] == pytest.approx(wanted, abs=3e-3) and image[:, 30] == pytest.approx(wanted, abs=3e-3)
 
 
 def test_a_quarter_wave_of_defocus_leaves_a_strehl_ratio_of_81_percent() -> None:

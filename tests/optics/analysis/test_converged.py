@@ -13,8 +13,6 @@ from test_bundles import D, moved
 from neurolens.optics.analysis.bundles import Bundle, Filled, bundle
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.spots import (
-    diffraction_image,
-    diffraction_mtf,
     mtf,
     mtf_over_height,
     spots,
@@ -84,22 +82,6 @@ def hopkins(frequency: np.ndarray, waves: float, cut_off: float) -> np.ndarray:
         y = np.sqrt(1 - (np.abs(x) + s / 2) ** 2)
         found.append(abs(np.sum(2 * y * np.exp(4j * np.pi * waves * s * x))) * (2 - s) / 20000 / np.pi)
     return np.array(found)
-
-
-@pytest.mark.parametrize("waves", [0.0, 0.5])
-def test_the_diffraction_image_has_the_mtf_of_closed_forms(waves: float) -> None:
-    given = cartesian(stop_mm=2.0)
-    n = working_f_number(given, D)
-    cut_off = 1e6 / (D * n)
-    given = moved(given, waves * 8 * D * 1e-6 * n * n)
-    half = 16e-6 * D * n
-    image = diffraction_image(Filled(given, [0.0], [D]).bundle(2, path=True), (0.0, 0.0), half, points=301)
-    line, t = image.sum(1), np.linspace(-half, half, 301)
-    f = np.array([0.1, 0.25, 0.5, 0.7]) * cut_off
-    contrast = np.abs(np.exp(2j * np.pi * f[:, None] * t) @ line) / line.sum()
-    assert contrast == pytest.approx(hopkins(f, waves, cut_off), abs=0.025)  # 2% of the light falls beside the window
-    if waves == 0:
-        assert hopkins(f, 0.0, cut_off) == pytest.approx(diffraction_mtf(f, D, n), abs=1e-4)
 
 
 def test_geometric_mtf_is_that_of_diffraction_for_many_waves_of_defocus() -> None:

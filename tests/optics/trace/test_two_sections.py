@@ -17,7 +17,7 @@ from neurolens.graph.ir import Graph
 from neurolens.models.assemble import Form, sag
 from neurolens.optics.analysis.field_curves import seidel
 from neurolens.optics.analysis.fields import Scene
-from neurolens.optics.analysis.spots import psf
+from neurolens.optics.analysis.psf import psf
 from neurolens.optics.lens.figures import Biconic, Cylinder, Figure, Ideal, Qcon, Toroid, figure_of
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens, Surface

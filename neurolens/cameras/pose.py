@@ -1,0 +1,132 @@
+"""How the film stands: turned about two axes, and moved in its plane.
+
+A lens knows lines alone. The line from a point of such a film through a point of the pupil meets the plane of an
+upright film, in which the axis meets both films, elsewhere: `to_plane` finds the place and what the turn does to the
+light, `to_film` the way back.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.graph.ir import Graph
+from neurolens.optics.lens.shot import Shot
+
+_HAIR = 1e-18  # mm; added so that the axis stays finite
+
+
+@dataclass(frozen=True)
+class FilmPose:
+    """How a film stands; all 0 is upright and centred, and false.
+
+    Attributes:
+        tilt, swing: turns (rad) as `Shot.film_tilt_deg` and `Shot.film_swing_deg` state them.
+        moved_mm: what is taken from a film point before the film is turned: shift and rise.
+    """
+
+    tilt: float = 0.0
+    swing: float = 0.0
+    moved_mm: tuple[float, float] = (0.0, 0.0)
+
+    @staticmethod
+    def of(shot: Shot) -> FilmPose:
+        """Return how the film of a shot stands."""
+        moved = shot.film_shift_mm, shot.film_rise_mm
+        return FilmPose(math.radians(shot.film_tilt_deg), math.radians(shot.film_swing_deg), moved)
+
+    def __bool__(self) -> bool:
+        return self.turned or any(self.moved_mm)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the film is not square to the axis."""
+        return bool(self.tilt or self.swing)
+
+    @cached_property
+    def axes(self) -> NDArray[np.float64]:
+        """The film's x, its y and its normal as columns [3, 3] in the lens frame."""
+        (sin, cos), (sway, stay) = ((math.sin(a), math.cos(a)) for a in (self.tilt, self.swing))
+        return np.array([[stay, -sway * sin, -sway * cos], [0.0, cos, -sin], [sway, stay * sin, stay * cos]])
+
+    def covers_mm(self, film_mm: tuple[float, float], distance_mm: float) -> tuple[float, float]:
+        """Return width and height of an upright film about the axis that lines through the pupil's middle cover.
+
+        Args:
+            film_mm: width and height. distance_mm: from the pupil to the film on the axis.
+        """
+        if not self:
+            return film_mm
+        corners = np.array([[-1, -1, 1, 1], [-1, 1, -1, 1]]) * np.array(film_mm)[:, None] / 2
+        x, y, depth = self.axes[:, :2] @ (corners - np.array(self.moved_mm)[:, None])
+        away = np.maximum(1 + depth / distance_mm, 0.1)  # the film of a short lens may reach its pupil
+        return 2 * float(np.abs(x / away).max()), 2 * float(np.abs(y / away).max())
+
+    def lean(self, film_mm: tuple[float, float], distance_mm: float) -> float:
+        """Return the largest size of the share that `to_plane` gives as `lean`."""
+        corners = np.array([[-1, -1, 1, 1], [-1, 1, -1, 1]]) * np.array(film_mm)[:, None] / 2
+        depth = self.axes[2, :2] @ (corners - np.array(self.moved_mm)[:, None]) / distance_mm
+        return float(np.abs(depth / np.maximum(1 + depth, 0.1)).max())
+
+
+UPRIGHT = FilmPose()
+
+
+@lru_cache(maxsize=16)
+def to_plane(pose: FilmPose, radius_mm: float, derivatives: tuple[str, ...] = ()) -> Graph:
+    """Write the graph from rays of a film to rays of the upright film plane.
+
+    Args:
+        pose: how the film stands.
+        radius_mm: the last film radius of the outline.
+        derivatives: names of derivatives of `scene_ray` by a point of the plane, along x and y: inputs and outputs.
+
+    Inputs are `film_mm` [2] on the film, `pupil_mm` [2], `area_mm2` and, for a whole call, `per_distance`. Outputs are
+    `plane_mm` [2], where the ray meets the plane; `area_mm2`, by which its weight on the plane is that on the film;
+    `central_mm` [2], where the line through the middle of the pupil meets the plane, within the radius; and `lean`, the
+    share by which the ray's place on the plane lies from there towards its pupil point: plane = central + lean pupil.
+    """
+    g = Graph()
+    film, pupil, area = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2")
+    moved = film - list(pose.moved_mm) if any(pose.moved_mm) else film
+    moves = [g.input(name, 6) for name in derivatives]
+    if not pose.turned:
+        g.outputs = {"central_mm": moved, "plane_mm": moved, "area_mm2": area, "lean": 0.0 * area}
+        g.outputs |= dict(zip(derivatives, moves, strict=True))
+        return g
+    per_distance, axes = g.input("per_distance", per_call=True), pose.axes
+    place, depth = g.affine(axes[:2, :2], moved), g.affine(axes[2:, :2], moved) * per_distance
+    nearer = 1.0 / (1.0 + depth)  # distance of the plane over that of the point, from the pupil
+    way, central = pupil - place, place * nearer
+    within = (0.9999 * radius_mm / g.square(central).sqrt().maximum(_HAIR)).minimum(1.0)
+    g.outputs["central_mm"] = central * within
+    g.outputs["plane_mm"] = place + way * (depth * nearer)
+    g.outputs["lean"] = depth * nearer
+    facing = g.affine(-axes[None, :2, 2], way) * per_distance * nearer + axes[2, 2]
+    g.outputs["area_mm2"] = area * nearer * nearer * facing
+    if moves:
+        far = per_distance * nearer * nearer
+        for k, name in enumerate(derivatives):
+            step = way * (far * axes[2, k]) + nearer * axes[:2, k]
+            g.outputs[name] = moves[0] * step[0] + moves[1] * step[1]
+    return g
+
+
+@lru_cache(maxsize=16)
+def to_film(pose: FilmPose) -> Graph:
+    """Write the graph from `plane_mm` and `pupil_mm` [2] to the `film_mm` [2] of a film; `per_distance` as before."""
+    g = Graph()
+    place, pupil = g.input("plane_mm", 2), g.input("pupil_mm", 2)
+    if pose.turned:
+        back = np.linalg.inv(pose.axes[:2, :2])
+        slope, way = pose.axes[2:, :2] @ back, pupil - place
+        per_distance = g.input("per_distance", per_call=True)
+        # The film is z = slope . (x, y); along the ray z falls by the distance of the pupil.
+        along = g.affine(-slope, place) * per_distance / (1.0 + g.affine(slope, way) * per_distance)
+        place = g.affine(back, place + way * along)
+    g.outputs["film_mm"] = place + list(pose.moved_mm) if any(pose.moved_mm) else place
+    return g

@@ -1,0 +1,213 @@
+"""Where and how light leaves a lens: the pupil function of an object point, fitted to its rays.
+
+The exit pupil of a point is a part of the plane of direction cosines (L, M) in which its rays meet the film: the part
+that the stop's blades or mask and every rim leave open, as traced for this point. There it has the light per area and
+the wavefront W: the mixed characteristic, whose slopes are the aberrations of the rays, dW/dL = -x, dW/dM = -y (Born
+and Wolf, section 4.1). All are polynomials fitted to a few thousand traced rays, so that they are known everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from neurolens.optics.analysis.fields import on_plane
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.trace.aiming import without_rims
+from neurolens.optics.trace.rays import Rays, trace
+
+Array = NDArray[np.floating[Any]]
+
+_DEGREE = 14  # of the polynomials
+_FEWEST = 240  # the fewest rays for their 120 terms
+_BEYOND = 1.15  # rays up to so many radii of a rim count for the polynomials
+_PARTS = 4  # of a cell along its side, where an edge crosses it
+_ROOM = 1.1  # the box of cosines over the rays that pass, between which edges lie
+_FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
+
+
+@dataclass(frozen=True)
+class ExitPupil:
+    """Where and how the light of one direction and wavelength leaves a lens, in direction cosines at the film.
+
+    Attributes:
+        wavelength_nm: of the light.
+        centre_mm: film point [2] from which x and y are counted: the mean of the rays.
+        middle, half: [2] middle and half sides of the box of cosines that holds the light.
+        figures: [D, D, K] Chebyshev coefficients on that box: of the wavefront W in mm, of the light per area of
+            cosines in mm^2 (for an irradiance of 1 at the lens), and of x, y in mm at each surface that may cut the
+            beam.
+        limits_mm: radii of those surfaces; the stop is the first.
+        aperture: the stop's shape.
+        hits_mm: [2, N] where some of the rays meet the film, counted from the centre.
+        box: the part of the disc across the light's direction that holds the rays, [2 (low, high), 2].
+    """
+
+    wavelength_nm: float
+    centre_mm: Array
+    middle: Array
+    half: Array
+    figures: Array
+    limits_mm: tuple[float, ...]
+    aperture: Aperture | None
+    hits_mm: Array
+    box: Array
+
+    @property
+    def blur_mm(self) -> float:
+        """The greatest distance of a ray from the centre on the film."""
+        return float(np.hypot(*self.hits_mm).max())
+
+    def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
+        """Whether light passes at points [2, N] of the box (-1 to 1); a tuple of two axes stands for their grid."""
+        at = self._at(places, slice(2, None))
+        inside = np.ones(at.shape[1:], bool)
+        for x, y, limit in zip(at[::2], at[1::2], self.limits_mm, strict=True):
+            inside &= x * x + y * y <= limit * limit
+        if self.aperture is not None:
+            inside[inside] = self.aperture.inside(at[0][inside], at[1][inside], self.limits_mm[0])
+        return inside
+
+    def open_share(self, cells: int) -> Array:
+        """Return the share [cells, cells] of each cell of the box that light passes; cells on an edge are divided."""
+        nodes = np.linspace(-1, 1, cells + 1)
+        lit = self.passes((nodes, nodes))
+        corners = np.stack([lit[:-1, :-1], lit[1:, :-1], lit[:-1, 1:], lit[1:, 1:]])
+        share: Array = np.array(corners.all(0), np.float64)
+        edge = np.nonzero(corners.any(0) & ~corners.all(0))
+        part = (np.arange(_PARTS) + 0.5) / _PARTS
+        at = [2 * (k[:, None, None] + step) / cells - 1 for k, step in zip(edge, (part[:, None], part), strict=True)]
+        places = np.stack([np.broadcast_to(a, (len(edge[0]), _PARTS, _PARTS)).reshape(-1) for a in at])
+        share[edge] = self.passes(places).reshape(len(edge[0]), -1).mean(1)
+        return share
+
+    def field(self, places: Array | tuple[Array, Array]) -> NDArray[np.complex128]:
+        """Return sqrt(e) exp(i k W) at points, which are as in `passes`."""
+        w, e = self._at(places, slice(2))
+        return np.sqrt(np.maximum(e, 0)) * np.exp(2e6j * math.pi / self.wavelength_nm * w)
+
+    def hits(self, places: Array) -> Array:
+        """Return where the rays of points [2, N] meet the film, [2, N] in mm from the centre."""
+        (u, v), wave = places, self.figures[..., 0]
+        return -np.stack([chebyshev.chebval2d(u, v, chebyshev.chebder(wave, axis=k)) / self.half[k] for k in (0, 1)])
+
+    def _at(self, places: Array | tuple[Array, Array], rows: slice) -> Array:
+        """Return the figures [K, ...] at points, which are as in `passes`."""
+        u, v = (chebyshev.chebvander(p, _DEGREE) for p in places)
+        figures = np.moveaxis(self.figures[..., rows], -1, 0)
+        if isinstance(places, tuple):
+            return np.asarray(u @ figures @ v.T)
+        return np.stack([((u @ figure) * v).sum(1) for figure in figures])
+
+
+class Arrived(NamedTuple):
+    """N rays through the whole lens without its rims, on the film.
+
+    Attributes:
+        cosines, hits: [2, N] directions and places (mm) on the film. at: [S, 2, N] x and y in mm at each surface.
+        power: [N] share of unpolarised light that arrives. exists: [N] False where a ray is lost.
+    """
+
+    cosines: Array
+    hits: Array
+    at: Array
+    power: Array
+    exists: NDArray[np.bool_]
+
+
+def arrived(lens: Lens, rays: Rays, wavelength_nm: torch.Tensor | float) -> Arrived:
+    """Trace rays from before the lens, whose film is placed, to the film."""
+    every = range(len(lens.surfaces))
+    with torch.no_grad():
+        found = trace(without_rims(lens), rays, wavelength_nm, towards="film", transmittance=True, record=every)
+    film = on_plane(found.rays, float(lens.film_z_mm or 0.0))
+    assert found.transmittance is not None
+    at = np.stack([np.stack([found.crossings[k].x.numpy(), found.crossings[k].y.numpy()]) for k in every])
+    cosines, hits = (np.stack([a.numpy(), b.numpy()]) for a, b in ((film.dx, film.dy), (film.x, film.y)))
+    return Arrived(cosines, hits, at, found.transmittance.numpy(), found.status.numpy() == 0)
+
+
+def fitted_pupil(
+    lens: Lens, rays: Arrived, places: Array, energy: Array | float, wavelength_nm: float,
+    like: ExitPupil | None = None, box: Array | None = None,
+) -> ExitPupil | None:  # fmt: skip
+    """Fit the exit pupil to rays; None where too few arrive, or the rays meet nowhere (a pinhole, a plate).
+
+    Args:
+        places: [2, N] of the rays on a surface before the lens. energy: of the rays, per area of those places.
+        like: the pupil of another wavelength, whose boxes are taken.
+    """
+    limits = np.array([s.semi_diameter_mm for s in lens.surfaces])
+    part = np.hypot(rays.at[:, 0], rays.at[:, 1]) / limits[:, None]  # relative to the rim's radius, at each surface
+    near = rays.exists & (part.max(0) < _BEYOND)
+    inside = near & (part.max(0) <= 1)
+    if inside.sum() < 16 or near.sum() < _FEWEST:
+        return None
+    cosines = rays.cosines
+    low, high = cosines[:, inside].min(1), cosines[:, inside].max(1)
+    middle, half = ((low + high) / 2, _ROOM * (high - low) / 2) if like is None else (like.middle, like.half)
+    if not half.min() > _FLAT:
+        return None
+    centre = rays.hits[:, inside].mean(1)
+    every = range(len(limits))
+    cut = [lens.stop_index, *(k for k in every if k != lens.stop_index and part[k, near].max() > 1)]
+    off = rays.hits[:, near] - centre[:, None]
+    figures = _fitted(
+        (cosines[:, near] - middle[:, None]) / half[:, None], half, off, places[:, near],
+        (rays.power * energy)[near], rays.at[cut][..., near].reshape(2 * len(cut), -1),
+    )  # fmt: skip
+    through = inside.copy()
+    if lens.aperture is not None:
+        through &= lens.aperture.inside(rays.at[lens.stop_index, 0], rays.at[lens.stop_index, 1], lens.stop_radius_mm)
+    hits = (rays.hits - centre[:, None])[:, through if through.any() else inside]
+    box = np.zeros((2, 2)) if box is None else box
+    return ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), lens.aperture, hits, box)
+
+
+def _fitted(places: Array, half: Array, off_mm: Array, disc_places: Array, power: Array, at_mm: Array) -> Array:
+    """Fit `ExitPupil.figures` by least squares to rays at points [2, N] of the box.
+
+    The wavefront is fitted by its slopes, the light per area of cosines by the derivatives of the points on the disc.
+    """
+    orders = np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE
+    # Chebyshev polynomials of each coordinate, and their slopes.
+    value = [chebyshev.chebvander(p, _DEGREE) for p in places]
+    turn = chebyshev.chebder(np.eye(_DEGREE + 1))
+    slope = [chebyshev.chebvander(p, _DEGREE - 1) @ turn for p in places]
+
+    def products(a: Array, b: Array) -> Array:
+        return (a[:, :, None] * b[:, None, :])[:, orders]
+
+    plain, by_u, by_v = products(*value), products(slope[0], value[1]), products(value[0], slope[1])
+    slopes = np.concatenate([by_u / half[0], by_v / half[1]])
+    wave = _least(slopes[:, 1:])(-off_mm.reshape(-1))
+    solved = _least(plain)
+    mapped = solved(disc_places.T)
+    (au, bu), (av, bv) = (by_u @ mapped).T / half[0], (by_v @ mapped).T / half[1]
+    rest = solved(np.stack([power * np.abs(au * bv - av * bu), *at_mm], 1))
+    figures = np.zeros((_DEGREE + 1, _DEGREE + 1, 1 + rest.shape[1]))
+    figures[orders] = np.concatenate([np.concatenate([[0.0], wave])[:, None], rest], 1)
+    return figures
+
+
+def _least(a: Array) -> Callable[[Array], Array]:
+    """Return what solves a x = b for any b by least squares.
+
+    The normal equations take a third of the time of a QR decomposition; a second step on what the first leaves
+    restores the digits that they lose.
+    """
+    squares = np.linalg.inv(a.T @ a) @ a.T
+
+    def solved(b: Array) -> Array:
+        first = squares @ b
+        return np.asarray(first + squares @ (b - a @ first))
+
+    return solved

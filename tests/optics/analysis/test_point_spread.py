@@ -1,0 +1,193 @@
+"""Point spread by diffraction: closed forms, sums of waves over exactly traced rays, energy, and rays out of focus."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from analysis_lenses import cartesian, grid, library
+from path_difference import diffraction_image
+from scipy.special import j1, jv
+from test_bundles import PINHOLE, D, moved
+from test_converged import hopkins
+
+from neurolens.base.errors import InputError
+from neurolens.optics.analysis.bundles import bundle
+from neurolens.optics.analysis.diffraction import (
+    by_pixel,
+    cells_needed,
+    irradiance,
+    perfect_peak,
+    pupils,
+    pupils_at,
+    spread,
+)
+from neurolens.optics.analysis.exit_pupil import ExitPupil
+from neurolens.optics.analysis.field_curves import illumination
+from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.analysis.psf import psf
+from neurolens.optics.analysis.spots import diffraction_mtf, working_f_number
+from neurolens.optics.lens.apertures import Aperture
+
+ONE = np.ones((1, 1))
+
+
+def pupil_of(scene: Scene, field_deg: float = 0.0) -> ExitPupil:
+    [[[found]]] = pupils(scene, [field_deg], [D])
+    assert found is not None
+    return found
+
+
+def line_through(pupil: ExitPupil, x_mm: np.ndarray, cells: int = 256) -> np.ndarray:
+    """Irradiance along x through the middle, over the peak of the same pupil without aberrations."""
+    open_share = pupil.open_share(cells)
+    return irradiance(pupil, x_mm, np.zeros(1), open_share)[0] / perfect_peak(pupil, open_share)
+
+
+def test_a_perfect_lens_has_airys_disc() -> None:
+    """(2 J1(v) / v)^2 with v = pi r / (lambda N), to the fourth dark ring."""
+    given = cartesian(stop_mm=2.0)
+    n = working_f_number(given, D)
+    x = np.linspace(-4, 4, 161) * D * 1e-6 * n
+    v = np.where(x == 0, 1.0, math.pi * x / (D * 1e-6 * n))
+    wanted = np.where(x == 0, 1.0, (2 * j1(v) / v) ** 2)
+    assert line_through(pupil_of(given), x) == pytest.approx(wanted, abs=5e-4)
+
+
+def lommel(u: float, v: np.ndarray) -> np.ndarray:
+    """Irradiance of a defocused circle over the peak in focus (Born and Wolf, 8.8.1): (2/u)^2 (U1^2 + U2^2), and the
+    V functions outside the shadow, |u| < |v|."""
+    found = []
+    for one in np.abs(v):
+        s = np.arange(60)
+        if one < u:
+            first, second = (((-1.0) ** s * (one / u) ** (n + 2 * s) * jv(n + 2 * s, one)).sum() for n in (0, 1))
+            turn = (u + one * one / u) / 2
+            found.append(
+                (2 / u) ** 2 * (1 + first**2 + second**2 - 2 * first * math.cos(turn) - 2 * second * math.sin(turn))
+            )
+        else:
+            both = (((-1.0) ** s * (u / one) ** (n + 2 * s) * jv(n + 2 * s, one)).sum() for n in (1, 2))
+            found.append((2 / u) ** 2 * sum(value**2 for value in both))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("waves", [1.0, 4.5])
+def test_a_defocused_circle_is_lommels(waves: float) -> None:
+    """u = 2 pi / lambda shift / (2 N)^2: at whole waves of defocus the middle is dark."""
+    given = cartesian(stop_mm=1.0)
+    n = working_f_number(given, D)
+    pupil = pupil_of(moved(given, waves * 8 * D * 1e-6 * n * n))
+    u = 4 * math.pi * waves
+    v = np.linspace(0.2, 1.6 * u + 3, 60)
+    assert line_through(pupil, v / math.pi * D * 1e-6 * n) == pytest.approx(lommel(u, v), abs=2e-3)
+    assert lommel(u, np.array([1e-9]))[0] == pytest.approx((math.sin(u / 4) / (u / 4)) ** 2, abs=1e-12)
+
+
+@pytest.mark.parametrize("waves", [0.0, 0.5])
+def test_the_image_has_the_mtf_of_closed_forms(waves: float) -> None:
+    given = cartesian(stop_mm=2.0)
+    n = working_f_number(given, D)
+    cut_off = 1e6 / (D * n)
+    pupil = pupil_of(moved(given, waves * 8 * D * 1e-6 * n * n))
+    x = np.linspace(-16e-6, 16e-6, 201) * D * n
+    image = irradiance(pupil, x, x, pupil.open_share(192))
+    f = np.array([0.1, 0.25, 0.5, 0.7]) * cut_off
+    contrast = np.abs(np.exp(2j * np.pi * f[:, None] * x) @ image.sum(0)) / image.sum()
+    assert contrast == pytest.approx(hopkins(f, waves, cut_off), abs=0.025)  # 2% of the light falls beside the window
+    if waves == 0:
+        assert hopkins(f, 0.0, cut_off) == pytest.approx(diffraction_mtf(f, D, n), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("f_number", "field", "focus_m"), [(5.6, 0.0, math.inf), (4.0, 14.0, math.inf), (8.0, 20.0, 1.5)]
+)
+def test_the_image_is_the_sum_of_waves_over_exact_rays(f_number: float, field: float, focus_m: float) -> None:
+    """Strehl ratio and every pixel, against 30,000 traced rays with their optical paths; rims cut the last two."""
+    given = library("laikin_double_gauss_50", f_number=f_number, focus_m=focus_m)
+    found = psf(given, [field], [D])
+    rays = bundle(given, [field], [D], grid(200))
+    t, s = (
+        float((rays.weight * v.nan_to_num()).sum() / rays.weight.sum()) for v in (rays.tangential_mm, rays.sagittal_mm)
+    )
+    pupil = pupil_of(given, field)
+    half, points = found.half_width_um[0] / 1000, found.diffraction.shape[1]
+    direct = diffraction_image(rays, (t, s), half, points)
+    # The windows have their middles at two centroids, whose difference is below a twentieth of a pixel.
+    assert found.diffraction[0] == pytest.approx(direct, abs=0.02 * direct.max())
+    assert found.strehl[0] == pytest.approx(direct.max(), abs=5e-3)
+    assert pupil.blur_mm < half
+
+
+def test_all_light_is_in_the_image() -> None:
+    given = library("laikin_double_gauss_50", f_number=4.0)
+    [[pupil]] = pupils_at(given, np.array([[12.0, 8.0]]), [D])
+    [small, large] = (spread([pupil], ONE, 0.004, side) for side in (31, 121))
+    assert small.inside[0] < large.inside[0] < 1
+    assert large.inside[0] == pytest.approx(1, abs=3e-3)
+    # Pixels tile: four small ones hold what a large one holds.
+    x = np.arange(-6, 7) * 0.004
+    share = pupil.open_share(256)
+    fine = by_pixel(pupil, np.arange(-13, 13) * 0.002 + 0.001, np.arange(-13, 13) * 0.002 + 0.001, 0.002, share)
+    tiles = fine.reshape(13, 2, 13, 2).sum((1, 3))
+    assert tiles == pytest.approx(by_pixel(pupil, x, x, 0.004, share), rel=1e-2, abs=1e-4 * tiles.max())
+
+
+def test_an_image_turns_with_its_place() -> None:
+    given = library("laikin_double_gauss_50", f_number=4.0)
+    right, down, left = (
+        spread(p, ONE, 0.003, 33).light[0] for p in pupils_at(given, np.array([[15.0, 0], [0, 15.0], [-15, 0]]), [D])
+    )
+    assert left == pytest.approx(right[:, ::-1], abs=1e-4 * right.max())
+    assert down == pytest.approx(right.T, abs=1e-4 * right.max())
+    assert right == pytest.approx(right[::-1], abs=1e-4 * right.max())
+    assert np.abs(right - right.T).max() > 0.05 * right.max()
+
+
+def test_blades_stay_where_they_are_all_over_the_film() -> None:
+    given = library("laikin_double_gauss_50", f_number=8.0)
+    given = Scene(replace(given.lens, aperture=Aperture(blades=4)))
+    for found in pupils_at(given, np.array([[9.0, 9.0], [0.0, 0.0]]), [D]):
+        share = found[0].open_share(64)  # a square on its corner
+        assert share.mean() == pytest.approx(0.5 / 1.08**2, rel=0.03)
+        assert share[2, 2] == share[-3, 2] == 0 and share[32, 32] == 1
+
+
+def test_relative_illumination_is_that_of_the_analysis() -> None:
+    """Which traces from the film: the rays of one object point come from other film points, hence f/4."""
+    given = library("laikin_double_gauss_50", f_number=4.0)
+    light = illumination(given, fields=4)
+    places = np.stack([0 * light.height_mm, light.height_mm], 1)
+    seen = np.array([spread(p, ONE, 0.01, 3).pupil[0] for p in pupils_at(given, places, [given.lens.reference_nm])])
+    assert seen / seen[0] == pytest.approx(light.relative, rel=3e-3)
+    assert seen[-1] < 0.9 * seen[0]
+
+
+def test_rays_take_over_far_out_of_focus() -> None:
+    """Where both are known, few pixels differ: the fewer, the larger pixels are against the fringes."""
+    lens = library("laikin_double_gauss_50", f_number=2.8, focus_m=1.0).lens
+    [[near], [far]] = (pupils_at(Scene(lens, d), np.array([[6.0, 4.0]]), [D])[0] for d in (1.02, 1.2))
+    off = [spread([near], ONE, pixel, side) for pixel, side in ((0.003, 55), (0.01, 19), (0.03, 9))]
+    assert [found.by_rays for found in off] == [False] * 3
+    assert off[2].differs < 0.5 * off[1].differs < 0.5 * off[0].differs < 0.05
+    found = spread([far], ONE, 0.01, 35)
+    assert found.by_rays and math.isnan(found.differs)
+    assert found.inside[0] == pytest.approx(1, abs=1e-6)
+
+
+def test_twice_as_many_cells_give_the_same_image() -> None:
+    given = library("nikon_zoom_14_24", f_number=4.0)
+    [[pupil]] = pupils_at(given, np.array([[14.0, 8.0]]), [D])
+    x = np.linspace(-0.03, 0.03, 61)
+    images = [irradiance(pupil, x, x, pupil.open_share(k * cells_needed(pupil, 0.043))) for k in (1, 2)]
+    assert images[0] == pytest.approx(images[1], abs=3e-3 * images[1].max())
+
+
+def test_a_lens_without_symmetry_or_power_is_refused_and_a_dark_place_is_dark() -> None:
+    given = library("laikin_double_gauss_50")
+    [[dark]] = pupils_at(given, np.array([[300.0, 0.0]]), [D])
+    assert dark is None
+    found = spread([dark], ONE, 0.003, 5)
+    assert not found.light.any() and found.pupil[0] == 0 and math.isnan(found.differs)
+    with pytest.raises(InputError, match="a lens with power"):
+        pupils_at(PINHOLE, np.zeros((1, 2)), [D])
