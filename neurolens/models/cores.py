@@ -234,6 +234,17 @@ class _Symmetric(Core):
         merge[np.arange(len(rest)), place.reshape(-1)] = w ** self.exponents[:, -1].astype(float)
         return replace(self, exponents=unique, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
 
+    def plus(self, ab: Array, scalars: Array) -> Self:
+        """Return the polynomial with constants added to `ab` [3, 2, ..] and to the scalars [S]."""
+        exponents, more = self.exponents, [ab[..., None], scalars[:, None]]
+        constant = (exponents == 0).all(1)
+        if constant.any():
+            both = (old + new * constant for old, new in zip((self.ab, self.scalars), more, strict=True))
+        else:
+            exponents = np.concatenate([exponents, np.zeros((1, exponents.shape[1]), np.int64)])
+            both = (np.concatenate(pair, -1) for pair in zip((self.ab, self.scalars), more, strict=True))
+        return replace(self, exponents=exponents, **dict(zip(("ab", "scalars"), both, strict=True)))  # type: ignore[type-var]
+
     def keep(self, scalars: Sequence[int]) -> Self:
         return replace(self, scalars=self.scalars[list(scalars)])  # type: ignore[type-var]
 
@@ -269,19 +280,6 @@ class InvariantPolynomial(_Symmetric):
     ab: Array
     scalars: Array
     _forms = ROUND
-
-    def plus(self, ab: Array, scalars: Array) -> InvariantPolynomial:
-        """Return the core with constants [3, 2] and [S] added."""
-        constant = (self.exponents == 0).all(1)
-        if constant.any():
-            return replace(
-                self, ab=self.ab + ab[..., None] * constant, scalars=self.scalars + scalars[:, None] * constant
-            )
-        return InvariantPolynomial(
-            np.concatenate([self.exponents, np.zeros((1, 4), np.int64)]),
-            np.concatenate([self.ab, ab[..., None]], 2),
-            np.concatenate([self.scalars, scalars[:, None]], 1),
-        )
 
     @cached_property
     def coefficients_per_vector(self) -> int:
@@ -403,15 +401,16 @@ class Residual(Composite):
     The polynomial takes the bulk, which is smooth and of low degree, the network the fine structure of every output.
     """
 
-    parts: tuple[InvariantPolynomial, Network]
+    parts: tuple[InvariantPolynomial | MirrorPolynomial, Network]
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         polynomial, network = self.parts
         # The network's last bias joins the polynomial's constant, so that its last product adds the two.
-        weight, bias = network.output
-        whole = polynomial.plus(bias[:6].reshape(3, 2), bias[6:])
+        (weight, bias), n = network.output, network.ab_rows
+        vectors = bias[:n].reshape(3, n // 6, 2).swapaxes(1, 2)  # A and B, each of x and y where these differ
+        whole = polynomial.plus(vectors.reshape(polynomial.ab.shape[:-1]), bias[n:])
         network = replace(network, output=(weight, np.zeros_like(bias)))
-        return symmetric(network.rows(g, field, units, whole.rows(g, field, units)), field, len(bias) - 6)
+        return symmetric(network.rows(g, field, units, whole.rows(g, field, units)), field, len(bias) - n)
 
 
 @stored_as("refracted")
