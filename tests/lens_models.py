@@ -27,7 +27,7 @@ from neurolens.models.source import at_wavelength
 from neurolens.models.targets import TRANSMITTANCE_TERMS
 from neurolens.models.transmittance import refitted, with_transmittance
 from neurolens.optics.lens import designs, paraxial
-from neurolens.optics.lens.prescription import Coating, Lens, Surface
+from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
@@ -57,17 +57,9 @@ def lens(name: str = GAUSS) -> Lens:
 
 
 @cache
-def coated(design: str = "multi-layer") -> Lens:
-    """The double Gauss with a coating on each surface between glass and air."""
-    bare = lens()
-    pairs = zip(bare.media, bare.surfaces, strict=False)
-    sides = [(float(m.n_d), float(s.n_d)) for m, s in pairs]
-    coatings = [designs.design(design, *n) if n[0] != n[1] and 1.0 in n else None for n in sides]
-    return replace(bare, surfaces=tuple(map(_coated, bare.surfaces, coatings)))
-
-
-def _coated(surface: Surface, coating: Coating | None) -> Surface:
-    return replace(surface, coating=coating)
+def coated() -> Lens:
+    """The double Gauss with seven films on each surface between glass and air."""
+    return designs.coated(lens(), "multi-layer")
 
 
 @cache

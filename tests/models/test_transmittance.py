@@ -88,6 +88,7 @@ def test_files_are_fitted_again_with_their_cards(tmp_path: Path) -> None:
     errors = refit_transmittance(lens_models.exported("invariants"), lens, file)
     card, bare = read_card(file), read_card(lens_models.exported("invariants"))
     assert card["lens"]["sha256"] == lens.sha256 != bare["lens"]["sha256"]
+    assert (card["lens"]["coatings"], bare["lens"]["coatings"]) == ("multi-layer", "bare")
     assert card["errors"] == {"rms_um": 1.0} | {k: errors[k] for k in ("transmittance_rms", "transmittance_max")}
     assert {k: card[k] for k in ("domain", "gates", "units")} == {k: bare[k] for k in ("domain", "gates", "units")}
     assert read_model(file).nodes[0].lens.surfaces == lens.surfaces
