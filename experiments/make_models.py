@@ -345,7 +345,8 @@ def transmittance_mark(lens: Lens) -> str:
     light = np.linspace(*LIGHT_NM, 7)
     absorbed = [absorption_of(surface, light) for surface in lens.surfaces]
     glass = [None if a is None else np.round(np.broadcast_to(a, light.shape), 9).tolist() for a in absorbed]
-    return fingerprint_of([lens.sha256, glass, TRANSMITTANCE_TERMS])
+    films = [s.coating and s.coating.layers for s in lens.surfaces]  # those that are assumed, too
+    return fingerprint_of([lens.sha256, films, glass, TRANSMITTANCE_TERMS])
 
 
 def refit(entries: Sequence[Entry], library: Library, out: Path, progress: Progress, *, again: bool) -> list[str]:
