@@ -40,7 +40,8 @@ FINE, TRANSMITTANCE_ERROR, _CHEAP = 8e-5, 4e-4, 24
 _DEGREE, _BESIDE_W, _MOST_W = {3: 5, 6: 4}, 2, 10
 _CHOICE_RAYS, _PASSES = 8000, 3
 _BEYOND_LIGHT = 0.3  # weight of rays outside `LIGHT_NM`, where films reflect most and pictures have hardly any light
-_RAYS, _FEWEST_RAYS = 12_000, 2000  # that a refit traces in all, and at least of each node
+# Rays of a refit: in all, at least of each node, and traced at a time, for few more are needed than pass.
+_RAYS, _FEWEST_RAYS, BATCH = 8000, 2000, 5000
 
 Polynomial = InvariantPolynomial | MirrorPolynomial
 Sample = tuple[FilmRays, Tensor]  # rays that pass, and the transmittance [N] of the exact lens
@@ -65,7 +66,7 @@ def refitted(models: Sequence[LensModel], lenses: Sequence[Lens], most: int) -> 
     samples, found = [], []
     for model, lens in zip(models, lenses, strict=True):
         seed = int(model.settings.get("rays_seed") or 0)
-        passing = passing_rays(lens, model.domain, max(_RAYS // len(models), _FEWEST_RAYS), seed)
+        passing = passing_rays(lens, model.domain, max(_RAYS // len(models), _FEWEST_RAYS), seed, batch=BATCH)
         samples.append((passing.inputs, passing.transmittance))
         found.append(replace(model, lens=lens, settings={**model.settings, "transmittance_terms": most}))
     return with_transmittance(found, samples, most)

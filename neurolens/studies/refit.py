@@ -15,12 +15,12 @@ from neurolens.models.fit import StateModel, StateSpace
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import passing_rays
 from neurolens.models.targets import TRANSMITTANCE_TERMS
-from neurolens.models.transmittance import refitted
+from neurolens.models.transmittance import BATCH, refitted
 from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.check import random_states
 from neurolens.studies.measure import FRESH
 
-_RAYS, _STATES = 12_000, 4  # fresh rays of a state on which errors are measured, and states
+_RAYS, _STATES = 6000, 4  # fresh rays of a state on which errors are measured, and states
 
 
 def refit_transmittance(file: Path, lens: Lens | StateSpace, out: Path | None = None) -> dict[str, Any]:
@@ -58,7 +58,8 @@ def transmittance_errors(models: Sequence[LensModel]) -> dict[str, float]:
     """Return the errors of the transmittance on rays that no fit has seen: RMS and largest, of models the worst."""
     rows = []
     for model in as_stored(models):
-        fresh = passing_rays(model.lens, model.domain, _RAYS, int(model.settings.get("rays_seed") or 0) + FRESH)
+        seed = int(model.settings.get("rays_seed") or 0) + FRESH
+        fresh = passing_rays(model.lens, model.domain, _RAYS, seed, batch=BATCH)
         with torch.no_grad():
             found = model.predict(fresh.inputs.to(torch.float32)).transmittance.double()
         off = (found - fresh.transmittance).abs()
