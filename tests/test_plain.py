@@ -73,6 +73,11 @@ PLAIN: dict[str, tuple[str, str, str]] = {
         f"{FULL}, --output laikin_double_gauss_50_ols-36-handover",
         "laikin_double_gauss_50_ols-36-handover/README.md",
     ),
+    "psf": (
+        f"{LENS} --grid 1x1",
+        f"{TRIPLET}, --output {LENS}-psf.npz, --pixel-um 4.15",
+        f"{LENS}-psf.npz",
+    ),
     "rays": (
         f"{MODEL} --samples 1",
         f"{FULL}, --output laikin_double_gauss_50_ols-36-rays.npz, --width 480",
