@@ -184,6 +184,8 @@ known.
 
 - **Errors** are those of held-out rays (`neurolens.studies.rays`), in micrometres at an image radius of 21.6 mm.
   Every card was checked on fresh rays. `neurolens evaluate models/FILE` checks a model again.
+- **T RMS** is the error of the transmittance of the coated lens, whose coatings the card names. `--transmittance`
+  fits it again where coatings or glass are others now.
 - **Times** are ns a ray on one core, in onnxruntime and as C compiled here, with stop, rims and transmittance. "–"
   was not timed. The other times are of earlier models with as many coefficients, which were fitted before glasses of
   two figures had a partial dispersion. `--times` takes them again.
