@@ -66,7 +66,7 @@ def test_the_wheel_of_the_source_distribution_renders_the_first_picture_of_the_r
     away.mkdir()
 
     def python(code: str, cwd: Path, *path: Path) -> str:
-        env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path)), "PYTHONPYCACHEPREFIX": str(tmp_path)}
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path)), "PYTHONDONTWRITEBYTECODE": "1"}
         done = subprocess.run(
             [sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, env=env, check=False
         )
@@ -79,8 +79,8 @@ def test_the_wheel_of_the_source_distribution_renders_the_first_picture_of_the_r
     (unpacked,) = (tmp_path / "unpacked").iterdir()
     assert not (unpacked / "tests").exists() and (unpacked / "CITATION.cff").exists()
     wheel = python(build.format("wheel", str(tmp_path)), unpacked).splitlines()[-1]
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", str(parts)]
-    subprocess.run([*pip, str(tmp_path / wheel)], check=True, capture_output=True)
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-compile", "--target", parts]
+    subprocess.run([*pip, tmp_path / wheel], check=True, capture_output=True)
     line = re.search(r"^    neurolens (render .*?)(?: +#.*)?$", (ROOT / "README.md").read_text(encoding="utf-8"), re.M)
     assert line is not None
     code = "import sys; sys.modules['torch'] = None; import neurolens; from neurolens.cli import main; "

@@ -116,7 +116,7 @@ def test_a_plate_with_layers_is_nearer_to_the_path_traced_lens(tmp_path: Path, p
     """Posts before a wall of lamps: nothing is made up with layers, and less of the light is missing."""
     camera = make_camera("thin", Shot((36.0, 20.25), 1.0, f_number=1.4, focal_length_mm=50.0))
     lens = "--camera", "thin", "--f-number", 1.4, "--focal-length", 50, "--film", FILM, "--width", 192
-    truth, _ = read_exr(render(posts, tmp_path / "lens.exr", *lens, "--samples", 128))
+    truth, _ = read_exr(render(posts, tmp_path / "lens.exr", *lens, "--samples", 64))
     path = render(posts, tmp_path / "plate.exr", *PLATE, "--focal-length", 50, "--behind", 1)
     error, light, lost, filled = [], [], [], []
     for layers in (1, 2):
