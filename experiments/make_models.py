@@ -21,6 +21,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments import lab
 from experiments.exact_race import exact_candidates
 from experiments.lab import Row
@@ -30,11 +32,13 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Progress
 from neurolens.base.records import versions
-from neurolens.base.settings import RANGE, read_config
+from neurolens.base.settings import LIGHT_NM, RANGE, read_config
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import NETWORKS, ModelSettings, prepare
 from neurolens.models.model import Domain
 from neurolens.models.pairs import PairSettings, make_pairs
+from neurolens.models.targets import TRANSMITTANCE_TERMS
+from neurolens.optics.lens.glass import absorption_of
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import lens_files
 from neurolens.optics.setting.pupils import image_radius_mm
@@ -42,6 +46,7 @@ from neurolens.studies.check import check_model, check_states
 from neurolens.studies.experiment import DomainChoice, Experiment, LensChoice, check_names
 from neurolens.studies.measure import Measured, fit_and_measure, shared_rays
 from neurolens.studies.rays import REFERENCE_RADIUS_MM
+from neurolens.studies.refit import refit_transmittance
 from neurolens.studies.speed import model_candidate, model_candidates, race
 from neurolens.studies.train import fit_and_measure_states, state_settings
 
@@ -179,6 +184,8 @@ known.
 
 - **Errors** are those of held-out rays (`neurolens.studies.rays`), in micrometres at an image radius of 21.6 mm.
   Every card was checked on fresh rays. `neurolens evaluate models/FILE` checks a model again.
+- **T RMS** is the error of the transmittance of the coated lens, whose coatings the card names. `--transmittance`
+  fits it again where coatings or glass are others now.
 - **Times** are ns a ray on one core, in onnxruntime and as C compiled here, with stop, rims and transmittance. "–"
   was not timed. The other times are of earlier models with as many coefficients, which were fitted before glasses of
   two figures had a partial dispersion. `--times` takes them again.
@@ -335,12 +342,52 @@ def _stands(entry: Entry, pairs: PairSettings, known: Sequence[Row], out: Path) 
         return False
 
 
+def transmittance_mark(lens: Lens) -> str:
+    """Hash of everything that decides the transmittance of a lens's models: coatings, glass, and how it is fitted."""
+    light = np.linspace(*LIGHT_NM, 7)
+    absorbed = [absorption_of(surface, light) for surface in lens.surfaces]
+    glass = [None if a is None else np.round(np.broadcast_to(a, light.shape), 9).tolist() for a in absorbed]
+    films = [s.coating and s.coating.layers for s in lens.surfaces]  # those that are assumed, too
+    return fingerprint_of([lens.sha256, films, glass, TRANSMITTANCE_TERMS])
+
+
+def refit(entries: Sequence[Entry], library: Library, out: Path, progress: Progress, *, again: bool) -> list[str]:
+    """Fit the transmittance of the models that are there again, where the lens has other coatings or glass now.
+
+    Returns: models that cannot be fitted so, as sentences.
+    """
+    failed = []
+    progress.plan({f"{entry.state}: transmittance": 4.0 for entry in entries})
+    for entry in entries:
+        rows, left_out = _known(out)
+        mine, lens = [row for row in rows if row["entry"] == entry.state], entry.lens.read()
+        mark = transmittance_mark(lens)
+        with warnings.catch_warnings(), progress.stage(f"{entry.state}: transmittance"):
+            warnings.simplefilter("ignore", NeurolensWarning)
+            for row in (row for row in mine if again or row.get("transmittance") != mark):
+                file = out / row["file"]
+                try:
+                    found = refit_transmittance(file, _experiment(entry, library).states() if "axes" in row else lens)
+                except NeurolensError as error:
+                    failed.append(f"{row['file']}: to be made again: {error}")
+                    continue
+                row |= {key: found[key] for key in ("transmittance_rms", "parameters")}
+                row |= {"sha256": sha256_of(file), "bytes": file.stat().st_size, "transmittance": mark}
+        _keep(rows, left_out, library, out)
+    return failed
+
+
+def _experiment(entry: Entry, library: Library) -> Experiment:
+    return Experiment(entry.state, entry.lens, entry.models, entry.domain, library.pairs)
+
+
 def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[Row]:
     """Fit, check and time the models of one lens; writes their files and returns their rows of the index."""
     make = _make_of_many_states if entry.lens.many_states else _make_of_one_state
     lens_file = Path(os.path.relpath(entry.lens.file.resolve(), lab.ROOT.resolve())).as_posix()
     mark = fingerprint(entry, library.pairs)
     common = {"entry": entry.state, "fingerprint": mark, "lens_file": lens_file}
+    common["transmittance"] = transmittance_mark(entry.lens.read())
     return [{**row, **common} for row in make(entry, library, out, progress)]
 
 
@@ -454,8 +501,7 @@ _CHECKED = 4  # states at which a card is checked on fresh rays
 
 def _make_of_many_states(entry: Entry, library: Library, out: Path, progress: Progress) -> list[Row]:
     """The rows of models of many states, whose figures are the worst over random states."""
-    experiment = Experiment(entry.state, entry.lens, entry.models, entry.domain, library.pairs)
-    rows = []
+    experiment, rows = _experiment(entry, library), []
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
         warnings.simplefilter("ignore", NeurolensWarning)
         space = experiment.states()
@@ -502,6 +548,11 @@ OPTIONS = (
     lab.option("--list", metavar="FILE", type=Path, default=_LIST, help="list (default: experiments/models.toml)"),
     lab.option("--restart", old=("--again",), action="store_true", help="make the chosen entries again"),
     lab.option("--untimed", action="store_true", help="models keep the times of those of their name before"),
+    lab.option(
+        "--transmittance",
+        action="store_true",
+        help="only fit the transmittance again, after coatings or glass",
+    ),
     lab.option("--times", action="store_true", help="only time the models that are there (on a quiet machine)"),
     lab.out(lab.MODELS, "folder"),
 )
@@ -513,7 +564,9 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     entries = chosen(library, args.lenses)
     progress = Progress(quiet=args.quiet)
-    if args.times:
+    if args.transmittance:
+        failed = refit(entries, library, args.out, progress, again=args.restart)
+    elif args.times:
         failed = time_models(library, entries, args.out, progress)
     else:
         failed = make_models(library, entries, args.out, progress, again=args.restart)

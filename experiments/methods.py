@@ -45,7 +45,7 @@ POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no elimination": {"elimination": False},
     "no replacement": {"replacement": False},
     "position at its first-order weight": {"position_weight": 1.0},
-    "no terms for transmittance": {"transmittance_terms": 0},
+    "transmittance of 8 terms": {"transmittance_terms": 8},
     "forward selection alone": {"planes": False, "growth": 0, "elimination": False, "replacement": False},
     "matching pursuit": {"method": "omp"},
 }

@@ -24,7 +24,9 @@ from neurolens.models.model import Domain, LensModel
 from neurolens.models.network import fit_network
 from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.source import at_wavelength
-from neurolens.optics.lens import paraxial
+from neurolens.models.targets import TRANSMITTANCE_TERMS
+from neurolens.models.transmittance import refitted, with_transmittance
+from neurolens.optics.lens import designs, paraxial
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
@@ -52,6 +54,12 @@ _FITS = {
 @cache
 def lens(name: str = GAUSS) -> Lens:
     return set_lens(read_lens(LENSES / f"{name}.toml"), focal_length_mm=14.0 if "muller" in name else None)
+
+
+@cache
+def coated() -> Lens:
+    """The double Gauss with seven films on each surface between glass and air."""
+    return designs.coated(lens(), "multi-layer")
 
 
 @cache
@@ -113,13 +121,17 @@ def model(kind: str) -> LensModel:
 
     `KINDS` (each kind of core, first order, a fisheye whose rays graze its front), `GATED`, `PUBLISHED` (after which
     " fisheye" takes that lens), or "residual" network, "laser" (one wavelength), "colourless" (a fisheye
-    without known dispersion), "cylinders", "cylinders network".
+    without known dispersion), "cylinders", "cylinders network"; "coated" or "coated network": those of the invariants
+    and "residual", whose transmittance is fitted again to the multi-coated lens.
     """
+    if kind.startswith("coated"):
+        return refitted([model("residual" if "network" in kind else "invariants")], [coated()], TRANSMITTANCE_TERMS)[0]
     if kind in ("fisheye", "colourless"):
         return fit_model(prepared(FISHEYE if kind == "fisheye" else COLOURLESS), _FITS["invariants"])
     if kind == "network":
         settings = ModelSettings("mlp", units=12, steps=4)
-        return as_model(prepared(), fit_network(prepared(), settings), settings, 0.0)
+        known, train = as_model(prepared(), fit_network(prepared(), settings), settings, 0.0), prepared().pairs.train
+        return with_transmittance([known], [(train.inputs, train.transmittance)], 12)[0]
     if kind == "laser":
         return at_wavelength(model("invariants"), 550.0)
     if kind.startswith("cylinders"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -66,7 +67,7 @@ examples:
         shot = standards.Handed(
             standard_attributes(frames[0].camera.settings), __version__, (self.fps.numerator, self.fps.denominator),
             tuple(standards.Pinhole.of(f.number, f.fields[""], f.camera.settings, f.focus_m) for f in frames), plates,
-            tuple(name for name in frames[0].fields if name), str(frames[0].camera.settings.get("coatings", "")),
+            tuple(name for name in frames[0].fields if name), _coatings(frames[0].camera.settings),
         )  # fmt: skip
         writer = _Writer(self, frames, shot)
         files = self.maps(frames, plates, progress, self.out / "shot") + writer.files(data, progress)
@@ -205,6 +206,12 @@ class _Writer:
                 self._worse("lensfun_share", entry.light_share)
                 report(len(found) / len(chosen))
         return found
+
+
+def _coatings(settings: Mapping[str, Any]) -> str:
+    """Return the coatings of a camera's lens, as `Lens.coatings`; "" where the camera states none."""
+    card = settings.get("card") or {}
+    return str(settings.get("coatings") or card.get("lens", {}).get("coatings", ""))
 
 
 def _rate(text: str) -> Fraction:

@@ -269,6 +269,9 @@ def _light(data: dict[str, Any]) -> str:
         ("T-stop", "-" if data["t_stop"] is None else f"T{cli.number(data['t_stop'])}", "of the axial ray, d line"),
         ("coatings", data["coatings"] or "-", "of the surfaces between glass and air"),
     ]
+    if glasses := dict.fromkeys(s["absorbs_as"] for s in data["surfaces"] if s["absorbs_as"]):
+        names = ", ".join(name.partition(":")[2] for name in glasses)
+        rows.append(("absorption", "assumed", f"that of the nearest catalogue glasses: {names}"))
     if data["white_rb"]:
         red, blue = data["white_rb"]
         rows.append(("white card", f"R/G {red:.3f}, B/G {blue:.3f}", "on the axis, in daylight D65"))
@@ -298,7 +301,7 @@ def _surface_words(row: dict[str, Any]) -> str:
     """Properties of a row of `studies.describe.glass_table` besides radius and glass; empty for a sphere."""
     words = [
         row["figure"],
-        f"coating {row['coating']['name']}" if row["coating"] else "",
+        f"coating {row['coating']['name']}" if row["coating"] and row["coating"]["origin"] != "assumed" else "",
         f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
     ]
     return ", ".join(word for word in words if word)

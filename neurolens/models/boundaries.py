@@ -1,8 +1,7 @@
-"""Fits of the stop crossing, the transmittance and the gates, which follow those of position and direction.
+"""Fits of the stop crossing and the gates, which follow those of position and direction.
 
 Polynomials use the terms that position and direction have anyway, networks their last hidden layer. Both get more terms
-where the boundaries or the transmittance need them: absorption and coatings change with the wavelength faster than any
-ray's path does, and near grazing rays faster with the ray.
+where the boundaries need them. The transmittance is fitted afterwards (`models.transmittance`).
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from neurolens.models.terms import (
     further,
     invariant_exponents,
     monomials,
-    powers,
     solve,
     vector_columns,
 )
@@ -33,18 +31,14 @@ from neurolens.models.terms import (
 GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that squared error to which a grown polynomial may be held for the stop crossing
 MOST_BOUNDARY_TERMS = 64
-# Polynomials drop terms of a boundary or of the transmittance while it errs by less than this share of those errors, or
-# by at most `_NEARLY` times as much as with all terms. At a quarter hardly more rays were clipped wrongly than with all
-# terms. Networks clipped more, and keep all. For the transmittance, which decides nothing, a larger share is enough.
-NEEDED_SHARE, _NEARLY, _THROUGH_SHARE = 0.25, 1.2, 0.6
+# Polynomials drop terms of a boundary while it errs by less than this share of those errors, or by at most `_NEARLY`
+# times as much as with all terms. At a quarter hardly more rays were clipped wrongly than with all terms. Networks
+# clipped more, and keep all.
+NEEDED_SHARE, _NEARLY = 0.25, 1.2
 # Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
 _RAYS = 12_000  # on which they are found
-TRANSMITTANCE_ERROR = 2.5e-4  # RMS at which no term is added
-_TRANSMITTANCE_RAYS = 6000
-_TRANSMITTANCE_DEGREE, _MOST_W = 7, 8  # of the candidates
-_LEAST_GAIN = 0.03  # a term must take away this share of the squared error left
 # A far ray that passes all fitted gates is added to the fit of one gate: with its own value there, kept between these
 # two, or with the first where that is not known. Its weight doubles while it still passes, from the first to the last.
 _TARGET, _MOST_TARGET = 0.1, 1.0
@@ -104,18 +98,14 @@ def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
     rows = vector_columns(features(data.boundary_field), data.boundary_field)
     found = rows.new_zeros(len(rows))
     found[stop] = solve(rows[stop], crossing.reshape(1, -1), weight.repeat(2))[0]
-    rays = data.pairs.train
-    seen, wanted = features(data.encoding(rays.inputs)), rays.transmittance[None]
-    scale = (NEEDED_SHARE / (_THROUGH_SHARE * TRANSMITTANCE_ERROR)) ** 2 / len(rays)
-    through = _BoundaryFit(Sweep.of_columns(seen, wanted), len(seen), scale, len(seen))
-    return found, solve_scalars(data, features, [through.needed(), *gates])
+    return found, solve_scalars(data, features, gates)
 
 
 def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] | None = None) -> Tensor:
     """Fit [1 + G, M]: the transmittance to passing rays, each gate to those that reach it, most to those it decides.
 
     Args:
-        kept: the features that the transmittance and each gate may use; None: all.
+        kept: the features that each gate may use; None: all.
 
     Raises:
         InputError: there are no more rays near the boundaries than terms.
@@ -124,13 +114,10 @@ def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] 
     train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
     if len(data.boundary) <= len(train):
         raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
-    through, *gates = kept or [list(range(len(train)))]
     values = gate_values(pairs.lens, data.gates, data.boundary)
-    fit = GateFit(near, values, data.boundary_weights[0], gates if kept else None)
+    fit = GateFit(near, values, data.boundary_weights[0], kept)
     fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
-    transmittance = torch.zeros((1, len(train)), dtype=torch.float64)
-    transmittance[:, through] = solve(train[through], pairs.train.transmittance[None])
-    return torch.cat([transmittance, fit.coefficients()])
+    return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
 
 
 def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidden: Features | None = None) -> Exponents:
@@ -157,27 +144,6 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidde
     start, features = fits[0].terms, features_of(np.concatenate([exponents, added]), hidden)
     fits = _boundary_fits(data, features, start, bad, share)
     return added[[k - start for k in _selected(fits, min(most, len(added)), allowed)]]
-
-
-def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Exponents:
-    """Choose at most `most` further exponents [K, 4] by forward selection beside the given [M, 4]; often none."""
-    rays = data.pairs.train.select(slice(0, _TRANSMITTANCE_RAYS))
-    if most == 0 or len(rays) < 2 * (len(exponents) + most):
-        return exponents[:0]
-    invariants, wanted = data.encoding(rays.inputs).invariants(), rays.transmittance[None]
-    features = monomials(invariants, exponents)
-    left = wanted - solve(features, wanted) @ features
-    allowed = TRANSMITTANCE_ERROR**2 * len(rays)
-    if not float((left**2).sum()) > allowed:
-        return exponents[:0]
-    candidates = invariant_exponents(_TRANSMITTANCE_DEGREE, dispersive=data.encoding.dispersive)
-    if data.encoding.dispersive:  # absorption: high powers of w, with low ones of the others
-        colours = np.array([(*p, w) for w in range(1, _MOST_W + 1) for p in powers(3, 1)], dtype=np.int64)
-        candidates = np.unique(np.concatenate([candidates, colours]), axis=0)
-    added, start = further(candidates, exponents), len(exponents)
-    features = monomials(invariants, np.concatenate([exponents, added]))
-    fit = _BoundaryFit(Sweep.of_columns(features, wanted), len(features), 1 / allowed, start)
-    return added[[k - start for k in _selected([fit], most, 1.0, _LEAST_GAIN) if k >= start]]
 
 
 class _BoundaryFit:
@@ -217,13 +183,13 @@ def needed_for(sweep: Sweep, error: float) -> list[int]:
     return _BoundaryFit(sweep, terms, NEEDED_SHARE**2 / max(error, 1e-300), terms).needed()
 
 
-def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: float = 0.0) -> list[int]:
-    """Select terms forwards until no fit errs by more than allowed, or no term removes `least_gain` of the errors."""
+def _selected(fits: list[_BoundaryFit], most: int, allowed: float) -> list[int]:
+    """Select terms forwards until no fit errs by more than allowed, or no term helps."""
     chosen: list[int] = []
     while fits and len(chosen) < most:
         scores = np.sum([fit.scores() for fit in fits], axis=0)
         best = int(np.argmax(scores))
-        if not scores[best] > least_gain * sum(fit.error for fit in fits):
+        if not scores[best] > 0:
             break
         chosen.append(best)
         for fit in fits:

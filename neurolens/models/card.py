@@ -220,6 +220,7 @@ _NODE_RULES = {**_LENS_AND_DOMAIN, "lens.infinity_film_z_mm": _NUMBER, "lens.fil
 _OPTIONAL: dict[str, Rule] = {
     "lens.stop_surface": (lambda v: _is_integer(v, 0, 9999), "an integer"),
     "lens.index_ratio": _POSITIVE,
+    "lens.coatings": _TEXT,
     "domain.nearest_m": (lambda v: v is None or _is_positive(v), "a number above 0, or null"),
     "errors.poor": (lambda v: _is_list(v, lambda t: isinstance(t, str)), "a list of texts"),
     "fit.settings.rays_seed": (

@@ -206,13 +206,17 @@ class Core:
         return g
 
 
-def symmetric(rows: Value, field: Field, scalars: int) -> CoreValues:
-    """Make vectors A p + B u and scalars of rows: A of each vector, B of each (with mirrors of x, then y), scalars."""
+def symmetric(rows: Value, field: Field, scalars: int, light: Value | None = None) -> CoreValues:
+    """Make vectors A p + B u and scalars of rows: A of each vector, B of each (with mirrors of x, then y), scalars.
+
+    `light` is what else belongs to the transmittance.
+    """
     g, wide = rows.graph, (rows.rows - scalars) // 6
     *ab, transmittance, gates = g.split(rows, [wide] * 6 + [1, scalars - 1])
     p, u = field.p, field.u
     vectors = tuple(a * p + b * u for a, b in zip(ab[:3], ab[3:], strict=True))
-    return CoreValues(vectors, transmittance, gates if scalars > 1 else None)  # type: ignore[arg-type]
+    through = transmittance if light is None else transmittance + light
+    return CoreValues(vectors, through, gates if scalars > 1 else None)  # type: ignore[arg-type]
 
 
 class _Symmetric(Core):
@@ -234,6 +238,17 @@ class _Symmetric(Core):
         merge[np.arange(len(rest)), place.reshape(-1)] = w ** self.exponents[:, -1].astype(float)
         return replace(self, exponents=unique, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
 
+    def plus(self, ab: Array, scalars: Array) -> Self:
+        """Return the polynomial with constants added to `ab` [3, 2, ..] and to the scalars [S]."""
+        exponents, more = self.exponents, [ab[..., None], scalars[:, None]]
+        constant = (exponents == 0).all(1)
+        if constant.any():
+            both = (old + new * constant for old, new in zip((self.ab, self.scalars), more, strict=True))
+        else:
+            exponents = np.concatenate([exponents, np.zeros((1, exponents.shape[1]), np.int64)])
+            both = (np.concatenate(pair, -1) for pair in zip((self.ab, self.scalars), more, strict=True))
+        return replace(self, exponents=exponents, **dict(zip(("ab", "scalars"), both, strict=True)))  # type: ignore[type-var]
+
     def keep(self, scalars: Sequence[int]) -> Self:
         return replace(self, scalars=self.scalars[list(scalars)])  # type: ignore[type-var]
 
@@ -242,16 +257,42 @@ class _Symmetric(Core):
         return int((self.ab != 0).sum() + (self.scalars != 0).sum())
 
     def rows(self, g: Graph, field: Field, units: Units) -> Value:
-        """Return rows A of the three vectors, B of them, scalars; terms in w are left out where it is 0."""
+        """Return rows A of the three vectors, B of them, scalars without `light`; no terms in w where it is 0."""
         ab = self.ab * np.array(units.vectors).reshape(3, *[1] * (self.ab.ndim - 1))
         scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
         a, b = (ab[:, k].reshape(-1, len(self.exponents)) for k in (0, 1))
         x, weight = field.products(self._forms), np.concatenate([a, b, scalars])
-        used = np.ones(len(self.exponents), bool) if field.dispersive else self.exponents[:, -1] == 0
+        used = ~self._coloured if field.dispersive else self.exponents[:, -1] == 0
         return g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
 
+    @cached_property
+    def serves(self) -> NDArray[np.bool_]:
+        """Return which terms [M] serve another output than the transmittance."""
+        ab = (self.ab != 0).any(axis=tuple(range(self.ab.ndim - 1)))
+        return np.asarray(ab | (self.scalars[1:] != 0).any(0))
+
+    @property
+    def _coloured(self) -> NDArray[np.bool_]:
+        return ~self.serves & (self.exponents[:, -1] > 0)
+
+    def light(self, g: Graph, field: Field) -> Value | None:
+        """Return the part of the transmittance whose terms in w nothing else has; None without any.
+
+        It is written by Horner's scheme in w, whose coefficients are short polynomials in the ray: a power of w costs
+        one operation, and no product waits for the one before, as products of high degree would.
+        """
+        terms, powers = self.exponents[self._coloured], self.exponents[self._coloured, -1]
+        if not field.dispersive or not len(terms):
+            return None
+        exponents, place = np.unique(terms[:, :-1], axis=0, return_inverse=True)
+        weight = np.zeros((powers.max() + 1, len(exponents)))
+        weight[powers, place.reshape(-1)] = self.scalars[0, self._coloured]
+        x = field.products(self._forms)
+        rows, w = g.polynomial(exponents, weight, x[0 : x.rows - 1]), x[x.rows - 1]
+        return reduce(lambda total, k: total * w + rows[k], range(len(weight) - 2, -1, -1), rows[len(weight) - 1])
+
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        return symmetric(self.rows(g, field, units), field, len(self.scalars))
+        return symmetric(self.rows(g, field, units), field, len(self.scalars), self.light(g, field))
 
 
 @stored_as("invariants")
@@ -269,19 +310,6 @@ class InvariantPolynomial(_Symmetric):
     ab: Array
     scalars: Array
     _forms = ROUND
-
-    def plus(self, ab: Array, scalars: Array) -> InvariantPolynomial:
-        """Return the core with constants [3, 2] and [S] added."""
-        constant = (self.exponents == 0).all(1)
-        if constant.any():
-            return replace(
-                self, ab=self.ab + ab[..., None] * constant, scalars=self.scalars + scalars[:, None] * constant
-            )
-        return InvariantPolynomial(
-            np.concatenate([self.exponents, np.zeros((1, 4), np.int64)]),
-            np.concatenate([self.ab, ab[..., None]], 2),
-            np.concatenate([self.scalars, scalars[:, None]], 1),
-        )
 
     @cached_property
     def coefficients_per_vector(self) -> int:
@@ -403,15 +431,17 @@ class Residual(Composite):
     The polynomial takes the bulk, which is smooth and of low degree, the network the fine structure of every output.
     """
 
-    parts: tuple[InvariantPolynomial, Network]
+    parts: tuple[InvariantPolynomial | MirrorPolynomial, Network]
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         polynomial, network = self.parts
         # The network's last bias joins the polynomial's constant, so that its last product adds the two.
-        weight, bias = network.output
-        whole = polynomial.plus(bias[:6].reshape(3, 2), bias[6:])
+        (weight, bias), n = network.output, network.ab_rows
+        vectors = bias[:n].reshape(3, n // 6, 2).swapaxes(1, 2)  # A and B, each of x and y where these differ
+        whole = polynomial.plus(vectors.reshape(polynomial.ab.shape[:-1]), bias[n:])
         network = replace(network, output=(weight, np.zeros_like(bias)))
-        return symmetric(network.rows(g, field, units, whole.rows(g, field, units)), field, len(bias) - 6)
+        rows = network.rows(g, field, units, whole.rows(g, field, units))
+        return symmetric(rows, field, len(bias) - n, whole.light(g, field))
 
 
 @stored_as("refracted")

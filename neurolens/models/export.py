@@ -234,6 +234,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "exit_pupil_z_mm": float(data.exit_pupil_z_mm) if math.isfinite(data.exit_pupil_z_mm) else "inf",
         "film_z_mm": near if lens.film_z_mm is None else min(max(float(lens.film_z_mm), near), far),
         "dispersive": lens.dispersive,
+        "coatings": lens.coatings,
         **({"believed_to_be": lens.believed_to_be} if lens.believed_to_be else {}),
         **({"measured": dict(lens.measured)} if lens.measured else {}),
         **({"licence": LENSFUN} if lens.measured or lens.rims == "photographs" else {}),

@@ -40,6 +40,7 @@ from neurolens.models.targets import (
     NETWORKS,
     PLANES_SEARCHED,
     POLYNOMIALS,
+    TRANSMITTANCE_TERMS,
     ModelSettings,
     Prepared,
     film_equivalent,
@@ -64,6 +65,7 @@ from neurolens.models.terms import (
     solve,
     vector_columns,
 )  # fmt: skip
+from neurolens.models.transmittance import with_transmittance
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.focusing import film_range_mm, focused_inside, infinity_states, nearest_focus_m
@@ -100,6 +102,9 @@ def fit_model(
             core = Refracted((core,), index_series(pairs.lens, encoding))
     fit_s = max(time.perf_counter() - start, training_s(checkpoint))
     model = as_model(replace(prepared, encoding=encoding), core, settings, fit_s)
+    if settings.family != "paraxial":
+        sample = (pairs.train.inputs, pairs.train.transmittance)
+        model = with_transmittance([model], [sample], settings.transmittance_terms)[0]
     return without_idle_gates((model,), settings.idle_gates)[0] if settings.idle_gates else model
 
 
@@ -367,6 +372,7 @@ class StateSettings:
     rays: int = 20_000
     seed: int = 1
     name: str = ""
+    transmittance_terms: int = TRANSMITTANCE_TERMS
 
     @property
     def label(self) -> str:
@@ -407,7 +413,7 @@ def fit_states(
         chosen = {k: replace(d, encoding=_scaled_like(scales, d.encoding)) for k, d in chosen.items()}
         stop_mm = max(d.pairs.lens.stop_radius_mm for d in chosen.values())
         exponents, columns = _choose_jointly(list(chosen.values()), settings)
-        nodes = []
+        nodes, samples = [], []
         for k, state in enumerate(states):
             if k in chosen:
                 data = replace(chosen.pop(k), gates=gates)
@@ -415,7 +421,9 @@ def fit_states(
                 pairs = _pairs(space, state, settings)
                 data = Prepared(pairs, _scaled_like(scales, fit_encoding(pairs.domain, pairs.train)), gates)
             nodes.append(_fit_node(data, exponents, columns, stop_mm, settings))
+            samples.append((data.pairs.train.inputs, data.pairs.train.transmittance))
             progress(0.4 + 0.6 * (k + 1) / len(states))
+        nodes = with_transmittance(nodes, samples, settings.transmittance_terms)
     return StateModel(space, tuple(nodes), time.perf_counter() - start)
 
 

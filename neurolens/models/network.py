@@ -45,9 +45,9 @@ from neurolens.models.targets import (
 from neurolens.models.terms import pinned_threads
 
 # What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop; and, for each mm of
-# the film radius, for a transmittance of 1 and for a gate of 1 (about half a rim's radius). They only decide which
-# features the hidden layers learn: the last layer is solved for each output by itself.
-_STOP_UM_PER_MM, _TRANSMITTANCE_UM, _GATE_UM = 30.0, 20.0, 10.0
+# the film radius, for a gate of 1 (about half a rim's radius). They only decide which features the hidden layers learn:
+# the last layer is solved for each output by itself. The transmittance, which has terms of its own, weighs nothing.
+_STOP_UM_PER_MM, _GATE_UM = 30.0, 10.0
 # Training ends at an RMS of this share of the film radius: float32 itself, which evaluates the model, has eps 1.2e-7.
 _ENOUGH = 1e-7
 FEWEST_RAYS, _RAYS = 2000, 16_000
@@ -76,8 +76,8 @@ def fit_network(
 ) -> Network:
     """Fit a network of `layers` tanh layers of `units` units, in float64 on one thread.
 
-    Position and direction weigh by their film-equivalent error; the stop crossing, the transmittance and the gates
-    weigh little beside them. Several random starts are tried, and the best goes on.
+    Position and direction weigh by their film-equivalent error; the stop crossing and the gates weigh little beside
+    them, and the transmittance is left to `models.transmittance`. Several random starts are tried; the best goes on.
 
     Args:
         data: half the rays come from `pairs.train`, half from those near the boundaries and beyond (`boundary`).
@@ -158,7 +158,7 @@ def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> t
     weights[STOP] = _STOP_UM_PER_MM * lens.stop_radius_mm * stop_weights
     vectors, scalars = targets.vectors, torch.cat([targets.transmittance[None], gate])
     size = domain.film_radius_mm
-    scalar_weights = torch.cat([_TRANSMITTANCE_UM * size * passes[None], _GATE_UM * size * gate_weights])
+    scalar_weights = torch.cat([torch.zeros_like(passes)[None], _GATE_UM * size * gate_weights])
     field = targets.field
     if base is not None:
         fitted, fitted_scalars = base(field)

@@ -411,15 +411,17 @@ def make_pairs(
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))
 
 
-def _batches(lens: Lens, domain: Domain, seed: int, first: int) -> Iterator[tuple[PairSet, Tensor, float]]:
+def _batches(
+    lens: Lens, domain: Domain, seed: int, first: int, size: int = _BATCH
+) -> Iterator[tuple[PairSet, Tensor, float]]:
     """Trace a domain from the ray of the number `first` on: batches, which of their rays pass, how many rays of the
     domain each stands for."""
     drawn = found = 0
     while drawn <= 10000 * (found + 10):
-        inputs, stands_for = draw(domain, _BATCH, seed, first + drawn)
+        inputs, stands_for = draw(domain, size, seed, first + drawn)
         batch = trace_pairs(lens, inputs, domain.pupil_z_mm)
         order = torch.nonzero(batch.status == st.PASSED)[:, 0]
-        drawn, found = drawn + _BATCH, found + len(order)
+        drawn, found = drawn + size, found + len(order)
         yield batch, order, stands_for
         del batch
     raise InputError(lens.path, "domain", f"({drawn} rays, {found} passed)", "a domain that the lens can reach")
@@ -427,23 +429,23 @@ def _batches(lens: Lens, domain: Domain, seed: int, first: int) -> Iterator[tupl
 
 def passing_rays(
     lens: Lens, domain: Domain, count: int, seed: int, first: int = _BATCH,
-    report: Callable[[int], object] = lambda found: None,
+    report: Callable[[int], object] = lambda found: None, batch: int = _BATCH,
 ) -> PairSet:  # fmt: skip
     """So many rays of a domain that the lens passes, from the number `first` on; a fit takes those of the first batch.
 
-    `report` is told how many there are.
+    `report` is told how many there are. `batch`: rays that are traced at a time.
 
     Raises:
         InputError: fewer than one ray in 10,000 of the domain passes.
     """
     parts, found = list[PairSet](), 0
-    for batch, order, _ in _batches(lens, domain, seed, first):
-        parts.append(batch.select(order[: count - found]))
+    for traced, order, _ in _batches(lens, domain, seed, first, batch):
+        parts.append(traced.select(order[: count - found]))
         found += len(parts[-1])
         report(found)
         if found == count:
             break
-        del batch
+        del traced
     return join_pairs(parts)
 
 

@@ -1,8 +1,8 @@
 """Polynomial surrogates: dense, by matching pursuit, by orthogonal least squares with replacement; and first order.
 
 One choice of monomials serves position and direction, by the film-equivalent error in the nearest focused plane and at
-infinity. Orthogonal least squares then keeps for each the terms that it needs. The stop crossing, the transmittance and
-the gates are fitted on the monomials that are computed anyway.
+infinity. Orthogonal least squares then keeps for each the terms that it needs. The stop crossing and the gates are
+fitted on the monomials that are computed anyway.
 The thin and the thick lens that renderers use today have the same form: their rays follow the ideal (collinear) map of
 the prescription's focal length and principal planes; stop and rims are fitted as quadratic forms, which is what
 first-order rim crossings are. Lenses with cylinders, which have two planes of symmetry, are fitted axis by axis.
@@ -30,7 +30,6 @@ from neurolens.models.boundaries import (
     needed_for,
     solve_scalars,
     stop_crossing,
-    transmittance_terms,
 )
 from neurolens.models.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, LightField, MirrorPolynomial
 from neurolens.models.model import Encoding
@@ -113,7 +112,6 @@ def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     exponents, columns = kept(exponents, chosen)
     own = len(exponents)
     exponents = np.concatenate([exponents, boundary_terms(data, exponents, first)])
-    exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
     columns = [c if c < own else c - own + len(exponents) for c in columns]
     rows = vector_columns(monomials(train.field.invariants(), exponents), train.field)
     coefficients = rows.new_zeros((STOP, len(rows)))
@@ -366,8 +364,7 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
 
 
 def _scalar_terms(*, dispersive: bool) -> Exponents:
-    """Return terms for transmittance and gates: every invariant, and high powers of w, for glass that absorbs blue."""
+    """Return terms for gates: every invariant, with low powers of w."""
     units = np.eye(7, dtype=np.int64)
-    w = units[6]
-    plain = [w * k for k in range(8 if dispersive else 1)]
-    return np.array([*plain, *(e + w * k for e in units[:6] for k in range(3 if dispersive else 1))])
+    w, reach = units[6], range(3 if dispersive else 1)
+    return np.array([*(w * k for k in reach), *(e + w * k for e in units[:6] for k in reach)])

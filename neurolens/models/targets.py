@@ -184,6 +184,7 @@ NETWORKS = ("mlp", "ols+mlp")
 PLANES_SEARCHED = ("ols", "ols+mlp")
 # About 5000 candidate columns, whose Gram matrix takes 200 MB.
 _MOST_DEGREE = 16
+TRANSMITTANCE_TERMS = 48  # at most; seven of 12 coated lenses need fewer
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,7 @@ class ModelSettings:
     # From 2 on a few more rounds follow where directions still err.
     growth: int = setting(2, "rounds in which ols adds products of the chosen terms to the candidates", within=(0, 16))
     position_weight: float = setting(2.0, "weight of the position in the choice of terms, relative to first order")
-    transmittance_terms: int = setting(16, "most further terms where the transmittance needs them", within=(0, 200))
+    transmittance_terms: int = setting(TRANSMITTANCE_TERMS, "most terms of the transmittance", within=(1, 200))
     idle_gates: float = setting(0.0, "rims that alone block at most this share of the domain's rays are left out")
     planes: bool = setting(True, "whether methods of `PLANES_SEARCHED` search the planes of the light field")
     units: int = setting(16, "units of each layer of a network", within=(1, 512))

@@ -30,6 +30,7 @@ from neurolens.optics.analysis import layout
 from neurolens.optics.analysis.bundles import Filled
 from neurolens.optics.analysis.fields import Array, Scene
 from neurolens.optics.analysis.spots import spots, working_f_number
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.glass import glass_of
 from neurolens.optics.lens.paraxial import first_order, light_of
 from neurolens.optics.lens.prescription import Lens
@@ -117,15 +118,16 @@ def white_rb(lens: Lens) -> tuple[float, float] | None:
     return (float(red / green), float(blue / green)) if green > 0 else None
 
 
-_AS_FILED = ("diameter_mm", "material", "stop", "glass", "absorption_per_mm")
+_AS_FILED = ("diameter_mm", "material", "stop", "glass", "absorbs_as", "absorption_per_mm")
 _ROUND = {"conic": 0.0, "asphere": {}, "cylinder": None, "across": None, "focal_mm": None}
 
 
 def glass_table(lens: Lens) -> list[dict[str, Any]]:
     """Return the prescription row by row with all figures.
 
-    n_d and V_d are the catalogue's where a glass rules. asphere is {power: coefficient}; figure says in words what it
-    is. coating is None or {name, layers: [[index, thickness in nm, V_d if known], ...]}.
+    n_d and V_d are the catalogue's where a glass rules; absorbs_as names the glass whose absorption is assumed. asphere
+    is {power: coefficient}; figure says in words what it is. coating is None or {name, layers: [[index, thickness in
+    nm, V_d if known], ...], origin}.
     """
     rows = []
     for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True)):
@@ -136,8 +138,7 @@ def glass_table(lens: Lens) -> list[dict[str, Any]]:
         figure = s.figure.record()
         figure["asphere"] = {str(power): a for power, a in figure.get("asphere", ())}
         row |= _ROUND | figure | {"figure": s.figure.words()}
-        layers = s.coating and {"name": s.coating.name, "layers": [list(layer) for layer in s.coating.layers]}
-        rows.append(row | {"coating": layers})
+        rows.append(row | {"coating": s.coating and asdict(s.coating)})
     return rows
 
 
@@ -306,7 +307,7 @@ class Character(Report):
         softness_um: RMS radius of a white point on the axis at the best focus of a far light, in a picture of 43.2 mm
             across its corners.
         flare: light of all ghosts of two reflections on the film's plane, over that of the image, for a light at half
-            the field; glass without a coating in the file is bare.
+            the field; of bare glass, where the file states no coating, so that designs are compared.
     """
 
     cats_eye: float
@@ -335,7 +336,7 @@ def character(lens: Lens) -> tuple[Character, Discs]:
     Raises:
         InputError: the lens forms no image, or passes no light.
     """
-    scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
+    scene = Scene(set_lens(coated(lens, "stated"), focus_m=math.inf, focus_mode="best"))
     scene.require_power()
     edge = scene.edge.field_deg
     discs, radius = discs_of(lens, [share * edge for share in FIELDS]), scene.image_radius_mm

@@ -13,6 +13,7 @@ from experiments.promises import read_index
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress
+from neurolens.optics.lens.prescription import Lens
 
 QUIET = Progress(quiet=True)
 
@@ -96,3 +97,35 @@ def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     made["broken"].clear()
     assert make_models.make_models(library, library.entry, tmp_path, QUIET) == []
     assert json.loads((tmp_path / "index.json").read_text())["left_out"] == {}
+
+
+def test_models_are_fitted_again_where_coatings_or_glass_are_others(
+    tmp_path: Path, library: Library, made: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_models.make_models(library, library.entry, tmp_path, QUIET)
+    done = []
+
+    def refit_transmittance(file: Path, lens: Lens) -> dict[str, Any]:
+        if file.stem in made["broken"]:
+            raise InputError(lens.path, "surfaces", "(another)", "its own")
+        done.append(file.stem)
+        file.write_bytes(b"another model")
+        return {"transmittance_rms": 0.5, "parameters": 7}
+
+    def run() -> list[str]:
+        done.clear()
+        return make_models.refit(library.entry, library, tmp_path, QUIET, again=False)
+
+    monkeypatch.setattr(make_models, "refit_transmittance", refit_transmittance)
+    made["broken"]["one.ols-6"] = True
+    assert [line[:32] for line in run()] == ["one.ols-6.onnx: to be made again"]
+    made["broken"].clear()
+    assert run() == [] and done == ["one.ols-6"]
+    rows = {r["file"]: r for r in read_index(tmp_path)}
+    assert rows["two.ols-4.onnx"]["sha256"] == sha256_of(tmp_path / "two.ols-4.onnx")
+    assert {r["transmittance_rms"] for r in rows.values()} == {0.5} and rows["two.ols-4.onnx"]["rms_um"] == 2.0
+    for line in ('coating = "single-layer"', "absorption_per_mm = 0.001"):
+        file = tmp_path / "lenses" / "two.toml"
+        text = file.read_text()
+        file.write_text(text.replace("n_d = 1.62041", f"{line}, n_d = 1.62041", 1))
+        assert file.read_text() != text and run() == [] and done == ["two.ols-4", "two.ols-5"]

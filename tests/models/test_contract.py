@@ -34,10 +34,10 @@ CORES = lens_models.KINDS
 # Of a fisheye those whose forms differ for it: a dense and a sparse one, a series, cells.
 OF_FISHEYE = tuple(f"{method} fisheye" for method in ("hanika", "schrade", "taylor", "cells"))
 # Each kind of core, a fisheye whose rays graze its front, and lost rays; others and published methods in the whole run.
-MODELS = ("invariants", "network", "fisheye", "hemisphere", "residual")
+MODELS = ("invariants", "network", "fisheye", "hemisphere", "coated", "coated network")
 FORMS = [
     *((form, kind) for form in ("onnx", "c") for kind in MODELS),
-    *(("glsl", kind) for kind in lens_models.KINDS),
+    *(("glsl", kind) for kind in (*lens_models.KINDS, "coated network")),
     *(("torch", kind) for kind in (*lens_models.KINDS, "residual")),
     *(pytest.param(form, "cylinders", marks=pytest.mark.slow) for form in ("onnx", "c")),
 ]

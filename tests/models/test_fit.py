@@ -54,14 +54,14 @@ def _infinity(stem: str) -> Prepared:
 
 
 def test_transmittance_terms_follow_absorption() -> None:
-    """A lens whose glasses absorb the blue; the ray's own terms hold low powers of the wavelength only."""
+    """Glasses absorb the blue: high powers of the wavelength hold it."""
     stem = "laikin_double_gauss_127"
     off = []
-    for most in (0, 16):
+    for most in (4, 48):
         model = fit_model(_infinity(stem), ModelSettings(terms=30, growth=1, planes=False, transmittance_terms=most))
         truth = _infinity(stem).pairs.held_out
         off.append(float((model.predict(truth.inputs).transmittance - truth.transmittance).square().mean().sqrt()))
-    assert off[1] < 4e-4 < off[0]
+    assert off[1] < 5e-4 < 1e-3 < off[0]
 
 
 SETTINGS = ModelSettings("ols+mlp", terms=12, degree=5, planes=False, units=8, layers=1, steps=60)

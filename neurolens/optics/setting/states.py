@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens import paraxial
-from neurolens.optics.lens.designs import coated
+from neurolens.optics.lens.designs import coated, with_assumptions
 from neurolens.optics.lens.prescription import Configuration, Lens
 from neurolens.optics.lens.shot import FocusMode, Shot
 from neurolens.optics.setting.focusing import (
@@ -78,6 +78,8 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
     if mode != "paraxial":
         lens = best_focused(lens, focus_of(lens, shot), light_nm)
     lens = with_cover_glass(lens, shot.cover_glass_mm or 0.0, focus_of(lens, shot), mode, light_nm)
+    if shot.cover_glass_mm and any(s.coating and s.coating.origin == "assumed" for s in lens.surfaces):
+        lens = with_assumptions(lens)
     lens = lens if shot.coating is None else coated(lens, shot.coating)
     assert lens.film_z_mm is not None
     return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens

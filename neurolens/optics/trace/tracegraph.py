@@ -142,7 +142,8 @@ class GraphPassage(Passage):
         if end is None:
             return None
         total = self.wavelength_nm.graph.constant(float(end))
-        bends = glass_of(surface.glass).bends() if surface.glass else []
+        name = surface.glass or surface.absorbs_as
+        bends = glass_of(name).bends() if name else []
         slope = sum(bend for nm, bend in bends if nm >= high)
         for nm, bend in [(high, slope), *((nm, bend) for nm, bend in bends if low < nm < high)]:
             if bend:
