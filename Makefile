@@ -61,8 +61,11 @@ demo: $(INSTALLED)
 
 # Two processes of one thread each: torch's threads only wait for each other in small tests. Each takes half of the tests
 # in their order, so that those of a folder share fits and cameras; the one that is done first takes over from the other.
+# Asserts stay as they are written, for each process would take 15 s to rewrite them, and Python keeps what it compiles for
+# the processes that tests start. What fails runs once more, and then shows the values in its asserts.
 test: $(INSTALLED)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10
+	@PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10 --assert=plain || \
+	    { $(BIN)/python -m pytest -q --last-failed --last-failed-no-failures=none; exit 1; }
 	$(MAKE) --no-print-directory lint
 
 test-whole:

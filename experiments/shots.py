@@ -23,8 +23,8 @@ from neurolens.base.progress import Report
 from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.models.terms import pinned_threads
+from neurolens.optics.setting.focusing import near_limit_m
 from neurolens.pictures.render.scene import load_scene
-from neurolens.studies.experiment import near_limit_m
 from neurolens.studies.plan import footprints as prints
 from neurolens.studies.plan.candidates import shot_fits
 from neurolens.studies.plan.costs import glsl_operations, ns_a_ray

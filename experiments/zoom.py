@@ -24,7 +24,8 @@ from neurolens.models.pairs import PairSettings, make_pairs
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.optics.readers.lensfile import read_lens
-from neurolens.studies.experiment import near_limit_m, wavelengths_nm
+from neurolens.optics.setting.focusing import near_limit_m
+from neurolens.studies.experiment import wavelengths_nm
 from neurolens.studies.plots import AXIS_LABELS, error_axes, error_line
 from neurolens.studies.rays import ray_errors
 from neurolens.studies.train import fit_and_measure_states

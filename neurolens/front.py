@@ -53,6 +53,7 @@ EXAMPLES = {  # of each name: its docstring shows it, and a test runs it
     "bokeh": f"nl.bokeh('{_LENS}.ols-36', width=480, film=(36, 24), focus_m=2, distance=[1, 5], output='bokeh')",
     "stmap": f"nl.stmap('{_LENS}.ols-36', width=480, film=(36, 20.25), focus_m=2, output='shot')",
     "projection": f"nl.projection('{_LENS}.ols-36', width=480, film=(36, 24), projection='opencv')",
+    "psf": f"nl.psf('{_LENS}', film=(36, 24), pixel_um=6, grid=(3, 1), f_number=[4, 8], output='gauss.npz')",
     "rays": f"nl.rays('{_LENS}.ols-36', (36, 24), width=48, focus_m=2, samples=4)['direction'].shape",
     "export": f"nl.export('{_LENS}.ols-36', to='c', output='lens.h')",
     "train": f"nl.train(lens='{_LENS}', within='5um', rounds=0, output='gauss')",

@@ -35,7 +35,7 @@ COMMANDS = next(a for a in build_parser()._actions if isinstance(a, _SubParsersA
 CALLS = [name for name in COMMANDS if issubclass(command(name), Reporting)]
 UNITS = "(_(mm|m|deg|nm|px|s|per_mm))?_?"  # at the end of a parameter; a word of Python has a further _
 # Examples that take more than two seconds, or that stand on the page, too.
-LONG = {"fit", "train", "plan", "verify", "bokeh", "analyse", "flare"}
+LONG = {"psf", "fit", "train", "plan", "verify", "bokeh", "analyse", "flare"}
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,6 @@
 """The plain line: each command with nothing but what it is about gives its result, and says what it assumed."""
 
+import math
 from argparse import _SubParsersAction
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from command_line import failure
 
 from neurolens.cli import build_parser, main
+from neurolens.cli.defocus import Defocus
 from neurolens.optics.lens.shot import FILMS, film_size, film_within
 from neurolens.pictures.render.pictures import write_channels
 
@@ -48,11 +50,15 @@ PLAIN: dict[str, tuple[str, str, str]] = {
         "--output room-laikin_double_gauss_50_ols-36-render.exr",
         "room-laikin_double_gauss_50_ols-36-render.png",
     ),
-    "flare": (f"{LENS} --quick", f"{TRIPLET}, --light 7.09,5.33", ""),
+    "flare": (
+        f"{LENS} --bins 2",
+        f"{TRIPLET}, --output {LENS}-flare.exr, --light 7.09,5.33, --quick",
+        f"{LENS}-flare.png",
+    ),
     "defocus": (
         f"plate.exr --lens {MODEL} --samples 8",
         "--film 36x18 (the shape of plate.exr within 36x24 (fullframe, which the lens covers)), "
-        "--output plate-laikin_double_gauss_50_ols-36-defocus.exr",
+        "--output plate-laikin_double_gauss_50_ols-36-defocus.exr, --focus 3.06 (what the middle of the plate shows)",
         "plate-laikin_double_gauss_50_ols-36-defocus.png",
     ),
     "bokeh": (f"{MODEL} --grid 1x1", f"{FULL}, --output laikin_double_gauss_50_ols-36-bokeh, --width 1920", ""),
@@ -67,15 +73,30 @@ PLAIN: dict[str, tuple[str, str, str]] = {
         f"{FULL}, --output laikin_double_gauss_50_ols-36-handover",
         "laikin_double_gauss_50_ols-36-handover/README.md",
     ),
+    "psf": (
+        f"{LENS} --grid 1x1",
+        f"{TRIPLET}, --output {LENS}-psf.npz, --pixel-um 4.15",
+        f"{LENS}-psf.npz",
+    ),
     "rays": (
         f"{MODEL} --samples 1",
         f"{FULL}, --output laikin_double_gauss_50_ols-36-rays.npz, --width 480",
         "laikin_double_gauss_50_ols-36-rays.npz",
     ),
     "export": (MODEL, "--output laikin_double_gauss_50_ols-36-export.h", "laikin_double_gauss_50_ols-36-export.h"),
+    "demo": ("--width 8 --samples 1", "", "neurolens-demo/index.html"),
+    "survey": ("patents --no-fit", "", "runs/survey/survey.html"),
+    "evaluate": (f"{MODEL} --rays 1000", "", ""),
+    "verify": ("sony_sonnar_55", "", ""),
 }
-# Their plain lines are held where they are tested: they take a minute, or a program from elsewhere.
-ELSEWHERE = {"demo", "survey", "train", "evaluate", "plan", "verify", "rims", "blender", "mitsuba"}
+# Why the plain line of the others is not run here.
+ELSEWHERE = {
+    "train": "it fits for a minute; runs of smaller settings are in tests/studies",
+    "plan": "it takes ten seconds, which tests/studies/test_plan.py spends once",
+    "rims": "it fits for ten seconds, which tests/optics/photographs spends once",
+    "blender": "it compiles for minutes; tests/programs/blender runs it with small lenses",
+    "mitsuba": "it takes a program from elsewhere",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -84,8 +105,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def plate(path: Path, depth: np.ndarray) -> Path:
+    grey = np.full(depth.shape, 0.5, np.float32)
+    write_channels(path, {**dict.fromkeys("RGB", grey), "Z": depth.astype(np.float32)}, None, {})
+    return path
+
+
 def test_every_command_has_a_plain_line() -> None:
-    assert PLAIN.keys() | ELSEWHERE == set(COMMANDS)
+    assert PLAIN.keys() | ELSEWHERE.keys() == set(COMMANDS) and not PLAIN.keys() & ELSEWHERE.keys()
 
 
 @pytest.mark.parametrize("name", PLAIN)
@@ -93,8 +120,9 @@ def test_the_plain_line_works_and_says_what_it_assumed(name: str, capsys: pytest
     words, assumed, written = PLAIN[name]
     Path("scenes").symlink_to(ROOT / "experiments" / "scenes")
     Path("triplet.seq").write_text(TRIPLET_SEQ)
-    grey, far = np.full((6, 12), 0.5, np.float32), np.full((6, 12), 3.0, np.float32)
-    write_channels(Path("plate.exr"), {**dict.fromkeys("RGB", grey), "Z": far}, None, {})
+    Path("patents").mkdir()
+    Path("patents", "triplet.seq").write_text(TRIPLET_SEQ)
+    plate(Path("plate.exr"), np.full((6, 12), 3.0))
     assert main([name, *words.split()]) == 0
     said = capsys.readouterr().err.splitlines()
     lines = [line for line in said if "assumed: " in line and "--distance" not in line]
@@ -146,3 +174,29 @@ def test_films_fall_in_size() -> None:
     """And each is within the circle of the one before, so that the largest that fits is the first that does."""
     sizes = [np.hypot(*film_size(name)) for name in FILMS]
     assert sizes == sorted(sizes, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "options", "focus_m", "said"),
+    [
+        (2.0, "--depth-from film", 2.0, "what the middle of the plate shows"),
+        (2.0, "", 2.06, "what the middle of the plate shows"),  # and the pinhole lies 61 mm before the film
+        (2000.0, "--depth-from film --depth-scale 0.001", 2.0, "what the middle of the plate shows"),
+        (np.inf, "", math.inf, "what the middle of the plate shows"),
+        (0.2, "--depth-scale 1", 0.7, "the nearest of the lens; what the middle of the plate shows is nearer"),
+    ],
+)
+def test_a_plate_is_focused_on_its_middle(depth_m: float, options: str, focus_m: float, said: str) -> None:
+    """Whatever is nearer or farther around it; and no nearer than the lens can."""
+    depth = np.full((9, 18), 30.0)
+    depth[3:6, 6:12] = depth_m
+    words = ["defocus", str(plate(Path("a.exr"), depth)), "--lens", MODEL, *options.split()]
+    made = COMMANDS["defocus"].parse_args(words[1:])
+    found = Defocus.of(made)
+    assert found.state.given.focus_m == pytest.approx(focus_m, abs=0.01) and f"({said})" in found.told
+
+
+def test_a_second_run_says_that_it_writes_over_the_first(capsys: pytest.CaptureFixture[str]) -> None:
+    for said in ("-rays.npz\n", "-rays.npz (written over)\n"):
+        assert main(["rays", MODEL, "--samples", "1", "--width", "8"]) == 0
+        assert said in capsys.readouterr().err

@@ -209,7 +209,12 @@ def whole(least: int, most: int | None = None) -> Callable[[str], int]:
 
 def wavelengths_nm(text: str) -> tuple[float, ...]:
     """Type of --wavelengths: one or more in nm, with commas between them."""
-    return tuple(between(*WAVELENGTH_NM, "wavelengths in nm")(word) for word in text.split(","))
+    return listed(between(*WAVELENGTH_NM, "wavelengths in nm"))(text)
+
+
+def listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:
+    """Type of an argument of one or more values of a type, with commas between them."""
+    return lambda text: tuple(kind(word) for word in text.split(","))
 
 
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
@@ -301,11 +306,11 @@ def _details(
     return tuple(filter(None, (option.short, spelling(f, option)))), details
 
 
-def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False) -> T:
+def from_options(cls: type[T], args: argparse.Namespace, names: Collection[str] = (), *, unset: bool = False) -> T:
     """Make settings from the options of `add_options`; options that were not added have their defaults.
 
     Args:
-        unset: whether fields that were not given are None in the result.
+        names: as in `add_options`. unset: whether fields that were not given are None in the result.
 
     Raises:
         InputError: what the class refuses.
@@ -313,7 +318,10 @@ def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False)
     hints, values = _hints(cls), dict.fromkeys((f.name for f in fields(cls)) if unset else (), None)  # type: ignore[arg-type]
     for f in _options(cls):
         if is_dataclass(hints[f.name]):
-            values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", unset))
+            more = f.metadata.get("more", {"names": names})
+            values[f.name] = from_options(hints[f.name], args, more.get("names", ()), unset=more.get("unset", unset))
+        elif names and f.name not in names:
+            continue
         elif (value := getattr(args, _dest(f, f.metadata["option"]), None)) is not None or unset:
             values[f.name] = tuple(value) if isinstance(value, list) else value
     return cls(**values)

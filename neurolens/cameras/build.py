@@ -62,6 +62,23 @@ def film_of(spec: str | Path, **size: Any) -> tuple[tuple[float, float], str]:
     return film_within(image_radius_mm(set_lens(read_any(path), **size))[0])
 
 
+def near_of(spec: str | Path, **size: Any) -> float:
+    """The distance in metres from the film to the nearest thing that a camera's lens focuses; arguments as `film_of`.
+
+    A model's card states it; of a lens file and an ideal camera it is usual, 14 focal lengths or more.
+    """
+    kind, path = resolve(spec)
+    if path is None:
+        return 14e-3 * float(size.get("focal_length_mm", _FOCAL_MM))
+    if is_model(path):
+        return min(map(float, read_card(path)["domain"]["focus_m"]))
+    from neurolens.optics.readers.any_format import read_any
+    from neurolens.optics.setting.focusing import near_limit_m
+    from neurolens.optics.setting.states import set_lens
+
+    return near_limit_m(set_lens(read_any(path), **size))
+
+
 def as_c(camera: Camera) -> Camera:
     """Return an ideal lens run as C where the machine has a compiler, and any other camera as it is."""
     with suppress(InputError):

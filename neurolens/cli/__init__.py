@@ -61,6 +61,7 @@ _COMMANDS = {
     "compositing and other programs": {
         "defocus": ("defocus.Defocus", "the blur of a lens for a sharp picture with depth"),
         "bokeh": ("defocus.Bokeh", "kernels of a lens's blur over field and distance"),
+        "psf": ("psf.PointSpread", "point spread of a lens by diffraction, over field, distance and f-number"),
         "handover": ("handover.Handover", "a lens as files for Nuke, Blender, USD, OpenTrackIO, lensfun, OpenCV"),
         "stmap": ("stmap.StMap", "ST maps, which undistort and redistort pictures of a lens"),
         "projection": ("stmap.Projection", "fit a lens with a projection of OpenCV, nerfstudio or NVIDIA"),

@@ -201,9 +201,9 @@ class Command:
         """Return the command with what `assumed` finds where nothing is given; its answer tells."""
         told, whole = list[str](), self
         for name, (option, found) in self.assumed().items():
-            if getattr(self, name) in (None, ()):
+            if name == "state" or getattr(self, name) in (None, (), False):  # a state: where it lacks something
                 value, said = found()
-                whole, told = replace(whole, **{name: value}), [*told, f"{option} {said}"]
+                whole, told = replace(whole, **{name: value}), [*told, f"{option} {said}".rstrip()]
         return replace(whole, told=f"assumed: {', '.join(told)}") if told else whole
 
     def assumed(self) -> dict[str, tuple[str, Callable[[], tuple[Any, str]]]]:
@@ -232,7 +232,8 @@ class Command:
         kind = f".{option.metavar.partition('.')[2]}".rstrip(".") if suffix is None else suffix
         names = [lens_id_of(split_kind(text)[1]) for text in self._inputs()]
         path = Path("-".join([*names, self.called.split()[-1]]) + kind)
-        return path, str(path)
+        there = path.exists() if kind else any(path.parent.glob(f"{path.name}.*")) or path.exists()
+        return path, f"{path}{' (written over)' * there}"
 
     def _inputs(self) -> list[str]:
         """Return what it reads first, as a scene, and then its lens."""
@@ -412,10 +413,16 @@ def film_like(picture: Path, film_mm: tuple[float, float], said: str) -> tuple[t
     from neurolens.pictures.render.pictures import header_of
 
     (left, top), (last, bottom) = header_of(picture)["displayWindow"]
-    across, down = max(1, last - left + 1), max(1, bottom - top + 1)
-    scale = min(film_mm[0] / across, film_mm[1] / down)
-    film = float(f"{scale * across:.6g}"), float(f"{scale * down:.6g}")
-    return film, f"{film[0]:g}x{film[1]:g} (the shape of {picture.name} within {said})"
+    return film_shaped(max(1, last - left + 1), max(1, bottom - top + 1), picture.name, film_mm, said)
+
+
+def film_shaped(
+    width: int, height: int, name: str, film_mm: tuple[float, float], said: str
+) -> tuple[tuple[float, float], str]:
+    """Return the largest film of the shape of a picture, of so many pixels, as `film_like`."""
+    scale = min(film_mm[0] / width, film_mm[1] / height)
+    film = float(f"{scale * width:.6g}"), float(f"{scale * height:.6g}")
+    return film, f"{film[0]:g}x{film[1]:g} (the shape of {name} within {said})"
 
 
 def within(about: str, default: Any = None, title: str = "") -> Any:

@@ -10,14 +10,16 @@ from typing import Any, Literal
 
 from neurolens import __version__
 from neurolens.base.errors import note
+from neurolens.base.progress import Progress
 from neurolens.base.settings import group, positive, setting, whole
-from neurolens.cameras.field import frame_of
+from neurolens.cameras.build import near_of
+from neurolens.cameras.field import Frame, frame_of
 from neurolens.cameras.sampling import focus_m
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
 from neurolens.pictures.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
 from neurolens.pictures.defocus.picture import SAMPLES, check_field, defocus
-from neurolens.pictures.defocus.plate import DepthSettings, read_plate
+from neurolens.pictures.defocus.plate import DepthSettings, middle_m, read_plate
 from neurolens.pictures.frames import Files
 from neurolens.pictures.render.pictures import standard_attributes, write_channels, write_exr, write_png
 from neurolens.pictures.render.sensor import about, expose
@@ -28,8 +30,8 @@ _MOST = 64  # fields along a side, at most
 
 @dataclass(frozen=True, kw_only=True)
 class Defocus(cli.Reporting):
-    """Give a sharp picture with depth the blur of a lens with its widest stop: by field, depth and colour, with its
-    distortion and vignetting.
+    """Give a sharp picture with depth the blur of a lens with its widest stop, focused on what its middle shows: by
+    field, depth and colour, with its distortion and vignetting.
 
     PLATE.exr is a pinhole's picture: R, G, B and a channel Z with the distance along the axis in metres (0, 1e9
     and more, inf: sky), without motion blur; depth without antialiasing is best. Its pinhole stands where
@@ -72,9 +74,32 @@ examples:
     state: cli.LensState = cli.camera_state()
     threads: int = cli.threads()
 
+    def assumed(self) -> Any:
+        """The focus, too."""
+        given = self.state.given
+        return super().assumed() | ({} if given.focus_m or given.zoom else {"state": ("--focus", self._focus)})
+
     def _film(self) -> tuple[tuple[float, float], str]:
         """The largest film of the plate's shape on that which the lens covers."""
         return cli.film_like(self.plate, *super()._film())
+
+    def _focus(self) -> tuple[cli.LensState, str]:
+        """The state with the focus on what the middle of the plate shows, or on the nearest that the lens can."""
+        near_m, said = near_of(self.lens, **self._size()), "what the middle of the plate shows"
+        focus_m = float(f"{middle_m(self.plate, self._frame, self._depth()):.3g}")
+        if focus_m < near_m:
+            focus_m, said = near_m, f"the nearest of the lens; {said} is nearer"
+        return self.state.at(focus_m=focus_m), f"{focus_m:g} ({said})"
+
+    def _frame(self) -> Frame:
+        """The frame of the lens's picture, focused as it is without --focus."""
+        film = self.film or self._film()[0]
+        return frame_of(cli.camera(self.lens, self.state.shot(film, runtime="onnxruntime"), Progress(quiet=True)))
+
+    def _depth(self) -> DepthSettings:
+        """What the plate's depth means."""
+        starts = {"auto": None, "film": True, "pinhole": False}
+        return DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
 
     def run(self) -> int:
         """Read the plate, blur it, write the picture."""
@@ -87,9 +112,7 @@ examples:
         progress = self.progress()
         camera = cli.camera(self.lens, shot := self.state.shot(self.film), progress)
         check_field(camera)
-        starts = {"auto": None, "film": True, "pinhole": False}
-        depth = DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
-        plate = read_plate(self.plate, self.film, frame_of(camera), depth, self.behind)
+        plate = read_plate(self.plate, self.film, frame_of(camera), self._depth(), self.behind)
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
         data: dict[str, Any] = {"plate": self.plate.name, "layers": len(plate.layers), "file": str(files.out)}
         data |= {name: getattr(found, name) for name in ("highlights", "filled", "lost", "beyond")}

@@ -39,8 +39,8 @@ _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 
 @dataclass(frozen=True, kw_only=True)
 class Export(cli.Reporting):
-    """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for arrays
-    that compilers vectorise), a function in a shading language, or an ONNX file.
+    """Write an exported model in another form, as C unless --to says otherwise: a self-contained C99 header (one
+    function for a ray, one for arrays that compilers vectorise), a function in a shading language, or an ONNX file.
 
     Domain guard, stop, rims, transmittance and status codes are those of the model; the card is a comment at the top,
     and constants and the film's position for a focus stand beside it. Of a model of a zoom's whole range (or of

@@ -77,7 +77,8 @@ def _gain(text: str) -> tuple[str, list[float]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Flare(cli.Figures):
-    """Print the brightest ghosts of a lens that is focused at infinity, and with -o write a picture of its flare.
+    """Print the brightest ghosts of a lens that is focused at infinity, and with -o, or of the lens alone, write a
+    picture of its flare.
 
     Ghosts are traced exactly: light that two surfaces reflect on its way to the film, with the reflectance of
     Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. They are
@@ -122,9 +123,7 @@ examples:
         "so that none switches on at once (default: 2)",
         kind=positive("a value of the picture"), metavar="T", title=OF_LIGHTS,
     )  # fmt: skip
-    out: Path | None = cli.output_path(
-        "OUT.exr", "picture to write; the preview is OUT.png (default: only the table)", None
-    )
+    out: Path | None = cli.output_path("OUT.exr", "picture to write, of a light that is given; the preview is OUT.png")
     path: tuple[str, str] | None = setting(
         None, "draw the rays of one ghost of the first light (PNG, PDF, SVG)",
         kind=str, nargs=2, metavar=("GHOST", "OUT"),
@@ -212,8 +211,13 @@ examples:
             cli.check_written(Path(self.path[1]), "--path", "OUT.png")
 
     def assumed(self) -> Any:
-        """A light, too."""
-        return super().assumed() | ({} if self.lights or self.image else {"light": ("--light", self._a_light)})
+        """A light, too; and where none is given, and neither figures nor rays alone are asked for, a small picture."""
+        found = super().assumed() | ({} if self.lights or self.image else {"light": ("--light", self._a_light)})
+        if any((self.light, self.lights, self.image, self.path, self.csv, self.json, self.frames.frames)):
+            del found["out"]
+        elif self.out is None and self.width == type(self).width:
+            found["quick"] = "--quick", lambda: (True, "")
+        return found
 
     def _film(self) -> tuple[tuple[float, float], str]:
         """The film that the lens covers, with --image of its shape."""

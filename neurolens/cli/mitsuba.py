@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
+from neurolens.base.errors import note
 from neurolens.base.progress import duration
 from neurolens.base.records import plain
 from neurolens.base.settings import positive, setting, whole
@@ -15,7 +16,7 @@ from neurolens.cli import arguments as cli
 from neurolens.pictures.frames import Files
 from neurolens.pictures.render.pictures import standard_attributes, write_exr, write_png
 from neurolens.programs.mitsuba import load_scene, render
-from neurolens.programs.mitsuba.sensor import FILM_WIDTH_MM, libraries
+from neurolens.programs.mitsuba.sensor import libraries
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,9 @@ examples:
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     variant: str | None = setting(None, "of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)")
     samples: int | None = setting(None, "a pixel (default: the scene's)", within=(1, 1 << 20), common=True)
-    film: tuple[float, float] | None = cli.film(None, "size in mm (default: 36 wide, the picture's shape)")
+    film: tuple[float, float] | None = cli.film(
+        None, "size in mm (default: the largest of the picture's shape that the lens covers)"
+    )
     seed: int = setting(0, "default: 0", kind=whole(0, 1 << 15))
     units_per_m: float = setting(
         1.0, "of the scene (default: 1; 1000 for one in millimetres)", option="units-per-m", metavar="N",
@@ -50,7 +53,9 @@ examples:
         scene = load_scene(self.scene, self.variant)
         width, height = (int(v) for v in scene.sensors()[0].film().size())
         progress = self.progress()
-        film = self.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width)
+        if (film := self.film) is None:
+            film, said = cli.film_shaped(width, height, self.scene, *self._film())
+            note(f"assumed: --film {said}")
         camera = cli.camera(self.camera, self.state.shot(film), progress)
         began = time.perf_counter()
         with progress.stage(f"render {self.scene}, {camera.name}") as report:

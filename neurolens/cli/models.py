@@ -7,6 +7,7 @@ import json
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Models(cli.Figures):
-    """List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
-    nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
+    """List the exported models of all lenses, or of one: film circle, focus, film-equivalent RMS error on rays held
+    out, and nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
     star is the best model of a lens: the fastest of those within 2 um (or --within) that their card does
     not call poor; where none is, the closest. Of one lens the last lines say whether to use that model or
     the lens itself, whose time is expected from its number of refractions. Models of one focus alone, such
@@ -177,7 +178,7 @@ def _remarks(model: dict[str, Any]) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(cli.Figures):
-    """Measure an exported model on fresh rays of its card's domain, traced through the exact lens in float64 and
+    """Measure an exported model on 30,000 fresh rays of its card's domain, traced through the exact lens in float64 and
     through the ONNX model in onnxruntime. Prints each figure beside the card's promise, of the whole film, stopped down
     ("2_stops.false_pass") and of its thirds by radius ("full.edge.rms_um"); exits with code 1 if one does not hold.
     Needs the extra "train" (torch).
@@ -196,7 +197,10 @@ examples:
 The lens file is looked for by the card's lens id: lenses/ beside the model and its folder, where a run
 keeps its own; ./lenses; the project's."""
 
-    model: Path = setting(..., "exported model (.onnx)", positional=True, metavar="MODEL")
+    model: Path = setting(
+        ..., "exported model (.onnx), or the name of one", positional=True, metavar="MODEL",
+        kind=partial(cli.named_lens, True, False),
+    )  # fmt: skip
     lens: Path | None = cli.lens(None, " (default: found by the card's lens id)")
     rays: int = setting(
         30_000, "rays that the lens passes, eight times as many if a few bad ones dominate an error; "

@@ -19,6 +19,7 @@ from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.settings import LIGHT_NM, positive, setting, wavelengths_nm
+from neurolens.cameras.build import near_of
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Field, Frame, diagonal_points, field_of, frame_of, lit_points, shown_at, spectrum_of
 from neurolens.cameras.sampling import focus_m
@@ -41,7 +42,6 @@ from neurolens.pictures.render.stmap import (
 Maker = Callable[[Field, Plates, Callable[[float], None]], dict[str, FloatArray]]
 _LARGEST = 16384  # pixels a side
 _SEEN = 17, 11  # points of the film, whose parallax is told
-_NEAR_M = 0.3  # and how far from the film, or 1.5 times as far as the entrance pupil
 # Dominant wavelengths of the primaries of Rec. 709 (and sRGB), for light of D65.
 _CHANNELS_NM = (611.4, 549.1, 464.2)
 _NAMES = ("red", "green", "blue")
@@ -126,7 +126,7 @@ class FieldCommand(PictureCommand):
 
     near: float | None = setting(
         None, "distance from the film to the nearest thing that is seen, of which is told what one centre leaves "
-        f"(default: {_NEAR_M:g}, or 1.5 times the entrance pupil's)",
+        "(default: the nearest that the lens focuses)",
         kind=positive("a distance in metres"), metavar="M", common=True,
     )  # fmt: skip
 
@@ -135,7 +135,7 @@ class FieldCommand(PictureCommand):
         pupil = 1e-3 * max(frame.pupil_mm)
         if self.near is not None and self.near <= pupil:
             self.refuse("--near", self.near, f"more than {pupil:.4g} m, the distance of the entrance pupil")
-        return self.near or max(_NEAR_M, 1.5 * pupil)
+        return self.near or float(f"{max(near_of(self.camera, **self._size()), 1.5 * pupil):.3g}")
 
     def parallax(self, camera: Camera, field: Field) -> list[dict[str, float]]:
         """Return, by distance (at infinity and near), how far things are from where the field's one centre has them."""

@@ -23,12 +23,12 @@ from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import OURS, kind_of, read_any
 from neurolens.optics.readers.lensfile import write_lens
+from neurolens.optics.setting.focusing import near_limit_m
 from neurolens.optics.setting.states import set_lens
 from neurolens.studies.rays import PIXELS_ACROSS, frame_width_mm
 
 # Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens); for a long lens of short
 # focus, which has less room, the object 8 focal lengths before the front vertex.
-NEAR_LIMIT_FOCAL_LENGTHS, NEAREST_OBJECT_FOCAL_LENGTHS = 14, 8
 # A film that is dark beyond this share of its radius counts as stated too large.
 DARK_FROM = 0.9
 
@@ -119,15 +119,6 @@ class DomainChoice:
         text = f"{lens.path}: the film, {film_mm:.4g} mm in radius, is dark beyond {lit_mm:.4g} mm"
         warnings.warn(text if asked else f"{text}: models are of what is lit", NeurolensWarning, stacklevel=2)
         return domain if asked else domain_of(lens, film_radius_mm=lit_mm, focus_m=focus_m, wavelength_nm=wavelengths)
-
-
-def near_limit_m(lens: Lens) -> float:
-    """Return the default distance from the film to the nearest object in focus."""
-    data = first_order(lens)
-    f, film_z = abs(data.efl_mm), data.rear_focal_z_mm
-    separation = data.rear_principal_z_mm - data.front_principal_z_mm
-    lengths = (NEAR_LIMIT_FOCAL_LENGTHS * f, film_z + NEAREST_OBJECT_FOCAL_LENGTHS * f, 6 * f + separation)
-    return max(v for v in lengths if math.isfinite(v)) / 1000
 
 
 def wavelengths_nm(lens: Lens) -> tuple[float, float]:

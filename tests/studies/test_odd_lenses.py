@@ -18,9 +18,10 @@ from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.optics.lens.glass import LINE_D_NM
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.focusing import near_limit_m
 from neurolens.optics.setting.states import set_lens
 from neurolens.studies.check import check_model
-from neurolens.studies.experiment import default_experiment, near_limit_m, wavelengths_nm
+from neurolens.studies.experiment import default_experiment, wavelengths_nm
 from neurolens.studies.measure import measure_on, shared_rays
 
 AIR: dict[str, float] = {}

@@ -107,8 +107,8 @@ def pupils_at(scene: Scene, places_mm: Array, wavelengths_nm: Sequence[float]) -
     Raises:
         InputError: the lens has no rotational symmetry, or no power.
     """
-    if scene.lens.anamorphic:
-        raise InputError(scene.lens.path, "surfaces", "(anamorphic)", "a lens of rotational symmetry")
+    if not scene.lens.round:
+        raise InputError(scene.lens.path, "surfaces", "(not round about the axis)", "a lens of rotational symmetry")
     height, number = np.unique(np.hypot(*places_mm.T).round(9), return_inverse=True)
     fields = np.array(scene.fields_at(height.tolist()))
     known = np.nonzero(np.isfinite(fields))[0]

@@ -342,3 +342,34 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> None:
             grid[1, i].set_xlabel("sagittal (µm)", size=8.5)
         grid[0, 0].set_ylabel(f"geometric ({_wavelengths(data.wavelength_nm)})\ntangential (µm)", size=8.5)
         grid[1, 0].set_ylabel(f"diffraction ({data.wavelength_nm[0]:.0f} nm)\ntangential (µm)", size=8.5)
+
+
+def plot_point_spread(arrays: Any, pixel_um: float, path: str | Path, title: str, channels: Any) -> None:
+    """Plot point spread over the picture, of the first f-number and distance of a file of `neurolens psf`.
+
+    Three channels are red, green and blue, longest wavelengths first; others are grey. All have one scale, and each its
+    own brightness, as square root.
+    """
+    whole = arrays["psf"][0, 0]
+    order = sorted(range(whole.shape[2]), key=lambda c: -np.mean(list(channels.values())[c]))
+    colours = whole[:, :, order] if len(order) == 3 else whole.sum(2, keepdims=True).repeat(3, 2)
+    rows, columns, _, side, _ = colours.shape
+    away = np.abs(np.arange(side) - side // 2)
+    ring = np.maximum(away[:, None], away)
+    total = whole.sum((0, 1, 2))
+    inner = next(k for k in range(side // 2 + 1) if total[ring <= k].sum() >= 0.98 * total.sum())
+    part = slice(side // 2 - inner, side // 2 + inner + 1)
+    distance, number = float(arrays["distance_m"][0]), float(arrays["f_number"][0])
+    focus = "infinity" if math.isinf(distance) else f"{distance:g} m"
+    text = f"Point spread over the picture, f/{number:g}, object at {focus}; brightness as square root"
+    with drawing(path, 1.0 * columns + 0.4, 1.0 * rows + 1.0, title, text) as figure:
+        grid = figure.subplots(rows, columns, squeeze=False)
+        for i, j in np.ndindex(rows, columns):
+            image = colours[i, j][:, part, part].transpose(1, 2, 0)
+            grid[i, j].imshow(np.sqrt(image / max(float(image.max()), 1e-30)), interpolation="nearest")
+            grid[i, j].set(xticks=[], yticks=[])
+        width_um = (2 * inner + 1) * pixel_um
+        bar = next(n * 10.0**k for k in range(3, -4, -1) for n in (5, 2, 1) if n * 10.0**k <= 0.6 * width_um)
+        corner = grid[-1, 0]
+        corner.plot([0.2 * inner, 0.2 * inner + bar / pixel_um], [1.75 * inner] * 2, color="white", lw=2)
+        corner.text(0.2 * inner, 1.65 * inner, f"{bar:g} µm", color="white", fontsize=7, va="bottom")

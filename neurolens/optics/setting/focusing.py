@@ -21,6 +21,7 @@ from neurolens.optics.trace.arrays import follow
 from neurolens.optics.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
+_NEAR_LIMIT_FOCAL_LENGTHS, _NEAREST_OBJECT_FOCAL_LENGTHS = 14, 8
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
@@ -155,6 +156,15 @@ def nearest_focus_m(lens: Lens) -> float:
     """Return the nearest distance from object to film that internal focusing reaches."""
     path, place = _mover(at_infinity(lens))
     return 1 / _vergence(place(len(path[len(lens.surfaces) - 1]) - 1)) / 1000
+
+
+def near_limit_m(lens: Lens) -> float:
+    """Return the default distance from the film to the nearest object in focus."""
+    data = paraxial.first_order(lens)
+    f, film_z = abs(data.efl_mm), data.rear_focal_z_mm
+    separation = data.rear_principal_z_mm - data.front_principal_z_mm
+    lengths = (_NEAR_LIMIT_FOCAL_LENGTHS * f, film_z + _NEAREST_OBJECT_FOCAL_LENGTHS * f, 6 * f + separation)
+    return max(v for v in lengths if math.isfinite(v)) / 1000
 
 
 def _mover(lens: Lens) -> tuple[dict[int, list[float]], Callable[[float], Lens]]:

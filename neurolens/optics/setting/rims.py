@@ -13,6 +13,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.figures import SPHERE, Bound
 from neurolens.optics.lens.paraxial import first_order, stop_radius_mm
@@ -96,12 +98,12 @@ def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[flo
     steps = 1 if before.figure.plain and after.figure.plain else 32
     azimuths = [(1.0, 0.0), (0.0, 1.0)] if before.figure.axis or after.figure.axis else [(1.0, 0.0)]
     found = (axis_gap_mm, 0.0)
-    for cos, sin in azimuths:
-        for i in range(1, steps + 1):
-            h = rim * i / steps
-            x, y = h * cos, h * sin
-            gap = axis_gap_mm + sag_mm(after, x, y) - sag_mm(before, x, y)
-            found = min(found, (gap, h))
+    with np.errstate(invalid="ignore", over="ignore"):  # of rims that are not known, and figures that no lens has
+        h = rim * np.arange(1, steps + 1) / steps
+        for cos, sin in azimuths:
+            gap = axis_gap_mm + sag_mm(after, h * cos, h * sin) - sag_mm(before, h * cos, h * sin)
+            k = int(np.argmin(np.where(np.isnan(gap), np.inf, gap)))
+            found = min(found, (float(gap[k]), float(h[k])))
     return found
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -257,6 +257,22 @@ def read_plate(
                 light /= (cosine**4)[..., None]
             layers.append(Layer(light, w))
     return Plate(layers, pinhole, film_px, space)
+
+
+def middle_m(path: Path, frame: Callable[[], Frame], depth: DepthSettings) -> float:
+    """Return the distance from the film in metres of what the middle ninth of a plate shows, its median; inf is sky.
+
+    `frame` gives that of the camera, where depth counts from its pinhole. Raises InputError as `read_plate`.
+    """
+    ours = _pinhole(metadata_of(path, header_of(path))) is not None
+    nearest: NDArray[Any] = np.full((1, 1), np.inf)
+    for _, metres in _layers(path, depth, several=True):
+        there = np.isfinite(metres) & (metres != 0)
+        nearest = np.minimum(nearest, np.where(there, metres * np.float32(depth.scale_m or 1.0), np.inf))
+    height, width = nearest.shape
+    middle = float(np.median(nearest[height // 3 : height - height // 3, width // 3 : width - width // 3]))
+    from_film = ours if depth.from_film is None else depth.from_film
+    return math.inf if middle >= _SKY_M else middle + (0.0 if from_film else 1e-3 * frame().pupil_mm[1])
 
 
 def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -179,7 +179,7 @@ def test_the_command_writes_the_table_where_one_centre_is_not_enough(
 ) -> None:
     monkeypatch.setattr(fields, "_ROUND", (129, 1))
     words = ("projection", FISHEYE, "--width", "480", "--film", "18x18", "--quiet", "--focus", "1", "--projection")
-    told = run_json(capsys, *words, "kannala-brandt", "-o", tmp_path / "a")
+    told = run_json(capsys, *words, "kannala-brandt", "--near", "0.3", "-o", tmp_path / "a")
     assert str(tmp_path / "a.noncentral.yaml") in told["files"] and (tmp_path / "a.noncentral.yaml").is_file()
     assert {row["distance_m"] for row in told["noncentral"]} == {"infinity", 1.0, 0.3}
     assert max(row["worst_px"] for row in told["noncentral"]) < 0.01 < 10 < told["parallax"][1]["worst_px"]

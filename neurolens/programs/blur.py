@@ -1,0 +1,171 @@
+"""Pictures blurred by the point spread of a real lens, place by place, for torch: to train networks, or to invert.
+
+Every point of the picture spreads its light by the point spread of its own place, which is mixed linearly from those of
+the four places about it: y = sum over k of h_k * (w_k x), with w_k the shares of place k. The adjoint is x = sum over k
+of w_k (h_k correlated with y). Convolutions are exact, by Fourier transforms of the part of the picture that a place
+has a share of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from neurolens.base.errors import InputError
+from neurolens.pictures.render.images import read_picture
+from neurolens.pictures.render.sensor import about as about_sensor
+from neurolens.pictures.render.sensor import expose
+from neurolens.pictures.render.settings import SensorSettings
+from neurolens.programs.psf import Arrays, read_psf
+
+
+class Blur:
+    """The blur of a lens on a part of its picture, as a linear operator on tensors [C, H, W] of linear light.
+
+    Gradients go through it. Light from beyond the part counts as dark. Point spread is scaled to the sum 1: the light
+    that `inside` lacks is put back.
+
+    Args:
+        file: of `neurolens psf` (.npz), or what `read_psf` returns.
+        size: height and width of the part, in pixels of the file.
+        at_mm: (right, up) where the middle of the part lies in the picture of the lens.
+        state: which f-number and which distance of the file, counted from 0.
+        vignetting: whether light falls off towards the corners as through the lens.
+
+    Raises:
+        InputError: it is no such file, or has no such state.
+    """
+
+    def __init__(
+        self, file: Path | str | tuple[dict[str, Any], Arrays], size: tuple[int, int],
+        at_mm: tuple[float, float] = (0.0, 0.0), state: tuple[int, int] = (0, 0), *, vignetting: bool = True,
+    ) -> None:  # fmt: skip
+        about, arrays = file if isinstance(file, tuple) else read_psf(Path(file))
+        if not all(0 <= k < n for k, n in zip(state, arrays["psf"].shape[:2], strict=True)):
+            raise InputError("blur", "state", state, f"below {arrays['psf'].shape[:2]}, the file's states")
+        kernels, pixel_mm = arrays["psf"][state].astype(np.float64), about["pixel_um"] / 1000
+        self.size, self.channels, self.radius = size, kernels.shape[2], kernels.shape[-1] // 2
+        whole = kernels.sum((-2, -1), keepdims=True)
+        kernels /= np.where(whole > 0, whole, 1)
+        if vignetting:
+            kernels *= arrays["light"][state][..., None, None, None]
+        height, width = size
+        up = at_mm[1] + ((height - 1) / 2 - np.arange(height)) * pixel_mm
+        right = at_mm[0] + (np.arange(width) - (width - 1) / 2) * pixel_mm
+        rows = _shares(-arrays["place_mm"][:, 0, 1], -up)
+        columns = _shares(arrays["place_mm"][0, :, 0], right)
+        self._parts = [
+            (*down[0], *across[0], torch.from_numpy(down[1][:, None] * across[1]), torch.from_numpy(kernels[i, j]))
+            for i, down in rows
+            for j, across in columns
+        ]
+
+    def __call__(self, sharp: Tensor) -> Tensor:
+        """Return the blurred picture."""
+        return self._applied(sharp, adjoint=False)
+
+    def adjoint(self, blurred: Tensor) -> Tensor:
+        """Return the adjoint applied to a picture: the inner products <A x, y> and <x, A* y> are equal."""
+        return self._applied(blurred, adjoint=True)
+
+    def _applied(self, picture: Tensor, adjoint: bool) -> Tensor:
+        if picture.shape != (self.channels, *self.size):
+            raise InputError("blur", "picture", tuple(picture.shape), f"{(self.channels, *self.size)}")
+        r, (height, width) = self.radius, self.size
+        room = torch.nn.functional.pad(picture, (r, r, r, r))
+        found = torch.zeros_like(room)
+        for top, bottom, left, right, share, kernel in self._parts:
+            h = kernel.to(picture)
+            at = [slice(top, bottom + 2 * r), slice(left, right + 2 * r)]  # where the place's light goes
+            own = slice(top + r, bottom + r), slice(left + r, right + r)
+            weight = share.to(picture)
+            shape = bottom - top + 2 * r, right - left + 2 * r
+            if adjoint:
+                spectrum = torch.fft.rfft2(room[:, at[0], at[1]]) * torch.fft.rfft2(h, s=shape).conj()
+                seen = torch.fft.irfft2(spectrum, s=shape)[:, : bottom - top, : right - left]
+                found[:, own[0], own[1]] += weight * seen
+            else:
+                spectrum = torch.fft.rfft2(weight * room[:, own[0], own[1]], s=shape) * torch.fft.rfft2(h, s=shape)
+                found[:, at[0], at[1]] += torch.fft.irfft2(spectrum, s=shape)
+        return found[:, r : r + height, r : r + width]
+
+
+def _shares(places: Any, at: Any) -> list[tuple[int, tuple[tuple[int, int], Any]]]:
+    """Return of each place (increasing) that has a share of points: its number, first and last + 1 point, shares."""
+    found = []
+    for k, unit in enumerate(np.eye(len(places))):
+        share = np.interp(at, places, unit)
+        some = np.nonzero(share)[0]
+        if len(some):
+            first, last = int(some[0]), int(some[-1]) + 1
+            found.append((k, ((first, last), share[first:last])))
+    return found
+
+
+@dataclass
+class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
+    """Pairs of sharp and blurred patches of pictures, each at a random place and state of a random lens.
+
+    A pair is determined by its number and the seed. Patches are [3, n, n] of linear sRGB. With a sensor the second has
+    its noise and its colours: [3, n, n], or [1, n, n] of a mosaic, as light (electrons over those of value 1).
+
+    Attributes:
+        pictures: files (.exr, or .png and .jpg as sRGB) or arrays [H, W, 3] of linear sRGB.
+        files: of `neurolens psf` with channels R, G, B.
+        patch: pixels a side. sensor: None leaves light as it is. length: pairs in an epoch; None is that of pictures.
+        vignetting: as of `Blur`.
+    """
+
+    pictures: Sequence[Path | str | Any]
+    files: Sequence[Path | str]
+    patch: int = 128
+    sensor: SensorSettings | None = None
+    seed: int = 0
+    length: int | None = None
+    vignetting: bool = True
+
+    def __post_init__(self) -> None:
+        self._lenses = [read_psf(Path(file)) for file in self.files]
+        for file, (_, arrays) in zip(self.files, self._lenses, strict=True):
+            if arrays["psf"].shape[4] != 3:
+                raise InputError(file, "channels", arrays["psf"].shape[4], "three channels, R, G and B")
+
+    def __len__(self) -> int:
+        return self.length or len(self.pictures)
+
+    def __getitem__(self, number: int) -> tuple[Tensor, Tensor]:
+        """Return the sharp and the blurred patch of a number."""
+        random = np.random.default_rng([self.seed, number])
+        picture = self.pictures[number % len(self.pictures)]
+        if isinstance(picture, str | Path):
+            picture = read_picture(Path("pairs"), "picture", Path(picture))
+        if min(picture.shape[:2]) < self.patch:
+            raise InputError("pairs", "picture", picture.shape, f"at least {self.patch} pixels a side")
+        about, arrays = self._lenses[random.integers(len(self._lenses))]
+        n, d = (int(random.integers(count)) for count in arrays["psf"].shape[:2])
+        free_mm = np.maximum(np.array(about["film_mm"]) - self.patch * about["pixel_um"] / 1000, 0)
+        right, up = (free_mm * (random.random(2) - 0.5)).tolist()
+        # Beyond its edges a picture is mirrored, so that light comes from there, too.
+        room = arrays["psf"].shape[-1] // 2
+        rows, columns = (
+            size - 1 - np.abs((np.arange(self.patch + 2 * room) + corner - room) % (2 * size - 2) - size + 1)
+            for size in picture.shape[:2]
+            for corner in (int(random.integers(size - self.patch + 1)),)
+        )
+        around = torch.from_numpy(picture[rows[:, None], columns].astype(np.float32).transpose(2, 0, 1).copy())
+        blur = Blur((about, arrays), (len(rows), len(columns)), (right, up), (n, d), vignetting=self.vignetting)
+        sharp, blurred = (v[:, room : room + self.patch, room : room + self.patch] for v in (around, blur(around)))
+        if self.sensor is None:
+            return sharp, blurred
+        seed = int(random.integers(1 << 31))
+        planes = np.stack([*expose(blurred.permute(1, 2, 0).numpy(), self.sensor, seed).values()])
+        facts = about_sensor(self.sensor, seed)
+        electrons = (planes - facts["black_level"]) * facts["electrons_per_number"]
+        return sharp, torch.from_numpy((electrons / self.sensor.electrons).astype(np.float32))

@@ -1,0 +1,204 @@
+"""Point spread of a lens over its film, at several f-numbers and distances: made by any executor, kept, and in a file.
+
+A file holds the arrays
+
+    psf          [N, D, rows, columns, C, side, side] float32: share of the light of each channel C in each pixel
+    place_mm     [rows, columns, 2] places in the picture from its middle: right and up
+    centre_mm    [N, D, rows, columns, 2] where the middle pixel of each lies: the mean of its rays
+    inside       [N, D, rows, columns, C] share of the light that lies in the pixels
+    light        [N, D, rows, columns] relative illumination, without losses in glass
+    by_rays      [N, D, rows, columns] whether rays were counted (`optics.analysis.diffraction`)
+    differs      [N, D, rows, columns] share of the light that rays place in other pixels than diffraction
+    f_number     [N], distance_m [D] from the film
+
+for N f-numbers and D distances, and in about.json what they are of. Rows and columns are those of the picture, which is
+upright: row 0 is its top.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens import __version__
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import read_arrays, write_arrays
+from neurolens.base.progress import Progress
+from neurolens.base.records import plain
+from neurolens.base.settings import LIGHT_NM
+from neurolens.base.tasks import Failed, run_each
+from neurolens.optics.lens.prescription import Lens
+from neurolens.pictures.defocus.plate import channel_wavelengths
+from neurolens.pictures.render.film import digest
+
+Arrays = dict[str, NDArray[Any]]
+Channels = dict[str, tuple[float, ...]]
+MOST_PX = 255  # pixels along a side of the point spread
+_NAMES = ("psf", "centre_mm", "inside", "light", "by_rays", "differs", "place_mm", "f_number", "distance_m")
+_COLOURS = 3  # wavelengths in a channel of a sensor
+
+
+@dataclass(frozen=True)
+class PsfTask:
+    """The point spread of a lens that is set, for objects at one distance from its film.
+
+    Attributes:
+        places_mm: (right, up) in the picture, row by row; the axis must come last.
+        channels: wavelengths of each channel, of equal weight. side: pixels; None takes what holds the light.
+    """
+
+    lens: Lens
+    distance_m: float
+    places_mm: tuple[tuple[float, float], ...]
+    channels: tuple[tuple[float, ...], ...]
+    pixel_mm: float
+    side: int | None
+
+
+def channels_of(kind: str, lens: Lens) -> Channels:
+    """Return the wavelengths of channels: R, G and B ("rgb"), or Y, all of these ("mono").
+
+    They share the light of each channel equally, as the film responds to it. A lens that is made for other light has
+    the wavelengths of its file in Y.
+    """
+    if not lens.visible:
+        return {"Y": lens.wavelengths_nm}
+    found = channel_wavelengths(((np.arange(_COLOURS) + 0.5) / _COLOURS).astype(np.float32), *LIGHT_NM)
+    colours = {name: tuple(np.round(nm, 1).tolist()) for name, nm in zip("RGB", found.astype(float), strict=True)}
+    return colours if kind == "rgb" else {"Y": tuple(nm for waves in colours.values() for nm in waves)}
+
+
+def places_of(film_mm: tuple[float, float], grid: tuple[int, int]) -> tuple[tuple[float, float], ...]:
+    """Return the middles of equal parts of the picture, row by row from the top: right and up, in mm."""
+    right, up = (size * ((np.arange(n) + 0.5) / n - 0.5) for size, n in zip(film_mm, grid, strict=True))
+    return tuple((x, y) for y in up[::-1].tolist() for x in right.tolist())
+
+
+def point_spread(task: PsfTask) -> Arrays:
+    """Return the arrays of a task as a file has them, [places, ...] without the axis.
+
+    Places that are mirror images of each other are computed once, where the stop is round.
+    """
+    from neurolens.optics.analysis.diffraction import pupils_at, reach_of, spread
+    from neurolens.optics.analysis.fields import Scene
+
+    film = -np.array(task.places_mm)  # the picture is upright, the image on the film is not
+    mirrored = np.abs(film) if task.lens.aperture is None else film
+    unique, number = np.unique(mirrored.round(9), axis=0, return_inverse=True)
+    waves = sorted({nm for some in task.channels for nm in some})
+    middle = task.channels[len(task.channels) // 2]
+    waves.insert(0, waves.pop(waves.index(sorted(middle)[len(middle) // 2])))  # the reference comes first
+    weights = np.array([[nm in some for nm in waves] for some in task.channels], np.float64)
+    pupils = pupils_at(Scene(task.lens, task.distance_m), unique, waves)
+    reach = max(reach_of(some) for some in pupils)
+    side = task.side or min(2 * math.ceil(reach / task.pixel_mm) + 1, MOST_PX)
+    found = [spread(some, weights, task.pixel_mm, side) for some in pupils]
+    turned, centres = [], []
+    for place, k in zip(film, number.reshape(-1), strict=True):
+        x, y = (-1 if a < -1e-9 and task.lens.aperture is None else 1 for a in place)
+        turned.append(found[k].light[:, ::y, ::-x])  # columns of the picture run against x
+        centres.append(-found[k].centre_mm * (x, y))
+    every = [found[k] for k in number.reshape(-1)]
+    axis = every[-1].pupil.sum()
+    whole = {
+        "psf": np.array(turned, np.float32), "centre_mm": np.array(centres),
+        "inside": np.array([s.inside for s in every]),
+        "light": np.array([s.pupil.sum() / axis if axis > 0 else 0.0 for s in every]),
+        "by_rays": np.array([s.by_rays for s in every]), "differs": np.array([s.differs for s in every]),
+    }  # fmt: skip
+    return {name: array[:-1] for name, array in whole.items()}
+
+
+def library_of(
+    lenses: Mapping[float, Lens], distances_m: Sequence[float], task: PsfTask, grid: tuple[int, int],
+    executor: Executor, folder: Path, progress: Progress,
+) -> Arrays:  # fmt: skip
+    """Return the arrays of a file for lenses that are set, by f-number. Parts that are done are kept in a folder.
+
+    Raises:
+        NeurolensError: a part has failed; the others are kept. Lost: the executor has failed.
+    """
+    tasks = [replace(task, lens=lens, distance_m=d) for lens in lenses.values() for d in distances_m]
+    parts = [folder / f"{digest([__version__, each])}.npz" for each in tasks]
+    named = dict(zip(map(id, tasks), parts, strict=True))
+    missing = [each for each in tasks if not named[id(each)].is_file()]
+    folder.mkdir(exist_ok=True)
+    with progress.stage(f"point spread at {len(task.places_mm) - 1} places, {len(tasks)} states") as report:
+        for done, (each, answer) in enumerate(run_each(executor, point_spread, missing), 1):
+            if isinstance(answer, Failed):
+                raise NeurolensError(f"point spread at {each.distance_m:g} m: {answer.reason}; {how_to_resume(folder)}")
+            write_arrays(named[id(each)], {}, answer)
+            report((len(tasks) - len(missing) + done) / len(tasks))
+    found = []
+    for part in parts:
+        with read_arrays(part) as (_, read):
+            found.append({name: read(name) for name in _NAMES[:6]})
+    side = max(made["psf"].shape[-1] for made in found)
+    for made in found:
+        room = (side - made["psf"].shape[-1]) // 2
+        made["psf"] = np.pad(made["psf"], [(0, 0), (0, 0), (room, room), (room, room)])
+    states, (columns, rows) = (len(lenses), len(distances_m)), grid
+    arrays = {name: np.array([made[name] for made in found]) for name in found[0]}
+    arrays = {name: a.reshape(*states, rows, columns, *a.shape[2:]) for name, a in arrays.items()}
+    arrays["place_mm"] = np.array(task.places_mm[:-1]).reshape(rows, columns, 2)
+    return arrays | {"f_number": np.array([*lenses]), "distance_m": np.array(distances_m)}
+
+
+def forget(folder: Path) -> None:
+    """Remove the parts of a library that is written."""
+    for part in folder.glob("*.npz"):
+        part.unlink()
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def how_to_resume(folder: Path) -> str:
+    """Say in a sentence how to resume a library whose parts are in a folder."""
+    return f"parts that are done are kept in {folder}: the same command goes on"
+
+
+def read_psf(path: Path) -> tuple[dict[str, Any], Arrays]:
+    """Read a file of point spread: what it is of, and its arrays.
+
+    Raises:
+        InputError: it is no such file.
+    """
+    try:
+        with read_arrays(path, _NAMES) as (about, read):
+            return dict(about), {name: read(name) for name in _NAMES}
+    except ValueError as error:
+        raise InputError(path, "file", f"({error})", "a file of neurolens psf (.npz)") from None
+
+
+def channels_of_exr(arrays: Arrays, names: Sequence[str]) -> Arrays:
+    """Return an atlas [rows side, columns side] of each state and channel, as channels of an EXR."""
+    psf, planes = arrays["psf"], Arrays()
+    rows, columns, _, side, _ = psf.shape[2:]
+    for n, f_number in enumerate(arrays["f_number"]):
+        for d, distance in enumerate(arrays["distance_m"]):
+            for c, name in enumerate(names):
+                layer = f"f{f_number:g}_{distance:g}m".replace(".", "p")
+                atlas = psf[n, d, :, :, c].transpose(0, 2, 1, 3).reshape(rows * side, columns * side)
+                planes[f"{layer}.{name}"] = atlas
+    return planes
+
+
+def about(lens: Lens, settings: Mapping[str, Any], channels: Channels) -> dict[str, Any]:
+    """Return what about.json says: units, channels, the lens and how photographs of the product agree with it."""
+    from neurolens.base.find import read_index
+
+    row = read_index().get(f"{lens.lens_id}.toml", {}).get("row", {})
+    checked = {key: row.get(key) for key in ("match", "verdict")}
+    units = "lengths in mm, distances in m; psf: shares of a channel's light by pixel; rows from the top, upright"
+    return dict(plain({
+        "neurolens": __version__, "lens": lens.lens_id, "name": lens.name, "photographs": checked, "units": units,
+        "channels": channels, **settings,
+    }))  # fmt: skip

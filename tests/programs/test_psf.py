@@ -1,0 +1,185 @@
+"""`neurolens psf`: its file, resuming, orientation; blurred pictures, their adjoint and their noise."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_line import failure, run_json
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import library
+from neurolens.cameras.build import make_camera
+from neurolens.cli import main
+from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
+from neurolens.pictures.defocus.kernels import kernels_over
+from neurolens.pictures.render.pictures import read_channels
+from neurolens.pictures.render.settings import SensorSettings
+from neurolens.programs import psf as p
+from neurolens.programs.blur import Blur, BlurredPairs
+
+LENS = "laikin_double_gauss_50"
+WORDS = ("psf", LENS, "--film", "30x20", "--pixel-um", "8", "--grid", "3x2", "--focus", "2", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("psf") / "gauss.npz"
+    assert (
+        main(
+            [
+                *WORDS,
+                "--f-number",
+                "4,8",
+                "--distance",
+                "2,inf",
+                "--wavelengths",
+                "620,540,460",
+                "--side",
+                "41",
+                "-o",
+                str(out),
+            ]
+        )
+        == 0
+    )
+    return out
+
+
+def test_the_file_says_what_it_holds(made: Path) -> None:
+    about, arrays = p.read_psf(made)
+    assert arrays["psf"].shape == (2, 2, 2, 3, 3, 41, 41) and list(about["channels"]) == ["nm620", "nm540", "nm460"]
+    assert about["photographs"].keys() == {"match", "verdict"} and about["lens"] == LENS
+    assert arrays["f_number"].tolist() == [4, 8] and arrays["distance_m"].tolist() == [2, math.inf]
+    assert arrays["place_mm"][[0, 1], [0, 2]] == pytest.approx(np.array([[-10, 5], [10, -5]]))
+    assert arrays["psf"].sum((-2, -1)) == pytest.approx(arrays["inside"], abs=1e-5)
+    assert arrays["inside"][:, 0].min() > 0.97 and not made.with_name("gauss.npz.parts").exists()
+    # In focus the narrower stop is sharper at the corner, far out of focus it blurs less.
+    widths = (arrays["psf"].sum((4, -1)) > 0.02).sum(-1)[..., 0, 0]
+    assert widths[1, 1] < widths[0, 1]
+    assert (arrays["light"][0] < 1).all() and (arrays["light"][1] > arrays["light"][0]).all()
+    assert np.abs(arrays["centre_mm"] - arrays["place_mm"])[:, 0].max() < 0.03
+
+
+def test_an_image_out_of_focus_is_the_kernel_of_the_blur() -> None:
+    """Whose rays a camera makes from the film, in the upright picture: cat's eyes lie as they lie there."""
+    shot = Shot((30.0, 20.0), focus_m=2.0, f_number=2.0)
+    [cells] = kernels_over(make_camera(LENS, shot), (3750, 2500), [math.inf], (3, 2), (540.0, 540.0, 540.0))
+    lens = set_lens(read_lens(library() / "lenses" / f"{LENS}.toml"), replace(Shot.part(), focus_m=2.0, f_number=2.0))
+    task = p.PsfTask(lens, math.inf, (*p.places_of((30.0, 20.0), (3, 2)), (0.0, 0.0)), ((540.0,),), 0.008, 91)
+    for cell, image in zip(cells, p.point_spread(task)["psf"][:, 0], strict=True):
+        assert cell.kernel is not None
+        kernel = cell.kernel.centred(91, cell.place_px)[..., 1]
+        other = [np.abs(kernel / kernel.sum() - each).sum() / 2 for each in (image, image[::-1], image[::-1, ::-1])]
+        assert other[0] < 0.05 and other[1] > 1.3 * other[0] and other[2] > 1.3 * other[0]
+
+
+def test_images_on_both_sides_are_mirror_images(made: Path) -> None:
+    images = p.read_psf(made)[1]["psf"][0, 0]
+    assert images[0, 0] == pytest.approx(images[0, 2][..., ::-1], abs=1e-6)
+    assert images[0, 0] == pytest.approx(images[1, 0][..., ::-1, :], abs=1e-6)
+    assert np.abs(images[0, 0] - images[0, 2]).max() > 0.05 * images.max()
+
+
+def test_parts_that_are_done_are_not_computed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, computed, one = tmp_path / "a.npz", list[float](), p.point_spread
+
+    def failing(task: p.PsfTask) -> p.Arrays:
+        computed.append(task.distance_m)
+        if len(computed) == 2:
+            raise MemoryError("gone")
+        return one(task)
+
+    words = [*WORDS, "--distance", "1", "3", "--side", "9", "--f-number", "5.6", "--wavelengths", "550", "-o", str(out)]
+    monkeypatch.setattr(p, "point_spread", failing)
+    assert main(words) == 2 and not out.exists()
+    assert len(list(out.with_name("a.npz.parts").iterdir())) == 1
+    assert main(words) == 0
+    assert computed == [1, 3, 3] and p.read_psf(out)[1]["psf"].shape == (1, 2, 2, 3, 1, 9, 9)
+
+
+def test_an_exr_holds_the_atlas_of_each_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = {"--wavelengths": "550", "--side": 15, "--f-number": 5.6, "--plot": tmp_path / "a.svg"}
+    data = run_json(capsys, *WORDS, *(w for pair in words.items() for w in pair), "-o", tmp_path / "a.exr")
+    planes, about = read_channels(tmp_path / "a.exr")
+    assert planes["f5p6_2m.nm550"].shape == (30, 45) and about["pixel_um"] == 8
+    assert data["psfs"] == 6 and data["side_px"] == 15 and (tmp_path / "a.svg").read_text().count("µm")
+    assert json.loads(json.dumps(about))["channels"] == {"nm550": [550.0]}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--pixel-um", "0"), "--pixel-um"), (("--f-number", "2,x"), "expected f-numbers"),
+        (("--side", "8"), "an odd number"),
+        (("--distance", "-1"), "a distance in metres above 0"), (("--grid", "0x3"), "COLUMNSxROWS"),
+        (("-o", "a.safetensors"), ".npz or .exr"), (("--wavelengths", "5"), "wavelengths in nm"),
+        (("--focus", "0.01"), "focus"),
+    ],
+)  # fmt: skip
+def test_bad_values_are_one_line(words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert said in failure(capsys, *WORDS[:-1], *words)
+
+
+def test_a_file_of_other_arrays_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", psf=np.zeros(3))
+    with pytest.raises(InputError, match="a file of neurolens psf"):
+        Blur(tmp_path / "a.npz", (8, 8))
+
+
+def noise(*shape: int) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(3).standard_normal(shape))
+
+
+@pytest.mark.parametrize(("size", "at_mm"), [((60, 90), (0.0, 0.0)), ((40, 25), (9.0, -4.0)), ((8, 7), (14.0, 9.0))])
+def test_the_adjoint_has_the_same_inner_products(made: Path, size: tuple[int, int], at_mm: tuple[float, float]) -> None:
+    blur = Blur(made, size, at_mm, state=(0, 1))
+    x, y = noise(3, *size), noise(4, 3, *size)[1]
+    assert float((blur(x) * y).sum()) == pytest.approx(float((x * blur.adjoint(y)).sum()), rel=1e-12, abs=1e-12)
+    x.requires_grad_(True)
+    (gradient,) = torch.autograd.grad((blur(x) * y).sum(), x)
+    torch.testing.assert_close(gradient, blur.adjoint(y))
+
+
+def test_a_point_becomes_the_point_spread_of_its_place(made: Path) -> None:
+    """At a place of the file, and half way to the next, where it is the mean of both."""
+    _, arrays = p.read_psf(made)
+    x = torch.zeros(3, 81, 81, dtype=torch.float64)
+    x[:, 40, 40] = 1
+    at, beside = arrays["psf"][0, 0, 0, 0].astype(float), arrays["psf"][0, 0, 0, 1].astype(float)
+    at, beside = (k / k.sum((-2, -1), keepdims=True) for k in (at, beside))
+    found = Blur(made, (81, 81), (-10.0, 5.0), vignetting=False)(x).numpy()[:, 20:61, 20:61]
+    assert found == pytest.approx(at, abs=1e-12)
+    found = Blur(made, (81, 81), (-5.0, 5.0), vignetting=False)(x).numpy()[:, 20:61, 20:61]
+    assert found == pytest.approx((at + beside) / 2, abs=1e-12)
+    dark = Blur(made, (81, 81), (-10.0, 5.0))(x).sum((1, 2)).numpy()
+    assert dark == pytest.approx(arrays["light"][0, 0, 0, 0], rel=1e-9)
+
+
+def test_pairs_have_the_blur_and_the_noise_of_the_sensor(made: Path) -> None:
+    """Light is kept, so that lateral colour, which is another scale, changes grey by its 0.1%."""
+    flat = np.full((90, 70, 3), 0.4, np.float32)
+    clean = BlurredPairs([flat], [made], patch=32, length=3, vignetting=False)
+    sharp, blurred = clean[1]
+    assert len(clean) == 3 and sharp.shape == blurred.shape == (3, 32, 32)
+    assert blurred.numpy() == pytest.approx(0.4, rel=1e-3)
+    noisy = BlurredPairs([flat], [made], 32, SensorSettings(electrons=1000, read_noise=5), vignetting=False)
+    _, read = noisy[0]
+    assert read.shape == (1, 32, 32)
+    assert float(read.mean()) == pytest.approx(0.4, abs=5 * 0.02 / 32)
+    assert float(read.std()) == pytest.approx(math.sqrt(400 + 25) / 1000, rel=0.1)
+    assert torch.equal(read, noisy[0][1]) and not torch.equal(read, BlurredPairs([flat, flat], [made], 32)[1][1][:1])
+    with pytest.raises(InputError, match="at least 96 pixels"):
+        BlurredPairs([flat], [made], 96)[0]
+
+
+def test_a_state_that_is_not_there_is_refused(made: Path) -> None:
+    with pytest.raises(InputError, match="the file's states"):
+        Blur(made, (8, 8), state=(2, 0))
+    with pytest.raises(InputError, match="picture"):
+        Blur(made, (8, 8))(torch.zeros(3, 8, 9))
