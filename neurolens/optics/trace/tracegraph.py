@@ -32,7 +32,7 @@ from neurolens.optics.trace.transmission import Passage, Shares, times_film
 TRANSMITTANCE = (
     "Transmittance: of unpolarised light, with the polarisation that surfaces give to it, coatings and absorption."
 )
-_DEGREE, _FIT = 8, 1e-9  # degrees that the series of sine and cosine may have, and how close they are
+_DEGREE, _FIT = 8, 1e-11  # degrees that the series of sine and cosine may have, and how close they are
 _WIDEST_MM = 1e15  # widest radius of a stop, whose square is still finite in float32
 _HALVINGS = 12  # of a phase, at most: films of 500 waves
 
