@@ -122,7 +122,7 @@ release:
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy -n 2
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
