@@ -149,7 +149,8 @@ examples:
         data = {
             "file": str(self.out), "lens": lens.lens_id, "psfs": count, "side_px": arrays["psf"].shape[-1],
             "channels": list(waves), "by_rays": int(arrays["by_rays"].sum()), "plot": self.plot and str(self.plot),
-            "least_inside": float(arrays["inside"].min()), "cpu_s_a_psf": (time.process_time() - began) / count,
+            "least_inside": float(arrays["inside"].min()),
+            "cpu_s_a_psf": None if self.dask else (time.process_time() - began) / count,
         }  # fmt: skip
         if data["least_inside"] < 0.9:
             note(f"at some places {1 - data['least_inside']:.0%} of the light lies beyond {data['side_px']} pixels")
@@ -172,8 +173,8 @@ def _flat(values: tuple[tuple[float, ...], ...] | None) -> list[float]:
 
 def _text(data: dict[str, Any]) -> str:
     how = f"{data['by_rays']} of them by rays, " if data["by_rays"] else ""
+    how += f"{cli.number(data['cpu_s_a_psf'], 2)} CPU s each" if data["cpu_s_a_psf"] else "made on a cluster"
     return (
         f"{data['file']}: {data['psfs']} point spreads of {', '.join(data['channels'])}, {data['side_px']} pixels a "
-        f"side, {how}{cli.number(data['cpu_s_a_psf'], 2)} CPU s each; at least {data['least_inside']:.1%} of the light "
-        "inside"
+        f"side, {how}; at least {data['least_inside']:.1%} of the light inside"
     )
