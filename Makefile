@@ -94,7 +94,7 @@ test-shading: $(INSTALLED)
 	NEUROLENS_SHADING=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -rs tests/models/test_languages.py
 
 docs: $(INSTALLED) $(VENV)/.docs
-	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/docs
+	$(BIN)/sphinx-build -q -j 2 -W --keep-going -b html -c docs . build/docs
 	NEUROLENS_BROWSER="$(CHROMIUM)" OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 -rs --durations=10 tests/test_docs.py
 	@echo "Look at build/docs/index.html"
 
