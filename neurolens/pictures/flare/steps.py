@@ -286,7 +286,7 @@ class Stack:
             None if f is None else Shape(self._terms[k], *_sort(f), f.steps, f.bent, bool(f.across), f.turned),
             reflects(lens, k),
             bool(s.coating and s.coating.layers),
-            any(t.glass is not None or t.absorption_per_mm for t in lens.surfaces),
+            any(t.glass or t.absorbs_as or t.absorption_per_mm for t in lens.surfaces),
             lens.aperture if s.stop else None,
         )
 
