@@ -56,7 +56,8 @@ _MOST_LIGHTS = 8
 _STARS = 2  # lights whose stars are drawn, the brightest in view; each takes a second
 _HIGHLIGHT = 4.0  # times the picture's mean: what is brighter shines, or mirrors what shines
 _NEAR_DEG = 2.0  # within which a highlight is the image of a light
-_WAVES, _CELL_PX, _PHOTONS = 3, 2.0, 1 << 18  # wavelengths and cells of ghosts; photons of all lights together
+# Wavelengths of ghosts, of which coatings of many layers need so many; their cells; photons of all lights together.
+_WAVES, _CELL_PX, _PHOTONS = 10, 2.0, 1 << 18
 _TAIL = 1e-3  # share of the light that its range leaves out at either end
 
 
