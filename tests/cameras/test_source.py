@@ -184,7 +184,8 @@ def test_the_exact_lens_in_double_precision_is_the_tracer(name: str) -> None:
     assert wanted.transmittance is not None
     for key, value in zip(("x_mm", "y_mm", "z_mm", "dx", "dy", "dz"), wanted.rays, strict=True):
         assert np.abs(found[key] - value.numpy())[passed].max() < 1e-12
-    assert np.abs(found["transmittance"] - wanted.transmittance.numpy())[passed].max() < 1e-8
+    # What absorption leaves by tanh, a rational function that errs by 2.1e-8 (`graph.program`).
+    assert np.abs(found["transmittance"] - wanted.transmittance.numpy())[passed].max() < 2.1e-8
 
 
 @pytest.mark.whole  # as of a model
