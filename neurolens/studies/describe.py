@@ -232,14 +232,15 @@ def read_quietly(path: Path) -> Lens:
 def library_row(path: Path, checked: bool = True, characters: bool = False) -> dict[str, Any]:
     """Return a lens file as a row of a table.
 
-    Returns: lens, file, notes (the warnings of its reader), `lens_row`, checked or not, and its character (None unless
-    asked for). A file that cannot be read has the verdict "unreadable", with the error as its doubt.
+    Returns: lens, file, notes (the warnings of its reader), `lens_row`, checked or not, and its character and T-stop
+    (None unless asked for). A file that cannot be read has the verdict "unreadable", with the error as its doubt.
     """
     with warned(path) as notes:
         try:
             lens = read_any(path)
             row = lens_row(lens, check_lens(lens) if checked else None)
             row["character"] = character_or_none(lens)[0] if characters else None
+            row["t_stop"] = t_stop_of(lens) if characters else None
         except NeurolensError as error:
             row = {"verdict": "unreadable", "doubts": [str(error).removeprefix(f"{path}: ")]}
     return {"lens": path.stem, "file": str(path), **row, "notes": notes}
@@ -357,6 +358,16 @@ def character_or_none(lens: Lens) -> tuple[dict[str, float | None] | None, bytes
         return None, None
     figures = {k: None if math.isnan(v) else float(f"{v:.4g}") for k, v in found.to_dict().items()}
     return figures, picture(discs)
+
+
+def t_stop_of(lens: Lens) -> float | None:
+    """Return the T-stop at the d line of a lens as read from its file, with four digits; None where none is known."""
+    try:
+        placed = set_lens(lens)
+        found = state_of(placed, placed.light_nm)["t_stop"]
+    except NeurolensError:
+        return None
+    return found and float(f"{found:.4g}")
 
 
 def discs_of(lens: Lens, field_deg: list[float]) -> Discs:
