@@ -29,6 +29,7 @@ WRITTEN = {
     "layout",
     "breathing",
     "fit",
+    "plot",
 }  # what options name that a command writes
 
 

@@ -73,6 +73,11 @@ PLAIN: dict[str, tuple[str, str, str]] = {
         f"{FULL}, --output laikin_double_gauss_50_ols-36-handover",
         "laikin_double_gauss_50_ols-36-handover/README.md",
     ),
+    "copies": (
+        f"{LENS} --number 1",
+        f"--output {LENS}-copies",
+        f"{LENS}-copies/{LENS}-001.toml",
+    ),
     "psf": (
         f"{LENS} --grid 1x1",
         f"{TRIPLET}, --output {LENS}-psf.npz, --pixel-um 4.15",

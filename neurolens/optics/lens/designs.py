@@ -177,7 +177,7 @@ def assumed(year: int | None) -> str:
 
 
 def with_assumptions(lens: Lens) -> Lens:
-    """Return a lens, as read, with what its source leaves open and no product lacks: coatings, and absorption of glass.
+    """Return a lens with what its source leaves open and no product lacks: coatings, and absorption of glass.
 
     Its surfaces between glass and air have the coating that is `assumed` by the first year that the source names.
     Glasses without a name absorb as the catalogue glass with the nearest n_d and V_d. A lens for other than visible
@@ -188,7 +188,8 @@ def with_assumptions(lens: Lens) -> Lens:
     name, rows, before = assumed(year_of(lens.source)), [], float(lens.object_medium.n_d)
     for s in lens.surfaces:
         n_d = float(s.n_d)
-        if s.coating is None and before != n_d and 1.0 in (before, n_d):
+        given = s.coating is not None and s.coating.origin != "assumed"
+        if not given and before != n_d and 1.0 in (before, n_d):
             s = replace(s, coating=replace(design(name, before, n_d), origin="assumed"))
         if s.glass is None and s.V_d is not None and n_d > 1 and not s.absorption_per_mm:
             s = replace(s, absorbs_as=str(nearest(n_d, s.V_d)))

@@ -10,6 +10,7 @@ import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import check_bounds, setting
+from neurolens.optics.lens.designs import with_assumptions
 from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.rims import check_states
@@ -79,7 +80,7 @@ def copies_of(lens: Lens, tolerances: Tolerances, number: int, seed: int) -> Ite
                 continue
             said = f"Copy {n} of seed {seed}, drawn at random about the figures of its lens."
             notes = " ".join(filter(None, (lens.notes, lens.derived, said)))
-            yield replace(copy, name=f"{lens.name}, copy {n}", notes=notes, derived="")
+            yield replace(with_assumptions(copy), name=f"{lens.name}, copy {n}", notes=notes, derived="")
             break
         else:
             raise InputError(lens.path, last.field, last.value, f"{last.expected} (in one of {_DRAWS} draws of a copy)")
