@@ -235,11 +235,15 @@ class _Two(StateSpace):
 
 
 def test_graph_of_two_axes_agrees_with_the_model(tmp_path: Path) -> None:
-    """Nodes of the second axis are the zoom's with another core: whatever varies, the graph must follow it."""
+    """Nodes of the second axis are the zoom's with another core: whatever varies, the graph must follow it.
+
+    Coefficients that are 0 stay so: a node whose gates take more terms than those of others has another structure.
+    """
 
     def bent(node: LensModel) -> LensModel:
         core = node.core
-        return replace(node, core=replace(core, ab=1.01 * core.ab, scalars=core.scalars - 0.05))  # type: ignore
+        scalars = np.where(core.scalars != 0, core.scalars - 0.05, 0.0)  # type: ignore
+        return replace(node, core=replace(core, ab=1.01 * core.ab, scalars=scalars))  # type: ignore
 
     zoom, focus = space().axes[0], Axis("focus", "1/m", (0.0, 0.5), 1)
     nodes = [n for node in model().nodes for n in (node, bent(node))]
