@@ -26,11 +26,13 @@ from neurolens.models.pairs import (
     PairSettings,
     domain_of,
     make_pairs,
+    passing_rays,
     sample_domain,
     trace_pairs,
 )
 from neurolens.models.polynomial import ParaxialMethod, fit_paraxial, fit_polynomial
 from neurolens.models.targets import (
+    TRANSMITTANCE_TERMS,
     ModelSettings,
     Prepared,
     choose_gates,
@@ -39,6 +41,8 @@ from neurolens.models.targets import (
     scales_of,
 )
 from neurolens.models.terms import monomials, solve, vector_columns
+from neurolens.models.transmittance import refitted, with_transmittance
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.paraxial import stop_radius_mm
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
@@ -85,7 +89,7 @@ def film_um(of: LensModel) -> float:
     return float(((position * off) ** 2 + (direction * angles(out, truth)) ** 2).mean().sqrt())
 
 
-# About two and a half times what was measured; transmittance varies by 0.007 over these rays.
+# About two and a half times what was measured.
 LIMITS_UM = {"dense": 0.45, "omp": 12.0, "ols": 1.2}
 
 
@@ -102,7 +106,9 @@ def test_every_method_fits(method: str) -> None:
         assert fitted.core.coefficients_per_vector <= 36
         exponents = {tuple(e) for e in fitted.core.exponents.tolist()}
         assert len(exponents) == len(fitted.core.exponents)
-    truth = prepared().pairs.held_out
+    # What films reflect takes terms of its own, as `fit_model` gives every method; those of the rays leave 0.0025.
+    train, truth = prepared().pairs.train, prepared().pairs.held_out
+    fitted = with_transmittance([fitted], [(train.inputs, train.transmittance)], TRANSMITTANCE_TERMS)[0]
     out = fitted.predict(truth.inputs)
     assert (out.transmittance - truth.transmittance).square().mean().sqrt() < 1e-3
     on_surface = out.rays.x**2 + out.rays.y**2 + (out.rays.z - fitted.lens.surfaces[0].radius_mm) ** 2
@@ -264,7 +270,11 @@ def test_cylinders_fit_rays_and_rims(either: LensModel) -> None:
         assert errors.direction_rms_deg < 0.004
     else:
         assert errors.direction_rms_deg < 0.002 and errors.rms_um < 1.5 and errors.position_rms_um < 10
-        assert errors.transmittance_rms < 5e-4
+        # Films of 26 surfaces change with the wavelength faster than 48 terms follow; the bare lens has no such films.
+        assert errors.transmittance_rms < 3e-3
+        bare = coated(lens, "bare")
+        plain, rays = refitted([either], [bare], TRANSMITTANCE_TERMS)[0], passing_rays(bare, either.domain, 3000, 9)
+        assert ray_errors(bare, either.domain, rays, plain.predict).transmittance_rms < 5e-4
     shares = vignetting_errors(lens, either.domain, either.predict, count=30_000)
     assert shares["false_pass"] < 0.005 and shares["false_block"] < 0.005
 

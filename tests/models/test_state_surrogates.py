@@ -24,6 +24,9 @@ from neurolens.models.export import export_states
 from neurolens.models.fit import StateModel, StateSettings, StateSpace, fit_states, focus_axis, zoom_axis
 from neurolens.models.model import LensModel, mix
 from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
+from neurolens.models.targets import TRANSMITTANCE_TERMS
+from neurolens.models.transmittance import refitted
+from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
@@ -46,6 +49,16 @@ def space() -> StateSpace:
 @cache
 def model() -> StateModel:
     return fit_states(space(), StateSettings(terms=40, degree=5, rays=2500))
+
+
+@cache
+def bare() -> StateModel:
+    """The same model with the transmittance of the zoom without coatings, of glass that absorbs nothing."""
+    m, lens = model(), coated(space().lens, "bare")
+    clear = tuple(replace(s, absorption_per_mm=0.0, absorbs_as=None) for s in lens.surfaces)
+    plain = StateSpace(replace(lens, surfaces=clear), m.axes, focus_m=m.space.focus_m)
+    lenses = [plain.lens_at((z,)) for z in m.axes[0].nodes]
+    return StateModel(plain, tuple(refitted(m.nodes, lenses, TRANSMITTANCE_TERMS)))
 
 
 @cache
@@ -155,13 +168,23 @@ def test_a_node_is_its_own_model() -> None:
 
 @pytest.mark.parametrize("state", [91.7, 112.3, 187.0])
 def test_errors_between_nodes(state: float) -> None:
-    """No worse than twice the nodes and a micrometre, on the exact lens at states that no node has."""
+    """No worse than twice the nodes and a micrometre, on the exact lens at states that no node has.
+
+    The transmittance of bare, clear glass errs by 1e-4. Films and absorption change with the wavelength faster than 48
+    terms follow, and leave 9e-4 at every node; between nodes it is no more.
+    """
     part = model().at(state)
     (near, far), exact = part.domain.film_z_mm, set_lens(part.lens, zoom=state)
     assert near < exact.film_z_mm < far and near < best_focus_z_mm(exact) < far
     rays = passing_rays(part.lens, part.domain, 4000, 9)
     errors = ray_errors(part.lens, part.domain, rays, part.predict)
-    assert errors.rms_um < 1.7 and errors.transmittance_rms < 1e-4
+    assert errors.rms_um < 1.7 and errors.transmittance_rms < 1e-3
+    node = model().nodes[2]
+    at_node = ray_errors(node.lens, node.domain, passing_rays(node.lens, node.domain, 4000, 9), node.predict)
+    assert errors.transmittance_rms < 1.05 * at_node.transmittance_rms
+    plain = bare().at(state)
+    without_films = passing_rays(plain.lens, plain.domain, 4000, 9)
+    assert ray_errors(plain.lens, plain.domain, without_films, plain.predict).transmittance_rms < 1e-4
     shares = vignetting_errors(part.lens, part.domain, part.predict, count=30_000)
     assert shares["false_pass"] < 0.003 and shares["false_block"] < 0.003
 
@@ -235,11 +258,15 @@ class _Two(StateSpace):
 
 
 def test_graph_of_two_axes_agrees_with_the_model(tmp_path: Path) -> None:
-    """Nodes of the second axis are the zoom's with another core: whatever varies, the graph must follow it."""
+    """Nodes of the second axis are the zoom's with another core: whatever varies, the graph must follow it.
+
+    Coefficients that are 0 stay so: a node whose gates take more terms than those of others has another structure.
+    """
 
     def bent(node: LensModel) -> LensModel:
         core = node.core
-        return replace(node, core=replace(core, ab=1.01 * core.ab, scalars=core.scalars - 0.05))  # type: ignore
+        scalars = np.where(core.scalars != 0, core.scalars - 0.05, 0.0)  # type: ignore
+        return replace(node, core=replace(core, ab=1.01 * core.ab, scalars=scalars))  # type: ignore
 
     zoom, focus = space().axes[0], Axis("focus", "1/m", (0.0, 0.5), 1)
     nodes = [n for node in model().nodes for n in (node, bent(node))]
