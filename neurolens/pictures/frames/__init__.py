@@ -439,8 +439,10 @@ def flare_channels(flare: Mapping[str, FloatArray], space: ColourSpace) -> Layer
             f"({below / above:.1%} of the light){wider}"
         )
     if parts := [name for name in inside if name not in LAYERS]:
-        whole = np.maximum(np.sum([inside[name] for name in parts], 0), np.finfo(np.float32).tiny)
-        inside |= {name: inside[name] * (inside["ghosts"] / whole) for name in parts}
+        ghosts, whole = inside["ghosts"], np.sum([inside[name] for name in parts], 0)
+        # Parts without light stay so; a sum may be below 0 where colours are not mixed.
+        lit = np.abs(whole) > np.finfo(np.float32).tiny
+        inside |= {name: inside[name] * np.divide(ghosts, whole, out=np.ones_like(whole), where=lit) for name in parts}
     return {f"{name}.{c}": colour[..., k] for name, colour in inside.items() for k, c in enumerate("RGB")}
 
 

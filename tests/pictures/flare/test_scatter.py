@@ -152,7 +152,9 @@ def _four_reflections(lens: Lens, rays: np.ndarray) -> float:
 
 def test_any_boost_gives_the_light_of_all_paths() -> None:
     """Of two and of four reflections: the sums over all pairs and over all paths of four, and the same places."""
-    lens, light = lens_of("cooke_triplet_50"), Light(15.0, 8.0)
+    # Bare, for of so many photons coated glass reflects one twice and none four times without a boost.
+    lens = set_lens(read_lens(LENSES / "cooke_triplet_50.toml"), focus_m=math.inf, coating="bare")
+    light = Light(15.0, 8.0)
     rays, _ = light_rays(lens, light, 0, COUNT)
     ghosts = GhostTracer(lens)
     exact = ghosts.trace(rays[:, : 1 << 14], 550.0, direct=True)
