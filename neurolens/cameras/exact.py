@@ -204,7 +204,8 @@ def axial_transmittance(lens: Lens, at_nm: Sequence[float], wavelength_nm: tuple
     """
     assert lens.film_z_mm is not None
     call = {"film_z_mm": np.array([[lens.film_z_mm]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
-    graph, rays = exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm), np.zeros((5, len(at_nm)))
+    # In double precision films are matrices, not polynomials, which may miss 0.02% a surface.
+    graph, rays = exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm, double=True), np.zeros((5, len(at_nm)))
     rays[4] = at_nm
     axial = evaluate(graph, {"rays": rays} | call)
     through = np.broadcast_to(axial["transmittance"], (1, len(at_nm)))[0]

@@ -59,6 +59,7 @@ Array = NDArray[np.float64]
 _FARTHEST_M = 1e4
 _DEGREE, _ORDERS = 7, 3  # degrees of the shift's polynomial, in the film point and in the wavelength
 _POINTS, _SIDE, _WAVES = 192, 8, 7  # what the fit uses: film points, pupil samples a side, wavelengths
+_TINTS = 61  # wavelengths of the tint: 5 nm over 400-700 nm, as coated old glass falls steeply below 420 nm
 _BEYOND = 1.5  # how far beyond the fitted points' shifts the farthest companion may lie
 _STEP = 1e-3  # share of the film's width: a step of the film point that tells how what it shows moves
 _SIDE_OF_AXIS = 64  # pupil samples a side, for the light on the axis
@@ -141,9 +142,9 @@ class ReducedDispersion:
         self._nm = min(max(LINE_D_NM, light[0]), light[1])
         self.lateral = self.dispersive = dispersion == "lateral" and camera.dispersive and light[0] < light[1]
         self.settings: dict[str, Any] = {**camera.settings, "dispersion": dispersion}
-        self._lit_nm = np.linspace(*light, _WAVES)
+        self._lit_nm = np.linspace(*light, _TINTS)
         lit = np.array([self._exposure(nm) for nm in (self._nm, *self._lit_nm)])
-        self._tint = lit[1:] / lit[0] if lit[0] > 0 else np.ones(_WAVES)
+        self._tint = lit[1:] / lit[0] if lit[0] > 0 else np.ones(_TINTS)
         self.achromatic = not self.lateral and bool(np.ptp(self._tint) == 0)
         self.companion_reach_mm: tuple[float, float] | None = None
         if self.lateral:

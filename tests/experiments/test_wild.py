@@ -4,7 +4,7 @@ import lens_models
 import numpy as np
 
 from experiments import lab
-from experiments.wild import TRACER, Form, Row, by_numpy, judge, tracer, wild
+from experiments.wild import TRACER, Form, Row, by_numpy, coated_surfaces, judge, tracer, wild
 from neurolens.base import status as st
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
@@ -58,7 +58,7 @@ def test_the_graph_of_the_exact_lens_is_the_tracer_for_wild_numbers() -> None:
     film, rear, stop = float(lens.film_z_mm), lens.surfaces[-1].semi_diameter_mm, float(lens.stop_radius_mm)
     ends = dict(zip(RAY, [(-20.0, 20.0)] * 2 + [(-rear, rear)] * 2, strict=True)) | {"wavelength_nm": LIGHT_NM}
     ends |= {"film_z_mm": (film, film + 1), "stop_radius_mm": (0.0, stop)}
-    tried = Form(lens_program([lens], (), planes), ends, ("film_z_mm", "stop_radius_mm"))
+    tried = Form(lens_program([lens], (), planes), ends, ("film_z_mm", "stop_radius_mm"), coated=coated_surfaces(lens))
     traced, row, rng = tracer(lens, planes[0]), Row("exact lens", TRACER), np.random.default_rng(5)
     for call in ({}, {}, {"stop_radius_mm": -stop}, {"stop_radius_mm": np.nan}, {"film_z_mm": np.inf}):
         rays = wild(tried, 10 * COUNT, rng) | {name: np.float32(value) for name, value in call.items()}
