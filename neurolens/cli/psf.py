@@ -150,8 +150,8 @@ examples:
         inside = float(arrays["inside"].min())
         found = Spread(
             file=str(self.out), lens=lens.lens_id, psfs=count, side_px=arrays["psf"].shape[-1], channels=list(waves),
-            by_rays=int(arrays["by_rays"].sum()), plot=self.plot and str(self.plot), least_inside=inside,
-            cpu_s_a_psf=None if self.dask else (time.process_time() - began) / count,
+            by_rays=int(arrays["by_rays"].sum()), plot=None if self.plot is None else str(self.plot),
+            least_inside=inside, cpu_s_a_psf=None if self.dask else (time.process_time() - began) / count,
         )  # fmt: skip
         if inside < 0.9:
             note(f"at some places {1 - inside:.0%} of the light lies beyond {found.side_px} pixels")
