@@ -100,9 +100,10 @@ def test_breathing_is_no_other_f_number(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "coated.toml"
-    material = 'n_d = 1.5168, V_d = 64.17, material = "N-BK7"'
+    material = 'n_d = 1.5168, V_d = 64.17, coating = "bare", material = "N-BK7"'
     more = 'coating = "quarter-wave", conic = -1.1, asphere = { 4 = 1e-7, 6 = 2e-10 }, absorption_per_mm = 0.01'
-    path.write_text(SINGLET.read_text().replace(material, f'glass = "N-BK7", {more}'))
+    assert material in (text := SINGLET.read_text())
+    path.write_text(text.replace(material, f'glass = "N-BK7", {more}'))
     row = run_json(capsys, "lens", path)["surfaces"][1]
     assert (row["conic"], row["asphere"], row["glass"]) == (-1.1, {"4": 1e-7, "6": 2e-10}, "N-BK7")
     assert row["n_d"] == pytest.approx(1.5168, abs=1e-4) and row["V_d"] == pytest.approx(64.17, abs=0.02)

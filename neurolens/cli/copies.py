@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
+from neurolens.base.report import Report
 from neurolens.base.settings import group, read_config, setting, whole, with_changes
 from neurolens.cli import arguments as cli
 from neurolens.cli.convert import write_checked
@@ -52,12 +52,22 @@ examples:
             write_checked(copy, path := self.out / f"{lens.lens_id}-{n:0{digits}}.toml")
             files.append(str(path))
         spans = [[e[0], e[-1]] for e in elements_of(lens)]
-        data: dict[str, Any] = {"lens": lens.name, "seed": self.seed, "elements": spans, "tolerances": asdict(limits)}
-        return self.answer(data | {"files": files}, lambda: _text(data, files))
+        return self.answer(Drawn(lens.name, self.seed, spans, limits, files))
 
 
-def _text(data: dict[str, Any], files: list[str]) -> str:
-    spans = ", ".join(f"{first}-{last}" for first, last in data["elements"])
-    limits = ", ".join(f"{name} {value:g}" for name, value in data["tolerances"].items())
-    written = files[0] if len(files) == 1 else f"{files[0]} to {files[-1]}"
-    return f"{data['lens']}: elements of surfaces {spans}\nwithin {limits}\n{written}"
+@dataclass(frozen=True)
+class Drawn(Report):
+    """Copies that were drawn: the first and last surface of each element, what limits them, and their files."""
+
+    lens: str
+    seed: int
+    elements: list[list[int]]
+    tolerances: Tolerances
+    files: list[str]
+
+    def text(self) -> str:
+        """Elements, limits and the files, from the first to the last."""
+        spans = ", ".join(f"{first}-{last}" for first, last in self.elements)
+        limits = ", ".join(f"{name} {value:g}" for name, value in asdict(self.tolerances).items())
+        written = self.files[0] if len(self.files) == 1 else f"{self.files[0]} to {self.files[-1]}"
+        return f"{self.lens}: elements of surfaces {spans}\nwithin {limits}\n{written}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +12,7 @@ import numpy as np
 
 from neurolens.base.errors import note
 from neurolens.base.files import write_arrays
+from neurolens.base.report import Report
 from neurolens.base.settings import (
     F_NUMBER,
     WAVELENGTH_NM,
@@ -146,17 +147,17 @@ examples:
 
             plot_point_spread(arrays, self.pixel_um, self.plot, lens.name, facts["channels"])
         count = int(np.prod(arrays["psf"].shape[:4]))
-        data = {
-            "file": str(self.out), "lens": lens.lens_id, "psfs": count, "side_px": arrays["psf"].shape[-1],
-            "channels": list(waves), "by_rays": int(arrays["by_rays"].sum()), "plot": self.plot and str(self.plot),
-            "least_inside": float(arrays["inside"].min()),
-            "cpu_s_a_psf": None if self.dask else (time.process_time() - began) / count,
-        }  # fmt: skip
-        if data["least_inside"] < 0.9:
-            note(f"at some places {1 - data['least_inside']:.0%} of the light lies beyond {data['side_px']} pixels")
-        return self.answer(data, lambda: _text(data))
+        inside = float(arrays["inside"].min())
+        found = Spread(
+            file=str(self.out), lens=lens.lens_id, psfs=count, side_px=arrays["psf"].shape[-1], channels=list(waves),
+            by_rays=int(arrays["by_rays"].sum()), plot=None if self.plot is None else str(self.plot),
+            least_inside=inside, cpu_s_a_psf=None if self.dask else (time.process_time() - began) / count,
+        )  # fmt: skip
+        if inside < 0.9:
+            note(f"at some places {1 - inside:.0%} of the light lies beyond {found.side_px} pixels")
+        return self.answer(found)
 
-    def _writer(self) -> Callable[[Arrays, dict[str, Any]], None]:
+    def _writer(self) -> Callable[[Arrays, Mapping[str, Any]], None]:
         """Return what writes the file, chosen before the work."""
         if (kind := self.out.suffix.lower()) == ".npz":
             return lambda arrays, facts: write_arrays(self.out, facts, arrays)
@@ -171,10 +172,25 @@ def _flat(values: tuple[tuple[float, ...], ...] | None) -> list[float]:
     return [value for some in values or () for value in some]
 
 
-def _text(data: dict[str, Any]) -> str:
-    how = f"{data['by_rays']} of them by rays, " if data["by_rays"] else ""
-    how += f"{cli.number(data['cpu_s_a_psf'], 2)} CPU s each" if data["cpu_s_a_psf"] else "made on a cluster"
-    return (
-        f"{data['file']}: {data['psfs']} point spreads of {', '.join(data['channels'])}, {data['side_px']} pixels a "
-        f"side, {how}; at least {data['least_inside']:.1%} of the light inside"
-    )
+@dataclass(frozen=True, kw_only=True)
+class Spread(Report):
+    """A file of point spreads that was written, and what it took."""
+
+    file: str
+    lens: str
+    psfs: int
+    side_px: int
+    channels: list[str]
+    by_rays: int
+    plot: str | None
+    least_inside: float
+    cpu_s_a_psf: float | None
+
+    def text(self) -> str:
+        """What the file holds, and how it was made."""
+        how = f"{self.by_rays} of them by rays, " if self.by_rays else ""
+        how += f"{cli.number(self.cpu_s_a_psf, 2)} CPU s each" if self.cpu_s_a_psf else "made on a cluster"
+        return (
+            f"{self.file}: {self.psfs} point spreads of {', '.join(self.channels)}, {self.side_px} pixels a side, "
+            f"{how}; at least {self.least_inside:.1%} of the light inside"
+        )

@@ -151,7 +151,9 @@ def test_a_pinhole_has_no_focus(pinhole: Path, capsys: pytest.CaptureFixture[str
 def test_far_wavelengths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     acrylic = tmp_path / "acrylic.toml"
     text = (LENSES / "thorlabs_lb1471_biconvex_50.toml").read_text(encoding="utf-8")
-    acrylic.write_text(text.replace('n_d = 1.5168, V_d = 64.17, material = "N-BK7"', 'glass = "PMMA"'), "utf-8")
+    glass = 'n_d = 1.5168, V_d = 64.17, coating = "bare", material = "N-BK7"'
+    assert glass in text
+    acrylic.write_text(text.replace(glass, 'coating = "bare", glass = "PMMA"'), "utf-8")
     assert "got 2200.0, expected 380 to 1620 nm" in failure(
         capsys, "analyse", acrylic, "spots", "--wavelengths", 2200, "--quiet"
     )
