@@ -31,6 +31,7 @@ Pair = tuple[float, float]
 # Degrees in film and pupil point: of the terms without a wavelength, of those linear in the wavelengths, and of the
 # quadratic ones. The second set serves where the first does not keep film points within `_WORST_MM`.
 _DEGREES = ((5, 3, 1), (7, 3, 1))
+_FITTED = 1.5  # up to where the variable of the wavelength counts as fitted; the ends of the fit are at 1
 _LIGHT_DEGREE, _TINT = 4, 8  # degrees of the ratio of light: in film and pupil point, and in the wavelength alone
 _STEPS, _CLOSE = 5, 1e-4  # steps of Newton's method, and how closely (mm) a shift must keep the scene ray
 _FAR_MM = 50.0  # distance from the lens at which an error of direction counts as one of position
@@ -147,7 +148,9 @@ def _shift_graphs(degrees: Degrees, weights: Array, tint: Array, scale: Array, w
         moved = (constant + (linear + quadratic * other) * other) * (other - hero)
         g.outputs[f"{what}_there"] = g.input(f"{what}_mm", 2) + moved
     light = g.series(other, tint) / g.series(hero, tint)
-    g.outputs["ratio"] = light.maximum(0.0) * ((other - hero) * g.input("tint") + 1.0)
+    # A wavelength far from those that were fitted has no light: the series would give it any number.
+    light = g.select(g.square(other) <= _FITTED**2, light.maximum(0.0), 0.0)
+    g.outputs["ratio"] = light * ((other - hero) * g.input("tint") + 1.0)
     return of_hero, g
 
 

@@ -235,6 +235,7 @@ def test_lights_send_what_the_front_receives(distance_m: float, depth: float) ->
 
 def test_photons_are_the_ghosts_and_none_is_lost() -> None:
     lens, light, count = double_gauss(), Light(15.0, 8.0), 1 << 17
+    lens = replace(lens, surfaces=tuple(replace(s, absorbs_as=None) for s in lens.surfaces))  # clear glass
     rays, _ = light_rays(lens, light, 0, count)
     exact = GhostTracer(lens).trace(rays[:, : 1 << 15], 550.0, direct=True)
     direct, twice = float(exact.power[-1].mean()), float(exact.power[:-1].sum(0).mean())
