@@ -18,8 +18,8 @@ from neurolens.pictures.flare.lights import Light, Patch, light_towards, rays_ac
 from neurolens.pictures.flare.steps import LOST, Floats, entering
 
 Array = NDArray[np.float64]
-# Lit cells, at least: what a coating reflects changes over a ghost; and cells along a side, at most.
-FEWEST, MOST = 2000, 512
+# Lit cells, at least, which leave up to 9% of the light of a ghost of many layers wrong; cells along a side, at most.
+FEWEST, MOST = 320, 512
 REACH = 16.0  # of `GhostTracer.follow`, so that rims can be cut between rays inside and outside
 _SCOUTS = 48  # cells a side of the grid of scouts, the rays that look for ghosts
 _FEW = 2  # every n-th scout along a side is traced at all wavelengths

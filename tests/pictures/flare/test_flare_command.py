@@ -440,14 +440,27 @@ def test_no_picture_replaces_what_it_is_made_from(tmp_path: Path, capsys: pytest
 def test_no_picture_is_negative(tmp_path: Path, space: str, colour: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Flare of saturated lights: nothing below zero, the luminance of the light kept, the layers still its sums."""
     out = tmp_path / "led.exr"
-    words = ["flare", "laikin_double_gauss_50", "--light", f"15,8,{colour}", "--width", "48", "--cell", "16"]
+    words = [
+        "flare",
+        "laikin_double_gauss_50",
+        "--light",
+        f"15,8,{colour}",
+        "--width",
+        "48",
+        "--cell",
+        "16",
+        "--coating",
+        "bare",
+    ]
     assert main([*words, "--bins", "4", "--layers", "2", "--colour-space", space, "-o", str(out)]) == 0
     said = capsys.readouterr().err
     rgb, layers = read_exr(out)[0], layers_of(out)
     assert min(picture.min() for picture in (rgb, *layers.values())) >= 0
     np.testing.assert_array_equal(layers["ghosts"], rgb)
     np.testing.assert_allclose(sum(v for name, v in layers.items() if name != "ghosts"), rgb, rtol=1e-5, atol=1e-7)
-    lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=math.inf, focus_mode="best")
+    lens = set_lens(
+        read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=math.inf, focus_mode="best", coating="bare"
+    )
     light = Light(15.0, 8.0, tuple(map(float, colour.split("/"))))
     job = FlareJob(lens, [light], Raster((36, 24), 48, 32), FlareSettings(bins=4, cell_px=16.0))
     raw = flare_layers(job)["ghosts"]
