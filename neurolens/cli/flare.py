@@ -211,7 +211,7 @@ examples:
             cli.check_written(Path(self.path[1]), "--path", "OUT.png")
 
     def assumed(self) -> Any:
-        """A light, too; and where none is given, and neither figures nor rays alone are asked for, a small picture."""
+        """Assume a light as well. Without a light, a path, CSV or JSON in the command, assume a small picture, too."""
         found = super().assumed() | ({} if self.lights or self.image else {"light": ("--light", self._a_light)})
         if any((self.light, self.lights, self.image, self.path, self.csv, self.json, self.frames.frames)):
             del found["out"]

@@ -433,7 +433,7 @@ def passing_rays(
 ) -> PairSet:  # fmt: skip
     """So many rays of a domain that the lens passes, from the number `first` on; a fit takes those of the first batch.
 
-    `report` is told how many there are. `batch`: rays that are traced at a time.
+    `report` is called with the number of rays found so far. `batch` is how many rays are traced at a time.
 
     Raises:
         InputError: fewer than one ray in 10,000 of the domain passes.

@@ -35,8 +35,8 @@ from neurolens.optics.lens.prescription import Lens
 
 # RMS at which no term is added: so long as there are fewer than `_CHEAP`, and from then on.
 FINE, TRANSMITTANCE_ERROR, _CHEAP = 8e-5, 4e-4, 24
-# Of the candidates: the degree in the ray's invariants and w together (by the number of these invariants), that in the
-# invariants beside high powers of w, and the highest of these. Of 12 coated lenses more of any gained nothing.
+# The degree of candidates in the ray's invariants and w together, by the number of invariants; the degree in the
+# invariants beside high powers of w; and the highest power of w. Of 12 coated lenses more of any gained nothing.
 _DEGREE, _BESIDE_W, _MOST_W = {3: 5, 6: 4}, 2, 10
 _CHOICE_RAYS, _PASSES = 8000, 3
 _BEYOND_LIGHT = 0.3  # weight of rays outside `LIGHT_NM`, where films reflect most and pictures have hardly any light

@@ -203,8 +203,8 @@ def coated(lens: Lens, names: str) -> Lens:
 
     Args:
         names: a design, for all surfaces whose coating the source of the lens does not state; "bare" takes every
-            coating away, "stated" all but those of the source. After commas come designs of single surfaces, whatever
-            these have: "three-layer,s07=bare".
+            coating away, "stated" all but those of the source. Designs of single surfaces follow after commas; they
+            replace stated ones, too: "three-layer,s07=bare".
 
     Raises:
         InputError: a design or surface is unknown, or a design cannot match the media.
