@@ -164,7 +164,7 @@ def _response(
     return Response(before, after, plus, minus, passes, fade)
 
 
-def _film(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _film(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Any]:
     """Return cos, sin / q and q sin of the phase q * `phase_per_q` of a film, and the factor `fade` in all three.
 
     Below q2 = 0 they turn into those of evanescent waves (cosh, sinh). Since cos and sin / q are entire functions of
@@ -172,6 +172,10 @@ def _film(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]
     thick film from overflowing.
     """
     x = q2 * phase_per_q**2
+    if x.device.type == "cpu" and not torch.compiler.is_compiling() and not (x < SMALL_PHASE2).any():
+        phase = torch.sqrt(x)  # nearly always: below, each ray is computed in all three ways
+        sine = torch.sin(phase) / phase * phase_per_q
+        return torch.cos(phase), sine, q2 * sine, 1.0
     small = x.abs() < SMALL_PHASE2
     phase = torch.sqrt(torch.where(small, 1.0, x.abs()))
     deep = (x < 0) & ~small
