@@ -52,7 +52,7 @@ LEAN_MODULES = {
         for name in ("arithmetic", "arrays", "shapes", "surfaces", "tracegraph", "transmission")
     ),
     *(f"neurolens.optics.setting.{name}" for name in ("focusing", "pupils", "rims", "states")),
-    *(f"neurolens.models.{name}" for name in ("assemble", "axes", "card", "cores", "file", "inverse")),
+    *(f"neurolens.models.{name}" for name in ("assemble", "axes", "card", "copied", "cores", "file", "inverse")),
     *(f"neurolens.models.{name}" for name in ("model", "source")),
 }
 
