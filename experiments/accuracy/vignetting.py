@@ -79,7 +79,7 @@ def opening_errors(lens: Lens, model: LensModel, count: int, seed: int = SEED) -
 
 def passing(lens: Lens, model: LensModel, rays: FilmRays) -> dict[str, tuple[Tensor, Tensor]]:
     """Whether rays pass the exact lens, and whether the model passes them, by name of `OPENINGS`."""
-    exact, predicted = trace_pairs(lens, rays, model.domain.pupil_z_mm), model.predict(rays)
+    exact, predicted = trace_pairs(lens, rays, model.domain.pupil_z_mm, power=False), model.predict(rays)
     x, y = exact.cross_x[lens.stop_index], exact.cross_y[lens.stop_index]
     return {
         name: (
@@ -217,7 +217,7 @@ def measure_models(rows: Sequence[Row], folder: Path, count: int) -> list[Row]:
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), SEED, start)
         predicted = torch.stack([onnx_predictor(model)(rays).status == st.PASSED for model in models])
-        parts.append((trace_pairs(lens, rays, domain.pupil_z_mm).status == st.PASSED, predicted))
+        parts.append((trace_pairs(lens, rays, domain.pupil_z_mm, power=False).status == st.PASSED, predicted))
     exact, passed = (torch.cat(part, -1) for part in zip(*parts, strict=True))
     return [
         {"lens": row["entry"], "model": row["model"], "passing": int(exact.sum())} | false_shares(exact, passed[n])

@@ -196,7 +196,7 @@ def _passing(data: RawData, y_mm: float) -> Array:
     plane = zero + data.encoding.film_plane_z_mm
     crossing = torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)])
     rays = FilmRays(zero, zero + y_mm, plane, crossing[0], crossing[1], low + (high - low) * points[2])
-    passed = trace_pairs(data.pairs.lens, rays, domain.pupil_z_mm).status == st.PASSED
+    passed = trace_pairs(data.pairs.lens, rays, domain.pupil_z_mm, power=False).status == st.PASSED
     return np.asarray(crossing[:, passed].T.numpy(), dtype=np.float64)
 
 
