@@ -271,15 +271,15 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
     for s in lens.surfaces:
         numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, *(index_of(s, w) for w in sorted(waves)))
         rows.append([[float(v) for v in numbers], s.stop, s.figure.record(), s.placement.record()])
-    return fingerprint_of([_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
+    return fingerprint_of([searching_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
 
 
 @cache
-def _code() -> list[str]:
+def searching_code() -> list[str]:
     """Hash the modules that trace and search, and name the library that computes."""
     package = Path(__file__).parents[1]
-    folders = ("optics/lens/*.py", "optics/trace/*.py", "optics/setting/*.py", "graph/*.py", "cameras/pupil_*.py")
-    files = [f"{file.name} {sha256_of(file)}" for folder in map(package.glob, folders) for file in sorted(folder)]
+    rooms = ("optics/lens/", "optics/trace/", "optics/setting/", "graph/", "models/", "cameras/pupil_")
+    files = [f"{file.name} {sha256_of(file)}" for room in rooms for file in sorted(package.glob(f"{room}*.py"))]
     return [*files, np.__version__]
 
 
