@@ -268,6 +268,11 @@ class PairSettings:
     rim: int = 30000
     seed: int = 1
 
+    def __post_init__(self) -> None:
+        for name in ("train", "held_out", "rim"):
+            if getattr(self, name) < 1:
+                raise InputError("settings", name, getattr(self, name), "at least one ray")
+
 
 @dataclass(frozen=True)
 class PairSet:
@@ -371,7 +376,7 @@ def make_pairs(
     `rim`, `edge` and `far` are filled from the rays drawn for `train`, as far as these go; their transmittance is NaN.
 
     Raises:
-        InputError: a split is empty, surfaces lie off the axis, the stop has blades or a mask (models give the crossing
+        InputError: surfaces lie off the axis, the stop has blades or a mask (models give the crossing
             with it instead), or fewer than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
@@ -380,9 +385,6 @@ def make_pairs(
         raise InputError(
             lens.path, "aperture", "(blades or a mask)", "a round stop: cameras shape it outside the model"
         )
-    for name in ("train", "held_out", "rim"):
-        if getattr(settings, name) < 1:
-            raise InputError("pairs", name, getattr(settings, name), "at least one ray")
     splits: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
     counts, tested, total = dict.fromkeys(splits, 0), 0.0, settings.train + settings.held_out
 

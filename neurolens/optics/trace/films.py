@@ -26,7 +26,7 @@ from torch import Tensor
 from neurolens.optics.lens.glass import index_at
 from neurolens.optics.trace.arithmetic import times
 from neurolens.optics.trace.surfaces import Hit, Medium
-from neurolens.optics.trace.transmission import FLOOR, Passage, Shares, times_film
+from neurolens.optics.trace.transmission import FLOOR, NO_FILM, Passage, Shares, times_film
 
 
 def coated_shares(
@@ -135,8 +135,7 @@ def _responses(
     if phase_beyond:
         q = torch.where(size > FLOOR, q, 0.0)
     wave_number = 2 * math.pi / wavelength_nm
-    s: tuple[Any, ...] = (1.0, 0.0, 0.0, 1.0)
-    p = s
+    s = p = NO_FILM
     fade: Any = 1.0
     for n_d, thickness_nm, *V_d in layers if sense > 0 else reversed(layers):
         index = index_at(n_d, V_d[0], wavelength_nm) if V_d else n_d
