@@ -126,10 +126,10 @@ def steps_of(lens: Lens, limits: Tolerances) -> tuple[list[_Step], list[_Step]]:
 
 def derivatives(model: LensModel, steps: Sequence[_Step], inputs: FilmRays) -> Answers:
     """Return the derivatives [V, ...] of the exact answers by each figure, and which rays go through with all."""
-    found, whole = [], torch.ones(len(inputs), dtype=torch.bool)
+    found, whole = list[list[Tensor]](), torch.ones(len(inputs), dtype=torch.bool)
     for off, step, _ in steps:
         if not step:
-            found.append(None)
+            found.append([])
             continue
         back = Off(*(-v for v in vars(off).values()))
         ahead, behind = (exact_answers(model, perturbed(model.lens, o), inputs) for o in (off, back))
@@ -212,7 +212,7 @@ class _Fit:
         allowed[there] = self.core.serves
         allowed[len(own) :] = True
         candidates = terms[allowed]
-        count, place = len(candidates), np.flatnonzero(allowed)
+        count, place = len(candidates), np.flatnonzero(allowed).tolist()
         bends = np.zeros((len(deviation), 3, FORMS, len(terms)))
         leans = np.zeros((len(deviation), len(self.gates), 2, len(terms)))
         for v, most in _MOST.items():
@@ -265,9 +265,9 @@ class _Fit:
         return ab.reshape(-1, *core.ab.shape), rows
 
 
-def _columns(chosen: list[int], count: int, place: Array, terms: int) -> list[int]:
+def _columns(chosen: list[int], count: int, place: list[int], terms: int) -> list[int]:
     """Return where columns of `count` candidates a form stand among those of all terms, of which `place` are these."""
-    return [k // count * terms + int(place[k % count]) for k in chosen]
+    return [k // count * terms + place[k % count] for k in chosen]
 
 
 def _pursued(
