@@ -131,7 +131,7 @@ def glass_of(element: Row, index: float) -> dict[str, Any]:
 
 
 def mended_of(row: Row, listed: Row) -> Row:
-    """The row with aspheres as decided: conic constants with a number added, and powers in place of the collection's."""
+    """The row with aspheres as decided: a number is added to conic constants, powers take the collection's place."""
     if row["key"] not in listed["aspheres"]:
         return row
     decided = listed["aspheres"][row["key"]]
@@ -542,7 +542,8 @@ def run(args: argparse.Namespace) -> None:
             beside = evidence(theirs_of(row, now, listed))
             decided.append([name, decision["differs"], evidence(now), beside, decision["decided"]])
     count = len([file for file in wanted if file.is_file()])
-    atomic_write_text(lab.RESULTS / "patent_lenses.md", page(left_out, doubles, count, decided, listed["aspheres_kept"]))
+    text = page(left_out, doubles, count, decided, listed["aspheres_kept"])
+    atomic_write_text(lab.RESULTS / "patent_lenses.md", text)
     print(f"{count} lens files in {args.out}, {len(left_out)} left out, {len(doubles)} there already")
 
 

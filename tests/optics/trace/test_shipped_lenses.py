@@ -125,8 +125,8 @@ def test_a_lens_lights_its_film_without_nan(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOME)
 def test_figures_computed_elsewhere_from_the_same_table(name: str) -> None:
-    """EFL and back focus to rounding, but where our file takes its glass from a catalogue, or to 6e-4 where it has n_d of
-    a source's n_e; blur to its sampling."""
+    """EFL and back focus to rounding, but where our file takes its glass from a catalogue, and to 6e-4 where it has the
+    n_d of a source's n_e; blur to its sampling."""
     if not SHARED.is_dir():
         pytest.skip("../shared is not there")
     other = json.loads((SHARED / f"{SAME_TABLE[name]}.json").read_text())
