@@ -161,7 +161,6 @@ def models() -> Answer:
         [
             ("experiments/results/zoom.md", "one model for a whole zoom: `python -m experiments zoom`"),
             ("experiments/results/inverse.md", "from the scene back to the film: `python -m experiments inverse`"),
-            ("experiments/results/phase.md", "the optical path, for diffraction: `python -m experiments phase`"),
             (
                 "experiments/results/vignetting.md",
                 "stopped down, without another fit: `python -m experiments vignetting`",
