@@ -16,7 +16,16 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
-from neurolens.models.cores import Array, Core, InvariantPolynomial, MirrorPolynomial, Network, Refracted, Residual
+from neurolens.models.cores import (
+    Array,
+    Core,
+    InvariantPolynomial,
+    MirrorPolynomial,
+    Network,
+    Phased,
+    Refracted,
+    Residual,
+)
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import FilmRays, passing_rays
 from neurolens.models.terms import (
@@ -125,7 +134,7 @@ def _opened(core: Core) -> tuple[Polynomial, Callable[[Polynomial], Core]]:
     """Return the polynomial that has the transmittance, and what makes the core of another in its place."""
     if isinstance(core, (InvariantPolynomial, MirrorPolynomial)):
         return core, lambda new: new
-    if isinstance(core, Refracted):
+    if isinstance(core, (Phased, Refracted)):
         inner, closed = _opened(core.parts[0])
         return inner, lambda new: replace(core, parts=(closed(new),))
     network = core.parts[1] if isinstance(core, Residual) else core
