@@ -132,7 +132,7 @@ class CoreValues:
     """The outputs of a core: three vectors (2 rows each), transmittance, gates (a row each; None without any).
 
     `unit`: the unit direction (3 rows) where a core gives it instead of `vectors[DIRECTION]`. `index`: the index of the
-    front glass, where the direction is that inside it (see `Refracted`).
+    front glass, where the direction is that inside it (see `Refracted`). `path_um`: see `Phased`.
     """
 
     vectors: tuple[Value, Value, Value]
@@ -140,6 +140,7 @@ class CoreValues:
     gates: Value | None
     unit: Value | None = None
     index: Value | None = None
+    path_um: Value | None = None
 
 
 _CoreType = TypeVar("_CoreType", bound=type)
@@ -475,3 +476,37 @@ class Refracted(Composite):
 
     def fixed(self, w: float) -> Self:
         return replace(super().fixed(w), index=np.array([np.polyval(self.index[::-1], w)]))
+
+
+@stored_as("phased")
+@dataclass(frozen=True, eq=False)
+class Phased(Composite):
+    """A core with a polynomial beside it that gives the optical path; `models.phase` says from where to where.
+
+    Attributes:
+        parts: the one core, whose rays stay as they are.
+        exponents: [M, 4] int64 of rho, sigma, tau, w. path: [M] coefficients in um.
+        focal_z_mm, front_z_mm: of the plane on which the path begins, and of the point about which it ends.
+        direction: coefficients of the direction s(P) in which a wave leaves; see `models.phase.Waves`.
+    """
+
+    parts: tuple[Any]
+    exponents: Exponents
+    path: Array
+    focal_z_mm: float
+    front_z_mm: float
+    direction: tuple[float, ...]
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        x, used = field.products(ROUND), self.exponents[:, -1] == 0
+        used = used | field.dispersive
+        path = g.polynomial(self.exponents[used][:, : x.rows], self.path[None, used], x)
+        return replace(self.parts[0].build(g, field, units), path_um=path)
+
+    def fixed(self, w: float) -> Self:
+        unique, merge = without_w(self.exponents, w)
+        return replace(super().fixed(w), exponents=unique, path=self.path @ merge)
+
+    @property
+    def coefficients(self) -> int:
+        return super().coefficients + len(self.path)
