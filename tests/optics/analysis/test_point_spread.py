@@ -193,7 +193,7 @@ def test_a_lens_without_symmetry_or_power_is_refused_and_a_dark_place_is_dark() 
         pupils_at(PINHOLE, np.zeros((1, 2)), [D])
 
 
-# Optiland 0.6.3: HuygensPSF(optic, field, 0.546074, num_rays=160, image_size=80, pixel_pitch=0.00025) of the surfaces of
+# Optiland 0.6.3: HuygensPSF(optic, field, 0.546074, num_rays=160, image_size=80, pixel_pitch=0.00025), the surfaces of
 # a lens file, with constant indices, without rims and with `float_by_stop_size`. Lens, f-number, film z and radius of
 # the stop in mm; by field in degrees the peak, and the full widths at its half along the meridian and across it in um.
 OPTILAND = [
