@@ -138,7 +138,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
             continue
         _lessen(picture)
         figures.append({"file": picture.name, "title": title})
-    models = [m for m in models_in(library() / "models") if m["lens"] == lens.lens_id]
+    models = [vars(m) for m in models_in(library() / "models") if m.lens == lens.lens_id]
     doubts = [*row["doubts"], *rim_doubts(lens), *notes]
     names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
     page = html(
