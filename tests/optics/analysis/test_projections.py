@@ -154,7 +154,7 @@ def test_blue_light_at_the_rim_does_not_bend_the_fit() -> None:
     field = field_of_camera(ROOT / "lenses" / "isshiki_fisheye_10.toml")
     _, left, told = files.fitted_projection("kannala-brandt", field, (384, 216), (36.0, 20.25), "here")
     assert all(worst < 0.002 for _, to, _, worst in left.by_field if to < 91)  # pixels; 0.03 with all points alike
-    assert left.rms_px < 0.04 and left.worst_at_deg > 111 and 0.001 < told["light_at_worst"] < 0.02
+    assert left.rms_px < 0.04 and left.worst_at_deg > 111 and 0.001 < told.light_at_worst < 0.02
 
 
 @pytest.mark.parametrize("camera", [GAUSS, ROOT / "models" / "nikon_zoom_14_24.ols-64.onnx"])
