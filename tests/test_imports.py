@@ -61,7 +61,7 @@ LEAN_MODULES = {
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
     "__init__": 25, "__main__": 4, "base": 2006, "graph": 2629, "optics": 9560, "models": 3770, "cameras": 4240,
-    "pictures": 7540, "programs": 2730, "studies": 3405, "cli": 3817, "front": 210,
+    "pictures": 7540, "programs": 2760, "studies": 3420, "cli": 3935, "front": 210,
 }  # fmt: skip
 SLACK = 1.03
 
