@@ -498,7 +498,7 @@ class LensState:
         return with_changes(self.given, {"aperture": self.aperture(), "film_mm": film_mm} | settings)
 
     def at(self, **settings: Any) -> Self:
-        """Return the same with other settings of the shot."""
+        """Return the state with some settings of the shot replaced."""
         return replace(self, given=replace(self.given, **settings))
 
 

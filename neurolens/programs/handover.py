@@ -399,7 +399,11 @@ class FittedProjection:
 def fitted_projection(
     kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
 ) -> tuple[projections.Projection, projections.Residual, FittedProjection]:
-    """Fit a projection to a field: the projection, what it leaves, and both as figures; raises InputError as `fit`."""
+    """Fit a projection to a field; return the projection, what it leaves, and both as figures.
+
+    Raises:
+        InputError: as `projections.fit`.
+    """
     step = [side / count for side, count in zip(film_mm, size, strict=True)]
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):

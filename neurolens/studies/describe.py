@@ -432,7 +432,10 @@ def character(lens: Lens) -> tuple[Character, Discs]:
 
 
 def character_or_none(lens: Lens) -> tuple[dict[str, float | None] | None, bytes | None]:
-    """Return the figures of `character` with four digits (None for NaN), and the `picture`; None twice without any."""
+    """Return the figures of `character` with four digits (None for NaN), and the `picture` of its discs.
+
+    Both are None for a lens whose character cannot be had.
+    """
     try:
         found, discs = character(lens)
     except NeurolensError:

@@ -91,7 +91,7 @@ class FlareJob:
 
     @property
     def exposure(self) -> float:
-        """The exposure: see `axis_irradiance`."""
+        """The irradiance on the axis at the mean wavelength: see `axis_irradiance`."""
         return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm))
 
     @cached_property
@@ -448,7 +448,12 @@ def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
 
 
 class Choice(NamedTuple):
-    """What the flare of all a scene's frames shares: ghosts that become layers; whether lights fade (`keep`)."""
+    """What is chosen once for the flare of all frames of a scene.
+
+    Attributes:
+        single: names of the ghosts that become layers.
+        fade: whether lights fade where they leave the view (`keep`).
+    """
 
     single: tuple[str, ...]
     fade: bool
