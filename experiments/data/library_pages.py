@@ -168,7 +168,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     """Name and title of each drawing, and the function that draws it to a path."""
     from neurolens.cli.analyse import analysis_of
-    from neurolens.optics.analysis.field_curves import draw_breathing
+    from neurolens.optics.analysis.breathing import draw_breathing
     from neurolens.optics.analysis.fields import Scene
     from neurolens.optics.analysis.layout import state_text
     from neurolens.optics.analysis.spots import spots

@@ -18,7 +18,7 @@ from neurolens.base.settings import changed, setting
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
-    from neurolens.optics.analysis.field_curves import Breath
+    from neurolens.optics.analysis.breathing import Breath
     from neurolens.optics.setting.rims import Rim
     from neurolens.studies.describe import LensFacts, SurfaceRow
 
@@ -121,7 +121,7 @@ examples:
 
             lens_layout(layout_profile(lens, domain), self.layout)
         if self.breathing is not None:
-            from neurolens.optics.analysis.field_curves import draw_breathing
+            from neurolens.optics.analysis.breathing import draw_breathing
 
             breathing = draw_breathing(lens, self.breathing)
         found = Described(

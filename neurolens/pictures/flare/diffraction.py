@@ -217,7 +217,7 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
     for number, patch in enumerate(parts):
         colours = spectral.response * spectral.spectrum(patch.light.rgb) / (spectral.bins * job.exposure)
         moved = raster.per_mm * image_moves(job.lens, patch, float(spectral.centres_nm.mean())) * (-1, 1)
-        smear = smear_of(patch, moved)
+        smear = smear_of(patch.weights, patch.round, moved)
         kernel = np.ones((1, 1), np.float32) if smear is None else smear.kernel(max(raster.width, raster.height) // 2)
         height, width = (n + k - 1 for n, k in zip((raster.height, raster.width), kernel.shape, strict=True))
         canvas = np.zeros((height, width, 3), np.float32)

@@ -159,7 +159,7 @@ def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) 
     for light in job.lights:
         for patch, pair, grid, moves in _parts(job, tracer, light, nm.tolist()):
             response = np.asarray(unit * spectral.response * spectral.spectrum(patch.light.rgb), np.float64).T
-            smear = canvas.smear_of(patch, raster.per_mm * moves * (-1, 1))
+            smear = canvas.smear_of(patch.weights, patch.round, raster.per_mm * moves * (-1, 1))
             coarse = 1 if smear is None else smear.coarse
             grid = grid.coarser(coarse, _CELLS)
             task = _Task(patch.light, pair, grid, *_bands(nm, response, grid))
