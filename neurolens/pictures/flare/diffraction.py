@@ -25,7 +25,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -37,11 +36,9 @@ from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.optics.lens.prescription import Lens
 from neurolens.pictures.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.pictures.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
+from neurolens.pictures.flare.job import FlareJob
 from neurolens.pictures.flare.lights import Floats, Light, patches
 from neurolens.pictures.render.colour import in_gamut
-
-if TYPE_CHECKING:
-    from neurolens.pictures.flare.layers import FlareJob
 
 _PER_CYCLE = 2.5  # cells a cycle of the field needs
 _NEAR, _FAR = 2.0, 4.0  # pixels from the centre: between these the sum over cells gives way to the outline

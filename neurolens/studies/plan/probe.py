@@ -36,7 +36,8 @@ from neurolens.optics.lens.shot import Dispersion, Shot
 from neurolens.optics.setting.pupils import image_radius_mm
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
-from neurolens.pictures.flare.layers import FlareJob, flare_layers
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import flare_layers
 from neurolens.pictures.flare.lights import Light, SceneLights, highlights, keep
 from neurolens.pictures.render.colour import SpectralRange
 from neurolens.pictures.render.job import expected_light
