@@ -68,7 +68,12 @@ def test_opencv_projects_to_the_same_pixels(kind: str, tmp_path: Path) -> None:
     found = example(kind)
     direction = rays(min(found.widest_rad, 1.5))
     path = tmp_path / "camera.yaml"
-    files.write_projection(tmp_path / "camera", found, {"rms_px": 0.25})
+    told = files.FittedProjection(
+        camera="it", model=kind, size=list(SIZE), focal_px=[1.0, 1.0], centre_px=[0.0, 0.0], coefficients={},
+        rms_px=0.25, worst_px=1.0, worst_at_deg=1.0, light_at_worst=1.0, field_deg=1.0, turns_back_at_deg=None,
+        by_field=[], before_film_mm=[1.0, 1.0],
+    )  # fmt: skip
+    files.write_projection(tmp_path / "camera", found, told)
     stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix, numbers = (stored.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
     assert (stored.getNode("image_width").real(), stored.getNode("avg_reprojection_error").real()) == (1920, 0.25)
