@@ -135,7 +135,7 @@ class CoreValues:
     """The outputs of a core: three vectors (2 rows each), transmittance, gates (a row each; None without any).
 
     `unit`: the unit direction (3 rows) where a core gives it instead of `vectors[DIRECTION]`. `index`: the index of the
-    front glass, where the direction is that inside it (see `Refracted`).
+    front glass, where the direction is that inside it (see `Refracted`). `path_um`: see `Phased`.
     """
 
     vectors: tuple[Value, Value, Value]
@@ -143,6 +143,7 @@ class CoreValues:
     gates: Value | None
     unit: Value | None = None
     index: Value | None = None
+    path_um: Value | None = None
 
 
 _CoreType = TypeVar("_CoreType", bound=type)
@@ -222,6 +223,16 @@ def symmetric(rows: Value, field: Field, scalars: int, light: Value | None = Non
     return CoreValues(vectors, through, gates if scalars > 1 else None)  # type: ignore[arg-type]
 
 
+def _merged(exponents: Exponents, w: float) -> tuple[Exponents, Array]:
+    """Return the exponents [K, V] that are left where w has one value, and how terms [M] join in them, [M, K]."""
+    rest = exponents.copy()
+    rest[:, -1] = 0
+    unique, place = np.unique(rest, axis=0, return_inverse=True)
+    merge = np.zeros((len(rest), len(unique)))
+    merge[np.arange(len(rest)), place.reshape(-1)] = w ** exponents[:, -1].astype(float)
+    return unique, merge
+
+
 class _Symmetric(Core):
     """Polynomials in invariants for the scalars and for A and B of A p + B u: `ab` [3, 2, .., M], `scalars` [S, M].
 
@@ -234,11 +245,7 @@ class _Symmetric(Core):
     _forms: ClassVar[tuple[Form, ...]]
 
     def fixed(self, w: float) -> Self:
-        rest = self.exponents.copy()
-        rest[:, -1] = 0
-        unique, place = np.unique(rest, axis=0, return_inverse=True)
-        merge = np.zeros((len(rest), len(unique)))
-        merge[np.arange(len(rest)), place.reshape(-1)] = w ** self.exponents[:, -1].astype(float)
+        unique, merge = _merged(self.exponents, w)
         return replace(self, exponents=unique, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
 
     def plus(self, ab: Array, scalars: Array) -> Self:
@@ -469,3 +476,37 @@ class Refracted(Composite):
 
     def fixed(self, w: float) -> Self:
         return replace(super().fixed(w), index=np.array([np.polyval(self.index[::-1], w)]))
+
+
+@stored_as("phased")
+@dataclass(frozen=True, eq=False)
+class Phased(Composite):
+    """A core with a polynomial beside it that gives the optical path; `models.phase` says from where to where.
+
+    Attributes:
+        parts: the one core, whose rays stay as they are.
+        exponents: [M, 4] int64 of rho, sigma, tau, w. path: [M] coefficients in um.
+        focal_z_mm, front_z_mm: of the plane on which the path begins, and of the point about which it ends.
+        direction: coefficients of the direction s(P) in which a wave leaves; see `models.phase.Waves`.
+    """
+
+    parts: tuple[Any]
+    exponents: Exponents
+    path: Array
+    focal_z_mm: float
+    front_z_mm: float
+    direction: tuple[float, ...]
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        x, used = field.products(ROUND), self.exponents[:, -1] == 0
+        used = used | field.dispersive
+        path = g.polynomial(self.exponents[used][:, : x.rows], self.path[None, used], x)
+        return replace(self.parts[0].build(g, field, units), path_um=path)
+
+    def fixed(self, w: float) -> Self:
+        unique, merge = _merged(self.exponents, w)
+        return replace(super().fixed(w), exponents=unique, path=self.path @ merge)
+
+    @property
+    def coefficients(self) -> int:
+        return super().coefficients + len(self.path)
