@@ -223,8 +223,8 @@ def symmetric(rows: Value, field: Field, scalars: int, light: Value | None = Non
     return CoreValues(vectors, through, gates if scalars > 1 else None)  # type: ignore[arg-type]
 
 
-def _merged(exponents: Exponents, w: float) -> tuple[Exponents, Array]:
-    """Return the exponents [K, V] that are left where w has one value, and how terms [M] join in them, [M, K]."""
+def without_w(exponents: Exponents, w: float) -> tuple[Exponents, Array]:
+    """Return the terms [U, V] that are left of [M, V] when w is known, and the matrix [M, U] that sums coefficients."""
     rest = exponents.copy()
     rest[:, -1] = 0
     unique, place = np.unique(rest, axis=0, return_inverse=True)
@@ -233,7 +233,7 @@ def _merged(exponents: Exponents, w: float) -> tuple[Exponents, Array]:
     return unique, merge
 
 
-class _Symmetric(Core):
+class Symmetric(Core):
     """Polynomials in invariants for the scalars and for A and B of A p + B u: `ab` [3, 2, .., M], `scalars` [S, M].
 
     The last column of the exponents is that of w.
@@ -245,8 +245,8 @@ class _Symmetric(Core):
     _forms: ClassVar[tuple[Form, ...]]
 
     def fixed(self, w: float) -> Self:
-        unique, merge = _merged(self.exponents, w)
-        return replace(self, exponents=unique, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
+        exponents, merge = without_w(self.exponents, w)
+        return replace(self, exponents=exponents, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
 
     def plus(self, ab: Array, scalars: Array) -> Self:
         """Return the polynomial with constants added to `ab` [3, 2, ..] and to the scalars [S]."""
@@ -266,12 +266,15 @@ class _Symmetric(Core):
     def coefficients(self) -> int:
         return int((self.ab != 0).sum() + (self.scalars != 0).sum())
 
-    def rows(self, g: Graph, field: Field, units: Units) -> Value:
-        """Return rows A of the three vectors, B of them, scalars without `light`; no terms in w where it is 0."""
+    def rows(self, g: Graph, field: Field, units: Units, more: Sequence[Array] = ()) -> Value:
+        """Return rows A of the three vectors, B of them, scalars without `light`, and `more` coefficients [R, M].
+
+        No terms in w are written where it is 0.
+        """
         ab = self.ab * np.array(units.vectors).reshape(3, *[1] * (self.ab.ndim - 1))
         scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
         a, b = (ab[:, k].reshape(-1, len(self.exponents)) for k in (0, 1))
-        x, weight = field.products(self._forms), np.concatenate([a, b, scalars])
+        x, weight = field.products(self._forms), np.concatenate([a, b, scalars, *more])
         used = ~self._coloured if field.dispersive else self.exponents[:, -1] == 0
         return g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
 
@@ -307,7 +310,7 @@ class _Symmetric(Core):
 
 @stored_as("invariants")
 @dataclass(frozen=True, eq=False)
-class InvariantPolynomial(_Symmetric):
+class InvariantPolynomial(Symmetric):
     """out = A p + B u, with A, B and the scalars polynomials in rho, sigma, tau, w.
 
     Attributes:
@@ -328,7 +331,7 @@ class InvariantPolynomial(_Symmetric):
 
 @stored_as("mirror")
 @dataclass(frozen=True, eq=False)
-class MirrorPolynomial(_Symmetric):
+class MirrorPolynomial(Symmetric):
     """The polynomial of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
 
     Attributes:
@@ -504,7 +507,7 @@ class Phased(Composite):
         return replace(self.parts[0].build(g, field, units), path_um=path)
 
     def fixed(self, w: float) -> Self:
-        unique, merge = _merged(self.exponents, w)
+        unique, merge = without_w(self.exponents, w)
         return replace(super().fixed(w), exponents=unique, path=self.path @ merge)
 
     @property

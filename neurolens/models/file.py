@@ -38,6 +38,7 @@ from neurolens.models.card import (
     default_state,
     read_metadata,
 )  # fmt: skip
+from neurolens.models.copied import Copied as Copied  # the cores of copies, which files may hold
 from neurolens.models.cores import CORES, Core
 from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 from neurolens.optics.lens.figures import figure_of
