@@ -340,7 +340,9 @@ def _sampled(
 ) -> NDArray[np.bool_]:
     """Test whether rays [N] of points of the unit square pass, at film positions and wavelengths `call` [2, N]."""
     (film_z, nanometres), stop = call, np.array([[share * lens.stop_radius_mm]])
-    inputs = {"film_mm": film, "square": square, "film_z_mm": film_z[None], "wavelength_nm": nanometres[None]}
-    sample = evaluate(pupil.graph, inputs | {"stop_radius_mm": stop})
-    passed = lens.status(film, sample["pupil_mm"], nanometres, film_z, stop) == st.PASSED
-    return np.asarray(passed & (sample["area_mm2"][0] > 0))
+    sample = evaluate(pupil.graph, {
+        "film_mm": film, "square": square, "film_z_mm": film_z[None], "wavelength_nm": nanometres[None],
+        "stop_radius_mm": stop,
+    })  # fmt: skip
+    status = lens.status(film, sample["pupil_mm"], nanometres, film_z, stop)
+    return np.asarray((status == st.PASSED) & (sample["area_mm2"][0] > 0))
