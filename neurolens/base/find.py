@@ -121,7 +121,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Found:
-    """What a query finds.
+    """The lenses that a query finds.
 
     Attributes:
         hits: the lenses that have all words of the query, best first.
