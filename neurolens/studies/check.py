@@ -201,8 +201,12 @@ def lens_of_card(
             lens there), in the working folder, and in this project.
 
     Raises:
-        InputError: there is no such file, or its prescription is the card's in no zoom state.
+        InputError: there is no such file, or its prescription is the card's in no zoom state; or the model is of a copy
+            of the lens, whose errors beside the exact copy are on its card.
     """
+    if copy := card["fit"]["settings"].get("copy"):
+        expected = "the model of a lens as designed: a copy's errors are on its card"
+        raise InputError(model_file, "fit.settings.copy", copy, expected)
     path = Path(lens_file) if lens_file is not None else find_lens(str(card["lens"]["id"]), Path(model_file))
     tabled = read_any(path)
     for lens in _states(tabled, float(card["lens"]["efl_mm"])):
