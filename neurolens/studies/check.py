@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -68,12 +68,11 @@ class Promise:
     promised: float
     measured: float | None
     allowed: float | None
+    holds: bool = field(init=False)
 
-    @property
-    def holds(self) -> bool:
-        if self.allowed is None:
-            return True
-        return self.measured is not None and self.measured <= self.allowed  # False for NaN
+    def __post_init__(self) -> None:
+        kept = self.allowed is None or (self.measured is not None and self.measured <= self.allowed)  # False for NaN
+        object.__setattr__(self, "holds", kept)
 
 
 def check_model(
