@@ -47,7 +47,7 @@ FINE, TRANSMITTANCE_ERROR, _CHEAP = 8e-5, 4e-4, 24
 # The degree of candidates in the ray's invariants and w together, by the number of invariants; the degree in the
 # invariants beside high powers of w; and the highest power of w. Of 12 coated lenses more of the first two gained
 # nothing; of 17, powers of w to 20 took 40% (median) off the error that those to 10 had in the light of pictures, which
-# films and flints make below 450 nm. Twice the terms gain 3% at most, and the logarithm loses 3 to 30%.
+# films and flints make below 450 nm. Twice the terms gain 4% at most, and the logarithm loses 1 to 31%.
 _DEGREE, _BESIDE_W, MOST_W = {3: 5, 6: 4}, 2, 20
 _CHOICE_RAYS, _PASSES = 8000, 3
 _BEYOND_LIGHT = 0.3  # weight of rays outside `LIGHT_NM`, where films reflect most and pictures have hardly any light
