@@ -106,7 +106,7 @@ examples:
     state: cli.LensState = group("state of the lens", names=tuple(n for n in BY_LENSES if n != "f_number"), unset=True)
 
     def assumed(self) -> Any:
-        """The pixel, too."""
+        """Return the values that a shot assumes, and the pitch of a pixel that follows from the film."""
         return super().assumed() | {"pixel_um": ("--pixel-um", self._pixel)}
 
     def _pixel(self) -> tuple[float, str]:

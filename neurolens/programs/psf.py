@@ -101,7 +101,7 @@ def places_of(film_mm: tuple[float, float], grid: tuple[int, int]) -> tuple[tupl
 
 
 def point_spread(task: PsfTask) -> Arrays:
-    """Return the arrays of a task as a file has them, [places, ...] without the axis.
+    """Return the arrays of a task as the file holds them, a row for each place off the axis.
 
     Places that are mirror images of each other are computed once, where the stop is round.
 

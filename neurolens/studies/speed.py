@@ -369,7 +369,11 @@ def program_candidate(
     name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None, flags: tuple[str, ...] = FLAGS,
     double: bool = False,
 ) -> Candidate:  # fmt: skip
-    """Return a program of `models.source`, compiled when the race prepares it; None takes the stop of the domain."""
+    """Return a program of `models.source` as a candidate, which is compiled when the race prepares it.
+
+    Args:
+        stop_radius_mm: None takes the stop of the domain.
+    """
     compiled = cache(lambda: CompiledSource(program, flags, double))
 
     @cache

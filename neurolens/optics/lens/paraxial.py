@@ -263,7 +263,7 @@ def stop_radius_mm(lens: Lens, f_number: float) -> float:
 
 
 def distance_m(focus_m: float) -> float:
-    """Return a distance (m), or infinity where the image of so far an object is, to a float64, the one at infinity."""
+    """Return a distance (m); infinity where a float64 cannot tell the image of such an object from one at infinity."""
     return math.inf if focus_m > _FAR_M else focus_m
 
 

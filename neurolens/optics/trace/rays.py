@@ -359,10 +359,15 @@ def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
 
 
 def check_rays(lens: Lens, rays: Rays, wavelength_nm: Tensor | float) -> None:
-    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not stated.
+    """Check that the components of rays are float tensors [N] of one length and dtype, and the wavelengths fit them.
 
-    Warn of wavelengths for which a glass's index is not stated; not of a tensor on a GPU, for which the host would
-    wait.
+    Wavelengths of a tensor on a GPU are not held against the glasses, for the host would have to wait.
+
+    Raises:
+        InputError: they are not, or as `glass.check_light`.
+
+    Warns:
+        NeurolensWarning: as `glass.check_light`.
     """
     shape, dtype = rays.x.shape, rays.x.dtype
     if dtype not in (torch.float32, torch.float64):
@@ -424,7 +429,12 @@ class GhostTrace(NamedTuple):
 
 
 def turning(count: int, reflections: Sequence[int]) -> list[tuple[int, Action]]:
-    """Return the steps of light from the front to the film of `count` surfaces, reflected at some, in this order."""
+    """Return the surfaces that light passes from the front to the film, each with "T" or, where it reflects, "R".
+
+    Args:
+        count: of surfaces.
+        reflections: the surfaces that reflect, in the order in which light meets them.
+    """
     steps: list[tuple[int, Action]] = []
     at, sense = 0, 1
     for k in reflections:

@@ -191,7 +191,12 @@ def gather(
     plate: Plate, camera: Camera, spread: NDArray[np.float64], samples: int = SAMPLES, threads: int = 1,
     report: Callable[[float], None] = lambda _: None,
 ) -> Gathered:  # fmt: skip
-    """Take a camera's picture of a plate; `spread` is `spread_over` of both, `samples` a power of two."""
+    """Take a camera's picture of a plate.
+
+    Args:
+        spread: what `spread_over` returns for this plate and camera.
+        samples: of a pixel, a power of two.
+    """
     width, height = plate.size
     points = _points(_SET, 5)
     jitter = np.ascontiguousarray(points[2:4].T)

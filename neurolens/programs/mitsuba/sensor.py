@@ -122,7 +122,7 @@ def _compile(variant: str) -> None:
 
 
 def rows(*values: Any) -> FloatArray:
-    """Evaluate numbers of the current variant, one wide or N, as [len(values), N] float32."""
+    """Evaluate values of the current variant, each one number or N, as rows [len(values), N] of float32."""
     arrays = [np.atleast_1d(np.asarray(value, np.float32)) for value in values]
     return np.stack(np.broadcast_arrays(*arrays))
 
