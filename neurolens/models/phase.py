@@ -47,7 +47,7 @@ from neurolens.optics.setting.pupils import camera_rays, on_plane
 from neurolens.optics.trace.rays import optical_path, trace
 from neurolens.optics.trace.surfaces import Rays
 
-TERMS, FINE_WAVES = 120, 0.005  # at most, and the RMS at which no term is added
+TERMS, FINE_WAVES = 120, 0.0015  # at most, and the RMS at which no term is added
 _DEGREE, _SURPLUS, _PASSES = 10, 1.5, 3  # of the candidates; terms before elimination over terms kept; of replacement
 _CHOICE_RAYS, _RAYS = 8000, 16_000
 _DIRECTION = 4  # coefficients of s(P): more make the path less smooth

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.status import DOMAIN_SLACK
@@ -27,6 +28,8 @@ from neurolens.optics.trace.surfaces import Rays
 
 _RAYS = 32  # along a side of the rectangle about what passes
 _WIDER = 1.1  # the rectangle over what passes
+# Rays up to so many radii of stop and rims count: before they are led to the source (the second: may pass), and after.
+_NEAR, _ASIDE, _BEYOND = 1.2, 1.04, 1.08
 _RIM = 2.0  # a gate is (height / rim radius)^2 - 1; with this added it stands for a height and a rim of this radius
 _NEWTON = 8  # steps from a direction to its point on the focal plane
 _SEARCH, _ROUNDS = 65, 3  # points among which the chief ray is sought, and how often
@@ -120,6 +123,11 @@ class _Known:
         if source is not None:
             way = source - self.front[:, None] - foot
             way = way / np.linalg.norm(way, axis=0)
+        slope, back = cosines / _forwards(cosines), self.model.domain.pupil_z_mm - self.core.focal_z_mm
+        stop_mm = self.scene.lens.stop_radius_mm
+        # Far outside the stop a model may fold: rays from there come back into it.
+        stop = out["stop"]  # of these rays, it is a rim, too: beyond it polynomials of the others may come back
+        near = self._passes(out, point + slope * back, _NEAR * stop_mm, _NEAR**2 - 1)
         # Rays of the source, by cosines: where those that leave so much aside come from.
         point = point + self._point_of(way) - self._point_of(leaves)
         aside = way - direction_at(self.core, point)
@@ -130,16 +138,18 @@ class _Known:
         shift = -(light * ahead).sum(0)
         if source is not None:
             shift = shift + ((source - self.front[:, None]) * way).sum(0)
+        pupil = point + slope * back
         found = list[ExitPupil | None]()
         for w, nm in enumerate(self.waves):
             part = {name: a[:, w * count : (w + 1) * count] for name, a in out.items()}
             foot, _, _ = foot_of(self.core, part["ray"])
             places, energy = self._across(foot, seen[3:, 0], source)
             gates = part.get("gates", np.zeros((0, count))) + _RIM
-            at = np.concatenate([part["stop"][None], np.stack([gates, 0 * gates], 1)])
-            limits = np.array([self.scene.lens.stop_radius_mm, *[_RIM] * len(gates)])
+            at = np.concatenate([part["stop"][None], stop[None], np.stack([gates, 0 * gates], 1)])
+            limits = np.array([stop_mm, _ASIDE * stop_mm, *[_RIM] * len(gates)])
             wave = part["path_um"][0] / 1000 + shift - (foot * aside).sum(0)
-            own = Arrived(cosines, place[:, None], at, part["power"][0], np.ones(count, bool), limits, 0, wave)
+            known = near & self._passes(part, pupil, _BEYOND * stop_mm, _BEYOND**2 - 1)
+            own = Arrived(cosines, place[:, None], at, part["power"][0], known, limits, 0, wave)
             found.append(fitted_pupil(self.scene.lens.aperture, own, places, energy, nm))
         return found
 
@@ -175,14 +185,18 @@ class _Known:
             slope = (pupil - place[:, None]) / (domain.pupil_z_mm - film_z)
             cosines = slope / np.sqrt(1 + (slope * slope).sum(0))
             out = self.rays(place[:, None], cosines, film_z, self.waves[0])
-            lit = (out["stop"] ** 2).sum(0) <= lens.stop_radius_mm**2
-            if "gates" in out:
-                lit &= (out["gates"] <= 0).all(0)
+            lit = self._passes(out, pupil, lens.stop_radius_mm)
             if not lit.any():
                 return None
             step = (high - low) / (2 * _RAYS - 1)
             low, high = pupil[:, lit].min(1) - step, pupil[:, lit].max(1) + step
         return cosines[:, lit].min(1), cosines[:, lit].max(1)
+
+    def _passes(self, out: dict[str, Array], pupil: Array, stop_mm: float, gate: float = 0.0) -> NDArray[np.bool_]:
+        """Return which rays [N] pass, of those through the pupil of the domain, outside which a model says anything."""
+        lit = (out["stop"] ** 2).sum(0) <= stop_mm**2
+        lit &= (pupil * pupil).sum(0) <= (self.model.domain.pupil_radius_mm * DOMAIN_SLACK) ** 2
+        return np.asarray(lit & (out.get("gates", np.zeros((1, 1))) <= gate).all(0))
 
     def _point_of(self, direction: Array) -> Array:
         """Return the points P [2, N] of the focal plane whose directions s(P) are these [3, N]."""
