@@ -109,8 +109,8 @@ class PhotonTracer:
     def turning(self, wavelength_nm: float, times: int) -> NDArray[np.float64]:
         """Return boosts [surfaces, 2, LEVELS] that make photons turn round `times` times (at most `LEVELS` - 1).
 
-        Each surface ahead is chosen in proportion to its reflectance at normal incidence, so that all paths with that
-        number of reflections have about the same weight. After that, reflection is no more frequent than it is.
+        Each surface ahead is chosen in proportion to its reflectance (a mean over angles of incidence), so that all
+        paths with that number of reflections have about the same weight. After that, reflection is as frequent as it is.
         """
         share = self.stack.reflectance(wavelength_nm)
         boosts = np.ones((len(share), 2, LEVELS))
