@@ -14,7 +14,7 @@ from typing import Any
 
 import onnx
 
-from experiments.published import PublishedSettings, fit_any
+from experiments.accuracy.published import PublishedSettings, fit_any
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
 from neurolens.models.card import CARD_KEY, MODEL_KEY, read_card

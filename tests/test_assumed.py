@@ -55,6 +55,8 @@ def test_the_year_of_a_design_decides(year: int | None, name: str) -> None:
     assert lens.coatings == "bare" and with_assumptions(lens).coatings == "bare"  # the file says so
     assert with_assumptions(bare).coatings == f"{name} (assumed)"
     assert with_assumptions(replace(bare, wavelengths_nm=(10600.0,))).coatings == "bare"  # not for visible light
+    for only_nm in (550.0, 587.6):  # what programs write where nobody chose a wavelength is meant for the eye
+        assert with_assumptions(replace(bare, wavelengths_nm=(only_nm,))).coatings == f"{name} (assumed)"
     own = replace(
         bare, surfaces=(replace(bare.surfaces[0], coating=Coating("own", ((1.4, 90.0),))), *bare.surfaces[1:])
     )

@@ -182,7 +182,7 @@ def test_six_hundred_lenses_take_no_time() -> None:
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the page's script")
 def test_the_search_of_the_index_page_finds_the_same(tmp_path: Path) -> None:
-    from experiments.library_pages import words_of_row
+    from experiments.data.library_pages import words_of_row
 
     queries = ["nikkor 50 1.2", "helios 44", "Angénieux", "F1.2 50mm", "canon rf", "70-200mm", "summilux 35", "1950s"]
     rows = [{"lens": entry.lens, "words": words_of_row({"lens": entry.lens})} for entry in entries()]

@@ -1,4 +1,4 @@
-"""Files and command lines of an attacker: one clear line each, in bounded time and memory (experiments/fuzz.py)."""
+"""Files and command lines of an attacker: one clear line each, in bounded time and memory (experiments/hostile)."""
 
 import json
 import os
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from command_line import failure
 
-from experiments import fuzz
+from experiments.hostile import fuzz
 from neurolens import cli
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular

@@ -60,7 +60,7 @@ LEAN_MODULES = {
 # Statements that each room has, as the last issue left it: what a reader has to hold. A room that grows by more than
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
-    "__init__": 25, "__main__": 4, "base": 2006, "graph": 2629, "optics": 9461, "models": 3753, "cameras": 4220,
+    "__init__": 25, "__main__": 4, "base": 2006, "graph": 2629, "optics": 9560, "models": 3770, "cameras": 4240,
     "pictures": 7540, "programs": 2730, "studies": 3405, "cli": 3817, "front": 210,
 }  # fmt: skip
 SLACK = 1.03

@@ -135,7 +135,7 @@ def printed_in(page: Path) -> list[str]:
 
 
 def test_lines_of_the_readme_run_and_leave_nothing_that_lint_or_git_sees(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_plots: None
 ) -> None:
     for name in ("lenses", "models", "experiments", "pyproject.toml", ".gitignore"):
         (tmp_path / name).symlink_to(ROOT / name)

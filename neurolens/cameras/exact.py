@@ -1,6 +1,6 @@
 """The exact lens as a camera, run as its graph: every ray passes through every surface.
 
-The same graph, in onnxruntime, serves the search for the outline of the light that passes the lens.
+The same graph, step by step on arrays, serves the search for the outline of the light that passes the lens.
 """
 
 from __future__ import annotations
@@ -8,13 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.files import fingerprint_of, kept_in_cache, sha256_of
@@ -23,12 +22,12 @@ from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera, LensScene
-from neurolens.cameras.onnxlens import LensRun
+from neurolens.cameras.onnxlens import BATCH, LensRays, LensRun
 from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTable, outline_of, wavelength_between
 from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, pruned
 from neurolens.models.assemble import SCALARS, Form
 from neurolens.optics.lens.glass import LINE_D_NM, check_light, index_of
 from neurolens.optics.lens.paraxial import PupilBounds, chief_reach_mm, first_order
@@ -42,7 +41,10 @@ from neurolens.optics.trace.tracegraph import exact_graph, light_limits
 
 
 class ExactRun(LensRun):
-    """Runs the graph of a lens that `set_lens` has placed, for light through points of a plane."""
+    """Runs the graph of a lens that `set_lens` has placed, for light through points of a plane.
+
+    It is evaluated on arrays, which takes as long as onnxruntime, without the time to open a session.
+    """
 
     def __init__(self, lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float]) -> None:
         super().__init__(Path(lens.path))
@@ -51,6 +53,28 @@ class ExactRun(LensRun):
     def graph(self, form: Form = SCALARS) -> Graph:
         """Return the graph, which is the same in every form."""
         return self._graph
+
+    def run(self, rays: FloatArray, film_z_mm: ArrayLike, stop_radius_mm: float) -> LensRays:
+        """Return the scene rays of columns [5, N] as `ray_columns` makes them."""
+        found = self._evaluated(self._graph, rays, film_z_mm, stop_radius_mm)
+        return LensRays(found["scene_ray"], found["transmittance"][0], found["stop_xy_mm"], found["status"][0])
+
+    def status(self, rays: FloatArray, film_z_mm: float, stop_radius_mm: float) -> NDArray[np.int32]:
+        """Return `run(...).status` alone, which takes less time, since nothing else is computed."""
+        found: NDArray[np.int32] = self._evaluated(self._tests, rays, film_z_mm, stop_radius_mm)["status"][0]
+        return found
+
+    @cached_property
+    def _tests(self) -> Graph:
+        return pruned(self._graph, {"status": self._graph.outputs["status"]})
+
+    @staticmethod
+    def _evaluated(graph: Graph, rays: FloatArray, film_z_mm: ArrayLike, stop_radius_mm: float) -> dict[str, Any]:
+        numbers = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
+        call = {name: np.full((1, 1), value, np.float32) for name, value in numbers.items()}
+        starts = range(0, max(rays.shape[1], 1), BATCH)
+        parts = [evaluate(graph, {"rays": rays[:, at : at + BATCH]} | call) for at in starts]
+        return {name: np.concatenate([part[name] for part in parts], axis=1) for name in parts[0]}
 
 
 class ExactCamera(LensCamera):
@@ -204,14 +228,19 @@ def axial_transmittance(lens: Lens, at_nm: Sequence[float], wavelength_nm: tuple
     """
     assert lens.film_z_mm is not None
     call = {"film_z_mm": np.array([[lens.film_z_mm]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
-    # In double precision films are matrices, not polynomials, which may miss 0.02% a surface.
-    graph, rays = exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm, double=True), np.zeros((5, len(at_nm)))
+    rays = np.zeros((5, len(at_nm)))
     rays[4] = at_nm
-    axial = evaluate(graph, {"rays": rays} | call)
+    axial = evaluate(_graph_of_matrices(replace(lens, aperture=None), wavelength_nm), {"rays": rays} | call)
     through = np.broadcast_to(axial["transmittance"], (1, len(at_nm)))[0]
     open_ = lens.aperture is None or bool(lens.aperture.inside(np.zeros(1), np.zeros(1), 1.0))
     passed = (axial["status"][0] == st.PASSED) & (through > 0) & (through <= 1) & open_
     return np.where(passed, through, 0.0)
+
+
+@lru_cache(maxsize=16)  # a camera, its T-stop and its tint ask for the same
+def _graph_of_matrices(lens: Lens, wavelength_nm: tuple[float, float]) -> Graph:
+    """In double precision films are matrices, not polynomials, which may miss 0.02% a surface."""
+    return exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm, double=True)
 
 
 def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) -> dict[str, Any]:
@@ -242,16 +271,16 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
     for s in lens.surfaces:
         numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, *(index_of(s, w) for w in sorted(waves)))
         rows.append([[float(v) for v in numbers], s.stop, s.figure.record(), s.placement.record()])
-    return fingerprint_of([_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
+    return fingerprint_of([searching_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
 
 
 @cache
-def _code() -> list[str]:
-    """Hash the modules that trace and search, and name the libraries that compute."""
+def searching_code() -> list[str]:
+    """Hash the modules that trace and search, and name the library that computes."""
     package = Path(__file__).parents[1]
-    folders = ("optics/lens/*.py", "optics/trace/*.py", "optics/setting/*.py", "graph/*.py", "cameras/pupil_*.py")
-    files = [f"{file.name} {sha256_of(file)}" for folder in map(package.glob, folders) for file in sorted(folder)]
-    return [*files, np.__version__, onnxruntime.__version__]
+    rooms = ("optics/lens/", "optics/trace/", "optics/setting/", "graph/", "models/", "cameras/pupil_")
+    files = [f"{file.name} {sha256_of(file)}" for room in rooms for file in sorted(package.glob(f"{room}*.py"))]
+    return [*files, np.__version__]
 
 
 def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOutline | None:

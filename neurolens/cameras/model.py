@@ -9,14 +9,17 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import onnxruntime
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.exact import kept_outline, searching_code
 from neurolens.cameras.lenscamera import LensCamera, LensScene
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pose import FilmPose
@@ -24,6 +27,7 @@ from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, ou
 from neurolens.cameras.sampling import beyond_circle, common_light, lens_state
 from neurolens.models.assemble import ONNX, SCALARS, Form
 from neurolens.models.card import state_for
+from neurolens.models.file import coefficients_text
 from neurolens.models.inverse import InverseModel, inverse_of
 from neurolens.optics.lens import paraxial
 from neurolens.optics.lens.prescription import Surface
@@ -244,12 +248,21 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
 
 
 def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilOutline | None:
-    """Search the outline of a model with a round stop; with cylinders, one for all azimuths that fits none well."""
-    domain = scene.lens.card["domain"]
-    bounds = PupilTable.of(domain["bounds"])
-    if scene.squeeze(_SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
-        return outline_of(bounds, scene.passes, wavelength_nm)
-    return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE)
+    """Search the outline of a model with a round stop, or take it from the cache; see `kept_outline`.
+
+    With cylinders it is one for all azimuths, which fits none well.
+    """
+    domain, model = scene.lens.card["domain"], coefficients_text([scene.lens.fitted])
+    place = scene.film_z_mm, scene.stop_radius_mm, *wavelength_nm
+
+    def search() -> PupilOutline | None:
+        bounds = PupilTable.of(domain["bounds"])
+        if scene.squeeze(_SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
+            return outline_of(bounds, scene.passes, wavelength_nm)
+        return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE)
+
+    code = [*searching_code(), onnxruntime.__version__]
+    return kept_outline(fingerprint_of([code, domain, model, *map(float, place)]), search)
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:

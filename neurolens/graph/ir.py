@@ -214,11 +214,13 @@ class Graph:
     def each(self, kind: str, *operands: Operand) -> Value:
         """Append an operation row by row; a single row stands for as many as the others have."""
         values = [self.value(v) for v in operands]
-        rows = max(v.rows for v in values)
-        if any(v.rows not in (1, rows) for v in values):
-            raise ValueError(f"{kind} of {[v.rows for v in values]} rows")
-        if kind in _FOLDED and all(v.node.kind == "constant" for v in values):
-            return self.constant(_FOLDED[kind](*(v.node.arrays[0] for v in values)))
+        nodes = [self.nodes[v.number] for v in values]
+        sizes = [node.rows for node in nodes]
+        rows = max(sizes)
+        if sizes.count(1) + sizes.count(rows) < len(sizes):
+            raise ValueError(f"{kind} of {sizes} rows")
+        if kind in _FOLDED and all(node.kind == "constant" for node in nodes):
+            return self.constant(_FOLDED[kind](*(node.arrays[0] for node in nodes)))
         return self.add(kind, values, rows)
 
     def take(self, x: Value, rows: Sequence[int]) -> Value:

@@ -85,7 +85,8 @@ def export_onnx(
         InputError: weights or errors are not finite; two gates have one reason on one surface; a gate is on the stop.
     """
     _check_gates(model)
-    metadata = {CARD_KEY: card_to_json(card_of(model, errors or {})), MODEL_KEY: coefficients_text([model])}
+    coefficients = coefficients_text([model])  # finite, or no ray of the card would be
+    metadata = {CARD_KEY: card_to_json(card_of(model, errors or {})), MODEL_KEY: coefficients}
     return write_file(path, onnx_of(as_stored([model]), metadata=metadata, derivatives=derivatives))
 
 

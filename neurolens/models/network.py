@@ -156,7 +156,7 @@ def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> t
     weights[POSITION], weights[DIRECTION] = position_um * passes, direction_um * passes
     gate_weights, stop_weights = boundary_weights(lens, gates, pairs)
     weights[STOP] = _STOP_UM_PER_MM * lens.stop_radius_mm * stop_weights
-    vectors, scalars = targets.vectors, torch.cat([targets.transmittance[None], gate])
+    vectors, scalars = targets.vectors, torch.cat([0 * passes[None], gate])  # power is not fitted here
     size = domain.film_radius_mm
     scalar_weights = torch.cat([torch.zeros_like(passes)[None], _GATE_UM * size * gate_weights])
     field = targets.field

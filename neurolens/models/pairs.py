@@ -268,6 +268,11 @@ class PairSettings:
     rim: int = 30000
     seed: int = 1
 
+    def __post_init__(self) -> None:
+        for name in ("train", "held_out", "rim"):
+            if getattr(self, name) < 1:
+                raise InputError("settings", name, getattr(self, name), "at least one ray")
+
 
 @dataclass(frozen=True)
 class PairSet:
@@ -276,7 +281,7 @@ class PairSet:
     Attributes:
         inputs: film point, pupil point, wavelength.
         scene: point on the front surface and unit direction (lens frame, mm).
-        transmittance: power of unpolarised light that arrives.
+        transmittance: power of unpolarised light that arrives; NaN where it was not followed.
         status: [N] int32.
         cross_x, cross_y: [S, N] crossings with every surface, mm.
         meets, refracts: [S, N] margins under the square roots of intersection and of refraction.
@@ -336,8 +341,11 @@ class RayPairs:
     tested: int
 
 
-def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
-    """Trace camera rays to their exact images, and note every crossing on the way."""
+def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float, power: bool = True) -> PairSet:
+    """Trace camera rays to their exact images, and note every crossing on the way.
+
+    `power` tells whether to follow the light's power, too, which with thin films takes several times as long.
+    """
     rays = camera_rays(inputs.film_x, inputs.film_y, inputs.film_z, inputs.pupil_x, inputs.pupil_y, pupil_z)
     every, parts = range(len(lens.surfaces)), []
     fields = rays.x.new_empty(4, len(every), len(rays.x))  # most of the memory of a lens with many surfaces: taken once
@@ -345,14 +353,18 @@ def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
         here = slice(start, start + CHUNK)
         with torch.no_grad():
             chunk = Rays(*(c[here] for c in rays))
-            out = trace(lens, chunk, inputs.wavelength_nm[here], transmittance=True, record=every)
-        assert out.transmittance is not None
+            out = trace(lens, chunk, inputs.wavelength_nm[here], transmittance=power, record=every)
         for k in every:
             for field, values in zip(fields, out.crossings[k], strict=True):
                 field[k, here] = values
-        parts.append((*out.rays, out.transmittance, out.status))
+        arrives = torch.full_like(out.rays.x, math.nan) if out.transmittance is None else out.transmittance
+        parts.append((*out.rays, arrives, out.status))
     *ended, transmittance, status = (torch.cat(c) for c in zip(*parts, strict=True))
     return PairSet(inputs, Rays(*ended), transmittance, status, *fields)
+
+
+def _with_power(lens: Lens, pairs: PairSet, pupil_z: float) -> PairSet:
+    return replace(pairs, transmittance=trace_pairs(lens, pairs.inputs, pupil_z).transmittance)
 
 
 def make_pairs(
@@ -361,10 +373,10 @@ def make_pairs(
 ) -> RayPairs:  # fmt: skip
     """Sample a domain and trace it in float64 until `train` and `held_out` are full.
 
-    `rim`, `edge` and `far` are filled from the rays drawn for `train`, as far as these go.
+    `rim`, `edge` and `far` are filled from the rays drawn for `train`, as far as these go; their transmittance is NaN.
 
     Raises:
-        InputError: a split is empty, surfaces lie off the axis, the stop has blades or a mask (models give the crossing
+        InputError: surfaces lie off the axis, the stop has blades or a mask (models give the crossing
             with it instead), or fewer than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
@@ -373,9 +385,6 @@ def make_pairs(
         raise InputError(
             lens.path, "aperture", "(blades or a mask)", "a round stop: cameras shape it outside the model"
         )
-    for name in ("train", "held_out", "rim"):
-        if getattr(settings, name) < 1:
-            raise InputError("pairs", name, getattr(settings, name), "at least one ray")
     splits: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
     counts, tested, total = dict.fromkeys(splits, 0), 0.0, settings.train + settings.held_out
 
@@ -388,7 +397,7 @@ def make_pairs(
                 counts[name] += len(splits[name][-1])
 
     if lit_share(domain) < SPARSE:  # then `draw` leaves far rays out
-        keep(trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm), "far")
+        keep(trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm, power=False), "far")
     for batch, order, stands_for in _batches(lens, domain, settings.seed, 0):
         needed = settings.train - counts["train"]
         used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
@@ -407,6 +416,7 @@ def make_pairs(
         )
     )
     joined = {name: join_pairs(splits.pop(name)) for name in SPLITS}
+    joined["train"] = _with_power(lens, joined["train"], domain.pupil_z_mm)
     joined |= {name: _unreached_as_zero(joined[name]) for name in ("edge", "far")}
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))
 
@@ -414,12 +424,12 @@ def make_pairs(
 def _batches(
     lens: Lens, domain: Domain, seed: int, first: int, size: int = _BATCH
 ) -> Iterator[tuple[PairSet, Tensor, float]]:
-    """Trace a domain from the ray of the number `first` on: batches, which of their rays pass, how many rays of the
-    domain each stands for."""
+    """Trace a domain from the ray of the number `first` on: batches without the light's power, which of their rays
+    pass, how many rays of the domain each stands for."""
     drawn = found = 0
     while drawn <= 10000 * (found + 10):
         inputs, stands_for = draw(domain, size, seed, first + drawn)
-        batch = trace_pairs(lens, inputs, domain.pupil_z_mm)
+        batch = trace_pairs(lens, inputs, domain.pupil_z_mm, power=False)
         order = torch.nonzero(batch.status == st.PASSED)[:, 0]
         drawn, found = drawn + size, found + len(order)
         yield batch, order, stands_for
@@ -446,7 +456,7 @@ def passing_rays(
         if found == count:
             break
         del traced
-    return join_pairs(parts)
+    return _with_power(lens, join_pairs(parts), domain.pupil_z_mm)
 
 
 def _blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:

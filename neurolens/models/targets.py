@@ -412,7 +412,7 @@ def prepare(pairs: RayPairs) -> Prepared:
     with pinned_threads():
         for start in range(0, len(drawn), CHUNK):  # crossings with many surfaces are large: of blocked rays alone
             some = FilmRays(*(c[start : start + CHUNK] for c in drawn.columns()))
-            traced = trace_pairs(pairs.lens, some, pairs.domain.pupil_z_mm)
+            traced = trace_pairs(pairs.lens, some, pairs.domain.pupil_z_mm, power=False)
             ended.append(traced.select(traced.status != st.PASSED))
             del traced
     blocked = join_pairs(ended)
@@ -442,7 +442,7 @@ def with_angle(model: LensModel) -> LensModel:
     """Return the model with the largest angle of its lens's rays in a sample of the domain; see `LensModel.angle`."""
     rays, _ = draw(model.domain, _ANGLE_RAYS, seed=5)
     with torch.no_grad():
-        exact = trace_pairs(model.lens, rays, model.domain.pupil_z_mm)
+        exact = trace_pairs(model.lens, rays, model.domain.pupil_z_mm, power=False)
         if isinstance(model.core, Refracted):
             angles = model.core(model.encoding(rays))[0][DIRECTION].norm(dim=0)
         else:

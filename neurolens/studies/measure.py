@@ -88,7 +88,7 @@ def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, see
     parts = []
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
-        exact = trace_pairs(lens, rays, domain.pupil_z_mm)
+        exact = trace_pairs(lens, rays, domain.pupil_z_mm, power=False)
         parts.append((*rays.columns(), exact.status == st.PASSED, _stop_square(lens, exact)))
     *drawn, passes, square = (torch.cat(c) for c in zip(*parts, strict=True))
     return FreshRays(lens, domain, held_out, _stop_square(lens, held_out), FilmRays(*drawn), passes, square)

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.gallery.cameras import CAMERAS, Shot, Surrogate, View, shot_of, surrogate_of
-from experiments.gallery.measures import MEASURES
-from experiments.gallery.settings import Panel
+from experiments.pictures.gallery.cameras import CAMERAS, Shot, Surrogate, View, shot_of, surrogate_of
+from experiments.pictures.gallery.measures import MEASURES
+from experiments.pictures.gallery.settings import Panel
 from neurolens.pictures.render.scene import scene_from_tables
 
 ROOT = Path(__file__).parents[2]

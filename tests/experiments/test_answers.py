@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments import answers, lab
-from experiments.make_models import errors_by_kind
-from experiments.surrogates import lens_page, summary_page
+from experiments import lab
+from experiments.accuracy.surrogates import lens_page, summary_page
+from experiments.data import answers
+from experiments.data.make_models import errors_by_kind
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

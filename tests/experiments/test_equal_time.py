@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from experiments.equal_time import (
+from experiments.lab import Row
+from experiments.pictures.equal_time import (
     Counts,
     Estimate,
     Passes,
@@ -18,7 +19,6 @@ from experiments.equal_time import (
     reference_variance,
     squared_error,
 )
-from experiments.lab import Row
 
 SHAPE = (12, 20, 3)
 Picture = NDArray[np.float64]

@@ -11,10 +11,10 @@ import pytest
 import torch
 from shipped import PATHS
 
-from experiments import extreme_cases as cases
-from experiments import extremes
 from experiments.__main__ import main
-from experiments.extremes import failures, measure, trace_reference
+from experiments.accuracy import extreme_cases as cases
+from experiments.accuracy import extremes
+from experiments.accuracy.extremes import failures, measure, trace_reference
 from neurolens.base import status as st
 from neurolens.optics.lens.figures import Cylinder, Figure
 from neurolens.optics.lens.prescription import Lens, Surface

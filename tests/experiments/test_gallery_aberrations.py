@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from gallery_shots import GALLERY, measured, shot
 
-from experiments.gallery.cameras import Shot, View, Window, exact_camera, shot_of, thin_camera
-from experiments.gallery.measures import light_profile, spot
-from experiments.gallery.settings import read_effect
+from experiments.pictures.gallery.cameras import Shot, View, Window, exact_camera, shot_of, thin_camera
+from experiments.pictures.gallery.measures import light_profile, spot
+from experiments.pictures.gallery.settings import read_effect
 from neurolens.cameras.ideal import ThinLens
 from neurolens.optics.analysis.field_curves import RECTILINEAR, curvature, distortion, seidel
 from neurolens.optics.analysis.fields import Scene

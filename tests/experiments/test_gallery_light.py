@@ -10,12 +10,20 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from experiments.gallery import bokeh
-from experiments.gallery.bokeh import LightDisc, light_disc
-from experiments.gallery.cameras import CAMERAS, PostProcessed, View, illumination, post_process, shot_of, strength_for
-from experiments.gallery.measures import MEASURES, PROJECTIONS, blur_mm, exposure, field_angles, scale
-from experiments.gallery.run import check
-from experiments.gallery.settings import read_effect
+from experiments.pictures.gallery import bokeh
+from experiments.pictures.gallery.bokeh import LightDisc, light_disc
+from experiments.pictures.gallery.cameras import (
+    CAMERAS,
+    PostProcessed,
+    View,
+    illumination,
+    post_process,
+    shot_of,
+    strength_for,
+)
+from experiments.pictures.gallery.measures import MEASURES, PROJECTIONS, blur_mm, exposure, field_angles, scale
+from experiments.pictures.gallery.run import check
+from experiments.pictures.gallery.settings import read_effect
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera

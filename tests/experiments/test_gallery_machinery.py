@@ -7,9 +7,9 @@ import pytest
 from gallery_shots import ROOT, shipped, shot
 
 from experiments.__main__ import main
-from experiments.gallery.cameras import exact_camera, surrogate_camera
-from experiments.gallery.run import MOST_BYTES, fingerprint_of
-from experiments.gallery.settings import read_effect
+from experiments.pictures.gallery.cameras import exact_camera, surrogate_camera
+from experiments.pictures.gallery.run import MOST_BYTES, fingerprint_of
+from experiments.pictures.gallery.settings import read_effect
 from neurolens.base.errors import InputError
 
 EFFECT = """\

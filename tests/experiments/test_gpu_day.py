@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments import gpu_day
 from experiments.__main__ import main
+from experiments.speed import gpu_day
 
 RESULTS = Path(__file__).parents[2] / "experiments" / "results"
 

@@ -8,14 +8,14 @@ SIZE, SAMPLES = (48, 32), 16
 
 def test_mitsuba_and_our_renderer_see_the_same_by_the_same_rays() -> None:
     pytest.importorskip("mitsuba", reason='needs the extra "mitsuba"')
-    from experiments.hosts import mitsuba, ours
+    from experiments.peers.hosts import mitsuba, ours
 
     np.testing.assert_allclose(mitsuba(SIZE, SAMPLES, 1, True), ours(SIZE, SAMPLES, 1, True), rtol=1e-3)
 
 
 def test_newton_sees_the_same_within_noise_and_its_depth_is_ours() -> None:
     pytest.importorskip("newton", reason="needs newton and warp-lang")
-    from experiments.hosts import compared, depth_error
+    from experiments.peers.hosts import compared, depth_error
 
     row = next(row for row in compared(SIZE, SAMPLES) if row["host"] == "Newton")
     assert abs(row["apart"] / row["expected"] - 1) < 0.15

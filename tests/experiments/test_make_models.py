@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from lens_models import LENSES
 
-from experiments import make_models
-from experiments.make_models import Entry, Library, fingerprint, read_list
-from experiments.promises import read_index
+from experiments.data import make_models
+from experiments.data.make_models import Entry, Library, fingerprint, read_list
+from experiments.speed.promises import read_index
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress

@@ -8,12 +8,12 @@ import pytest
 from shipped import whole
 
 from experiments import lab
-from experiments import pupils as passage
 from experiments.__main__ import main
-from experiments.methods import Bench, BenchSettings
-from experiments.promises import Outcome, read_index, report_outcome
-from experiments.pupils import CASES
-from experiments.surrogates import chosen_rows
+from experiments.accuracy import pupils as passage
+from experiments.accuracy.methods import Bench, BenchSettings
+from experiments.accuracy.pupils import CASES
+from experiments.accuracy.surrogates import chosen_rows
+from experiments.speed.promises import Outcome, read_index, report_outcome
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.program import SCENE_RAY

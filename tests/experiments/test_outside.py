@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from vignetting_oracle import vignetting_errors
 
-from experiments import outside
-from experiments.vignetting import DOMAINS, OPENINGS, opening_errors
+from experiments.accuracy.vignetting import DOMAINS, OPENINGS, opening_errors
+from experiments.hostile import outside
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
 from neurolens.models.fit import ModelSettings, fit_model, prepare

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import lab, plans
-from experiments.plan_errors import by_rays, fresh_places, fresh_prints, moved, pieces_of, rendered
+from experiments import lab
+from experiments.pictures import plans
+from experiments.pictures.plan_errors import by_rays, fresh_places, fresh_prints, moved, pieces_of, rendered
 from neurolens.cameras.build import make_camera
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens

@@ -10,8 +10,8 @@ import pytest
 import torch
 from shipped import PATHS
 
-from experiments import precision
 from experiments.__main__ import main
+from experiments.accuracy import precision
 from neurolens.base.errors import InputError
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, WAVELENGTH
 from neurolens.graph.scalars import lower

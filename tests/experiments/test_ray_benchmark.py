@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments import rays
-from experiments.ray_peers import PEERS, Found, Peer, Task, table_of
+from experiments.peers import rays
+from experiments.peers.ray_peers import PEERS, Found, Peer, Task, table_of
 from neurolens.optics.lens.figures import Cylinder, Figure, Ideal
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.studies.speed import Unavailable

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from shipped import whole
 
-from experiments.table_faults import (
+from experiments.data.table_faults import (
     ONE_OF,
     Checked,
     alarm,
@@ -20,7 +20,7 @@ from experiments.table_faults import (
     swapped,
     transposed,
 )
-from experiments.table_figures import SHARES, Tables, chief_rays, measure
+from experiments.data.table_figures import SHARES, Tables, chief_rays, measure
 from neurolens.optics.analysis import field_curves
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.figures import SPHERE

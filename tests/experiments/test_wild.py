@@ -4,7 +4,7 @@ import lens_models
 import numpy as np
 
 from experiments import lab
-from experiments.wild import TRACER, Form, Row, by_numpy, coated_surfaces, judge, tracer, wild
+from experiments.hostile.wild import TRACER, Form, Row, by_numpy, coated_surfaces, judge, tracer, wild
 from neurolens.base import status as st
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm

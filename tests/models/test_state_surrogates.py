@@ -14,7 +14,7 @@ import pytest
 import torch
 from vignetting_oracle import vignetting_errors
 
-from experiments import outside
+from experiments.hostile import outside
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from sklearn import linear_model
 
-from experiments.published.data import raw_exponents
+from experiments.accuracy.published.data import raw_exponents
 from neurolens.graph.interpret import monomials
 from neurolens.models.cores import LightField
 from neurolens.models.terms import (

@@ -26,7 +26,7 @@ from neurolens.studies.speed import CompiledSource
 
 COLUMNS = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
 Rows = dict[str, NDArray[np.float32]]  # by name, as `Program.evaluate` takes and gives them
-RUNNER = Path(__file__).parents[2] / "experiments" / "gl_compute.py"
+RUNNER = Path(__file__).parents[2] / "experiments" / "speed" / "gl_compute.py"
 HEADS = {"430": "#version 430\n", "310 es": "#version 310 es\nprecision highp float;\nprecision highp int;\n"}
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from report_results import Page, full_results
 
-from experiments import library_pages as library
 from experiments.__main__ import main as experiment
+from experiments.data import library_pages as library
 from neurolens.base import records
 from neurolens.base.errors import InputError
 from neurolens.base.html import local_url

@@ -138,6 +138,7 @@ def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict
     [
         ("render.seeds=2", "seeds"),
         ("model=[]", "model"),
+        ("pairs.train=0", "pairs.train"),
         ("lens.focal_length_mm=-3", "focal_length_mm"),
         ("domain.wavelength_nm=[700, 400]", "wavelength_nm"),
         ("nonsense=1", "nonsense"),
@@ -149,6 +150,7 @@ def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) 
     (tmp_path / "small.toml").write_text(SMALL.replace("ROOT", str(ROOT)))
     with pytest.raises(InputError, match=field):
         run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 SINGLET = str(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml")

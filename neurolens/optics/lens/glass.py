@@ -1,8 +1,9 @@
 """Glasses: manufacturers' catalogues with dispersion and absorption, and the medium after a surface.
 
-The table (data/glasses.json) is made by experiments/make_glass_table.py from the refractiveindex.info database (CC0). A
-glass without an entry has Cauchy's dispersion, A + B / lambda^2 + C / lambda^4, from n_d and the Abbe number V_d. These
-two figures leave the partial dispersion open: it is taken to be the mean of the catalogue's glasses of that V_d.
+The table (data/glasses.json) is made by experiments/data/make_glass_table.py from the refractiveindex.info database
+(CC0). A glass without an entry has Cauchy's dispersion, A + B / lambda^2 + C / lambda^4, from n_d and the Abbe number
+V_d. These two figures leave the partial dispersion open: it is taken to be the mean of the catalogue's glasses of that
+V_d.
 """
 
 from __future__ import annotations

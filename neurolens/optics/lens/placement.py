@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Vector = tuple[float, float, float]
+MOST_TILT_DEG, MOST_DECENTRE_MM = 60.0, 1e4  # of a surface, or of a group
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,19 @@ class Placement:
             from_pivot_mm: z of the surface's vertex in the centred lens, from the point about which the group turns.
         """
         place = group.axes @ (np.array(self.moved_mm) + [0.0, 0.0, from_pivot_mm]) + group.moved_mm
-        m = group.axes @ self.axes
-        turns = np.arctan2(-m[1, 2], m[2, 2]), np.arcsin(m[0, 2].clip(-1, 1)), np.arctan2(-m[0, 1], m[0, 0])
-        x, y, z = (float(v) for v in place - [0.0, 0.0, from_pivot_mm])
+        return Placement.of(place - [0.0, 0.0, from_pivot_mm], group.axes @ self.axes)
+
+    @classmethod
+    def of(cls, moved_mm: NDArray[np.float64], axes: NDArray[np.float64]) -> Placement:
+        """Return the placement of a surface that is moved so, and whose x, y and z are these columns [3, 3]."""
+        turns = (
+            np.arctan2(-axes[1, 2], axes[2, 2]),
+            np.arcsin(axes[0, 2].clip(-1, 1)),
+            np.arctan2(-axes[0, 1], axes[0, 0]),
+        )
+        x, y, z = (float(v) for v in moved_mm)
         a, b, c = (math.degrees(t) for t in turns)
-        return Placement((x, y, z), (a, b, c))
+        return cls((x, y, z), (a, b, c))
 
     def scaled(self, factor: float) -> Placement:
         """Return the placement in a lens that is larger by a factor."""

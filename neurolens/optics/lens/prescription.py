@@ -182,13 +182,20 @@ class Lens:
 
     @property
     def visible(self) -> bool:
-        """Whether the source designs the lens for a range that holds the d line, or states no range."""
-        return not self.wavelengths_nm or min(self.wavelengths_nm) <= LINE_D_NM <= max(self.wavelengths_nm)
+        """Whether the source designs the lens for visible light: by one of its wavelengths, by their range, or by none.
+
+        Files often name one wavelength, as 550 nm, or the d line rounded to 587.6 nm, and mean a lens for the eye.
+        """
+        low, high = LIGHT_NM
+        given = self.wavelengths_nm
+        return not given or any(low <= nm <= high for nm in given) or min(given) < LINE_D_NM < max(given)
 
     @property
     def reference_nm(self) -> float:
-        """The wavelength of first-order data and analyses: the d line, or the source's primary one for other light."""
-        return LINE_D_NM if self.visible else self.wavelengths_nm[0]
+        """The wavelength of first-order data and analyses: the d line, or the source's primary one where its range
+        does not hold the d line."""
+        given = self.wavelengths_nm
+        return LINE_D_NM if not given or min(given) <= LINE_D_NM <= max(given) else given[0]
 
     @property
     def light_nm(self) -> tuple[float, float]:

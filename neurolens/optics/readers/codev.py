@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
+from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers import draft
-from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, lens_of, primary_first
+from neurolens.optics.readers.breaks import Turn
+from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, lens_of, placed, primary_first
 from neurolens.optics.readers.glasses import by_indices, named_glass
 from neurolens.optics.readers.source import Line, ReadOptions, assume, by_word, read_lines, warn
 
@@ -33,6 +35,7 @@ REFUSED = by_word(
     ("GRN", "a medium without a gradient index"),
     ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
     ("RMD", "a surface that refracts: the lens model has no mirrors"),
+    ("BEN RET GLB", "tilts and decentres by XDE to CDE, DAR and REV: a bend belongs to a mirror"),
     ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
 )
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
@@ -42,8 +45,12 @@ SPECIAL = {"ODD": "AR", "QBF": "QB", "QCN": "QC"}
 ALONG = ("KX", "KY", "AR", "BR", "CR", "DR", "AP", "BP", "CP", "DP")  # of AAS
 # Coefficients of an ASP surface: r^4, r^6, ... r^20.
 LETTERS = {letter: 4 + 2 * k for k, letter in enumerate("ABCDEFGHJ")}
-NONE_BUT_0 = ("CUF", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
-READ = (*"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM".split(), *SHAPES, *ALONG, *LETTERS, *NONE_BUT_0)
+NONE_BUT_0 = ("CUF", "XOD", "YOD", "ZOD")
+TURNS = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
+READ = (
+    *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM DAR REV".split(),
+    *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0, *TURNS),
+)
 ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
 # Control codes, fields, vignetting factors, weights and wavelengths, which move no ray in a zoom.
 NOT_ZOOMED = frozenset(
@@ -114,6 +121,8 @@ class Block(draft.Block):
     unsaid: bool = False  # whether its first number may be a radius or a curvature; it is kept as a curvature
     terms: dict[str, float] = field(default_factory=dict)
     special: dict[str, float] | None = None  # coefficients of a special surface
+    turns: dict[str, float] = field(default_factory=dict)  # by the names of TURNS
+    after: str = ""  # DAR or REV
 
 
 @dataclass
@@ -136,7 +145,7 @@ def read_seq(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a CODE V sequence file.
 
     Raises:
-        InputError: see the module; also for tilts, mirrors and everything else that the lens model cannot represent.
+        InputError: see the module; also for mirrors and everything else that the lens model cannot represent.
     """
     file = File(str(path))
     for command in commands(read_lines(path)):
@@ -248,7 +257,11 @@ def _surface(file: File, command: Command) -> None:
             block.kind = name
         case _ if name in NONE_BUT_0:
             if value := command.first(words):
-                raise line.error(name, value, "0: Fresnel surfaces, tilts and decentres are not read")
+                raise line.error(name, value, "0: Fresnel surfaces and pivots of tilts are not read")
+        case _ if name in TURNS:
+            block.turns[name] = command.first(words)
+        case "DAR" | "REV":
+            block.after = name
         case _:
             block.terms[name] = command.first(words)
 
@@ -362,7 +375,9 @@ def _complete(file: File) -> None:
     for k, block in enumerate(middle[:-1], start=1):
         if block.solved:
             raise block.start.error("PIM", f"(on surface {k})", "the last surface")
-    file.rows = tuple(b.row(shape_of(b)) for b in middle)
+    for block in (*middle, image):
+        block.turn = _turn(block)
+    file.rows = placed([b.row(shape_of(b)) for b in middle], [*middle, image])
     file.half_field_deg = _edge(file, ("XAN", "YAN"))
     file.image_radius = _edge(file, ("XIM", "YIM"), ("XRI", "YRI"))
     if _edge(file, ("XOB", "YOB")) and not file.half_field_deg:
@@ -378,6 +393,14 @@ def _complete(file: File) -> None:
     primary = file.waves_nm[file.reference - 1] if 0 < file.reference <= len(file.waves_nm) else 0.0
     file.wavelengths_nm = primary_first(file.waves_nm, primary)
     file.film_given = not (last.solved and last.thickness == defocus)
+
+
+def _turn(block: Block) -> Turn | None:
+    """Return what moves and turns the local axes: ADE and BDE are left-handed, CDE is right-handed."""
+    x, y, z, a, b, c = (block.turns.get(name, 0.0) for name in TURNS)
+    if not any((x, y, z, a, b, c)):
+        return None
+    return Turn(Placement((x, y, z), (-a, -b, c)), returns=block.after == "DAR", undoes=block.after == "REV")
 
 
 def _edge(file: File, *pairs: tuple[str, str]) -> float | None:

@@ -29,6 +29,7 @@ from neurolens.optics.readers.assemble import (
     with_rims,
     with_stop,
 )
+from neurolens.optics.readers.breaks import Step, Turn, placements
 from neurolens.optics.readers.source import MAX_SURFACES, UNITS_MM, Line, ReadOptions, warn
 from neurolens.optics.setting.rims import check_states
 
@@ -51,6 +52,7 @@ class Block:
     stop: bool = False
     aperture: bool = False  # as in `Row`
     solved: bool = False  # whether the thickness follows from others, or from the paraxial image
+    turn: Turn | None = None  # of the local axes, at this surface
 
     @property
     def radius(self) -> float:
@@ -113,6 +115,13 @@ class Row:
     surface: Surface
     aperture: bool = False
     name: str = ""
+
+
+def placed(rows: Sequence[Row], blocks: Sequence[Block]) -> tuple[Row, ...]:
+    """Return the rows of blocks where tilts and decentres put them; the last block is the film."""
+    found = placements([Step(block.start, block.turn, block.thickness) for block in blocks])
+    surfaces = (replace(row.surface, placement=place) for row, place in zip(rows, found, strict=True))
+    return tuple(replace(row, surface=surface) for row, surface in zip(rows, surfaces, strict=True))
 
 
 @dataclass(frozen=True)
@@ -263,6 +272,8 @@ def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
     try:
         draft = with_stop(_without_negative_zeros(draft), options.stop)
         draft = _without_dummies(draft)
+        if draft.states and any(row.surface.placement for row in draft.rows):
+            raise InputError(draft.file, "configurations", f"({len(draft.states)} of them)", _ONE_PLACE)
         return _lens_of(draft, options)
     except InputError as error:
         value = draft.in_file(error.value) if isinstance(error.value, str) else error.value
@@ -316,6 +327,7 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
     return lens
 
 
+_ONE_PLACE = "one configuration, where surfaces are tilted or decentred"
 _ROUNDED_MM = 1e-4  # to which programs round lengths
 _AGREES = 0.03  # relative, since f-numbers are printed with two digits
 _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")

@@ -23,7 +23,7 @@ from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.figures import KEYS as FIGURE_KEYS
 from neurolens.optics.lens.figures import read_figure
 from neurolens.optics.lens.glass import by_figures, check_against_table, index_at
-from neurolens.optics.lens.placement import Placement
+from neurolens.optics.lens.placement import MOST_DECENTRE_MM, MOST_TILT_DEG, Placement
 from neurolens.optics.lens.prescription import Coating, Configuration, Lens, Medium, Surface
 from neurolens.optics.readers.source import MAX_INDEX, MAX_SURFACES, Table
 from neurolens.optics.setting.rims import check_states, with_derived_rims
@@ -51,7 +51,6 @@ COLUMNS = ("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", *FIGURE_KEY
 PLACE_KEYS = ("decentre_mm", "tilt_deg")
 SURFACE_KEYS = (*COLUMNS, "conic", "asphere", *PLACE_KEYS, "glass", "material", "absorption_per_mm", "coating", "stop")
 GROUP_KEYS = ("surfaces", *PLACE_KEYS, "pivot_mm")
-MOST_TILT_DEG, MOST_DECENTRE_MM = 60.0, 1e4
 STATE_NUMBERS = ("efl_mm", "half_field_deg", "f_number", "stop_diameter_mm", "object_distance_mm")
 CONFIGURATION_KEYS = ("name", *STATE_NUMBERS, "thickness_mm")
 APERTURE_KEYS = ("blades", "rotation_deg", "curvature")

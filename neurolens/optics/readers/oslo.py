@@ -26,7 +26,7 @@ HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
 # What changes rays and is not read, if a number other than 0 or a word follows; with what is expected in its place.
 REFUSED = by_word(
     ("NA", "EBR, FNO or NAO to size the stop"),
-    ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: the lens model has none"),
+    ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: they are not read from OSLO's files"),
     ("RFL RFH REFL", "no mirror: the lens model has none"),
     ("GRT GSP GOR DFR DOE HOE HOR", "no grating or hologram: the lens model has none"),
     ("GRD GDT NZ1 NR1 NR2 NR4", "no gradient index: the lens model has none"),

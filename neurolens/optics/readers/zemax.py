@@ -18,9 +18,11 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens import glass as catalogue
+from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers import draft
-from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, lens_of, primary_first
+from neurolens.optics.readers.breaks import Turn
+from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, lens_of, placed, primary_first
 from neurolens.optics.readers.glasses import named_glass
 from neurolens.optics.readers.source import MAX_POWER, Line, ReadOptions, assume, by_word, read_lines, warn
 
@@ -37,7 +39,7 @@ VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split
 # What changes rays at a surface and the lens model lacks.
 REFUSED = by_word(
     ("OBSC SQOB ELOB USOB SPID", "no obscuration: the lens model has none"),
-    ("SCBD", "no tilt and no decentre of a surface: the lens model has none"),
+    ("SCBD", "no tilt and no decentre of a surface but by coordinate breaks"),
 )
 # Operands of the multi-configuration editor: those that move no ray (fields, wavelengths, vignetting factors,
 # comments), and those that are read.
@@ -106,7 +108,7 @@ def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a Zemax file.
 
     Raises:
-        InputError: see the module; also for tilts, mirrors, obscurations and everything else that the lens model cannot
+        InputError: see the module; also for mirrors, obscurations and everything else that the lens model cannot
             hold. Names the keyword and the line.
     """
     file = File(str(path))
@@ -362,10 +364,11 @@ def _complete(file: File) -> None:
         block.semi_diameter = block.semi_diameter if block.clear is None else block.clear
         if block.kind == "COORDBRK" and block.glass is None:
             block.medium = before.medium  # the block stands in the medium of the surface before it
-    file.rows = tuple(b.row(shape_of(b)) for b in middle)
+    rows = tuple(b.row(shape_of(b)) for b in middle)
     for block in file.blocks:
         if math.isnan(block.thickness):
             raise block.start.error("DISZ", "(missing)", "the thickness behind every surface (is the file cut off?)")
+    file.rows = placed(rows, file.blocks[1:])
     if image.thickness or image.medium or image.stop:
         raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
     if image.curvature:
@@ -470,7 +473,11 @@ def shape_of(block: Block) -> dict[str, Any]:
             block.parameters.clear()  # a Jones matrix, which turns polarisation and no ray
             warn(block.start.file, f"surface {block.name} of the file: a JONESMAT is left out of transmittance")
         case "COORDBRK":
-            shape = block.rotational()  # harmless with tilts and decentres of 0, which are tested below
+            shape = block.rotational()
+            x, y, a, b, c = (block.parameter(n) for n in range(1, 6))
+            if any((x, y, a, b, c)):
+                block.turn = Turn(Placement((x, y, 0.0), (a, b, c)), tilts_first=bool(block.parameter(6)))
+            block.parameters.pop(6, None)
     for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):
         for n, (value, line) in table.items():
             # The second extra value of a toroid is a normalisation radius, for no terms.

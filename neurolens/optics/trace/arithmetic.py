@@ -21,7 +21,7 @@ TINY = 1e-30
 
 def is_number(value: Any) -> bool:
     """Test whether a value is a plain number, which can be folded into the operations around it."""
-    return isinstance(value, int | float)
+    return isinstance(value, (int, float))  # asked a million times; a union takes twice as long
 
 
 def times(a: Any, k: Any) -> Any:

@@ -19,7 +19,7 @@ from neurolens.optics.trace.surfaces import Hit, Rays, Test, cross, media, neare
 Array = NDArray[np.float64]
 
 UNIT_SLACK = 1e-3  # how far a direction's squared length may be from 1; float32 rounding is a thousandth of it
-_CHUNK = 8192  # rays at a time, which fit a core's cache
+_CHUNK = 32768  # rays at a time: many enough to hide the cost of calls
 _FEWER = 0.8  # share of rays left, below which they are packed together
 
 
@@ -57,12 +57,13 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float) -> NDArray[np.bool_]:
 def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bool = False) -> Followed:
     sense, order = (1, range(len(lens.surfaces))) if to_film else (-1, range(len(lens.surfaces))[::-1])
     mediums, vertex, left = media(lens, wavelength_nm), 0.0, np.arange(len(rays.x))
+    vertices = [float(z) for z in lens.vertices_mm]
     sound = np.abs(NUMPY.dot(rays[3:], rays[3:]) - 1) <= UNIT_SLACK
     status = np.where(sound, st.PASSED, st.blocked(order[0], st.MISSED)).astype(np.int32)
     start = nearest_approach(NUMPY, rays, 1.0) if to_film else rays[:3]  # light may start far away
     at_stop, r = (rays.x, rays.y), Rays(*start, *(d * mediums[0 if to_film else -1].n for d in rays[3:]))
     for k in order:
-        surface, z = lens.surfaces[k], float(lens.vertices_mm[k])
+        surface, z = lens.surfaces[k], vertices[k]
         r, vertex = r._replace(z=r.z + (vertex - z)), z
         before, after = (mediums[k], mediums[k + 1]) if to_film else (mediums[k + 1], mediums[k])
 

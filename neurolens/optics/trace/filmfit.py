@@ -17,7 +17,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from neurolens.optics.lens.glass import index_at
-from neurolens.optics.trace.transmission import times_film
+from neurolens.optics.trace.transmission import NO_FILM, times_film
 
 Array = NDArray[np.float64]
 Rows = tuple[tuple[float, ...], ...]
@@ -58,8 +58,7 @@ def fitted(
     most = float(np.minimum(n1, n2).max()) ** 2
     square = most / 2 * (1 + _nodes())
     q1, q2 = (np.sqrt(np.maximum(n * n - square, 0)) for n in (n1, n2))
-    s: tuple[Array | float, ...] = (1.0, 0.0, 0.0, 1.0)
-    p = s
+    s = p = NO_FILM
     for n_d, thickness_nm, *V_d in layers:
         index = index_at(n_d, V_d[0] if V_d else None, 1000 / inverse_um)
         q = np.emath.sqrt(index * index - square)

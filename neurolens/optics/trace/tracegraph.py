@@ -27,7 +27,7 @@ from neurolens.optics.trace.arithmetic import Graphs, is_number, times
 from neurolens.optics.trace.filmfit import FilmFit, Rows, fitted, inverse_um_at
 from neurolens.optics.trace.shapes import traced_curve
 from neurolens.optics.trace.surfaces import Hit, Medium, Rays, Test, cross, media, radius2
-from neurolens.optics.trace.transmission import Passage, Shares, times_film
+from neurolens.optics.trace.transmission import NO_FILM, Passage, Shares, times_film
 
 TRANSMITTANCE = (
     "Transmittance: of unpolarised light, with the polarisation that surfaces give to it, coatings and absorption."
@@ -172,8 +172,7 @@ class GraphPassage(Passage):
                 medium, cosine = (two, after) if is_number(two.n) else (one, before)
                 square = (medium.n2 - cosine * cosine) * (2 / fit.most) - 1.0
                 return self._by_fit(fit, square, inverse_um, around, before * after * 2.0)
-        s: tuple[Value | float, ...] = (1.0, 0.0, 0.0, 1.0)
-        p = s
+        s = p = NO_FILM
         for n_d, thickness_nm, *V_d in reversed(coating.layers):
             index = g.series(inverse_um * inverse_um, [float(v) for v in cauchy(n_d, V_d[0])] if V_d else [float(n_d)])
             phase_per_q = inverse_um * (2e-3 * math.pi * float(thickness_nm))

@@ -233,6 +233,9 @@ def path_mm(o: Arithmetic, r: Rays, met: Hit, before: Medium) -> Any:
     return times(along, times(before.n, before.inverse_n2))
 
 
+NO_FILM: tuple[Any, ...] = (1.0, 0.0, 0.0, 1.0)  # the matrix before the first film
+
+
 def times_film(s: tuple[Any, ...], p: tuple[Any, ...], film: tuple[Any, Any, Any], index2: Any) -> Any:
     """Return the matrices of s and p times those of a film, given as cos, sin / q and q sin of its phase.
 
@@ -244,4 +247,6 @@ def times_film(s: tuple[Any, ...], p: tuple[Any, ...], film: tuple[Any, Any, Any
 
 def _times(m: tuple[Any, ...], k: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return the product of two matrices [[a, -i b], [-i c, d]], each given as (a, b, c, d)."""
+    if m is NO_FILM:
+        return k
     return (m[0] * k[0] - m[1] * k[2], m[0] * k[1] + m[1] * k[3], m[2] * k[0] + m[3] * k[2], m[3] * k[3] - m[2] * k[1])

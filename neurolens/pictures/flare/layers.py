@@ -26,7 +26,7 @@ from neurolens.base.tasks import in_order
 from neurolens.optics.lens.glass import inverse_square_um
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.trace.rays import Rays, trace
+from neurolens.optics.trace.rays import Rays, Traced, trace
 from neurolens.pictures.flare import canvas
 from neurolens.pictures.flare.canvas import Doubles, Floats, Raster, Smear
 from neurolens.pictures.flare.diffraction import starburst_picture
@@ -108,18 +108,18 @@ def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
     film_z = lens.film_z_mm
     assert film_z is not None  # a tracer's lens has one
 
-    def share(sines: Doubles) -> Doubles:
+    def traced(sines: Doubles, power: bool) -> Traced:
         d = torch.from_numpy(np.stack([*sines, -np.sqrt(1 - (sines**2).sum(0))]))
         zero = torch.zeros_like(d[0])
-        traced = trace(lens, Rays(zero, zero, zero + film_z, *d), wavelength_nm, transmittance=True)
-        assert traced.transmittance is not None
-        return torch.where(traced.status == 0, traced.transmittance, 0.0).numpy()
+        return trace(lens, Rays(zero, zero, zero + film_z, *d), wavelength_nm, transmittance=power)
 
     coarse, widest = disc(0, _AXIS), 1.0
     for _ in range(3):  # narrows to a little more than the cone that passes
-        lit = share(widest * coarse) > 0
+        lit = (traced(widest * coarse, False).status == 0).numpy()
         widest *= 1.02 * float(np.hypot(*coarse)[lit].max(initial=0.0)) if lit.any() else 0.3
-    light = math.pi * widest**2 * float(share(min(widest, 1.0) * coarse).mean())
+    found = traced(min(widest, 1.0) * coarse, True)
+    assert found.transmittance is not None
+    light = math.pi * widest**2 * float(torch.where(found.status == 0, found.transmittance, 0.0).mean())
     if not light > 0:
         raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
     return light

@@ -163,7 +163,7 @@ def _csv(name: str) -> list[list[str]]:
 
 @cache
 def _tables() -> dict[str, FloatArray64]:
-    """Columns wavelength_nm, x, y, z, d65, d50, red, green, blue; made by experiments/make_spectral_tables.py."""
+    """Columns wavelength_nm, x, y, z, d65, d50, red, green, blue; made by experiments/data/make_spectral_tables.py."""
     names, *rows = _csv("spectra")
     columns = np.array(rows, np.float64).T
     columns.flags.writeable = False

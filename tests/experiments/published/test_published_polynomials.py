@@ -10,10 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as some
 
-from experiments.published import PublishedSettings, fit_any
-from experiments.published.data import RawData, from_tangents, to_tangents
-from experiments.published.polynomials import Pursuit
-from experiments.published.taylor import expand, truncated
+from experiments.accuracy.published import PublishedSettings, fit_any
+from experiments.accuracy.published.data import RawData, from_tangents, to_tangents
+from experiments.accuracy.published.polynomials import Pursuit
+from experiments.accuracy.published.taylor import expand, truncated
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate, monomials

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as some
 from torch import Tensor
 
-from experiments.published import PublishedSettings, fit_any
-from experiments.published.adaptive import Cells, fit_adaptive
-from experiments.published.data import RawData, RawPolynomial
-from experiments.published.neural import Layers
-from experiments.published.rtf import least_ellipse, meridian_variables, turn
+from experiments.accuracy.published import PublishedSettings, fit_any
+from experiments.accuracy.published.adaptive import Cells, fit_adaptive
+from experiments.accuracy.published.data import RawData, RawPolynomial
+from experiments.accuracy.published.neural import Layers
+from experiments.accuracy.published.rtf import least_ellipse, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.models.cores import LightField

@@ -243,7 +243,7 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
         ("GLAS N-BK7", "GLAS MIRROR", r"line 29, GLAS: got 'MIRROR'.*no mirrors"),
         ("GLAS N-BK7 0 0 1.5 4.0E+1", "GLAS ___BLANK 1 0 0.5 60", r"index: got 0.5"),
         ("SURF 2", "SURF 4", r"SURF: got '4', expected surface 2"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE COORDBRK\n  PARM 3 12\n  CURV -2", r"PARM 3 of COORDBRK: got 12.0"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE COORDBRK\n  PARM 7 12\n  CURV -2", r"PARM 7 of COORDBRK: got 12.0"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XPOLYNOM\n  CURV -2", r"line 32, TYPE: got 'XPOLYNOM'"),
         ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 9 1E-5\n  CURV -2", r"PARM 9 of TOROIDAL"),
         ("TYPE STANDARD\n  CURV -2", "TYPE ODDASPHE\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of ODDASPHE"),

@@ -8,7 +8,7 @@ import torch
 from shipped import SOME, focused
 from torch import Tensor
 
-from experiments.extreme_cases import from_film, from_scene, generator, unit
+from experiments.accuracy.extreme_cases import from_film, from_scene, generator, unit
 from neurolens.base import status as st
 from neurolens.optics.lens import glass
 from neurolens.optics.lens.designs import design

@@ -13,8 +13,8 @@ import pytest
 import torch
 from shipped import tabled
 
-from experiments.extreme_cases import from_film, from_scene, generator
-from experiments.extremes import both_precisions
+from experiments.accuracy.extreme_cases import from_film, from_scene, generator
+from experiments.accuracy.extremes import both_precisions
 from neurolens.base import status as st
 from neurolens.optics.lens.figures import Figure
 from neurolens.optics.lens.paraxial import first_order

@@ -11,7 +11,7 @@ import torch
 from film_light import film_light
 from shipped import SOME, focused, tabled, whole
 
-from experiments.pupil_methods import (
+from experiments.accuracy.pupil_methods import (
     RadialPupil,
     hull_disc,
     passes_through,

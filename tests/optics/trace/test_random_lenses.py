@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as hs
 from shipped import WHOLE, turned
 
-from experiments.extreme_cases import Case, disc, unit
-from experiments.extremes import measure
+from experiments.accuracy.extreme_cases import Case, disc, unit
+from experiments.accuracy.extremes import measure
 from neurolens.base import status as st
 from neurolens.optics.lens.figures import SPHERE, Cylinder
 from neurolens.optics.lens.prescription import Lens, Surface

@@ -11,7 +11,7 @@ import torch
 from shipped import backwards, focused, rays, whole
 from torch import Tensor
 
-from experiments.extreme_cases import from_film, generator
+from experiments.accuracy.extreme_cases import from_film, generator
 from neurolens.base import status as st
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens, Surface

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from experiments.defocus import point_light
+from experiments.pictures.defocus import point_light
 from neurolens.graph.compiler import has_compiler
 
 

@@ -11,7 +11,7 @@ import torch
 from path_difference import opd_mm
 from shipped import whole
 
-from experiments.starburst import light_of, streaks
+from experiments.pictures.starburst import light_of, streaks
 from neurolens.base.errors import InputError
 from neurolens.optics.analysis.bundles import bundle
 from neurolens.optics.analysis.bundles import points as stop_points

@@ -95,7 +95,7 @@ def stage_of(path: Path, build: Any) -> Path:
 
 
 def usd_rows(path: Path, frames: range = range(1)) -> list[dict[str, Any]]:
-    from experiments.usd_lights import usd_rows as rows
+    from experiments.pictures.usd_lights import usd_rows as rows
 
     return rows(path, frames)
 

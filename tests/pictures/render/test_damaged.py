@@ -11,6 +11,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from shipped import WHOLE
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.field import frame_of
@@ -131,9 +132,10 @@ def test_a_damaged_picture_is_refused_or_has_the_same_pixels(tmp_path: Path, nam
     file, hurt = tmp_path / f"good.{suffix}", tmp_path / f"hurt.{suffix}"
     write(file)
     data, good, refused = file.read_bytes(), read(file), 0
-    for percent in range(100):
+    for percent in range(0, 100, 1 if WHOLE else 3):
         at = len(data) * percent // 100
         for damaged in (data[:at], data[:at] + bytes(40) + data[at + 40 :])[: 1 + checked]:
+            hurt.unlink(missing_ok=True)  # a file system may wait for the disk where a file is cut and written again
             hurt.write_bytes(damaged)
             try:
                 found = read(hurt)
@@ -142,7 +144,7 @@ def test_a_damaged_picture_is_refused_or_has_the_same_pixels(tmp_path: Path, nam
             else:
                 assert len(found) == len(good), percent
                 assert all(np.array_equal(a, b) for a, b in zip(found, good, strict=True)), percent
-    assert refused >= 100
+    assert refused >= (100 if WHOLE else 34)
 
 
 @pytest.mark.parametrize("tiled", [False, True])

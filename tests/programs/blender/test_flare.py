@@ -302,7 +302,7 @@ def write_exr(path: Path, channels: dict[str, float], size: int = 8) -> None:
 
 def test_layers_are_added_in_the_compositor_by_their_gains(scene: Any, tmp_path: Path) -> None:
     """Each frame of a sequence gets its own picture of flare."""
-    tool = importlib.import_module("experiments.flare_in_blender")
+    tool = importlib.import_module("experiments.pictures.flare_in_blender")
     for frame in (3, 4):
         layers = {
             "ghosts": (0.1, 0.2, 0.4),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.mitsuba_scenes import our_scene, with_our_spectra
+from experiments.peers.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray

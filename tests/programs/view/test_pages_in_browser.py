@@ -127,8 +127,8 @@ def test_a_page_that_escapes_nothing_is_noticed(browser: Any, attack: str, tmp_p
 def test_library_and_the_pages_of_its_lenses(
     browser: Any, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from experiments import library_pages as library
     from experiments.__main__ import main as experiment
+    from experiments.data import library_pages as library
 
     def draw(path: Path) -> None:
         write_png(path, np.full((20, 30, 3), 0.5))

@@ -1,0 +1,1 @@
+"""How exact? Errors of models, of the tracer and of inverse maps against references."""

@@ -1,0 +1,1 @@
+"""How do other programs compare? Rays and pictures of ours beside theirs."""

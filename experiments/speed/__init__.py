@@ -1,0 +1,1 @@
+"""How fast? Nanoseconds a ray, seconds a picture and tasks an hour on this machine."""
