@@ -110,7 +110,7 @@ class PhotonTracer:
         """Return boosts [surfaces, 2, LEVELS] that make photons turn round `times` times (at most `LEVELS` - 1).
 
         Each surface ahead is chosen in proportion to its reflectance (a mean over angles of incidence), so that all
-        paths with that number of reflections have about the same weight. After that, reflection is as frequent as it is.
+        paths with that number of reflections have about the same weight. After that, photons go as they would.
         """
         share = self.stack.reflectance(wavelength_nm)
         boosts = np.ones((len(share), 2, LEVELS))

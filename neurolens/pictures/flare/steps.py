@@ -319,7 +319,8 @@ class Stack:
     def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the reflectances [surfaces] for light towards the film.
 
-        Those of coatings are means over angles of incidence up to 46 degrees. A coating that reflects nothing at right angles still reflects light that comes aslant.
+        Those of coatings are means over angles of incidence up to 46 degrees, for a coating that reflects nothing at
+        right angles still reflects light that comes aslant.
         """
         numbers = self.numbers(wavelength_nm)[0][:, 0].astype(np.float64)
         n1, n2 = numbers[:, CALL.index("n_before")], numbers[:, CALL.index("n_after")]
