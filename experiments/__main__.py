@@ -27,6 +27,7 @@ QUESTIONS = {
         "precision": ("precision", "rays in float32 beside float64, through every lens file"),
         "extremes": ("extremes", "errors and statuses at the ends of what optics allows"),
         "inverse": ("inverse", "inverse maps: how often they arrive"),
+        "phase": ("phase", "the optical path of models, and point spread from it, beside exact rays"),
         "zoom": ("zoom", "models of whole zooms, of internal focus"),
         "shots": ("shots", "models fitted to one shot beside those that ship: error, operations, time"),
         "pupils": ("pupils", "share of rays that pass a lens of those sent through its outlines"),

@@ -346,7 +346,8 @@ def fit(lens: str | os.PathLike[str], within_um: float | None = None, **options:
         lens: a name, a file, or a lens that is set, whose zoom, f-number and focal length count.
         within_um: the film-equivalent RMS error wanted, on rays that the fit has not seen; the smallest model within it
             is loaded.
-        options: further ones of `nl.train`, such as output, the folder of the run, and set, a mapping.
+        options: further ones of `nl.train`, such as output, the folder of the run, set, a mapping, and
+            phase=True for the optical path.
 
     Raises:
         InputError: a setting that models do not have, or no model is within the error.

@@ -52,7 +52,7 @@ LEAN_MODULES = {
         for name in ("arithmetic", "arrays", "shapes", "surfaces", "tracegraph", "transmission")
     ),
     *(f"neurolens.optics.setting.{name}" for name in ("focusing", "pupils", "rims", "states")),
-    *(f"neurolens.models.{name}" for name in ("assemble", "axes", "card", "cores", "file", "inverse")),
+    *(f"neurolens.models.{name}" for name in ("assemble", "axes", "card", "copied", "cores", "file", "inverse")),
     *(f"neurolens.models.{name}" for name in ("model", "source")),
 }
 
@@ -60,8 +60,8 @@ LEAN_MODULES = {
 # Statements that each room has, as the last issue left it: what a reader has to hold. A room that grows by more than
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
-    "__init__": 25, "__main__": 4, "base": 2006, "graph": 2629, "optics": 9560, "models": 3770, "cameras": 4240,
-    "pictures": 7540, "programs": 2730, "studies": 3405, "cli": 3817, "front": 210,
+    "__init__": 25, "__main__": 4, "base": 2006, "graph": 2629, "optics": 9600, "models": 4430, "cameras": 4240,
+    "pictures": 7540, "programs": 2730, "studies": 3405, "cli": 3865, "front": 210,
 }  # fmt: skip
 SLACK = 1.03
 
@@ -71,22 +71,31 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def statements(body: list[Any]) -> Iterator[Any]:
-    """All statements of a module; looking through their expressions, too, takes ten times as long."""
+@cache
+def parsed(path: Path) -> list[Any]:
+    """The statements of a module at its own level."""
+    return ast.parse(path.read_text(encoding="utf-8")).body
+
+
+def statements(body: list[Any], types: bool = True) -> Iterator[Any]:
+    """All statements of a module; looking through their expressions, too, takes ten times as long.
+
+    Without `types`, what stands there for types alone is left out.
+    """
     for node in body:
-        yield node
-        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
-            yield from statements(getattr(node, part, []))
+        if types or not isinstance(node, ast.If) or getattr(node.test, "id", "") != "TYPE_CHECKING":
+            yield node
+            for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+                yield from statements(getattr(node, part, []), types)
 
 
 def imported(path: Path) -> set[str]:
     """Dotted names of everything a module imports, anywhere in it."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
     package = module_name(path).split(".")
     if path.name != "__init__.py":
         package = package[:-1]
     names = set()
-    for node in statements(tree.body):
+    for node in statements(parsed(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -94,9 +103,6 @@ def imported(path: Path) -> set[str]:
             origin = ".".join([*above, *([node.module] if node.module else [])])
             names |= {f"{origin}.{alias.name}" for alias in node.names}
     return names
-
-
-TYPES_ALONE = re.compile(r"^if TYPE_CHECKING:\n(?:(?: .*)?\n)+", re.MULTILINE)
 
 
 @cache
@@ -135,9 +141,8 @@ def test_no_imports_go_in_a_circle() -> None:
     """Those inside functions count, too; those for types alone do not."""
     graph, known = {}, imports().keys()
     for path in MODULES:
-        text = TYPES_ALONE.sub("if 0:\n    pass\n", path.read_text(encoding="utf-8"))
         found = set()
-        for node in statements(ast.parse(text).body):
+        for node in statements(parsed(path), types=False):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("neurolens"):
                 names = {f"{node.module}.{alias.name}" for alias in node.names}
                 found |= names & known or {str(node.module)}
@@ -152,9 +157,8 @@ def test_no_imports_go_in_a_circle() -> None:
 def test_rooms_keep_within_their_bounds() -> None:
     found = Counter[str]()
     for path in MODULES:
-        text = path.read_text(encoding="utf-8")
-        assert len(text.splitlines()) <= MAX_LINES, path
-        found[room_of(module_name(path))] += sum(isinstance(node, ast.stmt) for node in ast.walk(ast.parse(text)))
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= MAX_LINES, path
+        found[room_of(module_name(path))] += sum(isinstance(node, ast.stmt) for node in statements(parsed(path)))
     print("\n".join(f"{count:6} of {STATEMENTS.get(room)} statements in {room}" for room, count in found.items()))
     assert {room: count for room, count in found.items() if count > SLACK * STATEMENTS[room]} == {}
 

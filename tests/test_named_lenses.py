@@ -106,6 +106,7 @@ def test_lenses_magnify_at_their_nearest_focus_as_makers_state() -> None:
     A unit focus would not do it: the 135 mm f/1.8 would have 0.39 where 0.25 is stated.
     """
     table = tomllib.loads((Path(__file__).parent / "data" / "close_focus.toml").read_text(encoding="utf-8"))
+    assert table["pages"].keys() <= table["stated"].keys()
     missing, agree = set(), 0
     for name, (stated, limit_m) in table["stated"].items():
         nearest_m = nearest_focus_m(focused(name))

@@ -29,7 +29,7 @@ def vignetting_errors(
     stopped, parts = lens.with_stop_radius(radius), []
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
-        exact = trace_pairs(stopped, rays, domain.pupil_z_mm)
+        exact = trace_pairs(stopped, rays, domain.pupil_z_mm, power=False)
         zone = torch.hypot(rays.film_x, rays.film_y) / domain.film_radius_mm
         parts.append((exact.status == st.PASSED, predict(rays, radius).status == st.PASSED, zone))
     exact_passes, model_passes, zone = (torch.cat(v) for v in zip(*parts, strict=True))

@@ -38,6 +38,7 @@ from neurolens.models.fit import NETWORKS, ModelSettings, prepare
 from neurolens.models.model import Domain
 from neurolens.models.pairs import PairSettings, make_pairs
 from neurolens.models.targets import TRANSMITTANCE_TERMS
+from neurolens.models.transmittance import MOST_W
 from neurolens.optics.lens.glass import absorption_of
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import lens_files
@@ -180,7 +181,8 @@ _HEAD = """# Models that ship
 polynomial of at most 64 coefficients per vector output. The historical lenses and 34 lenses by name also have the
 best network of two layers of 16 units, after 600 iterations. A few lenses have faster models, too. A model holds for
 the whole lit film, the full aperture, focus from infinity to near, and all wavelengths for which the glasses are
-known.
+known. It focuses by moving the whole lens, also where the lens file moves groups: `--focus-mode best` sets the exact
+lens so.
 
 - **Errors** are those of held-out rays (`neurolens.studies.rays`), in micrometres at an image radius of 21.6 mm.
   Every card was checked on fresh rays. `neurolens evaluate models/FILE` checks a model again.
@@ -348,7 +350,7 @@ def transmittance_mark(lens: Lens) -> str:
     absorbed = [absorption_of(surface, light) for surface in lens.surfaces]
     glass = [None if a is None else np.round(np.broadcast_to(a, light.shape), 9).tolist() for a in absorbed]
     films = [s.coating and s.coating.layers for s in lens.surfaces]  # those that are assumed, too
-    return fingerprint_of([lens.sha256, films, glass, TRANSMITTANCE_TERMS])
+    return fingerprint_of([lens.sha256, films, glass, TRANSMITTANCE_TERMS, MOST_W])
 
 
 def refit(entries: Sequence[Entry], library: Library, out: Path, progress: Progress, *, again: bool) -> list[str]:

@@ -98,7 +98,7 @@ def plain_letters(text: str) -> str:
 
 def product_of(name: str) -> str:
     """A product as its maker writes it: "CANON EF 11-24mm f/4 L USM" is "Canon EF 11-24mm f/4L USM"."""
-    text = plain_letters(name.replace("|", " ").replace("~", "-")).removeprefix("CARL ").removeprefix("Carl ")
+    text = plain_letters(re.sub("[~–]", "-", name.replace("|", " "))).removeprefix("CARL ").removeprefix("Carl ")
     text = re.sub(r"[A-Z]{4,}", lambda word: word[0].capitalize(), text)
     text = re.sub(r"(Canon EF.* f/[\d.-]+) (?=L)|(Nikkor .*f/[\d.-]+) (?=[DEG]\b)", r"\1\2", text)
     return re.sub(r"\s+", " ", text).strip()
@@ -130,12 +130,15 @@ def glass_of(element: Row, index: float) -> dict[str, Any]:
     return known
 
 
-def conics_of(row: Row, listed: Row) -> Row:
-    """The row with conic constants where it is listed as having them plus 1, as many patents state them."""
-    if row["key"] not in listed["conics"]:
+def mended_of(row: Row, listed: Row) -> Row:
+    """The row with aspheres as decided: a number is added to conic constants, powers take the collection's place."""
+    if row["key"] not in listed["aspheres"]:
         return row
-    asph = {label: a | {"K": a.get("K", 0) - 1} for label, a in row["asph"].items()}
-    return row | {"asph": asph, "conics": listed["conics"][row["key"]]}
+    decided = listed["aspheres"][row["key"]]
+    asph = {label: a | {"K": a.get("K", 0) + decided.get("conic", 0)} for label, a in row["asph"].items()}
+    for label, powers in decided.get("powers", {}).items():
+        asph[label] |= {f"A{n}": v for n, v in powers.items()}
+    return row | {"asph": asph, "mended": decided["why"]}
 
 
 def stated_at_e(row: Row) -> bool:
@@ -322,7 +325,7 @@ def described(row: Row, listed: Row) -> Lens:
         f"{row['file']}, which states no licence).",
         f"Believed to be the product: the collection names it, and the example has {first.efl_mm:.4g} mm and "
         f"f/{lens.f_number:.3g}.",
-        *filter(None, [lens.notes, row.get("conics")]),
+        *filter(None, [lens.notes, row.get("mended")]),
         _LATER,
         _RIMS[lens.rims],
     ]
@@ -473,7 +476,9 @@ def theirs_of(row: Row, ours: Lens, listed: Row) -> Lens:
         return lens.with_stop_radius(lens.stop_radius_mm * first_order(lens).f_number / ours.f_number)
 
 
-def page(left_out: dict[str, str], doubles: dict[str, Double], count: int, decided: list[list[str]]) -> str:
+def page(
+    left_out: dict[str, str], doubles: dict[str, Double], count: int, decided: list[list[str]], kept: dict[str, str]
+) -> str:
     """The table of lenses that do not ship, of those of which two transcriptions exist, and what was decided."""
     agree = sorted(doubles.keys() - {row[0] for row in decided})
     return lab.page(
@@ -487,6 +492,9 @@ def page(left_out: dict[str, str], doubles: dict[str, Double], count: int, decid
         "Focal length, back focus and RMS blur of the axis at full aperture of both tables, and, where the match with "
         "a profile is certain, how far the distortion is from photographs. The reasons stand in the files.",
         lab.table("file|what differs|ours now|theirs|decided", decided),
+        "## Aspheres that stay as the collection has them",
+        "The axis of these is sharper with conic constants larger or smaller by 1; other figures are then worse.",
+        lab.table("lens|why", list(kept.items())),
     )
 
 
@@ -498,7 +506,7 @@ def run(args: argparse.Namespace) -> None:
     named = tomllib.loads(NAMES.read_text(encoding="utf-8"))
     listed |= {key: named[key] for key in ("years", "first_us_patents")}
     rows = json.loads(args.json.read_text(encoding="utf-8"))
-    rows = lab.chosen([conics_of(r, listed) for r in rows], lambda r: r["key"], args.only, "patent-lenses")
+    rows = lab.chosen([mended_of(r, listed) for r in rows], lambda r: r["key"], args.only, "patent-lenses")
     ours = {file.stem: read_lens(file) for file in lab.LENSES.glob("*.toml") if "OpticsDatabase" in file.read_text()}
     names = {_plain(name): name for name in ours}
     left_out, doubles, wanted = dict[str, str](), dict[str, Double](), dict[Path, Row]()
@@ -534,7 +542,8 @@ def run(args: argparse.Namespace) -> None:
             beside = evidence(theirs_of(row, now, listed))
             decided.append([name, decision["differs"], evidence(now), beside, decision["decided"]])
     count = len([file for file in wanted if file.is_file()])
-    atomic_write_text(lab.RESULTS / "patent_lenses.md", page(left_out, doubles, count, decided))
+    text = page(left_out, doubles, count, decided, listed["aspheres_kept"])
+    atomic_write_text(lab.RESULTS / "patent_lenses.md", text)
     print(f"{count} lens files in {args.out}, {len(left_out)} left out, {len(doubles)} there already")
 
 

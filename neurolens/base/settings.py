@@ -397,7 +397,9 @@ def read_config(cls: type[T], path: str | Path, overrides: Sequence[str] = ()) -
 
 
 def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Return a copy of `data` with each "dotted.key=value" set. Values are TOML; a bare word is a string.
+    """Return a copy of `data` with each "dotted.key=value" set, in a list of tables in each of them.
+
+    Values are TOML; a bare word is a string.
 
     Raises:
         InputError: no "=", an empty key, broken TOML, or a key inside something that is not a table.
@@ -408,12 +410,15 @@ def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[s
         keys = dotted.split(".")
         if not equals or not all(keys):
             raise InputError("--set", text, "(not of this form)", "key=value or table.key=value")
-        table: Any = result
+        tables: list[Any] = [result]
         for depth, key in enumerate(keys[:-1]):
-            table = table.setdefault(key, {})
-            if not isinstance(table, dict):
+            inner = [table.setdefault(key, {}) for table in tables]
+            tables = [table for found in inner for table in (found if isinstance(found, list) else [found])]
+            if not all(isinstance(table, dict) for table in tables):
                 raise InputError("--set", dotted, f"({'.'.join(keys[: depth + 1])} is not a table)", "a key of a table")
-        table[keys[-1]] = _override_value(dotted, value)
+        found = _override_value(dotted, value)
+        for table in tables:
+            table[keys[-1]] = deepcopy(found)
     return result
 
 

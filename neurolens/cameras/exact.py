@@ -35,7 +35,7 @@ from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import BY_LENSES, Shot
 from neurolens.optics.setting.focusing import at_infinity
 from neurolens.optics.setting.pupils import passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
-from neurolens.optics.setting.states import focus_of, set_lens
+from neurolens.optics.setting.states import focus_mode_of, focus_of, set_lens
 from neurolens.optics.trace.surfaces import Rays, media
 from neurolens.optics.trace.tracegraph import exact_graph, light_limits
 
@@ -105,7 +105,7 @@ class ExactCamera(LensCamera):
         for nm in used:
             check_light(lens, nm)
         self.lens = set_lens(lens, replace(shot, focus_m=given.focus_m))
-        shot = replace(shot, focus_m=focus_of(self.lens, given))
+        shot = replace(shot, focus_m=focus_of(self.lens, given), focus_mode=focus_mode_of(self.lens, given))
         film_z, tabled, stop_mm = self.lens.film_z_mm, at_infinity(self.lens), float(self.lens.stop_radius_mm)
         assert film_z is not None  # `set_lens` places the film
         plane = pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm

@@ -70,6 +70,9 @@ class OnnxCamera(LensCamera):
         _check_shot(model, shot)
         if model.axes:
             model = model.at(*state_for(model.path, model.axes, model.state, shot.zoom, shot.focus_m))
+        if shot.focus_mode == "auto":  # the card's axes say which motion the model holds: its groups', or the film's
+            inside = any(a.name == "focus" for a in model.axes) and math.isfinite(shot.focus_m)
+            shot = replace(shot, focus_mode="internal" if inside else "best")
         card = model.card
         lens, domain = card["lens"], card["domain"]
         self.model, self.path = model, model.path

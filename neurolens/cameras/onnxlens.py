@@ -45,6 +45,8 @@ def open_session(
     # A plan of which arrays share memory takes a time that grows with the square of the nodes: 7 s for 2,600, an exact
     # lens with aspheres. Without a plan it opens in 0.5 s and runs as fast, for memory that is freed is taken again.
     options.enable_mem_reuse = False
+    # Nothing is left to simplify in what this package writes: searching for it takes two thirds of the time to open.
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     options.log_severity_level = 4  # errors are raised, so printing them would repeat them
     try:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])

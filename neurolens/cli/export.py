@@ -30,7 +30,7 @@ from neurolens.optics.lens.shot import BY_LENSES
 if TYPE_CHECKING:
     from neurolens.models.model import LensModel
 
-_PARTS = ("ray", "transmittance", "stop", "vignetting")
+_PARTS = ("ray", "transmittance", "stop", "vignetting", "path")
 _CAMERA = "camera: what a whole camera is set to"
 # Rays that measure the errors of an ONNX file with fixed inputs.
 _HELD_OUT, _VIGNETTING = 20_000, 100_000
@@ -74,7 +74,7 @@ examples:
     )
     out: Path = cli.output_path("FILE", "file to write")
     fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE", common=True)
-    only: tuple[str, str, str, str] = setting(
+    only: tuple[str, str, str, str, str] = setting(
         _PARTS, f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
         kind=cli.words_of(_PARTS, "ray"), metavar="PARTS",
     )  # fmt: skip

@@ -99,7 +99,7 @@ examples:
         """Print and draw one lens."""
         from neurolens.models.pairs import domain_of
         from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.setting.states import focus_of, set_lens
+        from neurolens.optics.setting.states import focus_mode_of, focus_of, set_lens
         from neurolens.studies.describe import file_doubts, glass_table, layout_profile, lens_facts
 
         began = time.perf_counter()
@@ -114,7 +114,7 @@ examples:
             "file": str(file),
             **facts,
             "zoom": self.state.given.zoom,
-            "focus_mode": self.state.given.focus_mode or "best",
+            "focus_mode": focus_mode_of(lens, shot),
             "derived": lens.derived,
             "aperture": lens.aperture and lens.aperture.settings(),
             "configurations": [
@@ -216,7 +216,7 @@ def _lens_text(data: dict[str, Any]) -> str:
         parts.append(f"Zoom states (--zoom, also mm between them): {states}")
     if nears:
         states = ", ".join(f"{c['name']} ({cli.number(c['object_distance_mm'])} mm)" for c in nears)
-        parts.append(f"Focus states (--zoom, or --focus-mode internal): {states} to the object")
+        parts.append(f"Focus states (--zoom, and --focus between them): {states} to the object")
     if data["derived"]:
         parts.append(f"Derived: {data['derived']}")
     parts += [f"Warning: {text}" for text in data["warnings"]]

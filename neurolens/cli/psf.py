@@ -12,6 +12,7 @@ import numpy as np
 
 from neurolens.base.errors import note
 from neurolens.base.files import write_arrays
+from neurolens.base.lensname import is_model
 from neurolens.base.report import Report
 from neurolens.base.settings import (
     F_NUMBER,
@@ -25,6 +26,7 @@ from neurolens.base.settings import (
     wavelengths_nm,
 )
 from neurolens.base.tasks import Here
+from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import whole_pair
 from neurolens.optics.lens.shot import BY_LENSES
@@ -55,8 +57,8 @@ class PointSpread(cli.Reporting):
 
     Waves are summed over the exact pupil, with its vignetting, blades, aberrations and losses in glass. Far out of
     focus, where fringes are finer than pixels, rays are counted instead, and the file says where. Each distance and
-    f-number is a part that is kept until the file is written: the same command goes on. Needs the extra "train"
-    (torch).
+    f-number is a part that is kept until the file is written: the same command goes on. A model with optical path
+    (train --phase) takes the place of traced rays. Needs the extra "train" (torch).
 
     In Python `neurolens.programs.blur` blurs pictures by such a file."""
 
@@ -69,7 +71,7 @@ examples:
     called = "neurolens psf"
     intermixed = True
 
-    file: Path = cli.lens(positional=True)
+    file: Path = cli.lens(also=", or a model with optical path (train --phase)", models=True, positional=True)
     out: Path = cli.output_path("OUT.npz", "file to write: .npz or .exr")
     film: tuple[float, float] = cli.film()
     pixel_um: float = setting(
@@ -122,7 +124,9 @@ examples:
         write = self._writer()
         if self.side is not None and self.side % 2 == 0:
             self.refuse("--side", self.side, "an odd number of pixels")
-        began, tabled, shot = time.process_time(), read_any(self.file), self.state.shot()
+        began, shot = time.process_time(), self.state.shot()
+        loaded = load_model(self.file) if is_model(self.file) else None
+        model, tabled = (loaded.fitted, loaded.fitted.lens) if loaded else (None, read_any(self.file))
         lenses = {}
         for number in dict.fromkeys(_flat(self.f_number)) or (None,):
             lens = set_lens(tabled, replace(shot, f_number=number))
@@ -134,11 +138,13 @@ examples:
         for nm in {nm for some in waves.values() for nm in some}:
             check_light(lens, nm)
         places = *places_of(self.film, self.grid), (0.0, 0.0)
-        task = PsfTask(lens, focus, places, tuple(waves.values()), self.pixel_um / 1000, self.side)
+        task = PsfTask(lens, focus, places, tuple(waves.values()), self.pixel_um / 1000, self.side, model)
         folder = self.out.with_name(f"{self.out.name}.parts")
         with cli.keeps(how_to_resume(folder)), Here() if self.dask is None else Dask(self.dask) as executor:
             arrays = library_of(lenses, distances, task, self.grid, executor, folder, self.progress())
         settings = {"film_mm": self.film, "pixel_um": self.pixel_um, "focus_m": focus, "state": self.state.given.given}
+        if loaded:
+            settings["model"] = {"file": self.file.name, "errors": loaded.card["errors"]}
         facts = about(lens, settings, waves)
         write(arrays, facts)
         forget(folder)

@@ -70,6 +70,7 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
         "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)"
     )
+    phase: bool = setting(False, "models have the optical path, too, for point spread by diffraction (neurolens psf)")
     pixels_across: int = setting(
         4000, "of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
         "4000: 9 um each for a radius of 21.6 mm)", within=(1, 10**6),
@@ -114,6 +115,7 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     def _changes(self) -> list[str]:
         """Return the options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
         changes = ['lens.zoom="range"'] * self.zoom_range + ['lens.focus_mode="internal"'] * self.internal_focus
+        changes += ["model.phase=true"] * self.phase
         if self.within is not None:
             unit = self.within[0].removeprefix("rms_")
             changes.append(f"target.{unit}={self.within[1]!r}")

@@ -2,7 +2,8 @@
 
 Light field, core, decoding, front surface, rims, domain: everything round a core is written here, once, for every kind
 of model. Inputs of the graph are `rays` (film x, y, pupil x, y in mm, wavelength in nm) and, of the call, `film_z_mm`
-and `stop_radius_mm`; outputs `scene_ray` (x, y, z in mm, unit direction), `transmittance`, `stop_xy_mm`, `status`.
+and `stop_radius_mm`; outputs `scene_ray` (x, y, z in mm, unit direction), `transmittance`, `stop_xy_mm`, `status`, and
+`path_um` of models with optical path.
 """
 
 from __future__ import annotations
@@ -69,14 +70,16 @@ class Parts:
         transmittance: whether it is an output.
         stop: whether the crossing with the stop is an output.
         vignetting: whether the status tells of the stop and of the rims.
+        path: whether the optical path is an output, of models that have it.
     """
 
     transmittance: bool = True
     stop: bool = True
     vignetting: bool = True
+    path: bool = True
 
 
-ALL, RAY_ONLY = Parts(), Parts(False, False, False)
+ALL, RAY_ONLY = Parts(), Parts(False, False, False, False)
 
 
 def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
@@ -117,6 +120,8 @@ def add_outputs(
         g.outputs["transmittance"] = values.transmittance
     if parts.stop:
         g.outputs["stop_xy_mm"] = values.vectors[STOP]
+    if parts.path and values.path_um is not None:
+        g.outputs["path_um"] = values.path_um
     tests = _tests(model, values, radius, form) if radius is not None else []
     if series.sinc is not None and values.unit is None:
         longest = (series.kappa * series.angle) ** 2

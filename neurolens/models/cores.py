@@ -132,7 +132,7 @@ class CoreValues:
     """The outputs of a core: three vectors (2 rows each), transmittance, gates (a row each; None without any).
 
     `unit`: the unit direction (3 rows) where a core gives it instead of `vectors[DIRECTION]`. `index`: the index of the
-    front glass, where the direction is that inside it (see `Refracted`).
+    front glass, where the direction is that inside it (see `Refracted`). `path_um`: see `Phased`.
     """
 
     vectors: tuple[Value, Value, Value]
@@ -140,6 +140,7 @@ class CoreValues:
     gates: Value | None
     unit: Value | None = None
     index: Value | None = None
+    path_um: Value | None = None
 
 
 _CoreType = TypeVar("_CoreType", bound=type)
@@ -219,7 +220,17 @@ def symmetric(rows: Value, field: Field, scalars: int, light: Value | None = Non
     return CoreValues(vectors, through, gates if scalars > 1 else None)  # type: ignore[arg-type]
 
 
-class _Symmetric(Core):
+def without_w(exponents: Exponents, w: float) -> tuple[Exponents, Array]:
+    """Return the terms [U, V] that are left of [M, V] when w is known, and the matrix [M, U] that sums coefficients."""
+    rest = exponents.copy()
+    rest[:, -1] = 0
+    unique, place = np.unique(rest, axis=0, return_inverse=True)
+    merge = np.zeros((len(rest), len(unique)))
+    merge[np.arange(len(rest)), place.reshape(-1)] = w ** exponents[:, -1].astype(float)
+    return unique, merge
+
+
+class Symmetric(Core):
     """Polynomials in invariants for the scalars and for A and B of A p + B u: `ab` [3, 2, .., M], `scalars` [S, M].
 
     The last column of the exponents is that of w.
@@ -231,12 +242,8 @@ class _Symmetric(Core):
     _forms: ClassVar[tuple[Form, ...]]
 
     def fixed(self, w: float) -> Self:
-        rest = self.exponents.copy()
-        rest[:, -1] = 0
-        unique, place = np.unique(rest, axis=0, return_inverse=True)
-        merge = np.zeros((len(rest), len(unique)))
-        merge[np.arange(len(rest)), place.reshape(-1)] = w ** self.exponents[:, -1].astype(float)
-        return replace(self, exponents=unique, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
+        exponents, merge = without_w(self.exponents, w)
+        return replace(self, exponents=exponents, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
 
     def plus(self, ab: Array, scalars: Array) -> Self:
         """Return the polynomial with constants added to `ab` [3, 2, ..] and to the scalars [S]."""
@@ -256,12 +263,15 @@ class _Symmetric(Core):
     def coefficients(self) -> int:
         return int((self.ab != 0).sum() + (self.scalars != 0).sum())
 
-    def rows(self, g: Graph, field: Field, units: Units) -> Value:
-        """Return rows A of the three vectors, B of them, scalars without `light`; no terms in w where it is 0."""
+    def rows(self, g: Graph, field: Field, units: Units, more: Sequence[Array] = ()) -> Value:
+        """Return rows A of the three vectors, B of them, scalars without `light`, and `more` coefficients [R, M].
+
+        No terms in w are written where it is 0.
+        """
         ab = self.ab * np.array(units.vectors).reshape(3, *[1] * (self.ab.ndim - 1))
         scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
         a, b = (ab[:, k].reshape(-1, len(self.exponents)) for k in (0, 1))
-        x, weight = field.products(self._forms), np.concatenate([a, b, scalars])
+        x, weight = field.products(self._forms), np.concatenate([a, b, scalars, *more])
         used = ~self._coloured if field.dispersive else self.exponents[:, -1] == 0
         return g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
 
@@ -297,7 +307,7 @@ class _Symmetric(Core):
 
 @stored_as("invariants")
 @dataclass(frozen=True, eq=False)
-class InvariantPolynomial(_Symmetric):
+class InvariantPolynomial(Symmetric):
     """out = A p + B u, with A, B and the scalars polynomials in rho, sigma, tau, w.
 
     Attributes:
@@ -318,7 +328,7 @@ class InvariantPolynomial(_Symmetric):
 
 @stored_as("mirror")
 @dataclass(frozen=True, eq=False)
-class MirrorPolynomial(_Symmetric):
+class MirrorPolynomial(Symmetric):
     """The polynomial of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
 
     Attributes:
@@ -466,3 +476,37 @@ class Refracted(Composite):
 
     def fixed(self, w: float) -> Self:
         return replace(super().fixed(w), index=np.array([np.polyval(self.index[::-1], w)]))
+
+
+@stored_as("phased")
+@dataclass(frozen=True, eq=False)
+class Phased(Composite):
+    """A core with a polynomial beside it that gives the optical path; `models.phase` says from where to where.
+
+    Attributes:
+        parts: the one core, whose rays stay as they are.
+        exponents: [M, 4] int64 of rho, sigma, tau, w. path: [M] coefficients in um.
+        focal_z_mm, front_z_mm: of the plane on which the path begins, and of the point about which it ends.
+        direction: coefficients of the direction s(P) in which a wave leaves; see `models.phase.Waves`.
+    """
+
+    parts: tuple[Any]
+    exponents: Exponents
+    path: Array
+    focal_z_mm: float
+    front_z_mm: float
+    direction: tuple[float, ...]
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        x, used = field.products(ROUND), self.exponents[:, -1] == 0
+        used = used | field.dispersive
+        path = g.polynomial(self.exponents[used][:, : x.rows], self.path[None, used], x)
+        return replace(self.parts[0].build(g, field, units), path_um=path)
+
+    def fixed(self, w: float) -> Self:
+        unique, merge = without_w(self.exponents, w)
+        return replace(super().fixed(w), exponents=unique, path=self.path @ merge)
+
+    @property
+    def coefficients(self) -> int:
+        return super().coefficients + len(self.path)

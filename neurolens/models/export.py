@@ -37,6 +37,7 @@ from neurolens.models.inverse import (
 )  # fmt: skip
 from neurolens.models.model import Domain, LensModel, Prediction
 from neurolens.models.pairs import FilmRays, sample_domain
+from neurolens.models.phase import card_entry
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.focusing import at_infinity
@@ -77,7 +78,8 @@ def export_onnx(
     Args:
         errors: held-out errors for the card, JSON-able.
         derivatives: whether to write two more outputs, scene_ray_d_film and scene_ray_d_pupil [2, 6, N]: the
-            derivatives of the scene ray by x and by y of the film point, and of the pupil point, per mm.
+            derivatives of the scene ray by x and by y of the film point, and of the pupil point, per mm; where there is
+            an optical path, path_um_d_film and path_um_d_pupil [2, N], too.
 
     Returns the path.
 
@@ -184,12 +186,13 @@ def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
 def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
     """Return the card of a model, JSON-able; `errors` are those on held-out rays, as the evaluation gives them."""
     stop, stopped = st.blocked(model.lens.stop_index, st.RIM), f"blocked by the stop, surface {model.lens.stop_index}"
+    phase = card_entry(model.core)
     codes = {st.PASSED, st.OUTSIDE_DOMAIN, stop, *(g.status for g in model.gates)}
     return {
         "kind": CARD_KIND,
         "schema": CARD_SCHEMA,
         "lens": lens_facts(model.lens, model.domain),
-        "units": UNITS,
+        "units": UNITS | ({"path_um": "um, see phase"} if phase else {}),
         "transmittance": POLARISED,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
@@ -204,6 +207,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
             "seed": model.settings.get("seed"),
             "seconds": model.fit_s,
         },
+        **phase,
         "errors": errors,
         "reference": reference_rays(model),
         "versions": {
@@ -248,7 +252,7 @@ def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict
 
     Left out are rays within 0.01 of any boundary (relative; 0.001 where no passing ray is further from all), and rays
     whose status float32 changes. For every status that the model gives there are up to `others` rays. `rounding` is the
-    error that float32 may cause: of position and stop crossing in mm, of direction and of transmittance. It is eight
+    error that float32 may cause: of each output in its unit. It is eight
     times what the reference evaluator errs on these rays.
     """
     # In some domains few rays pass; some are so wide that all passing rays lie near the boundaries.
@@ -269,6 +273,7 @@ def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict
         "scene_ray": torch.stack([c[index] for c in out.rays]),
         "transmittance": out.transmittance[index],
         "stop_xy_mm": torch.stack([out.stop_x[index], out.stop_y[index]]),
+        **({} if out.path_um is None else {"path_um": out.path_um[index]}),
     }
     return {
         **{name: _rounded(value.tolist()) for name, value in columns.items()},
@@ -310,6 +315,7 @@ def _rounding(model: LensModel, rays: FilmRays) -> dict[str, float]:
         "direction": off(fine.rays[3:], rough.rays[3:]),
         "transmittance": off([fine.transmittance], [rough.transmittance]),
         "stop_mm": off([fine.stop_x, fine.stop_y], [rough.stop_x, rough.stop_y]),
+        **({} if fine.path_um is None or rough.path_um is None else {"path_um": off([fine.path_um], [rough.path_um])}),
     }
 
 

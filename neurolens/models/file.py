@@ -38,6 +38,7 @@ from neurolens.models.card import (
     default_state,
     read_metadata,
 )  # fmt: skip
+from neurolens.models.copied import Copied as Copied  # the cores of copies, which files may hold
 from neurolens.models.cores import CORES, Core
 from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 from neurolens.optics.lens.figures import figure_of
@@ -57,10 +58,11 @@ _MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
 _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 42  # of a prescription, as `optics.readers.lensfile` has them
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 _NOWHERE = -1.0  # a film position in no domain, which replaces that of the call where the state is out of range
-DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
+DERIVATIVES = {"film": RAY[:2], "pupil": RAY[2:]}
 _DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError, RuntimeError)
 # Every reference ray may err by this; in position and stop crossing by this for each mm of the focal length.
 _OFF = 1e-5
+_OFF_UM = 5e-3  # of an optical path: a hundredth of a wave
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ def _check_rays(model: ModelFile, state: Sequence[float], reference: Any) -> Non
     if not same.all() or not passed.any():
         raise ModelError(f"{model.path}: reference rays: the status of {int((~same).sum())} is not that of its card")
     mm = _OFF * max(1.0, abs(float(model.card["lens"]["efl_mm"])))
-    rounding = {"position_mm": mm, "direction": _OFF, "transmittance": _OFF, "stop_mm": mm}
+    rounding = {"position_mm": mm, "direction": _OFF, "transmittance": _OFF, "stop_mm": mm, "path_um": _OFF_UM}
     try:  # the card says where float32 costs more
         stated = reference.get("rounding") or {}
         rounding = {name: max(least, float(stated.get(name, 0.0))) for name, least in rounding.items()}
@@ -213,8 +215,10 @@ def _check_rays(model: ModelFile, state: Sequence[float], reference: Any) -> Non
             raise ValueError("not finite")
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"rounding: {error}") from error
-    position, direction, power, stop = rounding.values()
+    position, direction, power, stop, path = rounding.values()
     allowed = {"scene_ray": [[position]] * 3 + [[direction]] * 3, "transmittance": [[power]], "stop_xy_mm": [[stop]]}
+    if "path_um" in outputs:
+        allowed["path_um"] = [[path]]
     for name, limit in allowed.items():
         wanted = np.atleast_2d(np.array(reference[name], np.float64))
         off = np.abs(np.broadcast_to(outputs[name], wanted.shape) - wanted)[:, passed]
@@ -236,7 +240,7 @@ def onnx_of(
     Args:
         nodes: one model, or one for every node of the axes. Numbers that are equal at all nodes are constants; the
             others follow the features of the state (`Axis.features`), which costs a few operations a call.
-        derivatives: whether the scene ray's derivatives by film and pupil point are outputs, too.
+        derivatives: whether the derivatives of scene ray and path by film and pupil point are outputs, too.
 
     Raises:
         InputError: weights that float32 does not hold, and nodes whose graphs differ in more than numbers.
@@ -244,10 +248,11 @@ def onnx_of(
     graphs = [model_graph(node, ONNX) for node in with_one_angle(nodes)]
     shapes = {}
     if derivatives:
-        graphs = [with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)]) for graph in graphs]
-        for g, (name, by) in product(graphs, DERIVATIVES.items()):
-            g.outputs[name] = g.concat(*(g.outputs.pop(derivative("scene_ray", row)) for row in by))
-        shapes = dict.fromkeys(DERIVATIVES, (2, 6))
+        of = [name for name in ("scene_ray", "path_um") if name in graphs[0].outputs]
+        graphs = [with_derivatives(graph, of, [("rays", k) for k in range(4)]) for graph in graphs]
+        for g, name, (by, rows) in product(graphs, of, DERIVATIVES.items()):
+            g.outputs[f"{name}_d_{by}"] = g.concat(*(g.outputs.pop(derivative(name, row)) for row in rows))
+        shapes = {f"scene_ray_d_{by}": (2, 6) for by in DERIVATIVES}
     if not axes:
         return write_onnx(graphs, metadata or {}, shapes=shapes)
     g, transform = state_graph(axes)

@@ -35,6 +35,7 @@ from neurolens.models.pairs import (
     domain_of,
     make_pairs,
 )
+from neurolens.models.phase import with_phase
 from neurolens.models.polynomial import fit_mirror, fit_paraxial, fit_planes, fit_polynomial
 from neurolens.models.targets import (
     NETWORKS,
@@ -105,6 +106,8 @@ def fit_model(
     if settings.family != "paraxial":
         sample = (pairs.train.inputs, pairs.train.transmittance)
         model = with_transmittance([model], [sample], settings.transmittance_terms)[0]
+    if settings.phase:
+        model = with_phase(model, pairs.train.inputs)
     return without_idle_gates((model,), settings.idle_gates)[0] if settings.idle_gates else model
 
 

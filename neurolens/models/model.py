@@ -187,13 +187,17 @@ class Scales:
 
 
 class Prediction(NamedTuple):
-    """What a model answers for N rays; lens frame, mm. The ray is meaningful where the status is 0."""
+    """What a model answers for N rays; lens frame, mm. The ray is meaningful where the status is 0.
+
+    `path_um` is the optical path, of models that have it (`models.phase`).
+    """
 
     rays: Rays
     transmittance: Tensor
     stop_x: Tensor
     stop_y: Tensor
     status: Tensor
+    path_um: Tensor | None = None
 
 
 def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
@@ -201,7 +205,8 @@ def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
     from neurolens.optics.trace.surfaces import Rays
 
     scene, power, stop, status = (out[n].expand(-1, count) for n in OUTPUTS)
-    return Prediction(Rays(*scene), power[0], stop[0], stop[1], status[0])
+    path = out["path_um"].expand(-1, count)[0] if "path_um" in out else None
+    return Prediction(Rays(*scene), power[0], stop[0], stop[1], status[0], path)
 
 
 @dataclass(frozen=True)

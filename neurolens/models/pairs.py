@@ -390,7 +390,7 @@ def make_pairs(
 
     def keep(batch: PairSet, *names: str) -> None:
         """Add the blocked rays of a batch to these splits, as far as those are not full."""
-        for name, chosen in _blocked_splits(lens, batch).items():
+        for name, chosen in blocked_splits(lens, batch).items():
             if name in names:
                 most = settings.rim if name == "rim" else (settings.rim + 1) // 2
                 splits[name].append(batch.select(torch.nonzero(chosen)[: most - counts[name], 0]))
@@ -459,7 +459,7 @@ def passing_rays(
     return _with_power(lens, join_pairs(parts), domain.pupil_z_mm)
 
 
-def _blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
+def blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
     """Return which rays [N] belong in each split of `RayPairs` that is about boundaries."""
     radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
     near = batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2
@@ -467,7 +467,7 @@ def _blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
     whole = refracts.all(0)
     # Not by status alone: a ray that a rim stops may be lost at a later surface. The tracer returns a lost ray on the
     # axis.
-    rim = whole & torch.isfinite(batch.cross_x).all(0) & ~_lost(batch) & near.all(0)
+    rim = whole & torch.isfinite(batch.cross_x).all(0) & ~lost(batch) & near.all(0)
     edge = ~whole & (~(reached(batch) & refracts) | near).all(0)
     return {"rim": rim, "edge": edge, "far": ~(rim | edge | (batch.status == st.PASSED))}
 
@@ -477,11 +477,11 @@ def reached(pairs: PairSet) -> Tensor:
     goes_on = ((pairs.meets > 0) & (pairs.refracts > 0)).flip(0)  # camera rays meet the last surface first
     before = torch.cat([torch.ones_like(goes_on[:1]), goes_on[:-1]])
     # A ray that meets the far half of a sphere, or a plane from behind, ends there with a positive discriminant.
-    end = torch.where(_lost(pairs), pairs.status // 4 - 1, -1)
+    end = torch.where(lost(pairs), pairs.status // 4 - 1, -1)
     return (before.cumprod(0, dtype=torch.uint8).flip(0) > 0) & (torch.arange(len(goes_on))[:, None] >= end)
 
 
-def _lost(pairs: PairSet) -> Tensor:
+def lost(pairs: PairSet) -> Tensor:
     """Return which rays [N] have the status of a missed surface or of total reflection."""
     return (pairs.status >= 4) & (pairs.status % 4 != st.RIM)
 

@@ -35,6 +35,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import Failed, run_each
+from neurolens.models.model import LensModel
 from neurolens.optics.lens.prescription import Lens
 from neurolens.pictures.defocus.plate import channel_wavelengths
 from neurolens.pictures.render.film import digest
@@ -53,9 +54,11 @@ class PsfTask:
     Attributes:
         places_mm: (right, up) in the picture, row by row; the axis must come last.
         channels: wavelengths of each channel, of equal weight. side: pixels; None takes what holds the light.
+        model: of the lens, with optical path, whose rays are taken; None traces them.
 
     Raises:
-        InputError: the lens is not round about its axis, or the objects are not in front of it.
+        InputError: the lens is not round about its axis, or the objects are not in front of it; as
+            `wavefront.checked_path`.
     """
 
     lens: Lens
@@ -64,11 +67,16 @@ class PsfTask:
     channels: tuple[tuple[float, ...], ...]
     pixel_mm: float
     side: int | None
+    model: LensModel | None = None
 
     def __post_init__(self) -> None:
         lens, front_m = self.lens, float(self.lens.film_z_mm or 0) / 1000
         if not lens.round:
             raise InputError(lens.path, "surfaces", "(not round about the axis)", "a lens of rotational symmetry")
+        if self.model is not None:
+            from neurolens.models.wavefront import checked_path
+
+            checked_path(self.model, lens, [nm for some in self.channels for nm in some])
         if not self.distance_m > front_m:
             raise InputError(lens.path, "distance_m", self.distance_m, f"above {front_m:.4g}, the front of the lens")
 
@@ -110,7 +118,13 @@ def point_spread(task: PsfTask) -> Arrays:
     middle = task.channels[len(task.channels) // 2]
     waves.insert(0, waves.pop(waves.index(sorted(middle)[len(middle) // 2])))  # the reference comes first
     weights = np.array([[nm in some for nm in waves] for some in task.channels], np.float64)
-    pupils = pupils_at(Scene(task.lens, task.distance_m), unique, waves)
+    scene = Scene(task.lens, task.distance_m)
+    if task.model is None:
+        pupils = pupils_at(scene, unique, waves)
+    else:
+        from neurolens.models.wavefront import model_pupils
+
+        pupils = model_pupils(task.model, scene, unique, waves)
     reach = max(reach_of(some) for some in pupils)
     side = task.side or min(2 * math.ceil(reach / task.pixel_mm) + 1, MOST_PX)
     found = [spread(some, weights, task.pixel_mm, side) for some in pupils]

@@ -33,6 +33,7 @@ from neurolens.models.pairs import (
     sample_domain,
     trace_pairs,
 )
+from neurolens.models.phase import path_errors
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.surfaces import Rays
 from neurolens.studies.rays import (
@@ -288,7 +289,11 @@ def fit_and_measure(
         "parameters": model.core.coefficients, "fit_s": model.fit_s,
     }  # fmt: skip
     record = export_measured(
-        file, fingerprint, facts, lambda path, errors: export_onnx(model, path, errors), lambda m: measure_on(on, m)
+        file,
+        fingerprint,
+        facts,
+        lambda path, errors: export_onnx(model, path, errors),
+        lambda m: measure_on(on, m) | path_errors(m.fitted, pairs.held_out.inputs),
     )
     clear_training(training)
     return Measured(settings, file, record)

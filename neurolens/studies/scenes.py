@@ -241,10 +241,10 @@ def scene_cameras(
     All are in best focus, and show the plane in focus at one size. With `fused` lens and models run as C.
     """
     widest = first_order(lens).f_number
-    # All cameras get the same light.
+    # All cameras get the same light, and the lens focuses as its models do: as a whole.
     real = Shot(
-        shot.film_mm, shot.focus_m, max(shot.f_number or widest, widest), wavelength_nm=shot.wavelength_nm,
-        runtime=None if fused else "onnxruntime",
+        shot.film_mm, shot.focus_m, max(shot.f_number or widest, widest), focus_mode="best",
+        wavelength_nm=shot.wavelength_nm, runtime=None if fused else "onnxruntime",
     )  # fmt: skip
     exact = ExactCamera(lens, real, bounds=domain.bounds)
     fitted = {name: OnnxCamera(load_model(file), real) for name, file in models.items()}

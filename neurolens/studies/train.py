@@ -280,6 +280,8 @@ def state_settings(settings: ModelSettings, rays: int, seed: int) -> StateSettin
     """
     if settings.method != "ols":
         raise InputError("settings", "model", settings.label, 'method "ols" on the invariants, for many states')
+    if settings.phase:
+        raise InputError("settings", "model.phase", "true", "false, or a model of one state of the lens")
     return StateSettings(settings.terms, settings.degree, rays, seed, settings.name or f"states-{settings.terms}")
 
 

@@ -13,6 +13,7 @@ from neurolens.base.progress import Progress
 from neurolens.cameras import exact
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import ExactCamera, kept_outline, search_key
+from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.optics.lens.figures import Cylinder, Figure
 from neurolens.optics.lens.prescription import Lens
@@ -54,6 +55,18 @@ def test_a_camera_starts_from_the_outline_of_the_run_before(monkeypatch: pytest.
     assert parts(camera(2.0).film.outline) == parts(first.film.outline)
     with pytest.raises(AssertionError, match="searched"):
         camera(2.1)
+
+
+def test_a_models_outline_is_kept_for_its_coefficients_focus_and_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    def camera(kind: str, focus_m: float = 2.0, f_number: float = 4.0) -> OnnxCamera:
+        return OnnxCamera(load_model(lens_models.exported(kind)), Shot((36, 24), focus_m, f_number))
+
+    first = camera("invariants")
+    monkeypatch.setattr("neurolens.cameras.model.outline_of", never)
+    assert parts(camera("invariants").film.outline) == parts(first.film.outline)
+    for others in (("thick",), ("invariants", 3.0), ("invariants", 2.0, 5.6)):
+        with pytest.raises(AssertionError, match="searched"):
+            camera(*others)
 
 
 def test_whatever_the_search_reads_is_in_the_key() -> None:

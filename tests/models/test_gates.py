@@ -43,7 +43,7 @@ OLS = ModelSettings("ols", terms=40, planes=False)  # of `lens_models.model`
 @cache
 def fresh(name: str) -> PairSet:
     pairs = gated(name).pairs
-    return trace_pairs(pairs.lens, sample_domain(pairs.domain, 50_000, 77), pairs.domain.pupil_z_mm)
+    return trace_pairs(pairs.lens, sample_domain(pairs.domain, 50_000, 77), pairs.domain.pupil_z_mm, power=False)
 
 
 def false_passes(model: LensModel, rays: PairSet) -> float:
@@ -154,7 +154,7 @@ def test_rays_of_the_boxes_pass_uniformly() -> None:
     lens, domain = narrow()
     samples = []
     for rays in (sample_lit(domain, 60_000, 3)[0], sample_domain(domain, 400_000, 4)):
-        inputs = rays.select(trace_pairs(lens, rays, domain.pupil_z_mm).status == st.PASSED)
+        inputs = rays.select(trace_pairs(lens, rays, domain.pupil_z_mm, power=False).status == st.PASSED)
         along = inputs.film_x * inputs.pupil_x + inputs.film_y * inputs.pupil_y
         samples.append([torch.hypot(inputs.film_x, inputs.film_y), torch.hypot(inputs.pupil_x, inputs.pupil_y), along])
     for a, b in zip(*samples, strict=True):
@@ -237,7 +237,7 @@ def test_rims_take_fewer_terms_and_clip_as_well() -> None:
     assert np.count_nonzero(core.scalars[1:]) < 0.7 * every.scalars[1:].size
     assert np.count_nonzero(core.ab[STOP]) < every.ab[STOP].size
     rays = sample_domain(model.domain, 40_000, seed=5)
-    passes = trace_pairs(model.lens, rays, model.domain.pupil_z_mm).status == st.PASSED
+    passes = trace_pairs(model.lens, rays, model.domain.pupil_z_mm, power=False).status == st.PASSED
     wrong, dense = (
         int(((m.predict(rays).status == st.PASSED) != passes).sum()) for m in (model, replace(model, core=every))
     )

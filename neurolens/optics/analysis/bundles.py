@@ -22,8 +22,8 @@ from neurolens.base.errors import InputError
 from neurolens.optics.analysis.fields import ChiefRays, Scene, on_plane
 from neurolens.optics.setting.pupil_nodes import LitPart, lit_nodes, lit_part
 from neurolens.optics.trace.aiming import without_rims
-from neurolens.optics.trace.rays import trace
-from neurolens.optics.trace.surfaces import Rays, media
+from neurolens.optics.trace.rays import optical_path, trace
+from neurolens.optics.trace.surfaces import Rays
 
 # The outermost ring lies this share inside the stop's edge, so that rounding never clips it.
 _EDGE = 1e-7
@@ -349,7 +349,7 @@ def _traced(
     with torch.no_grad():
         out = trace(scene.traced, start, aim.wavelength, towards="film", path=path)
     film, status = on_plane(out.rays, scene.film_z_mm), torch.where(aimed, out.status, st.blocked(0, st.MISSED))
-    length = _path_mm(scene, [start, *out.path, film], aim.wavelength) if path else math.nan
+    length = optical_path(scene.traced, [start, *out.path, film], aim.wavelength) if path else math.nan
 
     def shaped(value: Tensor, blocked: float = math.nan) -> Tensor:
         return torch.where(status == 0, value, blocked).reshape(aim.shape)
@@ -360,15 +360,6 @@ def _traced(
         scene, fields, aim.waves, Rays(*(c.reshape(aim.shape) for c in start)), rays, t, s, status.reshape(aim.shape),
         shaped(area, blocked=0.0), area.reshape(aim.shape), shaped(aim.lead_mm(*at) + length), chief.height_mm,
     )  # fmt: skip
-
-
-def _path_mm(scene: Scene, points: Sequence[Rays], wavelength_nm: Tensor) -> Tensor:
-    """Return the optical path along the points of rays on the surfaces."""
-    path = torch.zeros_like(points[0].x)
-    for medium, before, after in zip(media(scene.traced, wavelength_nm), points, points[1:], strict=False):
-        # Along the ray, which is no distance: steps back to the stop inside an element count as negative.
-        path = path + medium.n * sum((b - a) * d for a, b, d in zip(before[:3], after[:3], before[3:], strict=True))
-    return path
 
 
 def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> list[str]:

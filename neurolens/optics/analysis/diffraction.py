@@ -89,9 +89,9 @@ def pupils(
             for w, nm in enumerate(waves):
                 part = slice(w * len(square[0]), (w + 1) * len(square[0]))
                 turned = (turn @ rays.cosines[:, part], turn @ rays.hits[:, part], turn @ rays.at[..., part])
-                own = Arrived(*turned, rays.power[part], rays.exists[part])
+                own = Arrived(*turned, rays.power[part], rays.exists[part], rays.limits_mm, rays.stop)
                 dark = not filled.part.reach[k] > 0
-                found[-1][-1].append(None if dark else fitted_pupil(lens, own, places, energy[part], nm))
+                found[-1][-1].append(None if dark else fitted_pupil(lens.aperture, own, places, energy[part], nm))
     return found
 
 

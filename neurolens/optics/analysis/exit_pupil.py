@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,6 +114,8 @@ class Arrived(NamedTuple):
     Attributes:
         cosines, hits: [2, N] directions and places (mm) on the film. at: [S, 2, N] x and y in mm at each surface.
         power: [N] share of unpolarised light that arrives. exists: [N] False where a ray is lost.
+        limits_mm: [S] radii of the surfaces. stop: the number of the stop among them.
+        wave_mm: [N] the wavefront W about `hits` [2, 1], which then are one place; None: it follows from all hits.
     """
 
     cosines: Array
@@ -121,6 +123,9 @@ class Arrived(NamedTuple):
     at: Array
     power: Array
     exists: NDArray[np.bool_]
+    limits_mm: Array
+    stop: int
+    wave_mm: Array | None = None
 
 
 def arrived(lens: Lens, rays: Rays, wavelength_nm: torch.Tensor | float) -> Arrived:
@@ -132,20 +137,22 @@ def arrived(lens: Lens, rays: Rays, wavelength_nm: torch.Tensor | float) -> Arri
     assert found.transmittance is not None
     at = np.stack([np.stack([found.crossings[k].x.numpy(), found.crossings[k].y.numpy()]) for k in every])
     cosines, hits = (np.stack([a.numpy(), b.numpy()]) for a, b in ((film.dx, film.dy), (film.x, film.y)))
-    return Arrived(cosines, hits, at, found.transmittance.numpy(), found.status.numpy() == 0)
+    limits = np.array([s.semi_diameter_mm for s in lens.surfaces])
+    return Arrived(cosines, hits, at, found.transmittance.numpy(), found.status.numpy() == 0, limits, lens.stop_index)
 
 
 def fitted_pupil(
-    lens: Lens, rays: Arrived, places: Array, energy: Array | float, wavelength_nm: float,
+    aperture: Aperture | None, rays: Arrived, places: Array, energy: Array | float, wavelength_nm: float,
     like: ExitPupil | None = None, box: Array | None = None,
 ) -> ExitPupil | None:  # fmt: skip
     """Fit the exit pupil to rays; None where too few arrive, or the rays meet nowhere (a pinhole, a plate).
 
     Args:
+        aperture: shape of the stop; None is round.
         places: [2, N] of the rays on a surface before the lens. energy: of the rays, per area of those places.
         like: the pupil of another wavelength, whose boxes are taken.
     """
-    limits = np.array([s.semi_diameter_mm for s in lens.surfaces])
+    limits = rays.limits_mm
     part = np.hypot(rays.at[:, 0], rays.at[:, 1]) / limits[:, None]  # relative to the rim's radius, at each surface
     near = rays.exists & (part.max(0) < _BEYOND)
     inside = near & (part.max(0) <= 1)
@@ -156,26 +163,32 @@ def fitted_pupil(
     middle, half = ((low + high) / 2, _ROOM * (high - low) / 2) if like is None else (like.middle, like.half)
     if not half.min() > _FLAT:
         return None
-    centre = rays.hits[:, inside].mean(1)
+    centre = rays.hits[:, inside].mean(1) if rays.wave_mm is None else rays.hits[:, 0]
     every = range(len(limits))
-    cut = [lens.stop_index, *(k for k in every if k != lens.stop_index and part[k, near].max() > 1)]
-    off = rays.hits[:, near] - centre[:, None]
+    cut = [rays.stop, *(k for k in every if k != rays.stop and part[k, near].max() > 1)]
+    wave = -(rays.hits[:, near] - centre[:, None]).reshape(-1) if rays.wave_mm is None else rays.wave_mm[near]
     figures = _fitted(
-        (cosines[:, near] - middle[:, None]) / half[:, None], half, off, places[:, near],
+        (cosines[:, near] - middle[:, None]) / half[:, None], half, wave, places[:, near],
         (rays.power * energy)[near], rays.at[cut][..., near].reshape(2 * len(cut), -1),
     )  # fmt: skip
     through = inside.copy()
-    if lens.aperture is not None:
-        through &= lens.aperture.inside(rays.at[lens.stop_index, 0], rays.at[lens.stop_index, 1], lens.stop_radius_mm)
-    hits = (rays.hits - centre[:, None])[:, through if through.any() else inside]
+    if aperture is not None:
+        through &= aperture.inside(rays.at[rays.stop, 0], rays.at[rays.stop, 1], float(limits[rays.stop]))
+    through = through if through.any() else inside
     box = np.zeros((2, 2)) if box is None else box
-    return ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), lens.aperture, hits, box)
+    found = ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), aperture, np.zeros((2, 0)), box)
+    if rays.wave_mm is None:
+        return replace(found, hits_mm=(rays.hits - centre[:, None])[:, through])
+    hits = found.hits((cosines[:, through] - middle[:, None]) / half[:, None])
+    figures[1, 0, 0], figures[0, 1, 0] = (figures[1, 0, 0], figures[0, 1, 0]) + half * hits.mean(1)
+    return replace(found, centre_mm=centre + hits.mean(1), hits_mm=hits - hits.mean(1, keepdims=True))
 
 
-def _fitted(places: Array, half: Array, off_mm: Array, disc_places: Array, power: Array, at_mm: Array) -> Array:
+def _fitted(places: Array, half: Array, wave_mm: Array, disc_places: Array, power: Array, at_mm: Array) -> Array:
     """Fit `ExitPupil.figures` by least squares to rays at points [2, N] of the box.
 
-    The wavefront is fitted by its slopes, the light per area of cosines by the derivatives of the points on the disc.
+    The wavefront is fitted to its values [N] or its slopes [2 N] (dW/dL, then dW/dM), the light per area of cosines by
+    the derivatives of the points on the disc.
     """
     orders = np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE
     # Chebyshev polynomials of each coordinate, and their slopes.
@@ -187,9 +200,11 @@ def _fitted(places: Array, half: Array, off_mm: Array, disc_places: Array, power
         return (a[:, :, None] * b[:, None, :])[:, orders]
 
     plain, by_u, by_v = products(*value), products(slope[0], value[1]), products(value[0], slope[1])
-    slopes = np.concatenate([by_u / half[0], by_v / half[1]])
-    wave = _least(slopes[:, 1:])(-off_mm.reshape(-1))
     solved = _least(plain)
+    if len(wave_mm) == len(plain):
+        wave = solved(wave_mm)[1:]
+    else:
+        wave = _least(np.concatenate([by_u / half[0], by_v / half[1]])[:, 1:])(wave_mm)
     mapped = solved(disc_places.T)
     (au, bu), (av, bv) = (by_u @ mapped).T / half[0], (by_v @ mapped).T / half[1]
     rest = solved(np.stack([power * np.abs(au * bv - av * bu), *at_mm], 1))

@@ -14,7 +14,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.settings import F_NUMBER, FILM_MM, FOCAL_MM, LIGHT_NM, between, check_bounds, said, setting, within
 from neurolens.base.units import in_unit
 
-FocusMode = Literal["best", "paraxial", "internal"]
+FocusMode = Literal["auto", "best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
 Dispersion = Literal["full", "lateral", "off"]
 Runtime = Literal["c", "onnxruntime"]
@@ -57,6 +57,7 @@ class Shot:
             fisheye projection it is what the circle within the film shall see; beyond it the film is dark.
         focus_mode: "best" places the film where the spot on the axis is smallest, "paraxial" in the paraxial image;
             "internal" moves the groups as the lens file's focus states do, and then the film to the smallest spot.
+            "auto" is "internal" where the lens has such states and they reach the distance, else "best".
         aperture: an `Aperture`, the shape of the stop's opening; None is that of the lens file, else round.
         wavelength_nm: shortest and longest wavelength of the light, which sets exposure and best focus.
         film_offset_mm: moves the film away from the lens after focusing; a pinhole has none.
@@ -104,8 +105,9 @@ class Shot:
         within=(0.001, 360.0), unit="degrees", apart="size",
     )  # fmt: skip
     focus_mode: FocusMode = setting(
-        "best", "the film where the spot on the axis is smallest at this aperture, in the paraxial image, or first the "
-        "groups moved as the focus states of the lens file do (default: best)", old=("focusing",),
+        "auto", "best: the film where the spot on the axis is smallest at this aperture; paraxial: in the paraxial "
+        "image; internal: first the groups moved as the focus states of the lens file do (default: auto, internal "
+        "where these reach the distance, else best)", old=("focusing",),
     )  # fmt: skip
     aperture: Any = None  # an `Aperture`, whose module loads numpy, which the help of the command line does without
     wavelength_nm: tuple[float, float] = LIGHT_NM

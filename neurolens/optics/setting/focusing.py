@@ -158,6 +158,13 @@ def nearest_focus_m(lens: Lens) -> float:
     return 1 / _vergence(place(len(path[len(lens.surfaces) - 1]) - 1)) / 1000
 
 
+def reached_inside(lens: Lens, focus_m: float) -> bool:
+    """Whether the groups of a lens move for a distance (m): its file has focus states, which reach that near."""
+    if math.isinf(focus_m) or not focus_states(lens):
+        return False
+    return 0 < nearest_focus_m(lens) <= focus_m * (1 + 1e-9)
+
+
 def near_limit_m(lens: Lens) -> float:
     """Return the default distance from the film to the nearest object in focus."""
     data = paraxial.first_order(lens)

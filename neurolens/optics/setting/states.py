@@ -27,6 +27,7 @@ from neurolens.optics.setting.focusing import (
     gaps_mm,
     infinity_states,
     monotone,
+    reached_inside,
     with_cover_glass,
     zoom_state_of,
 )
@@ -41,7 +42,7 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
 
     Args:
         shot: some or all settings of a shot, as commands and cameras have them; what its `focus_mode` leaves open is
-            "best". Or some by name, as in the example.
+            "auto" (`focus_mode_of`). Or some by name, as in the example.
         focus_mode: of settings by name: "paraxial" moves the film as the paraxial image does; "best" to the least RMS
             spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as the file's focus states
             do (`focusing.focused_inside`), and then the film to that spot.
@@ -60,8 +61,9 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
         shot = Shot.part(focus_mode=focus_mode, **settings)
         if lens.film_z_mm is not None and shot.f_number and shot.given.keys() <= {"f_number", "focus_mode"}:
             return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), shot.f_number))
-    lens, mode, light_nm = at_infinity(lens), shot.focus_mode or Shot.focus_mode, shot.wavelength_nm or lens.light_nm
+    lens, light_nm = at_infinity(lens), shot.wavelength_nm or lens.light_nm
     lens = _sized(_zoomed_to(lens, shot.zoom), shot)
+    mode = focus_mode_of(lens, shot)
     lens = lens.with_aperture(shot.aperture or lens.aperture)
     if shot.f_number is not None:
         far = at_infinity(lens)
@@ -83,6 +85,17 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
     lens = lens if shot.coating is None else coated(lens, shot.coating)
     assert lens.film_z_mm is not None
     return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
+
+
+def focus_mode_of(lens: Lens, shot: Shot) -> FocusMode:
+    """Return how a lens in its zoom position and size focuses for a shot: what "auto" stands for, else as asked.
+
+    A focus state that the shot's zoom names keeps its groups.
+    """
+    if (mode := shot.focus_mode or Shot.focus_mode) != "auto":
+        return mode
+    inside = shot.focus_m is not None and _object_mm(lens, shot) is None and reached_inside(lens, shot.focus_m)
+    return "internal" if inside else "best"
 
 
 def focus_of(lens: Lens, shot: Shot) -> float:

@@ -134,6 +134,18 @@ def trace(
     return _joined(parts)
 
 
+def optical_path(
+    lens: Lens, points: Sequence[Rays], wavelength_nm: Tensor | float, towards: Towards = "film"
+) -> Tensor:
+    """Return the optical path [N] in mm along rays: their start, `Traced.path`, and then their end, if it counts."""
+    length = torch.zeros_like(points[0].x)
+    order = media(lens, wavelength_nm)[:: 1 if towards == "film" else -1]
+    for medium, before, after in zip(order, points, points[1:], strict=False):
+        # Along the ray, which is no distance: steps back to the stop inside an element count as negative.
+        length = length + medium.n * sum((b - a) * d for a, b, d in zip(before[:3], after[:3], before[3:], strict=True))
+    return length
+
+
 def _joined(parts: Sequence[Any]) -> Any:
     """Join the results of several chunks."""
     first = parts[0]

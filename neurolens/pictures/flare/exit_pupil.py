@@ -40,7 +40,7 @@ def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil |
     places = _grid(box, 1.1, _BOX)
     rays, area = rays_across(lens, light, places)
     found = arrived(lens, Rays(*torch.from_numpy(rays)), wavelength_nm)
-    return fitted_pupil(lens, found, places, area / math.pi, wavelength_nm, like, box)
+    return fitted_pupil(lens.aperture, found, places, area / math.pi, wavelength_nm, like, box)
 
 
 def image_moves(lens: Lens, patch: Patch, wavelength_nm: float) -> Array:

@@ -125,13 +125,14 @@ def test_a_lens_lights_its_film_without_nan(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOME)
 def test_figures_computed_elsewhere_from_the_same_table(name: str) -> None:
-    """EFL and back focus to rounding, but where our file takes its glass from a catalogue; blur to its sampling."""
+    """EFL and back focus to rounding, but where our file takes its glass from a catalogue, and to 6e-4 where it has the
+    n_d of a source's n_e; blur to its sampling."""
     if not SHARED.is_dir():
         pytest.skip("../shared is not there")
     other = json.loads((SHARED / f"{SAME_TABLE[name]}.json").read_text())
     computed = other["computed_at_nd"]
     lens, checks = checked(name)
-    rel = 3e-4 if any(s.glass for s in lens.surfaces) else 1e-6
+    rel = 3e-4 if any(s.glass for s in lens.surfaces) else 6e-4 if "of the e line" in lens.notes else 1e-6
     for meridian in ("y", "x") if "efl_x_mm" in computed else ("y",):
         data = first_order(lens, meridian=meridian)  # type: ignore[arg-type]
         key = f"{{}}_{meridian}_mm" if "efl_x_mm" in computed else "{}_mm"

@@ -13,6 +13,7 @@ from neurolens.optics.analysis.field_curves import breathing, field_change
 from neurolens.optics.lens.glass import LINE_D_NM
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Coating, Lens, Surface
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens, write_lens
 from neurolens.optics.setting.focusing import (
     axial_rays,
@@ -24,7 +25,7 @@ from neurolens.optics.setting.focusing import (
     nearest_focus_m,
 )
 from neurolens.optics.setting.rims import check_clearance
-from neurolens.optics.setting.states import in_state, set_lens
+from neurolens.optics.setting.states import focus_mode_of, in_state, set_lens
 from neurolens.optics.trace.rays import Rays, trace
 
 ZOOMS = ("ogawa_zoom_70_200", "nikon_zoom_70_200", "nikon_zoom_14_24", "nikon_zoom_80_200", "itoh_zoom_100_146")
@@ -399,6 +400,23 @@ def test_nearer_than_the_nearest_is_an_error_that_names_it() -> None:
     limit = float(caught.value.expected.split()[2])
     assert nearest <= limit < 1.001 * nearest  # rounded up: what is printed is allowed
     set_lens(lens, focus_m=limit, focus_mode="internal")
+
+
+def test_by_default_groups_move_where_the_file_says_how_and_the_lens_as_a_whole_elsewhere() -> None:
+    lens = tabled("sony_fe_135mm_f1_8_gm")
+    nearest = nearest_focus_m(set_lens(lens))
+    for focus_m, mode in ((1.01 * nearest, "internal"), (0.99 * nearest, "best"), (math.inf, "best")):
+        shot = Shot.part(focus_m=focus_m)
+        asked = set_lens(lens, Shot.part(focus_m=focus_m, focus_mode=mode))  # type: ignore[arg-type]
+        assert focus_mode_of(set_lens(lens), shot) == mode
+        assert set_lens(lens, shot) == asked
+    # "best" keeps its meaning, as the models that ship hold it: the groups stand as at infinity.
+    whole = set_lens(lens, Shot.part(focus_m=1.01 * nearest, focus_mode="best"))
+    assert gaps(whole) == gaps(set_lens(lens))
+    # A near state that is named keeps its groups, and a file without states its film.
+    near = next(c.name for c in lens.configurations if c.object_distance_mm)
+    assert focus_mode_of(set_lens(lens, zoom=near), Shot.part(zoom=near, focus_m=2.0)) == "best"
+    assert focus_mode_of(tabled("laikin_double_gauss_50"), Shot.part(focus_m=2.0)) == "best"
 
 
 # --- Breathing

@@ -1,0 +1,223 @@
+"""The optical path as one more output of models, fitted apart from where rays go.
+
+A camera ray crosses the focal plane, the paraxial image of infinity, in a point P. An ideal lens makes of all rays
+through P one plane wave, of the direction s(P). The output is the optical path from P to the plane across s(P) through
+the front focal point F, less that of the ray along the axis at the same wavelength, in um: with R the point of the
+scene ray nearest to F,
+
+    path = [P to R] - (R - F) . s(P) - (the same on the axis).
+
+So it is the aberration of the wave, some hundred waves at most where the path itself is 1e5, which float32 holds to a
+thousandth of a wave. A plane wave of any direction before the film meets near F, whatever direction it takes behind:
+therefore a small change of s changes the path by (F - R) . ds alone (to second order), and the path to any object point
+follows, in focus or not (`models.wavefront`). s(P) is stated (`direction_at`); it is near the mean of the rays of P.
+
+Path and rays belong together: at P, d path = dR . (d - s), with d the direction of the scene ray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.base.errors import InputError
+from neurolens.models.cores import Array, Phased, angle_vector
+from neurolens.models.model import LensModel
+from neurolens.models.pairs import FilmRays
+from neurolens.models.terms import (
+    Exponents,
+    Sweep,
+    backward,
+    forward,
+    invariant_exponents,
+    monomials,
+    pinned_threads,
+    replace_terms,
+    solve,
+)
+from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.setting.pupils import camera_rays, on_plane
+from neurolens.optics.trace.rays import optical_path, trace
+from neurolens.optics.trace.surfaces import Rays
+
+TERMS, FINE_WAVES = 120, 0.005  # at most, and the RMS at which no term is added
+_DEGREE, _SURPLUS, _PASSES = 10, 1.5, 3  # of the candidates; terms before elimination over terms kept; of replacement
+_CHOICE_RAYS, _RAYS = 8000, 16_000
+_DIRECTION = 4  # coefficients of s(P): more make the path less smooth
+_GREEN_NM = 546.0  # of the waves of a lens for visible light
+_STEP = 1e-4  # of the pupil's radius, for slopes of the path
+
+
+class Waves(NamedTuple):
+    """N rays about the focal point: P [2, N], R - F and directions [3, N] (mm), the path to R from P (mm) [N]."""
+
+    point: Array
+    foot: Array
+    direction: Array
+    length: Array
+
+
+def with_phase(model: LensModel, rays: FilmRays) -> LensModel:
+    """Return the model with the optical path as one more output, fitted to rays that its lens passes.
+
+    Raises:
+        InputError: a lens with cylinders or ideal surfaces, or a first-order model.
+    """
+    lens = model.lens
+    lens.require_glass("optical path")
+    if model.encoding.mirror or model.direction == "slope":
+        found = "(cylinders)" if model.encoding.mirror else f"(with method {model.method})"
+        raise InputError(lens.path, "phase", found, "a round lens, and a fit of its rays")
+    first = first_order(lens)
+    front = float(first.front_principal_z_mm - first.front_efl_mm)
+    empty = np.zeros((0, 4), np.int64), np.zeros(0)
+    core = Phased((model.core,), *empty, float(first.rear_focal_z_mm), front, ())
+    rays = rays.select(slice(0, _RAYS))
+    with pinned_threads():
+        waves = traced(lens, core, model.domain.pupil_z_mm, rays)
+        core = replace(core, direction=_mean_direction(waves))
+        wanted = torch.from_numpy(path_um(core, waves))[None]
+        variables = model.encoding(rays).invariants()
+        allowed = FINE_WAVES * unit_um(lens)
+        exponents = _chosen(variables, wanted, allowed, dispersive=model.encoding.dispersive)
+        coefficients = solve(monomials(variables, exponents), wanted)[0].numpy()
+    return replace(model, core=replace(core, exponents=exponents, path=coefficients))
+
+
+def unit_um(lens: Lens) -> float:
+    """Return the wavelength in which errors are counted: 546 nm, or the reference of a lens for other light."""
+    return (_GREEN_NM if lens.visible else lens.reference_nm) / 1000
+
+
+def traced(lens: Lens, core: Phased, pupil_z_mm: float, rays: FilmRays) -> Waves:
+    """Trace rays that the lens passes from the focal plane, and the axis for their paths."""
+    toward = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, pupil_z_mm)
+    start = on_plane(toward, core.focal_z_mm)
+    zero = torch.zeros_like(start.x)
+    axis = Rays(zero, zero, start.z, zero, zero, zero - 1)
+    ended, on_axis = (_to_foot(lens, core, each, rays.wavelength_nm) for each in (start, axis))
+    point = torch.stack([start.x, start.y]).numpy()
+    return Waves(point, ended[0], ended[1], ended[2] - on_axis[2])
+
+
+def _to_foot(lens: Lens, core: Phased, rays: Rays, wavelength_nm: Tensor) -> tuple[Array, Array, Array]:
+    with torch.no_grad():
+        out = trace(lens, rays, wavelength_nm, path=True)
+        length = optical_path(lens, [rays, *out.path], wavelength_nm, "scene")
+    foot, direction, further = foot_of(core, torch.stack(list(out.rays)).numpy())
+    return foot, direction, length.numpy() + further
+
+
+def foot_of(core: Phased, scene_ray: Array) -> tuple[Array, Array, Array]:
+    """Return R - F and the direction [3, N] of scene rays [6, N], and the way [N] from their points to R, in mm."""
+    direction = scene_ray[3:]
+    from_f = scene_ray[:3] - np.array([0.0, 0.0, core.front_z_mm])[:, None]
+    further = -(from_f * direction).sum(0)
+    return from_f + further * direction, direction, further
+
+
+def path_um(core: Phased, waves: Waves) -> Array:
+    """Return the path [N] as this module defines it."""
+    return np.asarray(1000 * (waves.length - (waves.foot * direction_at(core, waves.point)).sum(0)))
+
+
+def direction_at(core: Phased, point_mm: Array) -> Array:
+    """Return the unit direction s [3, N] of points P [2, N] of the focal plane (mm)."""
+    square = (point_mm * point_mm).sum(0)
+    angle = point_mm * np.polynomial.polynomial.polyval(square, np.array(core.direction))
+    theta = np.hypot(*angle)
+    return np.concatenate([angle * np.sinc(theta / math.pi), -np.cos(theta)[None]])
+
+
+def _mean_direction(waves: Waves) -> tuple[float, ...]:
+    """Fit s(P): its angle vector is P times a polynomial in |P|^2."""
+    scale = float(np.hypot(*waves.point).max())
+    columns = [(waves.point / scale * ((waves.point / scale) ** 2).sum(0) ** k).reshape(-1) for k in range(_DIRECTION)]
+    wanted = angle_vector(*torch.from_numpy(waves.direction)).numpy().reshape(-1)
+    found = np.linalg.lstsq(np.stack(columns, 1), wanted, rcond=None)[0]
+    return tuple((found / scale ** (1 + 2.0 * np.arange(_DIRECTION))).tolist())
+
+
+def _chosen(variables: Tensor, wanted: Tensor, allowed: float, *, dispersive: bool) -> Exponents:
+    """Choose terms [M, 4] for the path [1, N], whose RMS error may be the one allowed."""
+    candidates = invariant_exponents(_DEGREE, dispersive=dispersive)
+    variables, wanted = variables[:, :_CHOICE_RAYS], wanted[:, :_CHOICE_RAYS]
+    sweep, enough = Sweep.of_columns(monomials(variables, candidates), wanted), allowed**2 * wanted.shape[1]
+    for terms in range(1, math.ceil(_SURPLUS * TERMS) + 1):
+        forward(sweep, terms)
+        if sweep.residual <= enough:
+            break
+    backward(sweep, TERMS)
+    replace_terms(sweep, _PASSES)
+    while len(sweep.chosen) > 1 and sweep.residual + (costs := sweep.costs()).min() <= enough:
+        sweep.drop(sweep.chosen[int(costs.argmin())])
+    return candidates[sorted(sweep.chosen)]
+
+
+def path_errors(model: LensModel, rays: FilmRays) -> dict[str, float]:
+    """Return errors of the path in float32 on rays that the lens passes, and how far it and the model's rays differ.
+
+    "phase_rms_waves" and "phase_max_waves" are in waves of `unit_um`. "phase_rays_um" is the median distance, on the
+    film, between where the slopes of the path and where the model's own rays say that light goes. {} without a path.
+    """
+    core = model.core
+    if not isinstance(core, Phased):
+        return {}
+    with torch.no_grad():
+        exact = path_um(core, traced(model.lens, core, model.domain.pupil_z_mm, rays))
+        found = model.predict(rays.to(torch.float32)).path_um
+    assert found is not None
+    off = (found.double().numpy() - exact) / unit_um(model.lens)
+    by_slopes, direction = _directions(model, core, rays)
+    apart = np.linalg.norm(by_slopes - direction, axis=0) * abs(float(first_order(model.lens).efl_mm)) * 1000
+    return {
+        "phase_rms_waves": float(np.sqrt((off**2).mean())), "phase_max_waves": float(np.abs(off).max()),
+        "phase_rays_um": float(np.median(apart)),
+    }  # fmt: skip
+
+
+def _directions(model: LensModel, core: Phased, rays: FilmRays) -> tuple[Array, Array]:
+    """Return the directions [3, N] of scene rays by the slopes of the path at P, and those of the model."""
+    share = (core.focal_z_mm - rays.film_z) / (model.domain.pupil_z_mm - rays.film_z)
+    step = _STEP * model.domain.pupil_radius_mm
+
+    def moved(x: float, y: float) -> tuple[Array, Array, Array]:
+        """Return path, foot and direction with the pupil point moved, and P where it was."""
+        back = -share / (1 - share)
+        there = FilmRays(
+            rays.film_x + x * back, rays.film_y + y * back, rays.film_z, rays.pupil_x + x, rays.pupil_y + y,
+            rays.wavelength_nm,
+        )  # fmt: skip
+        with torch.no_grad():
+            out = model.predict(there)
+        assert out.path_um is not None
+        foot, direction, _ = foot_of(core, torch.stack(list(out.rays)).numpy())
+        return out.path_um.numpy() / 1000, foot, direction
+
+    _, _, direction = moved(0.0, 0.0)
+    ends = [(moved(x, y), moved(-x, -y)) for x, y in ((step, 0.0), (0.0, step))]
+    slopes = [high[0] - low[0] for high, low in ends]
+    across = [high[1] - low[1] for high, low in ends]
+    points = rays.film_x + (rays.pupil_x - rays.film_x) * share, rays.film_y + (rays.pupil_y - rays.film_y) * share
+    s = direction_at(core, torch.stack(points).numpy())
+    # d - s is across s + d, for both are unit vectors.
+    rows = np.stack([*across, s + direction]).transpose(2, 0, 1)
+    right = np.stack([*slopes, np.zeros_like(slopes[0])], 1)[..., None]
+    return s + np.linalg.solve(rows, right)[..., 0].T, direction
+
+
+def card_entry(core: Any) -> Mapping[str, Any]:
+    """Return what a card says of the path of a model; {} without one."""
+    if not isinstance(core, Phased):
+        return {}
+    return {"phase": {
+        "about": __doc__.split("\n\n", 1)[1].strip(), "terms": len(core.path), "focal_z_mm": core.focal_z_mm,
+        "front_z_mm": core.front_z_mm, "direction_rad_per_mm": list(core.direction),
+    }}  # fmt: skip
