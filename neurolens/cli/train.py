@@ -113,14 +113,15 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         return folder, run_experiment(experiment, folder, progress=progress, command=command)
 
     def _changes(self) -> list[str]:
-        """Return the options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
+        """Return the options as changes of the experiment's settings, KEY=VALUE; --set comes last, then what is of its
+        models."""
         changes = ['lens.zoom="range"'] * self.zoom_range + ['lens.focus_mode="internal"'] * self.internal_focus
-        changes += ["model.phase=true"] * self.phase
         if self.within is not None:
             unit = self.within[0].removeprefix("rms_")
             changes.append(f"target.{unit}={self.within[1]!r}")
             changes += [f"target.pixels_across={self.pixels_across}"] * (unit == "px")
-        return [*changes, *([] if self.rounds is None else [f"evaluation.rounds={self.rounds}"]), *self.set]
+        changes += [] if self.rounds is None else [f"evaluation.rounds={self.rounds}"]
+        return [*changes, *self.set, *["model.phase=true"] * self.phase]
 
     def _run_many(self, lenses: Sequence[Path]) -> int:
         """Run one experiment for each lens; a lens that fails becomes a line, and the exit code is then 2."""
@@ -140,6 +141,11 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
     header = ("model", "rms um", "p99 um", "angle rms deg", "false pass", "false block", "ns/ray", "C ns/ray", "fit s")
     rows = [_row(model) for model in results.get("models", ())]
     parts = [str(results.get("title") or folder.name), cli.table(header, rows)]
+    parts += [
+        f"Optical path of {m['name']}: {cli.number(m['phase_rms_waves'], 2)} waves RMS, "
+        f"{cli.number(m['phase_max_waves'], 2)} at worst"
+        for m in results.get("models", ()) if "phase_rms_waves" in m
+    ]  # fmt: skip
     target = results.get("target")
     if target:
         reached = "reached" if target["met"] else "no model tried reaches it, the closest is"

@@ -146,7 +146,11 @@ def _mean_direction(waves: Waves) -> tuple[float, ...]:
 
 
 def _chosen(variables: Tensor, wanted: Tensor, allowed: float, *, dispersive: bool) -> Exponents:
-    """Choose terms [M, 4] for the path [1, N], whose RMS error may be the one allowed."""
+    """Choose terms [M, 4] for the path [1, N], whose RMS error may be the one allowed.
+
+    Slopes of the path, which the rays give, save no terms as further equations: with 50 terms they left 0.047 waves in
+    place of 0.036 (double Gauss f/1.8), 0.064 for 0.049 (zoom 14-24), 0.45 for 0.25 (Canon 50 mm f/1.2, aspheric).
+    """
     candidates = invariant_exponents(_DEGREE, dispersive=dispersive)
     variables, wanted = variables[:, :_CHOICE_RAYS], wanted[:, :_CHOICE_RAYS]
     sweep, enough = Sweep.of_columns(monomials(variables, candidates), wanted), allowed**2 * wanted.shape[1]

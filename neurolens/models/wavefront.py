@@ -69,6 +69,11 @@ def model_pupils(
     return [known.pupils(place) if inside else dark for place, inside in zip(places_mm, lit, strict=True)]
 
 
+def _forwards(cosines: Array) -> Array:
+    """Return the third direction cosine [N] of light, which goes towards the film."""
+    return np.asarray(np.sqrt(np.maximum(1 - (cosines * cosines).sum(0), 1e-6)))
+
+
 class _Known:
     """A model whose graph tells all of a ray, also outside its domain."""
 
@@ -89,7 +94,7 @@ class _Known:
 
     def rays(self, point: Array, cosines: Array, z_mm: float, nm: Array | float) -> dict[str, Array]:
         """Return what the model says of rays through points [2, N] of a plane, by cosines [2, N] of light."""
-        slope = cosines / np.sqrt(1 - (cosines * cosines).sum(0))
+        slope = cosines / _forwards(cosines)
         pupil = point + slope * (self.model.domain.pupil_z_mm - z_mm)
         rows = np.concatenate([*np.broadcast_arrays(point, pupil), np.broadcast_to(nm, (1, pupil.shape[1]))])
         found = evaluate(self.graph, {"rays": rows, "film_z_mm": np.full((1, 1), z_mm)})
@@ -108,7 +113,7 @@ class _Known:
         share = np.linspace(-_WIDER, _WIDER, _RAYS)
         square = np.stack(np.meshgrid(share, share)).reshape(2, -1)
         cosines = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * square
-        light = np.concatenate([cosines, np.sqrt(1 - (cosines * cosines).sum(0))[None]])
+        light = np.concatenate([cosines, _forwards(cosines)[None]])
         out = self.rays(point, cosines, self.core.focal_z_mm, first)
         foot, leaves, _ = foot_of(self.core, out["ray"])
         way = seen[3:] + 0 * leaves

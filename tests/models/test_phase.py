@@ -30,6 +30,7 @@ from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.setting.states import set_lens
+from neurolens.programs.psf import PsfTask, point_spread
 from neurolens.studies.experiment import default_experiment
 from neurolens.studies.train import state_settings
 
@@ -204,3 +205,16 @@ def test_pupils_are_those_of_traced_rays(
     assert beyond == [[None, None]]
     with pytest.raises(InputError, match="wavelength_nm: got 900"):
         model_pupils(both[1], scene, places, (900.0,))
+
+
+def test_a_model_gives_the_point_spread_of_its_lens(both: tuple[LensModel, LensModel]) -> None:
+    """Light that lies in other pixels; the place of its middle; relative illumination."""
+    lens = set_lens(both[1].lens, Shot(film_mm=(36.0, 24.0), f_number=4.0))
+    task = PsfTask(lens, 20.0, ((-9.0, 8.0), (0.0, 0.0)), ((546.0,),), 0.004, 31)
+    exact, found = (point_spread(replace(task, model=model)) for model in (None, both[1]))
+    assert 0.5 * np.abs(exact["psf"] - found["psf"]).sum() < 0.02
+    assert found["centre_mm"] == pytest.approx(exact["centre_mm"], abs=0.01)
+    assert found["light"] == pytest.approx(exact["light"], rel=2e-3)
+    with pytest.raises(InputError, match="stop_radius_mm: got 17"):
+        wider = set_lens(both[1].lens, Shot(film_mm=(36.0, 24.0), f_number=1.0))
+        replace(task, lens=wider, model=both[1])

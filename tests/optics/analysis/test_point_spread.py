@@ -191,3 +191,44 @@ def test_a_lens_without_symmetry_or_power_is_refused_and_a_dark_place_is_dark() 
     assert not found.light.any() and found.pupil[0] == 0 and math.isnan(found.differs)
     with pytest.raises(InputError, match="a lens with power"):
         pupils_at(PINHOLE, np.zeros((1, 2)), [D])
+
+
+# Optiland 0.6.3: HuygensPSF(optic, field, 0.546074, num_rays=160, image_size=80, pixel_pitch=0.00025), the surfaces of
+# a lens file, with constant indices, without rims and with `float_by_stop_size`. Lens, f-number, film z and radius of
+# the stop in mm; by field in degrees the peak, and the full widths at its half along the meridian and across it in um.
+OPTILAND = [
+    ("cooke_triplet_50", 8.0, 60.3096, 2.378874, {0.0: (0.9604, 4.451, 4.451), 12.203: (0.2434, 4.575, 15.133)}),
+    ("brendel_tessar_100", 11.0, 119.3218, 3.720297, {0.0: (0.9853, 6.114, 6.114), 6.17: (0.8527, 6.135, 6.517)}),
+    ("laikin_double_gauss_50", 5.6, 91.5979, 3.075592, {0.0: (0.9792, 3.108, 3.108), 8.715: (0.5200, 2.955, 4.731)}),
+]
+
+
+@pytest.mark.parametrize(("name", "f_number", "film_z_mm", "stop_mm", "fields"), OPTILAND)
+def test_optiland_sums_huygens_wavelets_to_the_same_images(
+    name: str, f_number: float, film_z_mm: float, stop_mm: float, fields: dict[float, tuple[float, ...]]
+) -> None:
+    """Its peaks are 0.5 to 3.2% lower, and its widths differ by 2.2% at most; most are 1% narrower.
+
+    On the axis of the Tessar a perfect pupil of f/11 has the width 1.029 lambda N = 6.181 um, ours 6.182, Optiland's
+    6.114; and the Strehl ratio of Optiland's own wavefront (`OPD`) is 0.994, ours 0.996.
+    """
+    lens = library(name, f_number=f_number).lens
+    assert lens.stop_radius_mm == pytest.approx(stop_mm, rel=1e-5)
+    given, line = Scene(replace(lens, film_z_mm=film_z_mm), rims=False), (np.arange(161) - 80) * 0.25e-3
+    for [[pupil]], wanted in zip(pupils(given, [*fields], [546.074]), fields.values(), strict=True):
+        assert pupil is not None
+        share = pupil.open_share(256)
+        image = irradiance(pupil, line, line, share) / perfect_peak(pupil, share)
+        row, column = np.unravel_index(image.argmax(), image.shape)
+        widths = [0.25 * _full_width(image[:, column]), 0.25 * _full_width(image[row])]
+        assert [image.max(), *widths] == pytest.approx(wanted, rel=0.035)
+
+
+def _full_width(values: np.ndarray) -> float:
+    """Width in samples of the peak at half its height, between which values are linear."""
+    half, middle = values.max() / 2, int(values.argmax())
+    ends = []
+    for side in (values[middle:], values[middle::-1]):
+        k = int((side < half).argmax())
+        ends.append(k - (half - side[k]) / (side[k - 1] - side[k]))
+    return float(sum(ends))
