@@ -31,6 +31,7 @@ QUESTIONS = {
         "zoom": ("zoom", "models of whole zooms, of internal focus"),
         "shots": ("shots", "models fitted to one shot beside those that ship: error, operations, time"),
         "pupils": ("pupils", "share of rays that pass a lens of those sent through its outlines"),
+        "copies": ("copies", "copies of lenses by models beside the exact trace: spots, MTF, time"),
         "transmittance": ("transmittance", "what averaging over polarisation at every surface would cost"),
     },
     "speed": {

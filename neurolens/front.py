@@ -263,7 +263,7 @@ class Lens(_Chosen):
         return run_command(command("analyse"), self, list(what), **options)
 
     def describe(self, **options: Any) -> Answer:
-        """All that `neurolens lens` prints, and draw: pupils, image circle, what stops light, surfaces, doubts."""
+        """Return what `neurolens lens` prints: pupils, image circle, what stops light, surfaces, doubts."""
         return run_command(command("lens"), self, **options)
 
     def draw(self, output: str | Path) -> None:

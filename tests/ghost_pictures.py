@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurolens.pictures.flare.layers import FlareJob, ghost_layers
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import ghost_layers
 
 
 def ghost_picture(job: FlareJob, layers: Sequence[int] | None = None) -> np.ndarray:

@@ -294,7 +294,7 @@ def test_a_light_too_far_for_millimetres_is_refused(tmp_path: Path, capsys: pyte
 
 def test_a_lens_without_light_on_its_axis_has_no_exposure() -> None:
     from neurolens.optics.setting.states import set_lens
-    from neurolens.pictures.flare.layers import axis_irradiance
+    from neurolens.pictures.flare.job import axis_irradiance
 
     lens = set_lens(read_any(ROOT / "lenses" / "brendel_tessar_100.toml"))
     with pytest.raises(InputError, match="no ray passes on the axis"):

@@ -60,8 +60,8 @@ LEAN_MODULES = {
 # Statements that each room has, as the last issue left it: what a reader has to hold. A room that grows by more than
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
-    "__init__": 25, "__main__": 4, "base": 2006, "graph": 2629, "optics": 9600, "models": 4430, "cameras": 4240,
-    "pictures": 7540, "programs": 2730, "studies": 3405, "cli": 3865, "front": 210,
+    "__init__": 25, "__main__": 4, "base": 2012, "graph": 2629, "optics": 9620, "models": 4430, "cameras": 4245,
+    "pictures": 7540, "programs": 2760, "studies": 3420, "cli": 3985, "front": 210,
 }  # fmt: skip
 SLACK = 1.03
 

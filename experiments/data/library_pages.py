@@ -138,7 +138,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
             continue
         _lessen(picture)
         figures.append({"file": picture.name, "title": title})
-    models = [m for m in models_in(library() / "models") if m["lens"] == lens.lens_id]
+    models = [vars(m) for m in models_in(library() / "models") if m.lens == lens.lens_id]
     doubts = [*row["doubts"], *rim_doubts(lens), *notes]
     names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
     page = html(
@@ -168,7 +168,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     """Name and title of each drawing, and the function that draws it to a path."""
     from neurolens.cli.analyse import analysis_of
-    from neurolens.optics.analysis.field_curves import draw_breathing
+    from neurolens.optics.analysis.breathing import draw_breathing
     from neurolens.optics.analysis.fields import Scene
     from neurolens.optics.analysis.layout import state_text
     from neurolens.optics.analysis.spots import spots

@@ -477,7 +477,7 @@ def theirs_of(row: Row, ours: Lens, listed: Row) -> Lens:
 
 
 def page(
-    left_out: dict[str, str], doubles: dict[str, Double], count: int, decided: list[list[str]], kept: dict[str, str]
+    left_out: dict[str, str], doubles: dict[str, Double], count: int, decided: list[list[str]], listed: Row
 ) -> str:
     """The table of lenses that do not ship, of those of which two transcriptions exist, and what was decided."""
     agree = sorted(doubles.keys() - {row[0] for row in decided})
@@ -494,7 +494,10 @@ def page(
         lab.table("file|what differs|ours now|theirs|decided", decided),
         "## Aspheres that stay as the collection has them",
         "The axis of these is sharper with conic constants larger or smaller by 1; other figures are then worse.",
-        lab.table("lens|why", list(kept.items())),
+        lab.table("lens|why", list(listed["aspheres_kept"].items())),
+        "## Doubted",
+        "Some figure of these is likely to be wrong, as no product blurs so what is off the axis; it was not found.",
+        lab.table("lens|blur", list(listed["doubted"].items())),
     )
 
 
@@ -542,7 +545,7 @@ def run(args: argparse.Namespace) -> None:
             beside = evidence(theirs_of(row, now, listed))
             decided.append([name, decision["differs"], evidence(now), beside, decision["decided"]])
     count = len([file for file in wanted if file.is_file()])
-    text = page(left_out, doubles, count, decided, listed["aspheres_kept"])
+    text = page(left_out, doubles, count, decided, listed)
     atomic_write_text(lab.RESULTS / "patent_lenses.md", text)
     print(f"{count} lens files in {args.out}, {len(left_out)} left out, {len(doubles)} there already")
 

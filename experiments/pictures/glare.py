@@ -22,7 +22,7 @@ from neurolens.base.progress import Progress
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
-from neurolens.pictures.flare.layers import axis_irradiance
+from neurolens.pictures.flare.job import axis_irradiance
 from neurolens.pictures.flare.lights import front_sphere
 from neurolens.pictures.flare.photons import Photons, PhotonTracer
 from neurolens.pictures.flare.steps import Floats

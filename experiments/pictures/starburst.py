@@ -23,7 +23,7 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.diffraction import far_field, outline_spectrum, star, starburst_picture
 from neurolens.pictures.flare.exit_pupil import Array, ExitPupil, coverage, exit_pupil, outline
-from neurolens.pictures.flare.layers import FlareJob
+from neurolens.pictures.flare.job import FlareJob
 from neurolens.pictures.flare.lights import Light
 
 LENS, NM, FILM_MM = "laikin_double_gauss_50", 550.0, (36.0, 24.0)

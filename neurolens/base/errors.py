@@ -80,7 +80,7 @@ class AssumedWarning(NeurolensWarning):
 
 
 class Note(NeurolensWarning):
-    """What was taken or assumed where nothing was said: no reason to worry."""
+    """A message on what was taken where a file or command says nothing; it is no reason to worry."""
 
 
 def note(text: str) -> None:

@@ -470,7 +470,10 @@ class Kept:
         return None
 
     def save(self, state: Mapping[str, Any], arrays: Sequence[NDArray[Any]], *, now: bool = False) -> None:
-        """Write a state (JSON-able) and arrays, if the last write is `every_s` ago or `now` asks for it."""
+        """Write a state and arrays, if the last write was at least `every_s` ago or `now` asks for it.
+
+        The state is a mapping as JSON holds it.
+        """
         if self._path is not None and (now or time.monotonic() - self._written >= self._every_s):
             spent_s = self._spent_s + time.monotonic() - self._began  # by earlier runs, too
             about = {"key": self._key, "state": state, "spent_s": spent_s, "arrays": len(arrays)}

@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +99,10 @@ class Entry:
         """The product's name, or where there is none the design's."""
         return str(self.row.get("believed_to_be") or self.row.get("name") or self.lens)
 
+    @cached_property
+    def _letters(self) -> str:
+        return "".join(words_of(self.name))
+
     def strength(self, character: str) -> float:
         """Return how much of a character (a key of `CHARACTER`) the lens has; -inf where that is not known."""
         figures = self.row.get("character") or {}
@@ -112,12 +116,12 @@ class Entry:
         if not word.isalpha() or len(word) < 3:
             return 0
         begun = any(own.startswith(word) or (len(own) > 3 and word in (own + "s", own + "es")) for own in self.words)
-        return _BEGUN * begun or _INSIDE * (len(word) > 4 and word in "".join(words_of(self.name)))
+        return _BEGUN * begun or _INSIDE * (len(word) > 4 and word in self._letters)
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a query finds.
+    """The lenses that a query finds.
 
     Attributes:
         hits: the lenses that have all words of the query, best first.

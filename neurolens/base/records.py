@@ -126,8 +126,9 @@ def plain(value: Any, strict: bool = True, full: bool = True) -> Any:
     if is_dataclass(value):
         found: dict[str, Any] = {}
         for f in fields(value):
-            if full or "bulk" not in f.metadata:
-                item = plain(getattr(value, f.name), strict, full)
+            item = getattr(value, f.name)
+            if (full or "bulk" not in f.metadata) and not (item is None and "optional" in f.metadata):
+                item = plain(item, strict, full)
                 found |= item if "part" in f.metadata else {f.name: item}
         return found
     if hasattr(value, "tolist"):

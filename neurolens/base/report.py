@@ -44,8 +44,9 @@ class Report:
 
 
 # Metadata of fields. A field in bulk holds a number for each ray or pixel: JSON has it where it is asked for, tables
-# never. The keys of a part, which is a dataclass or a mapping, stand among those of the answer.
-BULK, PART = {"bulk": True}, {"part": True}
+# never. The keys of a part, which is a dataclass or a mapping, stand among those of the answer. An optional field has
+# no key where it is None.
+BULK, PART, OPTIONAL = {"bulk": True}, {"part": True}, {"optional": True}
 
 
 def over(*axes: str) -> dict[str, Any]:
@@ -75,7 +76,7 @@ def _add(value: Any, name: str, prefix: str, found: dict[str, Rows]) -> None:
     axes = {axis for about in told.values() for axis in about.get("over", ())}
     for key, item in whole.items():
         about, table = told.get(key, {}), f"{name}.{prefix}{key}"
-        if "bulk" in about:
+        if "bulk" in about or "optional" in about and item is None:
             continue
         if records := _records(item, about.get("over", ())):
             found[table] = []

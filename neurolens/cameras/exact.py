@@ -61,8 +61,7 @@ class ExactRun(LensRun):
 
     def status(self, rays: FloatArray, film_z_mm: float, stop_radius_mm: float) -> NDArray[np.int32]:
         """Return `run(...).status` alone, which takes less time, since nothing else is computed."""
-        found: NDArray[np.int32] = self._evaluated(self._tests, rays, film_z_mm, stop_radius_mm)["status"][0]
-        return found
+        return np.asarray(self._evaluated(self._tests, rays, film_z_mm, stop_radius_mm)["status"][0], np.int32)
 
     @cached_property
     def _tests(self) -> Graph:

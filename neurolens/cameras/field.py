@@ -408,7 +408,7 @@ def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> 
 
 
 def diagonal_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
-    """Return the same points on the way to a corner, where a picture that is not round has them too."""
+    """Return the points of `film_points` along the diagonal, for pictures that are not alike in all directions."""
     return film_points(field, film_mm, count) * (complex(*film_mm) / math.hypot(*film_mm))
 
 

@@ -174,7 +174,7 @@ class ThickLens:
         return arrived(film, 1e-3 * np.concatenate([height, plane]), point_m, weight, status, wavelength_nm)
 
     def compiled(self) -> Self:
-        """Return the same camera run as C, except with a mask in its stop, whose table is too large for that.
+        """Return the camera as compiled C; with a mask in its stop it stays as it is, for a mask's table is too large.
 
         Raises:
             InputError: there is no C compiler, or it fails.

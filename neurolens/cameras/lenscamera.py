@@ -346,7 +346,7 @@ class LensCamera:
         return FrontDiscs.of(found.scene_ray[:, found.status == st.PASSED].astype(np.float64), self.front)
 
     def compiled(self) -> Self:
-        """The same camera run as C, without a new search for its outline; raises InputError without a compiler."""
+        """Return the camera as compiled C, with the outline that was found; raises InputError without a compiler."""
         other = copy(self)
         other.start("c")
         return other

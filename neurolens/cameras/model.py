@@ -256,7 +256,6 @@ def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilO
     With cylinders it is one for all azimuths, which fits none well.
     """
     domain, model = scene.lens.card["domain"], coefficients_text([scene.lens.fitted])
-    place = scene.film_z_mm, scene.stop_radius_mm, *wavelength_nm
 
     def search() -> PupilOutline | None:
         bounds = PupilTable.of(domain["bounds"])
@@ -264,8 +263,9 @@ def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilO
             return outline_of(bounds, scene.passes, wavelength_nm)
         return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE)
 
-    code = [*searching_code(), onnxruntime.__version__]
-    return kept_outline(fingerprint_of([code, domain, model, *map(float, place)]), search)
+    place = map(float, (scene.film_z_mm, scene.stop_radius_mm, *wavelength_nm))
+    key = fingerprint_of([*searching_code(), onnxruntime.__version__, domain, model, *place])
+    return kept_outline(key, search)
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:

@@ -203,7 +203,7 @@ class OnnxLens(LensRun):
         self._graphs: dict[Form, Graph] = {}
 
     def at(self, *state: float) -> Self:
-        """Return the same model in another state; its card then has the lens and the domain of that state.
+        """Return the model in another state; its card then has the lens and the domain of that state.
 
         Raises:
             InputError: a number of values other than that of the axes, or a value out of range.

@@ -54,7 +54,7 @@ class FilmPose:
         return np.array([[stay, -sway * sin, -sway * cos], [0.0, cos, -sin], [sway, stay * sin, stay * cos]])
 
     def covers_mm(self, film_mm: tuple[float, float], distance_mm: float) -> tuple[float, float]:
-        """Return width and height of an upright film about the axis that lines through the pupil's middle cover.
+        """Return width and height of the least upright film that hides this film as seen from the pupil's middle.
 
         Args:
             film_mm: width and height. distance_mm: from the pupil to the film on the axis.

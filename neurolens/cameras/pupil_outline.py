@@ -168,7 +168,7 @@ class PupilTable:
 
 
 def tightened(table: PupilTable, passing: PassTest, lattice: tuple[int, int] = (96, 48)) -> PupilTable:
-    """Return the same rows with boxes cut to what passes now, for example through a stop that is closed down."""
+    """Return the table with its boxes cut to what passes now, for example through a stop that is closed down."""
     last = table.rows.shape[1] - 1
     place = np.minimum(np.arange(last + 1), last * (1 - 1e-6))
     found = _lattice(_boxes(table, place), table.film_radius_mm * place / last, passing, lattice)

@@ -148,7 +148,10 @@ def arrived(
 
 
 def ahead(depth: NDArray[np.float64]) -> NDArray[np.int32]:
-    """The status of scene points at depths [N] before a lens: those next to it or behind miss it, NaN is outside."""
+    """Return the status of scene points at depths [N] before a lens.
+
+    Points beside the lens or behind it miss the front surface; a depth that is NaN is outside the domain.
+    """
     behind = np.where(depth <= 0, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
     return np.where(depth > 0, st.PASSED, behind).astype(np.int32)
 

@@ -35,6 +35,7 @@ from neurolens.optics.lens.shot import BY_LENSES, Shot, StopShape, film_size
 if TYPE_CHECKING:
     from neurolens.cameras.contract import Camera
     from neurolens.optics.lens.apertures import Aperture
+    from neurolens.optics.lens.paraxial import FirstOrderLight
 
 CAMERAS_HELP = """\
 cameras:
@@ -497,7 +498,7 @@ class LensState:
         return with_changes(self.given, {"aperture": self.aperture(), "film_mm": film_mm} | settings)
 
     def at(self, **settings: Any) -> Self:
-        """Return the same with other settings of the shot."""
+        """Return the state with some settings of the shot replaced."""
         return replace(self, given=replace(self.given, **settings))
 
 
@@ -567,13 +568,13 @@ def number(value: Any, digits: int = 4) -> str:
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
-def first_order_light(data: dict[str, Any]) -> tuple[str, str]:
-    """Return the wavelength of first-order data (`paraxial.light_of`), and a note on them at the file's primary one."""
-    note, primary = "of these figures", data["primary"]
+def first_order_light(light: FirstOrderLight) -> tuple[str, str]:
+    """Return the wavelength of first-order data as text, and a note on the figures at the file's primary one."""
+    note, primary = "of these figures", light.primary
     if primary is not None:
-        efl, back = (f"{number(primary[key], 6)} mm" for key in ("efl_mm", "back_focus_mm"))
-        note += f"; at the file's primary {primary['wavelength_nm']:g} nm: focal length {efl}, back focus {back}"
-    return f"{data['wavelength_nm']:.2f} nm", note
+        efl, back = f"{number(primary.efl_mm, 6)} mm", f"{number(primary.back_focus_mm, 6)} mm"
+        note += f"; at the file's primary {primary.wavelength_nm:g} nm: focal length {efl}, back focus {back}"
+    return f"{light.wavelength_nm:.2f} nm", note
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from neurolens.base.errors import InputError, pip_install, warned
 from neurolens.base.files import atomic_path
 from neurolens.base.lensname import lens_id_of
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import group, setting
 from neurolens.cli import arguments as cli
 from neurolens.optics.readers.source import ReadOptions
 
 if TYPE_CHECKING:
+    from neurolens.optics.lens.paraxial import FirstOrderLight
     from neurolens.optics.lens.prescription import Lens
 
 
@@ -59,8 +61,7 @@ examples:
         if read:  # the file keeps what else its source had, and what was assumed
             lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
         write_checked(lens, self.out)
-        data = {"file": str(self.file), "output": str(self.out), **_summary(lens, [*read, *_doubts(lens)])}
-        return self.answer(data, lambda: _text(data))
+        return self.answer(_converted(lens, [*read, *_doubts(lens)], self.file, self.out))
 
 
 def _doubts(lens: Lens) -> list[str]:
@@ -95,8 +96,48 @@ def write_checked(lens: Lens, path: Path) -> None:
             raise InputError(path, "content", "(another lens when read back)", "the lens that was read")
 
 
-def _summary(lens: Lens, notes: list[str]) -> dict[str, Any]:
-    """Return figures of the lens for text and --json, in mm."""
+@dataclass(frozen=True, kw_only=True)
+class Converted(Report):
+    """Figures of a converted lens in mm, and what its reader and its check said of it."""
+
+    file: str
+    output: str
+    name: str
+    source: str
+    surfaces: int
+    stop_surface: int
+    light: FirstOrderLight = field(metadata=PART)
+    efl_mm: float
+    efl_x_mm: float | None
+    back_focus_mm: float
+    film_gap_mm: float
+    f_number: float
+    stated_f_number: float
+    rims: str
+    configurations: list[str]
+    warnings: list[str]
+
+    def text(self) -> str:
+        """Return a line for each figure."""
+        efl, back, gap = (f"{cli.number(v, 6)} mm" for v in (self.efl_mm, self.back_focus_mm, self.film_gap_mm))
+        across = "" if self.efl_x_mm is None else f" (in y; {cli.number(self.efl_x_mm, 6)} mm in x)"
+        lines = [
+            self.name,
+            self.source,
+            f"surfaces      {self.surfaces}, stop on {self.stop_surface}; rims: {self.rims}",
+            f"focal length  {efl}{across}",
+            f"back focus    {back}; film tabled at {gap}",
+            f"f-number      f/{cli.number(self.f_number)}, stated f/{cli.number(self.stated_f_number)}",
+            f"wavelength    {', '.join(cli.first_order_light(self.light))}",
+            *([f"states        {', '.join(self.configurations)}"] if self.configurations else ()),
+            *(f"warning: {text}" for text in self.warnings),
+            f"written to {self.output}",
+        ]
+        return "\n".join(lines)
+
+
+def _converted(lens: Lens, notes: list[str], file: Path, out: Path) -> Converted:
+    """Return the figures of a lens that was converted from a file to another."""
     from neurolens.optics.lens import paraxial
     from neurolens.optics.readers.assemble import first_order
 
@@ -105,42 +146,24 @@ def _summary(lens: Lens, notes: list[str]) -> dict[str, Any]:
     for axis in ("x", "y"):
         with suppress(InputError):  # a cylinder has no power in one of its planes
             efl_mm[axis] = paraxial.first_order(lens, meridian=axis).efl_mm
-    return {
-        "name": lens.name,
-        "source": lens.source,
-        "surfaces": len(lens.surfaces),
-        "stop_surface": lens.stop_index,
-        **paraxial.light_of(lens),
-        "efl_mm": efl_mm["y"],
-        "efl_x_mm": efl_mm["x"] if lens.anamorphic else None,
-        "back_focus_mm": data.back_focus_mm,
-        "film_gap_mm": float(lens.surfaces[-1].thickness_mm),
-        "f_number": data.f_number,
-        "stated_f_number": lens.f_number,
-        "rims": lens.rims,
-        "configurations": [c.name for c in lens.configurations],
-        "warnings": notes,
-    }
-
-
-def _text(data: dict[str, Any]) -> str:
-    def mm(key: str) -> str:
-        return f"{cli.number(data[key], 6)} mm"
-
-    across = "" if data["efl_x_mm"] is None else f" (in y; {mm('efl_x_mm')} in x)"
-    lines = [
-        data["name"],
-        data["source"],
-        f"surfaces      {data['surfaces']}, stop on {data['stop_surface']}; rims: {data['rims']}",
-        f"focal length  {mm('efl_mm')}{across}",
-        f"back focus    {mm('back_focus_mm')}; film tabled at {mm('film_gap_mm')}",
-        f"f-number      f/{cli.number(data['f_number'])}, stated f/{cli.number(data['stated_f_number'])}",
-        f"wavelength    {', '.join(cli.first_order_light(data))}",
-        *([f"states        {', '.join(data['configurations'])}"] if data["configurations"] else ()),
-        *(f"warning: {text}" for text in data["warnings"]),
-        f"written to {data['output']}",
-    ]
-    return "\n".join(lines)
+    return Converted(
+        file=str(file),
+        output=str(out),
+        name=lens.name,
+        source=lens.source,
+        surfaces=len(lens.surfaces),
+        stop_surface=lens.stop_index,
+        light=paraxial.light_of(lens),
+        efl_mm=efl_mm["y"],
+        efl_x_mm=efl_mm["x"] if lens.anamorphic else None,
+        back_focus_mm=data.back_focus_mm,
+        film_gap_mm=float(lens.surfaces[-1].thickness_mm),
+        f_number=data.f_number,
+        stated_f_number=lens.f_number,
+        rims=lens.rims,
+        configurations=[c.name for c in lens.configurations],
+        warnings=notes,
+    )
 
 
 _CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")

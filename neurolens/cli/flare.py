@@ -33,7 +33,8 @@ from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
-from neurolens.pictures.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import brightest, flare_layers, kept_beside, sum_of
 from neurolens.pictures.flare.lights import (
     SUN,
     KeptLights,

@@ -145,15 +145,15 @@ class _Writer:
         names = [str(path)]
         for kind in _KINDS:
             try:
-                fitted, left, data = standards.fitted_projection(
+                fitted, left, told = standards.fitted_projection(
                     kind, traced, command.picture, command.film, self.shot.about
                 )
             except InputError as error:
                 note = f"shot.{kind}: got {error.value}, expected {error.expected}"
                 self.notes.extend([note] if note not in self.notes else [])
                 continue
-            names += standards.write_projection(command.out / f"shot.{kind}{pinhole.name}", fitted, data)
-            row = {"worst_px": left.worst_px, "rms_px": left.rms_px, "turns_back_at_deg": data["turns_back_at_deg"]}
+            names += standards.write_projection(command.out / f"shot.{kind}{pinhole.name}", fitted, told)
+            row = {"worst_px": left.worst_px, "rms_px": left.rms_px, "turns_back_at_deg": told.turns_back_at_deg}
             if left.worst_px >= self.fits.get(kind, row)["worst_px"]:
                 self.fits[kind] = row
         return names

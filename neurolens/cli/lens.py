@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens.base.errors import one_line, warned
 from neurolens.base.files import library, sha256_of
 from neurolens.base.find import CHARACTER, read_index
 from neurolens.base.lensname import resolve
+from neurolens.base.report import OPTIONAL, PART, Report
 from neurolens.base.settings import changed, setting
 from neurolens.cli import arguments as cli
+
+if TYPE_CHECKING:
+    from neurolens.optics.analysis.breathing import Breath
+    from neurolens.optics.setting.rims import Rim
+    from neurolens.studies.describe import LensFacts, SurfaceRow
 
 _SORTS = {"maker": "maker", "focal-length": "efl_mm", "speed": "f_number", "year": "year"}
 _Sort = Literal["maker", "focal-length", "speed", "year", "cats-eye", "swirl", "bubbles", "softness", "flare"]
@@ -109,33 +115,30 @@ examples:
         focus, film_z = focus_of(lens, shot), float(lens.film_z_mm or 0.0)
         domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
         facts = lens_facts(lens, domain)
-        facts["warnings"] += notes + file_doubts(tabled)
-        data = {
-            "file": str(file),
-            **facts,
-            "zoom": self.state.given.zoom,
-            "focus_mode": focus_mode_of(lens, shot),
-            "derived": lens.derived,
-            "aperture": lens.aperture and lens.aperture.settings(),
-            "configurations": [
-                {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm}
-                for c in tabled.configurations
-            ],
-            "surfaces": glass_table(lens),
-            "layout": self.layout and str(self.layout),
-            "breathing_plot": self.breathing and str(self.breathing),
-        }
+        breathing: dict[str, list[Breath]] | None = None
         if self.layout is not None:
             from neurolens.optics.analysis.layout import lens_layout
 
             lens_layout(layout_profile(lens, domain), self.layout)
         if self.breathing is not None:
-            from neurolens.optics.analysis.field_curves import draw_breathing
+            from neurolens.optics.analysis.breathing import draw_breathing
 
-            figures = draw_breathing(lens, self.breathing)
-            data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in figures.items()}
-        data["seconds"] = time.perf_counter() - began
-        return self.answer(data, lambda: _lens_text(data))
+            breathing = draw_breathing(lens, self.breathing)
+        found = Described(
+            file=str(file),
+            facts=replace(facts, warnings=[*facts.warnings, *notes, *file_doubts(tabled)]),
+            zoom=self.state.given.zoom,
+            focus_mode=focus_mode_of(lens, shot),
+            derived=lens.derived,
+            aperture=None if lens.aperture is None else lens.aperture.settings(),
+            configurations=[State(c.name, c.efl_mm, c.object_distance_mm) for c in tabled.configurations],
+            surfaces=glass_table(lens),
+            layout=self.layout,
+            breathing_plot=self.breathing,
+            breathing=breathing,
+            seconds=time.perf_counter() - began,
+        )
+        return self.answer(found)
 
     def _list(self, paths: tuple[Path, ...], checked: bool) -> int:
         """Print a table of lenses."""
@@ -169,33 +172,63 @@ examples:
         lens = read_quietly(file)
         rule = RimRule(0.5 if self.edge_pupil is None else self.edge_pupil, half_field_deg=self.half_field)
         derived, rims = derive_rims(lens, rule)
-        field = self.half_field or half_field_deg(lens)
-        kept = f"{100 * rule.vignetting:g}% of the pupil's height"
+        edge = self.half_field or half_field_deg(lens)
+        found = DerivedRims(
+            file=str(file), f_number=lens.f_number, vignetting=rule.vignetting, clear_edge=rule.clear_edge,
+            half_field_deg=edge, rims=rims, output=self.out, name=lens.name,
+            marked=lens.rims, stop_surface=lens.stop_index,
+        )  # fmt: skip
         if self.out is not None:
             said = (
                 "Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
+                f"{found.kept} kept at {edge:.4g} degrees, a clear edge of {100 * rule.clear_edge:g}%."
             )
-            said += f"{kept} kept at {field:.4g} degrees, a clear edge of {100 * rule.clear_edge:g}%."
             write_lens(replace(derived, notes=f"{derived.notes} {said}".strip()), self.out)
+        return self.answer(found)
 
-        def text() -> str:
-            rows = []
-            for rim in rims:
-                note = "trimmed: limited by a neighbour" if rim.trimmed else ""
-                share = f"{100 * (rim.derived_mm / rim.tabled_mm - 1):+.1f}%"
-                cells = (f"{v:.3f}" for v in (rim.tabled_mm, rim.axis_mm, rim.field_mm, rim.derived_mm))
-                rows.append((str(rim.surface), *cells, share, "stop" if lens.surfaces[rim.surface].stop else note))
-            head = (
-                f"{lens.name}\nRims for f/{lens.f_number:g} and {field:.4g} degrees half field, where {kept} is kept; "
-            )
-            head += f"diameters in mm; those of the file are marked as {lens.rims}."
-            header = ("surface", "in the file", "axial beam", "field", "derived", "change", "")
-            tail = f"Written to {self.out}" if self.out else "Nothing is written without -o OUT.toml"
-            return "\n\n".join([head, cli.table(header, rows), tail])
 
-        data = {"file": str(file), "f_number": lens.f_number, "vignetting": rule.vignetting}
-        data |= {"clear_edge": rule.clear_edge, "half_field_deg": field, "rims": [vars(rim) for rim in rims]}
-        return self.answer(data | {"output": self.out and str(self.out)}, text)
+@dataclass(frozen=True, kw_only=True)
+class DerivedRims(Report):
+    """Rims that follow from the f-number and the field, beside those of the file.
+
+    Attributes:
+        vignetting: share of the pupil's height that is kept at the edge of the field.
+        clear_edge: share of a diameter that is left free around the beams.
+        output: the lens file that was written, if one was asked for.
+        marked: how the file marks its own rims.
+    """
+
+    file: str
+    f_number: float
+    vignetting: float
+    clear_edge: float
+    half_field_deg: float
+    rims: list[Rim]
+    output: Path | None
+    name: str
+    marked: str
+    stop_surface: int
+
+    @property
+    def kept(self) -> str:
+        """What is kept at the edge of the field, in words."""
+        return f"{100 * self.vignetting:g}% of the pupil's height"
+
+    def text(self) -> str:
+        """Return a row for each rim."""
+        rows = []
+        for rim in self.rims:
+            note = "trimmed: limited by a neighbour" if rim.trimmed else ""
+            share = f"{100 * (rim.derived_mm / rim.tabled_mm - 1):+.1f}%"
+            cells = (f"{v:.3f}" for v in (rim.tabled_mm, rim.axis_mm, rim.field_mm, rim.derived_mm))
+            rows.append((str(rim.surface), *cells, share, "stop" if rim.surface == self.stop_surface else note))
+        head = (
+            f"{self.name}\nRims for f/{self.f_number:g} and {self.half_field_deg:.4g} degrees half field, where "
+            f"{self.kept} is kept; diameters in mm; those of the file are marked as {self.marked}."
+        )
+        header = ("surface", "in the file", "axial beam", "field", "derived", "change", "")
+        tail = f"Written to {self.output}" if self.output else "Nothing is written without -o OUT.toml"
+        return "\n\n".join([head, cli.table(header, rows), tail])
 
 
 def _file(name: Path) -> Path:
@@ -205,76 +238,101 @@ def _file(name: Path) -> Path:
     return file
 
 
-def _lens_text(data: dict[str, Any]) -> str:
-    """The page of text for the data that --json prints."""
-    by = f", {data['designer']}" if data["designer"] else ""
-    parts = [f"{data['name']}{by}\n{data['source']}", _first_order(data), _light(data), _surfaces(data["surfaces"])]
-    zooms = [c for c in data["configurations"] if c["object_distance_mm"] is None]
-    nears = [c for c in data["configurations"] if c["object_distance_mm"] is not None]
-    if zooms:
-        states = ", ".join(f"{c['name']} ({cli.number(c['efl_mm'])} mm)" for c in zooms)
-        parts.append(f"Zoom states (--zoom, also mm between them): {states}")
-    if nears:
-        states = ", ".join(f"{c['name']} ({cli.number(c['object_distance_mm'])} mm)" for c in nears)
-        parts.append(f"Focus states (--zoom, and --focus between them): {states} to the object")
-    if data["derived"]:
-        parts.append(f"Derived: {data['derived']}")
-    parts += [f"Warning: {text}" for text in data["warnings"]]
-    plots = {"Layout": data["layout"], "Focus breathing": data["breathing_plot"]}
-    return "\n\n".join([*parts, *(f"{what} drawn in {file}" for what, file in plots.items() if file)])
+@dataclass(frozen=True, kw_only=True)
+class Described(Report):
+    """A lens as it is set: its figures, its table, and the drawings that were asked for."""
+
+    file: str
+    facts: LensFacts = field(metadata=PART)
+    zoom: str | float | None
+    focus_mode: str
+    derived: str
+    aperture: dict[str, Any] | None
+    configurations: list[State]
+    surfaces: list[SurfaceRow]
+    layout: Path | None
+    breathing_plot: Path | None
+    breathing: dict[str, list[Breath]] | None = field(metadata=OPTIONAL)
+    seconds: float
+
+    def text(self) -> str:
+        """Return a page of text: figures, light, the table, states and warnings."""
+        facts = self.facts
+        by = f", {facts.designer}" if facts.designer else ""
+        parts = [f"{facts.name}{by}\n{facts.source}", _first_order(facts), self._light(), _surfaces(self.surfaces)]
+        zooms = [c for c in self.configurations if c.object_distance_mm is None]
+        nears = [c for c in self.configurations if c.object_distance_mm is not None]
+        if zooms:
+            states = ", ".join(f"{c.name} ({cli.number(c.efl_mm)} mm)" for c in zooms)
+            parts.append(f"Zoom states (--zoom, also mm between them): {states}")
+        if nears:
+            states = ", ".join(f"{c.name} ({cli.number(c.object_distance_mm)} mm)" for c in nears)
+            parts.append(f"Focus states (--zoom, and --focus between them): {states} to the object")
+        if self.derived:
+            parts.append(f"Derived: {self.derived}")
+        parts += [f"Warning: {text}" for text in facts.warnings]
+        plots = {"Layout": self.layout, "Focus breathing": self.breathing_plot}
+        return "\n\n".join([*parts, *(f"{what} drawn in {file}" for what, file in plots.items() if file)])
+
+    def _light(self) -> str:
+        facts = self.facts
+        stated, anamorphic = facts.half_field_deg, facts.efl_x_mm is not None
+        along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
+        reached = facts.half_field_reached_deg, facts.half_field_reached_x_deg
+        half, half_x = ("-" if v is None else f"{v:.2f} degrees" for v in reached)
+        share_of = "of rays uniform over the film and over the disc of all passing rays, 5% wider"
+        rows = [
+            ("image radius", f"{cli.number(facts.image_radius_mm)} mm", f"from {facts.image_radius_from}"),
+            ("half field", half, f"reached at the edge of the film{along}{states}"),
+            *((("", half_x, "along x"),) if anamorphic else ()),
+            ("rays that pass", f"{100 * facts.passing_share:.1f}%", share_of),
+            *(("", f"{100 * e.share:.1f}%", e.text) for e in facts.ended),
+            ("T-stop", "-" if facts.t_stop is None else f"T{cli.number(facts.t_stop)}", "of the axial ray, d line"),
+            ("coatings", facts.coatings or "-", "of the surfaces between glass and air"),
+        ]
+        if glasses := dict.fromkeys(s.absorbs_as for s in self.surfaces if s.absorbs_as):
+            names = ", ".join(name.partition(":")[2] for name in glasses)
+            rows.append(("absorption", "assumed", f"that of the nearest catalogue glasses: {names}"))
+        if facts.white_rb:
+            red, blue = facts.white_rb
+            rows.append(("white card", f"R/G {red:.3f}, B/G {blue:.3f}", "on the axis, in daylight D65"))
+        return _columns(rows)
 
 
-def _first_order(data: dict[str, Any]) -> str:
-    def mm(*keys: str) -> str:
-        return ", ".join(f"{cli.number(data[key], 6)} mm" for key in keys)
+@dataclass(frozen=True)
+class State:
+    """A state of the file: a zoom by its focal length, or a focus by its distance to the object."""
 
-    focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
-    across = data["efl_x_mm"] is not None
+    name: str
+    efl_mm: float | None
+    object_distance_mm: float | None
+
+
+def _first_order(facts: LensFacts) -> str:
+    def mm(*values: float | None) -> str:
+        return ", ".join(f"{cli.number(value, 6)} mm" for value in values)
+
+    first, medium = facts.first, facts.object_medium
+    focus = "infinity" if math.isinf(facts.focus_m) else f"{facts.focus_m:g} m"
+    across = facts.efl_x_mm is not None
     rows = [
-        ("focal length", mm("efl_mm"), "in the y-z plane, as all that follows" if across else ""),
-        *((("", mm("efl_x_mm"), "in the x-z plane"),) if across else ()),
-        ("back focus", mm("back_focus_mm"), "last vertex to rear focal point"),
-        ("f-number", f"f/{cli.number(data['f_number'])}", "focal length over entrance pupil"),
-        ("working f-number", f"f/{cli.number(data['working_f_number'])}", "of the real marginal ray at this focus"),
-        ("principal planes", mm("front_principal_z_mm", "rear_principal_z_mm"), "front H, rear H'"),
-        ("entrance pupil", mm("entrance_pupil_z_mm"), f"diameter {mm('entrance_pupil_diameter_mm')}"),
-        ("exit pupil", mm("exit_pupil_z_mm"), f"diameter {mm('exit_pupil_diameter_mm')}"),
-        ("film plane", mm("film_z_mm"), f"focus at {focus}"),
-        ("stop", f"surface {data['stop_surface']}", f"diameter {mm('stop_diameter_mm')}"),
-        ("refractions", str(data["refractions"]), ""),
+        ("focal length", mm(first.efl_mm), "in the y-z plane, as all that follows" if across else ""),
+        *((("", mm(facts.efl_x_mm), "in the x-z plane"),) if across else ()),
+        ("back focus", mm(first.back_focus_mm), "last vertex to rear focal point"),
+        ("f-number", f"f/{cli.number(first.f_number)}", "focal length over entrance pupil"),
+        ("working f-number", f"f/{cli.number(facts.working_f_number)}", "of the real marginal ray at this focus"),
+        ("principal planes", mm(first.front_principal_z_mm, first.rear_principal_z_mm), "front H, rear H'"),
+        ("entrance pupil", mm(first.entrance_pupil_z_mm), f"diameter {mm(first.entrance_pupil_diameter_mm)}"),
+        ("exit pupil", mm(first.exit_pupil_z_mm), f"diameter {mm(first.exit_pupil_diameter_mm)}"),
+        ("film plane", mm(facts.film_z_mm), f"focus at {focus}"),
+        ("stop", f"surface {facts.stop_surface}", f"diameter {mm(facts.stop_diameter_mm)}"),
+        ("refractions", str(facts.refractions), ""),
     ]
-    medium = data["object_medium"]
-    if medium["n_d"] != 1:
-        rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
-    if data["front_efl_mm"] != data["efl_mm"]:
-        rows.append(("front focal", mm("front_efl_mm"), "focal length of the object side, in its medium"))
-    rows.append(("wavelength", *cli.first_order_light(data)))
-    return _columns(rows)
-
-
-def _light(data: dict[str, Any]) -> str:
-    stated, anamorphic = data["half_field_deg"], data["efl_x_mm"] is not None
-    along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
-    half, half_x = (
-        "-" if v is None else f"{v:.2f} degrees"
-        for v in (data["half_field_reached_deg"], data["half_field_reached_x_deg"])
-    )
-    share_of = "of rays uniform over the film and over the disc of all passing rays, 5% wider"
-    rows = [
-        ("image radius", f"{cli.number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
-        ("half field", half, f"reached at the edge of the film{along}{states}"),
-        *((("", half_x, "along x"),) if anamorphic else ()),
-        ("rays that pass", f"{100 * data['passing_share']:.1f}%", share_of),
-        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
-        ("T-stop", "-" if data["t_stop"] is None else f"T{cli.number(data['t_stop'])}", "of the axial ray, d line"),
-        ("coatings", data["coatings"] or "-", "of the surfaces between glass and air"),
-    ]
-    if glasses := dict.fromkeys(s["absorbs_as"] for s in data["surfaces"] if s["absorbs_as"]):
-        names = ", ".join(name.partition(":")[2] for name in glasses)
-        rows.append(("absorption", "assumed", f"that of the nearest catalogue glasses: {names}"))
-    if data["white_rb"]:
-        red, blue = data["white_rb"]
-        rows.append(("white card", f"R/G {red:.3f}, B/G {blue:.3f}", "on the axis, in daylight D65"))
+    if medium.n_d != 1:
+        rows.append(("medium in front", f"n_d {medium.n_d:.5f}", medium.material or medium.glass or ""))
+    if first.front_efl_mm != first.efl_mm:
+        rows.append(("front focal", mm(first.front_efl_mm), "focal length of the object side, in its medium"))
+    rows.append(("wavelength", *cli.first_order_light(facts.light)))
     return _columns(rows)
 
 
@@ -283,28 +341,17 @@ def _columns(rows: list[tuple[str, str, str]]) -> str:
     return "\n".join(f"{name:18}{value:{wide}}  {note}".rstrip() for name, value, note in rows)
 
 
-def _surfaces(surfaces: list[dict[str, Any]]) -> str:
+def _surfaces(surfaces: list[SurfaceRow]) -> str:
     header = ["surface", "radius mm", "thickness mm", "diameter mm", "n_d", "V_d", "", ""]
     rows = []
     for s in surfaces:
-        radius = "plane" if math.isinf(s["radius_mm"]) else f"{s['radius_mm']:.4f}"
-        glass = ("", "") if s["n_d"] == 1 else (f"{s['n_d']:.4f}", "-" if s["V_d"] is None else f"{s['V_d']:.2f}")
-        name = "stop" if s["stop"] else s["glass"] or s["material"] or ""
-        size = f"{s['thickness_mm']:.4f}", f"{s['diameter_mm']:.4f}"
-        rows.append([str(s["surface"]), radius, *size, *glass, name, _surface_words(s)])
+        radius = "plane" if math.isinf(s.radius_mm) else f"{s.radius_mm:.4f}"
+        glass = ("", "") if s.n_d == 1 else (f"{s.n_d:.4f}", "-" if s.V_d is None else f"{s.V_d:.2f}")
+        name = "stop" if s.stop else s.glass or s.material or ""
+        rows.append([str(s.surface), radius, f"{s.thickness_mm:.4f}", f"{s.diameter_mm:.4f}", *glass, name, s.words()])
     if not any(row[-1] for row in rows):
         header, rows = header[:-1], [row[:-1] for row in rows]
     return cli.table(header, rows)
-
-
-def _surface_words(row: dict[str, Any]) -> str:
-    """Properties of a row of `studies.describe.glass_table` besides radius and glass; empty for a sphere."""
-    words = [
-        row["figure"],
-        f"coating {row['coating']['name']}" if row["coating"] and row["coating"]["origin"] != "assumed" else "",
-        f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
-    ]
-    return ", ".join(word for word in words if word)
 
 
 def kept_row(file: Path, index: dict[str, dict[str, Any]]) -> dict[str, Any] | None:

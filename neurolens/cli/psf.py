@@ -193,7 +193,7 @@ class Spread(Report):
     cpu_s_a_psf: float | None
 
     def text(self) -> str:
-        """What the file holds, and how it was made."""
+        """Return sentences on what the file holds and how it was made."""
         how = f"{self.by_rays} of them by rays, " if self.by_rays else ""
         how += f"{cli.number(self.cpu_s_a_psf, 2)} CPU s each" if self.cpu_s_a_psf else "made on a cluster"
         return (

@@ -8,8 +8,9 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import LIGHT_NM, positive, setting, wavelengths_nm
 from neurolens.cameras.build import near_of
 from neurolens.cameras.contract import Camera, FloatArray
@@ -38,6 +40,9 @@ from neurolens.pictures.render.stmap import (
     undistort_map,
     worst_px,
 )
+
+if TYPE_CHECKING:
+    from neurolens.programs.handover import FittedProjection
 
 Maker = Callable[[Field, Plates, Callable[[float], None]], dict[str, FloatArray]]
 _LARGEST = 16384  # pixels a side
@@ -408,59 +413,68 @@ examples:
         with progress.stage(f"trace the field of {self.camera}"):
             field = field_of(camera, shot.focus_m, "equidistant", frame=frame, spectrum=spectrum)
         with progress.stage(f"fit {self.projection}"):
-            fitted, left, data = handover.fitted_projection(
+            fitted, left, told = handover.fitted_projection(
                 self.projection, field, self.picture, self.film, str(self.camera)
             )
         with progress.stage("trace other distances"):
-            data["parallax"] = self.parallax(camera, field)
+            parallax = self.parallax(camera, field)
+            told = replace(told, parallax=parallax)
             if field.round:
-                ends = np.array([row["to_deg"] for row in data["by_field"]])
-                pupil = handover.pupil_mm(camera, field, near_m, ends)
-                for row, mm in zip(data["by_field"], pupil.tolist(), strict=True):
-                    row["pupil_before_film_mm"] = mm
+                pupil = handover.pupil_mm(camera, field, near_m, np.array([row.to_deg for row in told.by_field]))
+                rows = zip(told.by_field, pupil.tolist(), strict=True)
+                told = replace(told, by_field=[replace(row, pupil_before_film_mm=mm) for row, mm in rows])
         files = []
-        if out is not None and (self.noncentral or handover.noncentral_pays(data["parallax"])):
+        if out is not None and (self.noncentral or handover.noncentral_pays(parallax)):
             with progress.stage("fit the ray of each pixel"):
-                table, data["noncentral"] = handover.ray_table(
-                    camera, field, self.picture, self.film, shot.focus_m, near_m
-                )
-            files = [handover.write_ray_table(out, table, data["noncentral"], str(self.camera), field)]
+                table, beside = handover.ray_table(camera, field, self.picture, self.film, shot.focus_m, near_m)
+            told = replace(told, noncentral=beside)
+            files = [handover.write_ray_table(out, table, beside, str(self.camera), field)]
         elif out is not None:  # one of an earlier run would not belong to these coefficients
             handover.ray_table_path(out).unlink(missing_ok=True)
         if out is not None:
-            files = handover.write_projection(out, fitted, data) + files
+            files = handover.write_projection(out, fitted, told) + files
         if not left.sound:
-            told = f"turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}"
-            warn(f"{self.projection} {told}")
-        return self.answer(data | {"files": files}, lambda: _projection_text(data | {"files": files}))
+            turns = f"turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}"
+            warn(f"{self.projection} {turns}")
+        return self.answer(Projected(told, files))
 
 
 def _where(distance_m: float) -> str:
     return "at infinity" if math.isinf(distance_m) else f"{distance_m:g} m from the film"
 
 
-def _projection_text(data: dict[str, Any]) -> str:
-    numbers = ", ".join(f"{k} {cli.number(v, 6)}" for k, v in data["coefficients"].items())
-    focal, centre = (" x ".join(cli.number(v, 7) for v in data[k]) for k in ("focal_px", "centre_px"))
-    radii = f"scale {focal}" if data["model"] == "f-theta" else f"focal length {focal}"
-    at = f"{data['worst_at_deg']:.3g} degrees, where {100 * data['light_at_worst']:.3g}% of the axis's light arrives"
-    worst = f"at most {data['worst_px']:.3g} (at {at})"
-    header, rows = ["field, degrees", "RMS px", "worst px"], list[tuple[str, ...]]()
-    for span in data["by_field"]:
-        start, end, *others = (f"{v:.4g}" if k[:5] == "pupil" else f"{v:.3g}" for k, v in span.items())
-        rows.append((f"{start} to {end}", *others))
-    if "pupil_before_film_mm" in data["by_field"][0]:
-        header.append("entrance pupil at its end, mm before the film")
-    lines = [
-        f"{data['camera']}, {data['model']}: {radii}, centre {centre} pixels",
-        numbers,
-        f"leaves {data['rms_px']:.3g} pixels RMS, {worst} of what is in focus",
-        cli.table(header, rows),
-        one_centre(data["parallax"], data["before_film_mm"]),
-    ]
-    if "noncentral" in data:
-        most = (cli.number(max(row[k] for row in data["noncentral"]), 2) for k in ("rms_px", "worst_px"))
-        lines.append("the ray of each pixel leaves {} pixels RMS, {} at most, at all these distances".format(*most))
-    if data["model"] == "kannala-brandt" and data["field_deg"] >= 90:
-        lines.append("OpenCV's own functions end at 90 degrees, for they divide by z")
-    return "\n".join([*lines, *data["files"]])
+@dataclass(frozen=True)
+class Projected(Report):
+    """A fitted projection, and the files that were written."""
+
+    found: FittedProjection = dataclass_field(metadata=PART)
+    files: list[str]
+
+    def text(self) -> str:
+        """Return the numbers of the projection, and what it leaves by field and by distance."""
+        found = self.found
+        numbers = ", ".join(f"{k} {cli.number(v, 6)}" for k, v in found.coefficients.items())
+        focal, centre = (" x ".join(cli.number(v, 7) for v in values) for values in (found.focal_px, found.centre_px))
+        radii = f"scale {focal}" if found.model == "f-theta" else f"focal length {focal}"
+        light = f"{100 * found.light_at_worst:.3g}% of the axis's light arrives"
+        worst = f"at most {found.worst_px:.3g} (at {found.worst_at_deg:.3g} degrees, where {light})"
+        header, rows = ["field, degrees", "RMS px", "worst px"], list[tuple[str, ...]]()
+        for span in found.by_field:
+            pupil = () if span.pupil_before_film_mm is None else (f"{span.pupil_before_film_mm:.4g}",)
+            angles = f"{span.from_deg:.3g} to {span.to_deg:.3g}"
+            rows.append((angles, f"{span.rms_px:.3g}", f"{span.worst_px:.3g}", *pupil))
+        if len(rows[0]) > len(header):
+            header.append("entrance pupil at its end, mm before the film")
+        lines = [
+            f"{found.camera}, {found.model}: {radii}, centre {centre} pixels",
+            numbers,
+            f"leaves {found.rms_px:.3g} pixels RMS, {worst} of what is in focus",
+            cli.table(header, rows),
+            one_centre(found.parallax or [], found.before_film_mm),
+        ]
+        if found.noncentral is not None:
+            rms, most = (cli.number(max(row[key] for row in found.noncentral), 2) for key in ("rms_px", "worst_px"))
+            lines.append(f"the ray of each pixel leaves {rms} pixels RMS, {most} at most, at all these distances")
+        if found.model == "kannala-brandt" and found.field_deg >= 90:
+            lines.append("OpenCV's own functions end at 90 degrees, for they divide by z")
+        return "\n".join([*lines, *self.files])

@@ -6,9 +6,9 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurolens.base.cluster import Dask
 from neurolens.base.errors import NeurolensError, one_line, printable
@@ -16,10 +16,14 @@ from neurolens.base.files import read_bytes
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import NOISY, noisy
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import setting, whole
 from neurolens.base.tasks import Processes, cores
 from neurolens.cli import arguments as cli
 from neurolens.studies.pages import advice, ns_text
+
+if TYPE_CHECKING:
+    from neurolens.studies.survey import Summary
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,7 +215,7 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
         """Survey a folder; return 1 where a file met a fault of neurolens."""
         from neurolens.optics.readers.any_format import collection_of
         from neurolens.optics.readers.source import MAX_BYTES
-        from neurolens.studies.survey import TIME_LIMIT_S, SurveySettings, summary_lines, summary_of, survey
+        from neurolens.studies.survey import TIME_LIMIT_S, SurveySettings, summary_of, survey
 
         if self.out.resolve() == self.folder.resolve():
             self.refuse("--output", str(self.out), "a folder other than that of the lenses")
@@ -223,7 +227,18 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
             records = survey(
                 collection, self.out, settings, executor, self.progress(), glasses=glasses, again=self.restart
             )
-        page = self.out / "survey.html"
-        summary = {**summary_of(records), "others": collection.others, "page": str(page)}
-        lines = [*summary_lines(records, collection.others), f"Look at {page}"]
-        return self.answer(summary, lambda: printable("\n".join(lines)), 1 if summary["fault"] else 0)
+        found = Surveyed(summary_of(records), dict(collection.others), self.out / "survey.html")
+        return self.answer(found, code=1 if found.found.fault else 0)
+
+
+@dataclass(frozen=True)
+class Surveyed(Report):
+    """The counts of a survey, the other files of its folder by their suffix, and its page."""
+
+    found: Summary = field(metadata=PART)
+    others: dict[str, int]
+    page: Path
+
+    def text(self) -> str:
+        """Return the counts in sentences, and where the page is."""
+        return printable("\n".join([*self.found.lines(self.others), f"Look at {self.page}"]))

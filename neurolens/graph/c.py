@@ -372,7 +372,7 @@ def _functions(s: Signature, macro: str, body: list[str], results: list[str], pa
 
 
 def padded_columns(columns: int) -> int:
-    """Return how many floats a group of a table's columns takes in compiled code: whole registers."""
+    """Return the number of columns of a table, rounded up to whole vector registers of 8 floats."""
     return -(-columns // 8) * 8
 
 

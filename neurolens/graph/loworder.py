@@ -49,7 +49,7 @@ class LowOrder:
 
 
 def with_film_derivatives(graph: Graph) -> Graph:
-    """Add the derivatives of `scene_ray` by the film point to a lens's graph: its own, not fitted ones."""
+    """Add the exact derivatives of `scene_ray` by the film point to a lens's graph."""
     return with_derivatives(graph, ["scene_ray"], [("rays", row) for row in range(len(FILM_X_Y))])
 
 

@@ -212,7 +212,7 @@ class DirectionSeries:
 
     @staticmethod
     def of(model: LensModel, form: Form) -> DirectionSeries:
-        """Choose the series of a model up to its largest angle; slopes need none."""
+        """Choose the series that decode a model's direction vector up to its largest angle; slopes need none."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
         angle = model.angle
@@ -227,7 +227,10 @@ class DirectionSeries:
 
     @staticmethod
     def fitted(angle: float, monic: bool = True) -> DirectionSeries:
-        """The shortest series that hold float32's last bit up to an angle (rad); with `monic` v is scaled for them."""
+        """Return the shortest series that hold float32's last bit up to an angle (rad).
+
+        With `monic` the vector is v times `kappa`, so that the highest coefficient of `sinc` is 1.
+        """
         sinc = fit_series(lambda t: np.sinc(np.sqrt(t) / np.pi), angle**2, _SERIES / max(angle, 0.1))
         minus_cos = fit_series(lambda t: -np.cos(np.sqrt(t)), angle**2, _SERIES)
         if not monic:

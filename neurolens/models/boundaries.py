@@ -177,7 +177,10 @@ class _BoundaryFit:
 
 
 def needed_for(sweep: Sweep, error: float) -> list[int]:
-    """The fewest columns (A and B of a vector) that leave this squared residual, or hardly more than all leave."""
+    """Return the smallest set of columns (A and B of a vector) whose squared residual is at most `error`.
+
+    Where even all columns leave more than that, a set is enough that leaves hardly more than all do.
+    """
     sweep.restart([])
     terms = sweep.count // 2
     return _BoundaryFit(sweep, terms, NEEDED_SHARE**2 / max(error, 1e-300), terms).needed()

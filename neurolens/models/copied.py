@@ -180,7 +180,7 @@ def copy_of(model: LensModel, off: Off, name: str = "") -> LensModel:
 
     Args:
         model: one whose core is `Perturbed`, as `perturbations.with_perturbations` makes it.
-        name: of the copy; empty keeps that of the lens.
+        name: of the copy.
 
     Raises:
         InputError: another model, or figures of a lens with other elements or surfaces.
@@ -191,4 +191,6 @@ def copy_of(model: LensModel, off: Off, name: str = "") -> LensModel:
     given, known = (len(off.vectors), len(off.scalars)), (len(core.bends), len(core.ab))
     if given != known:
         raise InputError(lens.path, "copy", given, f"{known[0]} vectors and {known[1]} figures, as the lens has")
-    return replace(model, core=core.copy(off.vectors, off.scalars), lens=replace(lens, name=name or lens.name))
+    named = replace(lens, name=name or f"{lens.name}, a copy")
+    settings = {**model.settings, "copy": named.name}
+    return replace(model, core=core.copy(off.vectors, off.scalars), lens=named, settings=settings)

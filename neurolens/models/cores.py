@@ -57,7 +57,10 @@ class LightField(NamedTuple):
         return self.w.shape[0]
 
     def invariants(self, mirror: bool = False) -> Tensor:
-        """Return rho, sigma, tau, w [4, N]; with `mirror` [7, N] p_x^2, p_x u_x, u_x^2, the same of y, w."""
+        """Return the rotational invariants rho, sigma and tau, and w, [4, N].
+
+        With `mirror` return the invariants of two planes of symmetry, [7, N]: p_x^2, p_x u_x, u_x^2, those in y, and w.
+        """
         import torch
 
         rows = (*self.p, *self.u)
@@ -168,16 +171,16 @@ class Core:
         raise NotImplementedError
 
     def fixed(self, w: float) -> Self:
-        """Return the same core for one value of w, as a core that takes w = 0."""
+        """Return the core for one value of w, whose powers are folded into the coefficients; its w is then 0."""
         raise InputError("export", "fix", type(self).__name__, "nothing fixed: a published method is written whole")
 
     def keep(self, scalars: Sequence[int]) -> Self:
-        """Return the same core with these of its scalars only."""
+        """Return the core without its other scalars."""
         raise InputError("export", "fix", type(self).__name__, "nothing fixed: a published method is written whole")
 
     @property
     def coefficients(self) -> int:
-        """All coefficients that are not 0; of networks, all weights."""
+        """The number of coefficients that are not 0; of a network, the number of its weights."""
         raise NotImplementedError
 
     @property

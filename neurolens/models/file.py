@@ -287,13 +287,17 @@ def as_stored(nodes: Sequence[LensModel]) -> tuple[LensModel, ...]:
 
 
 def deflated(data: dict[str, Any]) -> str:
-    """JSON as an entry of metadata."""
+    """Return JSON as a compressed text for an entry of metadata."""
     text = json.dumps(data, separators=(",", ":")).encode()
     return base64.b64encode(zlib.compress(text, 9)).decode()
 
 
 def inflated(text: str) -> bytes:
-    """Return the JSON of `deflated`. Raises ValueError: damaged, or too long."""
+    """Return the JSON that `deflated` has compressed.
+
+    Raises:
+        ValueError: the text is damaged, or its JSON is too long.
+    """
     unpacker = zlib.decompressobj()
     try:
         data = unpacker.decompress(base64.b64decode(text, validate=True), _MAX_TEXT)

@@ -278,13 +278,13 @@ def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree:
 
 
 def axes_of(lens: Lens, *, zoom: bool, internal: bool, state: str | float | None = None) -> tuple[Axis, ...]:
-    """Return the axes asked for: the zoom's whole range, internal focus, or both.
+    """Return the axes of a model of many states: the zoom's whole range, internal focus, or both.
 
     Args:
-        state: the zoom position where `zoom` is False.
+        state: the zoom position of a model that has no axis of zoom.
 
     Raises:
-        InputError: neither, or what the file has no states for.
+        InputError: neither axis is asked for, or the lens file has no states for it.
     """
     if not (zoom or internal):
         raise InputError(lens.path, "states", "(none)", "the zoom's range, internal focus, or both")

@@ -102,7 +102,7 @@ class Guess:
         return Guess(exponents, np.stack(ab, 2))
 
     def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
-        """Append the vectors, 2 rows each, that it makes of p and u of `light` and of z; where z is None it is 0."""
+        """Append the guessed vectors, 2 rows each, as functions of `light` and of z, which is 0 where None is given."""
         wide, last = self.ab.shape[2], self.exponents.shape[1] - 1
         variables = [v for v in range(last) if v < last - 1 or light.dispersive]
         x = light.products(MIRROR if wide == 2 else ROUND)

@@ -117,7 +117,7 @@ class Encoding:
 
     @property
     def chiefs(self) -> tuple[float, float]:
-        """Return k (see `chief`) of x and of y."""
+        """The factors `chief` for x and for y."""
         return self.chief, self.chief if self.chief_y is None else self.chief_y
 
     @property
@@ -201,7 +201,7 @@ class Prediction(NamedTuple):
 
 
 def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
-    """Make a prediction of the outputs of a model's graph for `count` rays."""
+    """Make the prediction for `count` rays from the outputs of a model's graph."""
     from neurolens.optics.trace.surfaces import Rays
 
     scene, power, stop, status = (out[n].expand(-1, count) for n in OUTPUTS)

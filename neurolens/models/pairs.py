@@ -300,7 +300,7 @@ class PairSet:
         return len(self.inputs)
 
     def columns(self) -> tuple[Tensor, ...]:
-        """Return all tensors, in the order of `of_columns`; rays last."""
+        """Return all tensors in the order that `of_columns` takes; the last axis of each is that of rays."""
         surfaces = (self.cross_x, self.cross_y, self.meets, self.refracts)
         return (*self.inputs.columns(), *self.scene, self.transmittance, self.status, *surfaces)
 

@@ -149,12 +149,13 @@ def with_perturbations(model: LensModel, limits: Tolerances | None = None) -> Le
         limits: how far each figure may be off, which decides what is worth a term.
 
     Raises:
-        InputError: a network, or a lens with cylinders or several states.
+        InputError: a network; a lens with cylinders, or whose rays graze its front; a model with optical paths.
     """
     core = model.core.parts[0] if isinstance(model.core, Perturbed) else model.core
     if not isinstance(core, InvariantPolynomial) or model.direction != "angle":
-        expected = "a polynomial of a round lens, such as ols-64"
-        raise InputError(model.lens.path, "model", model.method, f"{expected}, whose rays no surface refracts apart")
+        found = f"{model.method} ({type(core).__name__})"
+        expected = "a polynomial of a round lens, without a path and without refraction of grazing rays at its front"
+        raise InputError(model.lens.path, "model", found, expected)
     with pinned_threads(), torch.no_grad():
         rays, near = _rays(model)
         bent, turned = steps_of(model.lens, limits or Tolerances())
@@ -300,7 +301,7 @@ def _pursued(
 
 # Rays and copies on which errors are measured; how much of a copy's change may be left within the domain that a card
 # states, and by how many times the limits that domain is sought.
-_HELD_OUT, _COPIES, LEFT, _TIMES = 4000, 2, 0.05, (1, 2, 5, 10, 20)
+_HELD_OUT, _COPIES, LEFT, _TIMES = 4000, 2, 0.05, (0.1, 0.3, 1, 3, 10, 30)
 
 
 def copy_errors(model: LensModel, copy: LensModel, lens: Lens) -> dict[str, float]:

@@ -199,7 +199,7 @@ def ideal_map(lens: Lens, encoding: Encoding, method: ParaxialMethod) -> Tensor:
 
 
 def fit_paraxial(data: Prepared, method: ParaxialMethod) -> InvariantPolynomial:
-    """Fit a model whose rays are first order; its direction vector is a slope (see `LensModel.direction`)."""
+    """Fit a model of first order alone, whose direction vector is a slope (see `LensModel.direction`)."""
     exponents = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], dtype=np.int64)
     ab = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     ab[[POSITION, DIRECTION], :, 0] = ideal_map(data.pairs.lens, data.encoding, method)

@@ -79,7 +79,7 @@ FREE = Fix()
 
 
 def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
-    """Return models for what is fixed: one for each wavelength, all of one structure, or one where that stays free.
+    """Return a model for each wavelength that is fixed, all of one structure; one model where wavelengths stay free.
 
     One wavelength folds every power of w into the coefficients. That serves pictures in one colour of light (a laser
     line, a filter, a measurement at the d line), or one model a channel where dispersion within a channel does not
@@ -109,7 +109,7 @@ def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
 
 
 def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
-    """The same model for one wavelength: smaller and faster. Rays of any other wavelength are outside its domain.
+    """Return a smaller and faster model for one wavelength; rays of any other are outside its domain.
 
     Raises:
         InputError: a wavelength outside the model's domain, or a model without a wavelength input.

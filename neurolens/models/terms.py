@@ -66,7 +66,7 @@ def united(supports: Sequence[Exponents]) -> tuple[Exponents, list[list[int]]]:
 
 
 def further(candidates: Exponents, known: Exponents) -> Exponents:
-    """Return the candidates [K, V] that are not among the known [M, V], each once."""
+    """Return the candidates [K, V] that are not among the known exponents [M, V]; repeated rows are left out."""
     there = {tuple(e) for e in known.tolist()}
     new = [e for e in dict.fromkeys(map(tuple, candidates.tolist())) if e not in there]
     return np.array(new, dtype=np.int64).reshape(-1, known.shape[1])
@@ -224,7 +224,9 @@ class Sweep:
             self.add(k)
 
     def scores(self, rule: Rule) -> Floats:
-        """Return [M] gain of every candidate: squared correlation with the residual ("omp") or its true fall ("ols").
+        """Return the gain [M] of every candidate: how far it reduces the squared residual.
+
+        The gain is exact by the rule "ols"; by "omp" it is the squared correlation with the residual.
 
         It is -1 for chosen candidates, and for those that the chosen ones span in any problem.
         """

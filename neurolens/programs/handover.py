@@ -13,6 +13,7 @@ import math
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +25,7 @@ from neurolens import __version__
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
 from neurolens.base.records import plain
+from neurolens.base.report import OPTIONAL
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import (
     DIM,
@@ -353,10 +355,55 @@ def _lights(
 # Projections of OpenCV, nerfstudio and NVIDIA.
 
 
+@dataclass(frozen=True)
+class Span:
+    """What a projection leaves between two field angles; `pupil_before_film_mm` is the entrance pupil of the second."""
+
+    from_deg: float
+    to_deg: float
+    rms_px: float
+    worst_px: float
+    pupil_before_film_mm: float | None = dataclass_field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedProjection:
+    """A projection of another program as it fits a camera's field, and what it leaves in pixels.
+
+    Attributes:
+        light_at_worst: the light where the fit is worst, over that on the axis.
+        turns_back_at_deg: the field angle from which on the projection falls; None where it rises over the picture.
+        before_film_mm: the one centre, for the x and the y meridian.
+        parallax: by distance, how far things are from where the one centre has them; None where that was not asked for.
+        noncentral: the same of the ray of each pixel, where those are written.
+    """
+
+    camera: str
+    model: str
+    size: list[int]
+    focal_px: list[float]
+    centre_px: list[float]
+    coefficients: dict[str, float]
+    rms_px: float
+    worst_px: float
+    worst_at_deg: float
+    light_at_worst: float
+    field_deg: float
+    turns_back_at_deg: float | None
+    by_field: list[Span]
+    before_film_mm: list[float]
+    parallax: list[dict[str, float]] | None = dataclass_field(default=None, metadata=OPTIONAL)
+    noncentral: list[dict[str, float]] | None = dataclass_field(default=None, metadata=OPTIONAL)
+
+
 def fitted_projection(
     kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
-) -> tuple[projections.Projection, projections.Residual, dict[str, Any]]:
-    """Fit a projection to a field: the projection, what it leaves, and both as data; raises InputError as `fit`."""
+) -> tuple[projections.Projection, projections.Residual, FittedProjection]:
+    """Fit a projection to a field; return the projection, what it leaves, and both as figures.
+
+    Raises:
+        InputError: as `projections.fit`.
+    """
     step = [side / count for side, count in zip(film_mm, size, strict=True)]
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
@@ -370,24 +417,23 @@ def fitted_projection(
     points = np.concatenate([lit_points(field, film_mm, _HELD_OUT), diagonal_points(field, film_mm, _ALONG), beside])
     points = points[field.relative_light(points) >= DIM]  # the field traces no places beyond these
     left = projections.residual(fitted, *_shown(field, size, film_mm, points))
-    rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
-    data: dict[str, Any] = {
-        "camera": source,
-        "model": fitted.kind,
-        "size": list(fitted.size),
-        "focal_px": list(fitted.focal_px),
-        "centre_px": list(fitted.centre_px),
-        "coefficients": fitted.named,
-        "rms_px": left.rms_px,
-        "worst_px": left.worst_px,
-        "worst_at_deg": left.worst_at_deg,
-        "light_at_worst": float(field.relative_light(points)[left.worst]),
-        "field_deg": left.field_deg,
-        "turns_back_at_deg": None if left.sound else left.fold_deg,
-        "by_field": rows,
-        "before_film_mm": list(field.frame.pupil_mm),
-    }
-    return fitted, left, data
+    told = FittedProjection(
+        camera=source,
+        model=fitted.kind,
+        size=list(fitted.size),
+        focal_px=list(fitted.focal_px),
+        centre_px=list(fitted.centre_px),
+        coefficients=fitted.named,
+        rms_px=left.rms_px,
+        worst_px=left.worst_px,
+        worst_at_deg=left.worst_at_deg,
+        light_at_worst=float(field.relative_light(points)[left.worst]),
+        field_deg=left.field_deg,
+        turns_back_at_deg=None if left.sound else left.fold_deg,
+        by_field=[Span(*row) for row in left.by_field],
+        before_film_mm=list(field.frame.pupil_mm),
+    )
+    return fitted, left, told
 
 
 def _shown(field: Field, size: tuple[int, int], film_mm: tuple[float, float], point: Complex) -> tuple[Any, Any]:
@@ -400,14 +446,12 @@ def _pixels(point: Complex, size: tuple[int, int], film_mm: tuple[float, float])
     return np.stack([(point.real / film_mm[0] + 0.5) * size[0], (0.5 - point.imag / film_mm[1]) * size[1]], 1) - 0.5
 
 
-def write_projection(out: Path, fitted: projections.Projection, data: dict[str, Any]) -> list[str]:
+def write_projection(out: Path, fitted: projections.Projection, told: FittedProjection) -> list[str]:
     """Write the files of a projection, and return their names."""
     files = {}
     if fitted.kind in ("opencv", "opencv-rational", "kannala-brandt"):
-        files[out.with_name(f"{out.name}.yaml")] = html(
-            "handover.opencv.yaml.jinja", lens=fitted, rms_px=data["rms_px"]
-        )
-    block = _block(fitted) | {"neurolens": {"version": __version__, **data}}
+        files[out.with_name(f"{out.name}.yaml")] = html("handover.opencv.yaml.jinja", lens=fitted, rms_px=told.rms_px)
+    block = _block(fitted) | {"neurolens": {"version": __version__, **plain(told)}}
     files[out.with_name(f"{out.name}.json")] = json.dumps(plain(block), indent=1, allow_nan=False) + "\n"
     for path, text in files.items():
         atomic_write_text(path, text)

@@ -75,7 +75,7 @@ class Host(NamedTuple):
     lost: float = 1.0
 
     def views(self, arrays: Arrays) -> Arrays:
-        """Return the same memory as [H, W, S, ...], with rays under the names origin and direction."""
+        """Return views of the arrays as [H, W, S, ...], with rays under the names origin and direction."""
         found = dict(arrays)
         if self.samples_first:
             found = {name: np.moveaxis(a, 0, 2) if a.ndim > 2 else a for name, a in found.items()}

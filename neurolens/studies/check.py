@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -68,12 +68,11 @@ class Promise:
     promised: float
     measured: float | None
     allowed: float | None
+    holds: bool = field(init=False)
 
-    @property
-    def holds(self) -> bool:
-        if self.allowed is None:
-            return True
-        return self.measured is not None and self.measured <= self.allowed  # False for NaN
+    def __post_init__(self) -> None:
+        kept = self.allowed is None or (self.measured is not None and self.measured <= self.allowed)  # False for NaN
+        object.__setattr__(self, "holds", kept)
 
 
 def check_model(
@@ -202,8 +201,12 @@ def lens_of_card(
             lens there), in the working folder, and in this project.
 
     Raises:
-        InputError: there is no such file, or its prescription is the card's in no zoom state.
+        InputError: there is no such file, or its prescription is the card's in no zoom state; or the model is of a copy
+            of the lens, whose errors beside the exact copy are on its card.
     """
+    if copy := card["fit"]["settings"].get("copy"):
+        expected = "the model of a lens as designed: a copy's errors are on its card"
+        raise InputError(model_file, "fit.settings.copy", copy, expected)
     path = Path(lens_file) if lens_file is not None else find_lens(str(card["lens"]["id"]), Path(model_file))
     tabled = read_any(path)
     for lens in _states(tabled, float(card["lens"]["efl_mm"])):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import NeurolensError, warned
 from neurolens.base.lensname import maker_of, year_of
-from neurolens.base.report import Report
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.exact import axial_transmittance, state_of
 from neurolens.models.model import Domain
@@ -32,8 +33,8 @@ from neurolens.optics.analysis.fields import Array, Scene
 from neurolens.optics.analysis.spots import spots, working_f_number
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.glass import glass_of
-from neurolens.optics.lens.paraxial import first_order, light_of
-from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.paraxial import FirstOrder, FirstOrderLight, first_order, light_of
+from neurolens.optics.lens.prescription import Coating, Lens, Medium
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.check import Check, check_lens, doubts, verdict
 from neurolens.optics.setting.focusing import at_infinity
@@ -49,26 +50,67 @@ _BINS = 60  # wavelengths of a white card
 _NEGLIGIBLE = 1e-4  # a surface that blocks a smaller share of the rays is not listed
 
 
-def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
-    """Return the figures of a lens placed by `set_lens` over a domain, in JSON's types; d line unless stated otherwise.
+@dataclass(frozen=True)
+class Ended:
+    """The status that ends a share of the rays, and what it says."""
 
-    They are those of the file, those of `FirstOrder` (for an anamorphic lens in the y-z plane), and:
+    status: int
+    text: str
+    share: float
 
-        efl_x_mm: in the x-z plane; None for a round lens.
+
+@dataclass(frozen=True, kw_only=True)
+class LensFacts(Report):
+    """The figures of a lens that is placed, over a domain; for the d line unless stated otherwise.
+
+    Attributes:
+        first: first-order data; of an anamorphic lens those in the y-z plane.
+        efl_x_mm: focal length in the x-z plane; None for a round lens.
         working_f_number: that of the real marginal ray (y-z); None where no ray passes.
         image_radius_from: how the radius is known.
         half_field_deg: as the file states it.
         half_field_reached_deg: mean angle of the rays that reach the edge of the domain's film (for an anamorphic lens
             along y); None where none does. half_field_reached_x_deg is None for a round lens, too.
+        passing_share: share of rays uniform over the domain's film and pupil discs that pass.
         coatings: as `Lens.coatings`.
         t_stop: f-number over the root of the share of light at the d line that the axial ray keeps; None where that ray
             does not pass.
         white_rb: R/G and B/G (linear sRGB) of a white card on the axis in daylight D65; None without visible light.
-        passing_share: share of rays uniform over the domain's film and pupil discs that pass.
-        ended: what stops the others, a list of {status, text, share}, largest share first.
+        ended: what stops the other rays, largest share first.
         warnings: sentences.
     """
-    data, squeezed = first_order(lens), lens.anamorphic
+
+    name: str
+    designer: str
+    source: str
+    rims: str
+    sha256: str
+    refractions: int
+    first: FirstOrder = field(metadata=PART)
+    efl_x_mm: float | None
+    light: FirstOrderLight = field(metadata=PART)
+    object_medium: Medium
+    working_f_number: float | None
+    film_z_mm: float
+    focus_m: float
+    stop_surface: int
+    stop_diameter_mm: float
+    image_radius_mm: float
+    image_radius_from: str
+    half_field_deg: float | None
+    half_field_reached_deg: float | None
+    half_field_reached_x_deg: float | None
+    passing_share: float
+    coatings: str
+    t_stop: float | None
+    white_rb: tuple[float, float] | None
+    ended: list[Ended]
+    warnings: list[str]
+
+
+def lens_facts(lens: Lens, domain: Domain) -> LensFacts:
+    """Return the figures of a lens placed by `set_lens` over a domain."""
+    squeezed = lens.anamorphic
     film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
     radius, radius_from = image_radius_mm(lens)
     passing, ended = passing_share(lens, domain)
@@ -81,29 +123,34 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         where = " and ".join(axis for axis, deg in (("y", reached), ("x", reached_x)) if deg is None)
         along = f", along {where}" if squeezed else ""
         notes.append(f"no ray reaches the edge of the film ({domain.film_radius_mm:.4g} mm from the axis{along})")
-    return {
-        **{key: getattr(lens, key) for key in ("name", "designer", "source", "rims", "sha256", "refractions")},
-        **{key: float(value) for key, value in asdict(data).items()},
-        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if squeezed else None,
-        **light_of(lens),
-        "object_medium": {**asdict(lens.object_medium), "n_d": float(lens.object_medium.n_d)},
-        "working_f_number": None if math.isnan(working) else working,
-        "film_z_mm": film_z,
-        "focus_m": domain.focus_m[0],
-        "stop_surface": lens.stop_index,
-        "stop_diameter_mm": 2 * lens.stop_radius_mm,
-        "image_radius_mm": radius,
-        "image_radius_from": radius_from,
-        "half_field_deg": lens.half_field_deg,
-        "half_field_reached_deg": reached,
-        "half_field_reached_x_deg": reached_x if squeezed else None,
-        "passing_share": passing,
-        "coatings": lens.coatings,
-        "t_stop": state_of(lens, lens.light_nm)["t_stop"],
-        "white_rb": white_rb(lens),
-        "ended": ended,
-        "warnings": notes,
-    }
+    return LensFacts(
+        name=lens.name,
+        designer=lens.designer,
+        source=lens.source,
+        rims=lens.rims,
+        sha256=lens.sha256,
+        refractions=lens.refractions,
+        first=first_order(lens),
+        efl_x_mm=float(first_order(lens, meridian="x").efl_mm) if squeezed else None,
+        light=light_of(lens),
+        object_medium=lens.object_medium,
+        working_f_number=None if math.isnan(working) else working,
+        film_z_mm=film_z,
+        focus_m=domain.focus_m[0],
+        stop_surface=lens.stop_index,
+        stop_diameter_mm=2 * lens.stop_radius_mm,
+        image_radius_mm=radius,
+        image_radius_from=radius_from,
+        half_field_deg=lens.half_field_deg,
+        half_field_reached_deg=reached,
+        half_field_reached_x_deg=reached_x if squeezed else None,
+        passing_share=passing,
+        coatings=lens.coatings,
+        t_stop=state_of(lens, lens.light_nm)["t_stop"],
+        white_rb=white_rb(lens),
+        ended=ended,
+        warnings=notes,
+    )
 
 
 def white_rb(lens: Lens) -> tuple[float, float] | None:
@@ -118,27 +165,61 @@ def white_rb(lens: Lens) -> tuple[float, float] | None:
     return (float(red / green), float(blue / green)) if green > 0 else None
 
 
-_AS_FILED = ("diameter_mm", "material", "stop", "glass", "absorbs_as", "absorption_per_mm")
 _ROUND = {"conic": 0.0, "asphere": {}, "cylinder": None, "across": None, "focal_mm": None}
 
 
-def glass_table(lens: Lens) -> list[dict[str, Any]]:
-    """Return the prescription row by row with all figures.
+@dataclass(frozen=True, kw_only=True)
+class SurfaceRow:
+    """A row of a prescription with all its figures.
 
-    n_d and V_d are the catalogue's where a glass rules; absorbs_as names the glass whose absorption is assumed. asphere
-    is {power: coefficient}; figure says in words what it is. coating is None or {name, layers: [[index, thickness in
-    nm, V_d if known], ...], origin}.
+    Attributes:
+        n_d, V_d: the catalogue's where a glass rules.
+        absorbs_as: the glass whose absorption is assumed.
+        shape: the numbers of the figure; `asphere` is {power: coefficient}.
+        figure: what the figure is, in words; empty for a sphere.
     """
+
+    surface: int
+    z_mm: float
+    radius_mm: float
+    thickness_mm: float
+    diameter_mm: float
+    stop: bool
+    material: str | None
+    glass: str | None
+    n_d: float
+    V_d: float | None
+    absorbs_as: str | None
+    absorption_per_mm: float | None
+    shape: Mapping[str, Any] = field(metadata=PART)
+    figure: str
+    coating: Coating | None
+
+    def words(self) -> str:
+        """Return what the surface is besides its radius and glass; empty for a sphere."""
+        coating = self.coating
+        words = [
+            self.figure,
+            f"coating {coating.name}" if coating is not None and coating.origin != "assumed" else "",
+            f"absorbs {self.absorption_per_mm:.3g}/mm" if self.absorption_per_mm else "",
+        ]
+        return ", ".join(word for word in words if word)
+
+
+def glass_table(lens: Lens) -> list[SurfaceRow]:
+    """Return the prescription row by row."""
     rows = []
     for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True)):
-        row: dict[str, Any] = {key: getattr(s, key) for key in _AS_FILED}
-        row.update(surface=k, z_mm=float(z), radius_mm=float(s.radius_mm), thickness_mm=float(s.thickness_mm))
         glass = None if s.glass is None else glass_of(s.glass)
-        row.update(n_d=float(s.n_d if glass is None else glass.n_d), V_d=s.V_d if glass is None else float(glass.V_d))
-        figure = s.figure.record()
-        figure["asphere"] = {str(power): a for power, a in figure.get("asphere", ())}
-        row |= _ROUND | figure | {"figure": s.figure.words()}
-        rows.append(row | {"coating": s.coating and asdict(s.coating)})
+        shape = s.figure.record()
+        shape["asphere"] = {str(power): a for power, a in shape.get("asphere", ())}
+        rows.append(SurfaceRow(
+            surface=k, z_mm=float(z), radius_mm=float(s.radius_mm), thickness_mm=float(s.thickness_mm),
+            diameter_mm=s.diameter_mm, stop=s.stop, material=s.material, glass=s.glass,
+            n_d=float(s.n_d if glass is None else glass.n_d), V_d=s.V_d if glass is None else float(glass.V_d),
+            absorbs_as=s.absorbs_as, absorption_per_mm=s.absorption_per_mm, shape=_ROUND | shape,
+            figure=s.figure.words(), coating=s.coating,
+        ))  # fmt: skip
     return rows
 
 
@@ -161,8 +242,8 @@ def field_reached_deg(lens: Lens, domain: Domain, film_z: float, axis: Literal["
     return math.degrees(float(angle))
 
 
-def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, list[dict[str, Any]]]:
-    """Return the share of a domain's rays that pass, and what ends the others: {status, text, share}, largest first."""
+def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, list[Ended]]:
+    """Return the share of a domain's rays that pass, and what ends the others, largest share first."""
     rays = sample_domain(domain, _RAYS, seed)
     with torch.no_grad():
         start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
@@ -172,7 +253,7 @@ def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, lis
     passed = share.pop(st.PASSED, 0.0)
     stop = st.blocked(lens.stop_index, st.RIM)
     ended = [
-        {"status": code, "text": "blocked by the stop" if code == stop else st.describe(code), "share": part}
+        Ended(code, "blocked by the stop" if code == stop else st.describe(code), part)
         for code, part in sorted(share.items(), key=lambda item: -item[1])
         if part >= _NEGLIGIBLE
     ]
@@ -351,7 +432,10 @@ def character(lens: Lens) -> tuple[Character, Discs]:
 
 
 def character_or_none(lens: Lens) -> tuple[dict[str, float | None] | None, bytes | None]:
-    """Return the figures of `character` with four digits (None for NaN), and the `picture`; None twice without any."""
+    """Return the figures of `character` with four digits (None for NaN), and the `picture` of its discs.
+
+    Both are None for a lens whose character cannot be had.
+    """
     try:
         found, discs = character(lens)
     except NeurolensError:

@@ -184,7 +184,7 @@ def log_norm(low: float, high: float) -> Any:
 
 
 def rounded_up(value: float) -> float:
-    """Return 1, 2 or 5 times a power of ten that is at least `value`; 1 where that is not positive."""
+    """Return the least of 1, 2 and 5 times powers of ten that is at least `value`; 1 for a value of 0 or less."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

@@ -275,7 +275,7 @@ def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candid
 
 
 def model_candidates(files: Mapping[str, Path], domain: Domain) -> list[Candidate]:
-    """Return exported models by name, in onnxruntime, and as "NAME fused" in C where that is possible."""
+    """Return each exported model to be timed in onnxruntime and, as "NAME fused", in C where a compiler is here."""
     candidates = []
     for name, file in files.items():
         candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))

@@ -41,7 +41,7 @@ from neurolens.base.files import (
 from neurolens.base.html import html_parts
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, versions
-from neurolens.base.report import csv_text
+from neurolens.base.report import Report, csv_text
 from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import Failed, run_each
 from neurolens.cameras.model import load_model
@@ -223,7 +223,54 @@ def _fit(lens: Lens, domain: Domain, settings: SurveySettings, folder: Path) -> 
     }
 
 
-def summary_of(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class Summary(Report):
+    """How many files were read and fitted, and how good the fits are.
+
+    Attributes:
+        files, read: all files, and those that were read, doubtful or not.
+        ok, doubtful, refused, fault: the files of each verdict.
+        fitted: lenses with a fit. reach_goals: those whose fit reaches all of `GOALS`.
+        promises_held: those whose fit holds all promises of its card.
+        median: over the fits, of each goal's figure; a figure that is missing counts as the worst.
+    """
+
+    files: int
+    read: int
+    ok: int
+    doubtful: int
+    refused: int
+    fault: int
+    fitted: int
+    reach_goals: int
+    promises_held: int
+    median: dict[str, float | None]
+
+    def lines(self, others: Mapping[str, int]) -> list[str]:
+        """Return sentences on the files that were read, refused and fitted, and on the errors of the fits.
+
+        Args:
+            others: the files that were not taken as lens files, by suffix.
+        """
+        lines = [f"{self.files} files: {self.read} read ({self.doubtful} of them doubtful), {self.refused} refused"]
+        lines[0] += f", {self.fault} ended by a fault" if self.fault else ""
+        if others:
+            kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
+            lines.append(f"not taken as lens files: {kinds}")
+        if self.fitted:
+            goals = f"{GOALS['direction_rms_deg']:g} deg and {100 * GOALS['false_pass']:g}% false pass and block"
+            lines.append(
+                f"{self.fitted} fitted: {self.reach_goals} reach {goals}, {self.promises_held} hold all promises"
+            )
+            middle, angle = self.median, self.median["direction_rms_deg"]
+            found = (middle[key] for key in ("false_pass", "false_block"))
+            shares = [DASH if share is None else f"{100 * share:.2g}%" for share in found]
+            turn = DASH if angle is None else f"{angle:.2g} deg"
+            lines.append(f"medians: {turn}, false pass {shares[0]}, false block {shares[1]}")
+        return lines
+
+
+def summary_of(records: Sequence[Mapping[str, Any]]) -> Summary:
     """Count the records, and return shares and medians of the fits."""
     read = [r for r in records if r["verdict"] in VERDICTS[:2]]
     fits = [r["fit"] for r in read if r.get("fit")]
@@ -234,15 +281,15 @@ def summary_of(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         middle = values[(len(values) - 1) // 2] if values else math.inf
         return middle if math.isfinite(middle) else None
 
-    return {
-        "files": len(records),
-        "read": len(read),
+    return Summary(
+        files=len(records),
+        read=len(read),
         **counts,
-        "fitted": len(fits),
-        "reach_goals": sum(fit["reaches"] for fit in fits),
-        "promises_held": sum(not fit["broken"] for fit in fits),
-        "median": {key: median(key) for key in GOALS},
-    }
+        fitted=len(fits),
+        reach_goals=sum(fit["reaches"] for fit in fits),
+        promises_held=sum(not fit["broken"] for fit in fits),
+        median={key: median(key) for key in GOALS},
+    )
 
 
 _KEPT_EVERY_S, _SHARE = 60.0, 20.0  # pages are written at most so often, and for at most 1/20 of the time
@@ -351,7 +398,7 @@ def write_pages(
     """Write survey.json, survey.csv and survey.html to a folder that holds the records with their sections."""
     summary = summary_of(records)
     head = {"folder": str(collection.folder), "settings": asdict(settings), "others": collection.others}
-    write_json(out / "survey.json", {**head, "summary": summary, "versions": versions(), "lenses": records})
+    write_json(out / "survey.json", {**head, "summary": summary.to_dict(), "versions": versions(), "lenses": records})
     pages: dict[str, Iterable[str]] = {"csv": [_csv(records)], "html": _page(records, collection, out, settings)}
     for name, parts in pages.items():
         # Names of files may be bytes that are no text.
@@ -360,24 +407,6 @@ def write_pages(
             temporary.open("w", encoding="utf-8", errors="backslashreplace") as stream,
         ):
             stream.writelines(parts)
-
-
-def summary_lines(records: Sequence[Mapping[str, Any]], others: Mapping[str, int]) -> list[str]:
-    """Sentences on the numbers of files that were read, doubtful, refused and fitted, and on the fits' errors."""
-    s = summary_of(records)
-    lines = [f"{s['files']} files: {s['read']} read ({s['doubtful']} of them doubtful), {s['refused']} refused"]
-    lines[0] += f", {s['fault']} ended by a fault" if s["fault"] else ""
-    if others:
-        kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
-        lines.append(f"not taken as lens files: {kinds}")
-    if s["fitted"]:
-        goals = f"{GOALS['direction_rms_deg']:g} deg and {100 * GOALS['false_pass']:g}% false pass and block"
-        lines.append(f"{s['fitted']} fitted: {s['reach_goals']} reach {goals}, {s['promises_held']} hold all promises")
-        m = s["median"]
-        shares = [DASH if m[key] is None else f"{100 * m[key]:.2g}%" for key in ("false_pass", "false_block")]
-        turn = DASH if m["direction_rms_deg"] is None else f"{m['direction_rms_deg']:.2g} deg"
-        lines.append(f"medians: {turn}, false pass {shares[0]}, false block {shares[1]}")
-    return lines
 
 
 def _kinds(record: Mapping[str, Any]) -> list[str]:
@@ -404,7 +433,7 @@ def _page(
     return html_parts(
         "survey.html",
         title=f"Survey of {collection.folder.name or collection.folder}",
-        summary=summary_lines(records, collection.others),
+        summary=summary_of(records).lines(collection.others),
         kinds=[{"name": kind, "about": about, "count": counts[kind]} for kind, about in _KINDS.items()],
         columns=table((), records, COLUMNS).columns,
         rows=(

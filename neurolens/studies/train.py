@@ -185,7 +185,10 @@ def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measure
 
 
 def shown_models(measured: Sequence[Measured], use: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Name the polynomial and the network in pictures: the model to use, and the closest of the other kind."""
+    """Return the names of the polynomial and of the network that pictures show.
+
+    One of them is the model to use; of the other kind it is the model with the least error.
+    """
     names = []
     for networks in (False, True):
         rows = [m for m in measured if (m.settings.method in NETWORKS) == networks and m.settings.family != "paraxial"]

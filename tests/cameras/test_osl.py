@@ -17,9 +17,9 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.shaders import blender_shader as shaders
 from neurolens.cameras.shaders import osl, pupil_fit, shader_lens
 from neurolens.cameras.shaders.blender_shader import exact_lens
-from neurolens.cameras.shaders.pupil import Blades, PupilCircles
+from neurolens.cameras.shaders.pupil import Blades, PupilCircles, passing_share
 from neurolens.cameras.shaders.pupil_fit import fit_pupil
-from neurolens.cameras.shaders.shader_lens import ShaderLens, light, passing_share
+from neurolens.cameras.shaders.shader_lens import ShaderLens, light
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, pruned

@@ -27,6 +27,7 @@ from neurolens.studies.experiment import DomainChoice, EvaluationChoice, LensCho
     ("command", "told"),
     [
         (["pupils", "--only", "nobody"], "--only"),
+        (["copies", "--only", "nobody"], "--only"),
         (["vignetting", "--only", "nobody"], "--only"),
         (["equal-time", "--scene", "nowhere.toml"], "nowhere.toml"),
         (["models", "--list", "no.toml"], "no.toml"),

@@ -188,6 +188,8 @@ def test_the_command_writes_models_of_copies(
     (copy,), (again,) = ([p for p in (tmp_path / f).glob("*-001.onnx")] for f in "ab")
     first, second = read_model(copy), read_model(again)
     assert first.card["lens"]["name"].endswith(", copy 1") and first.card["errors"] == second.card["errors"]
+    assert main(["evaluate", str(copy), "--rays", "1000"]) == 2
+    assert "a copy's errors are on its card" in capsys.readouterr().err
     z, stop = float(rays.film_z[0]), first.at().domain.stop_radius_mm
     rows = rays.rows.numpy()
     found = load_model(copy).rays(rows[:2], rows[2:4], rows[4], z, stop)
@@ -205,5 +207,7 @@ def test_what_has_no_such_derivatives_is_refused(round_model: LensModel, model: 
     network = read_model(MODELS / "brendel_tessar_100.mlp-16x2.onnx").at()
     with pytest.raises(InputError, match="a polynomial of a round lens"):
         with_perturbations(network)
+    core = model.core
+    assert isinstance(core, Perturbed)
     with pytest.raises(ValueError, match="begin with those of the round core"):
-        replace(model.core, exponents=model.core.exponents[::-1])
+        replace(core, exponents=core.exponents[::-1])

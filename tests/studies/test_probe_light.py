@@ -17,7 +17,8 @@ from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import Rays, trace
 from neurolens.pictures.flare.canvas import Raster
-from neurolens.pictures.flare.layers import FlareJob, flare_layers
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import flare_layers
 from neurolens.pictures.flare.lights import SceneLights
 from neurolens.pictures.render.scene import scene_from_tables
 from neurolens.pictures.render.settings import FlareSettings

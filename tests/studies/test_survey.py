@@ -152,5 +152,5 @@ def test_summary_counts_goals_and_takes_a_missing_figure_for_the_worst() -> None
     bad = {**good, "direction_rms_deg": None, "reaches": False, "broken": ["x"]}
     records = [{"verdict": "ok", "fit": good}, {"verdict": "doubtful", "fit": bad}, {"verdict": "refused"}]
     found = summary_of(records)
-    assert [found[key] for key in ("read", "refused", "fitted", "reach_goals", "promises_held")] == [2, 1, 2, 1, 1]
-    assert summary_of(records[1:])["median"]["direction_rms_deg"] is None
+    assert (found.read, found.refused, found.fitted, found.reach_goals, found.promises_held) == (2, 1, 2, 1, 1)
+    assert summary_of(records[1:]).median["direction_rms_deg"] is None

@@ -143,7 +143,7 @@ def pupil_planes_mm(nodes: Sequence[Lens], axes: Sequence[Axis]) -> list[float]:
 
 
 def numbers(nodes: Sequence[Lens], planes_mm: Sequence[float]) -> list[tuple[str, list[float], str]]:
-    """Return names of numbers, their values at the nodes, and how they follow the state: see `number_of`."""
+    """Return the numbers of a lens by name: their values at the nodes, and how they follow the state (`number_of`)."""
     data, infinity = [first_order(n) for n in nodes], [film_z_mm(n, math.inf) for n in nodes]
     radii = [image_radius_mm(n)[0] for n in nodes]
     discs = [

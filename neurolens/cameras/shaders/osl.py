@@ -33,9 +33,9 @@ from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.cameras.sampling import stratified
-from neurolens.cameras.shaders.pupil import MAX_BLADES, Blades, PupilCircles
+from neurolens.cameras.shaders.pupil import MAX_BLADES, Blades, PupilCircles, passing_share
 from neurolens.cameras.shaders.pupil_fit import fit_pupil
-from neurolens.cameras.shaders.shader_lens import ShaderLens, light, passing_share
+from neurolens.cameras.shaders.shader_lens import ShaderLens, light
 from neurolens.cameras.shaders.source import SMALLEST, Focusing, followed_rows, model_focusing
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value

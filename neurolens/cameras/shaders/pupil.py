@@ -18,8 +18,10 @@ from functools import cached_property, reduce
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base import status as st
 from neurolens.cameras.cameragraph import unit_disc
-from neurolens.cameras.shaders.shader_lens import HAIR, StopImage, frame_of_film_point, moving_polynomial
+from neurolens.cameras.shaders.shader_lens import HAIR, ShaderLens, StopImage, frame_of_film_point, moving_polynomial
+from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Graph, Value
 
 MAX_BLADES = 16
@@ -111,7 +113,7 @@ class PupilCircles:
 
     @cached_property
     def graph(self) -> Graph:
-        """Write `sampler` for a round stop."""
+        """The graph of `sampler` for a round stop."""
         return self.sampler()
 
     def sampler(self, blades: type[Blades] | None = None, margin: float = 0.0) -> Graph:
@@ -302,3 +304,45 @@ def _within_blades(
         x, y, _ = shape.point(direction, direction[0] * share)
         share = blades.drawn(start, at_stop(x, y) - start, margin)
     return share
+
+
+_SAMPLES, _TRIES = 20_000, 64  # film points; samples that decide whether one has light
+
+
+def passing_share(
+    lens: ShaderLens, pupil: PupilCircles, stops: Sequence[float] = (1.0, 0.5, 0.25)
+) -> dict[float, float]:
+    """Return the share of samples that pass, all over the film, by shares of the widest stop.
+
+    Film points without light do not count. One whose ray is blocked counts where any of 64 more rays passes.
+    """
+    rng, shares = np.random.default_rng(3), {}
+    for stop in stops:
+        angle, radius = 2 * np.pi * rng.random(_SAMPLES), 0.98 * pupil.film_radius_mm * np.sqrt(rng.random(_SAMPLES))
+        film = radius * np.stack([np.cos(angle), np.sin(angle)])
+        call = np.stack([rng.uniform(*span, _SAMPLES) for span in (lens.film_z_mm, lens.wavelength_nm)])
+        passed = _sampled(lens, pupil, rng.random((2, _SAMPLES)), film, call, stop)
+        blocked = np.flatnonzero(~passed)
+        lit, tries = np.zeros(blocked.size, bool), 0
+        while tries < _TRIES and not lit.all():
+            # Each round doubles the rays of a dark point, because a call with few rays takes nearly as long as one with
+            # many.
+            more = min(max(1, min(tries, _SAMPLES // int(np.count_nonzero(~lit)))), _TRIES - tries)
+            dark, tries = np.repeat(blocked[~lit], more), tries + more
+            again = _sampled(lens, pupil, rng.random((2, dark.size)), film[:, dark], call[:, dark], stop)
+            lit[~lit] = again.reshape(-1, more).any(1)
+        shares[stop] = float(passed.sum() / max(passed.sum() + lit.sum(), 1))
+    return shares
+
+
+def _sampled(
+    lens: ShaderLens, pupil: PupilCircles, square: Array, film: Array, call: Array, share: float
+) -> NDArray[np.bool_]:
+    """Test whether rays [N] of points of the unit square pass, at film positions and wavelengths `call` [2, N]."""
+    (film_z, nanometres), stop = call, np.array([[share * lens.stop_radius_mm]])
+    sample = evaluate(pupil.graph, {
+        "film_mm": film, "square": square, "film_z_mm": film_z[None], "wavelength_nm": nanometres[None],
+        "stop_radius_mm": stop,
+    })  # fmt: skip
+    status = lens.status(film, sample["pupil_mm"], nanometres, film_z, stop)
+    return np.asarray((status == st.PASSED) & (sample["area_mm2"][0] > 0))

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
-from neurolens.cameras.shaders.pupil import PupilCircles
-from neurolens.cameras.shaders.shader_lens import ShaderLens, StopImage, draw_rays, fit_stop_images, passing_share
+from neurolens.cameras.shaders.pupil import PupilCircles, passing_share
+from neurolens.cameras.shaders.shader_lens import ShaderLens, StopImage, draw_rays, fit_stop_images
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents
 

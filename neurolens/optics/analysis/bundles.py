@@ -121,7 +121,7 @@ class Aim:
         return Rays(x, y, z, dx / length, dy / length, dz / length)
 
     def lead_mm(self, u: Tensor, v: Tensor) -> Tensor:
-        """Return by how much a ray's way from its object point to the front plane is longer than its chief ray's."""
+        """Return how much longer (mm) the rays' paths from object point to front plane are than the chief ray's."""
         if self.distance2 is None:
             return torch.zeros_like(u)
         # sqrt(a + b) - sqrt(a) without the loss of digits.
@@ -292,7 +292,7 @@ class Filled:
         self.part = lit_part(self._passes, low - margin, high + margin, torch.zeros_like(low))
 
     def only(self, fields: list[int]) -> Filled:
-        """Return the same for some of the fields, by their numbers."""
+        """Return the filled pupils of some of the fields, by the numbers of the fields."""
         some = copy(self)
         start, exists, height, film = self.chief
         rays = (Rays(*(c[fields] for c in r)) for r in (start, film))

@@ -122,7 +122,7 @@ def pupils_at(scene: Scene, places_mm: Array, wavelengths_nm: Sequence[float]) -
 
 
 def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
-    """Return the fewest cells across the pupil for points so far from its centre."""
+    """Return the fewest cells across the pupil that resolve its diffraction out to `reach_mm` from the centre."""
     cycles = 2 * float(pupil.half.max()) * (reach_mm + pupil.blur_mm) / (pupil.wavelength_nm * 1e-6)
     return max(_FEWEST, 16 * math.ceil(_PER_CYCLE * cycles / 16))
 

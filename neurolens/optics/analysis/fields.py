@@ -233,12 +233,12 @@ class Scene:
 
     @property
     def open(self) -> Scene:
-        """Return the same scene without rims."""
+        """Return the scene with a lens that has no rims."""
         return replace(self, rims=False)
 
     @property
     def round(self) -> Scene:
-        """Return the same scene with a round stop."""
+        """Return the scene with a round stop in its lens."""
         return replace(self, lens=replace(self.lens, aperture=None))
 
     @property

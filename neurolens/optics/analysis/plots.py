@@ -345,10 +345,10 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> None:
 
 
 def plot_point_spread(arrays: Any, pixel_um: float, path: str | Path, title: str, channels: Any) -> None:
-    """Plot point spread over the picture, of the first f-number and distance of a file of `neurolens psf`.
+    """Plot the point spread functions over the picture, of the first f-number and distance in a file of `psf`.
 
-    Three channels are red, green and blue, longest wavelengths first; others are grey. All have one scale, and each its
-    own brightness, as square root.
+    Three channels are drawn as red, green and blue, the longest wavelengths first; other numbers of channels are grey.
+    All spots have the same scale in length. Each is as bright as its own maximum allows, and the square root is drawn.
     """
     whole = arrays["psf"][0, 0]
     order = sorted(range(whole.shape[2]), key=lambda c: -np.mean(list(channels.values())[c]))

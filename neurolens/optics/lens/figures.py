@@ -67,7 +67,7 @@ class Figure:
 
     @property
     def across(self) -> tuple[float, float | None] | None:
-        """Radius and conic constant of the section across the curve of the radius; None where that section is straight.
+        """Radius and conic constant of the section at right angles to `axis`; None where that section is straight.
 
         The conic constant is None for a curve that is turned about a line parallel to its axis.
         """

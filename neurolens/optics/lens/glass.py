@@ -366,8 +366,11 @@ def glass_of(name: str) -> Glass:
 def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
     """Return the fields of a surface whose glass the catalogue lacks: its n_d and V_d, and the name for people.
 
+    Args:
+        place: the file and the field, for the warning.
+
     Warns:
-    NeurolensWarning: always, and tells the dispersion taken; `place` names the file and the field.
+        NeurolensWarning: always; it tells which dispersion is taken.
     """
     message = f"glass {name} is not in the catalogue: taken by n_d {n_d:g} and V_d {V_d:g}"
     message += ", and the partial dispersion of a mean glass (Cauchy), without absorption"

@@ -176,18 +176,35 @@ def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridi
     )
 
 
-def light_of(lens: Lens) -> dict[str, Any]:
-    """Return, as JSON, the wavelength of first-order data, and focal length and back focus at the source's primary one.
+@dataclass(frozen=True)
+class FirstOrderLight:
+    """The wavelength of first-order data (nm), and focal length and back focus at the source's primary wavelength.
 
     `primary` is None where the source states no wavelength or the same one.
     """
+
+    wavelength_nm: float
+    primary: AtPrimary | None
+
+
+@dataclass(frozen=True)
+class AtPrimary:
+    """Focal length and back focus at the primary wavelength of a lens's source."""
+
+    wavelength_nm: float
+    efl_mm: float
+    back_focus_mm: float
+
+
+def light_of(lens: Lens) -> FirstOrderLight:
+    """Return the wavelength of first-order data, with focal length and back focus at the source's primary one."""
     at, primary = lens.reference_nm, next(iter(lens.wavelengths_nm), lens.reference_nm)
     found = None
     if abs(primary - at) > _SAME_NM:
         straight = lens.anamorphic and system_of(lens).march(1.0, 0.0).after[-1] == 0  # no power in the y-z plane
         data = first_order(lens, primary, "x" if straight else "y")
-        found = {"wavelength_nm": primary, "efl_mm": float(data.efl_mm), "back_focus_mm": float(data.back_focus_mm)}
-    return {"wavelength_nm": at, "primary": found}
+        found = AtPrimary(primary, float(data.efl_mm), float(data.back_focus_mm))
+    return FirstOrderLight(at, found)
 
 
 def is_pinhole(lens: Lens) -> bool:

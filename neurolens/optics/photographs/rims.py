@@ -63,7 +63,7 @@ def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
 
 
 def stop_for(lens: Lens, f_number: float) -> float:
-    """Return the stop's radius at an f-number of a profile; it is the file's where that is the lens's widest."""
+    """Return the radius of the stop at an f-number of a profile; at the widest f-number it is that of the file."""
     if f_number <= _STOP_SLACK * lens.f_number:
         return lens.stop_radius_mm
     return float(stop_radius_mm(at_infinity(lens), f_number))
@@ -76,7 +76,7 @@ def near_f8(f_numbers: Iterable[float]) -> float:
 
 @dataclass(frozen=True)
 class OpenLight:
-    """What the rays of film points meet.
+    """The rays from film points through the open lens: their heights on every surface, and the light they bring.
 
     Attributes:
         radius_mm: [S, F, G, G] distance from the axis on each surface, inf where the ray does not get there.
@@ -290,7 +290,12 @@ class RimLight:
         return ring._replace(radius_mm=math.ceil(1e4 * radius_mm) / 1e4)
 
     def side(self, front: bool, way: int, value: float) -> Array:
-        """Return what one side lets through, [F, G, G], with scaled rims or with a ring."""
+        """Return what the rims on one side of the stop let through, [F, G, G] as shares of cells.
+
+        Args:
+            way: whether the rims are scaled, or which ring is added.
+            value: the factor on the rims, or the place of the ring between its limits (see `ring`).
+        """
         if way != _RIMS:
             ring = self.opened.inside(self.rings[way][0], self.ring(way, value).radius_mm)
             return np.minimum(self.side(front, _RIMS, 1.0), ring)
@@ -311,7 +316,13 @@ class RimLight:
         return np.asarray(np.sqrt(np.nanmean(off**2, axis=1)))
 
     def fit(self, used: Sequence[int]) -> list[tuple[int, float]]:
-        """Fit the way and the value of the front and of the rear, one side after the other, then by closer looks."""
+        """Return the way and the value that fit best, of the front and of the rear.
+
+        The sides are fitted in turn; later turns look more closely about the values found.
+
+        Args:
+            used: the apertures that count.
+        """
         chosen = [(_RIMS, 1.0), (_RIMS, 1.0)]
         ways = [[k for k, (_, ring) in enumerate(self.rings) if (ring.before == 0) == front] for front in (True, False)]
         sides = [self.side(True, *chosen[0]), self.side(False, *chosen[1])]

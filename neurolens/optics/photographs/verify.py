@@ -274,7 +274,7 @@ class Verified(Report):
 
     @property
     def measured(self) -> dict[str, Any]:
-        """What a lens file and the cards of its models keep of this."""
+        """The figures that a lens file and the cards of its models keep of the comparison."""
         figures = {
             "distortion_percent": self.distortion_percent,
             "light_widest_stops": self.light_stops(widest=True),

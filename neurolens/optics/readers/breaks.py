@@ -22,7 +22,7 @@ _ROUNDING = 1e-9  # in degrees, and in the unit of the file: what walking there 
 
 @dataclass(frozen=True)
 class Turn:
-    """What moves and turns the local axes at a surface.
+    """A displacement and a rotation of the local axes at a surface.
 
     Attributes:
         placement: the move, and the right-handed turns about x, then the new y, then the new z.

@@ -126,7 +126,7 @@ class FilmLight:
         self.part = lit_part(self._passes, low, high, near)
 
     def only(self, fields: list[int]) -> FilmLight:
-        """Return the same for some of the film points."""
+        """Return the light of some of the film points, by their numbers."""
         found = copy(self)
         found.film_mm = self.film_mm[0][fields], self.film_mm[1][fields]
         found.part = LitPart(*(c[fields] for c in self.part))

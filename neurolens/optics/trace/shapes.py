@@ -141,9 +141,9 @@ def without_rim(curve: Curve) -> Curve:
 
 
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
-    """Return cx, cy, cz of the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface, and the steps it needs.
+    """Return cx, cy, cz of the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface.
 
-    It is nearest inside the rim.
+    It is nearest inside the rim. The number of Newton steps from it to the surface is returned, too.
     """
     figure = figure_of(surface.figure.record())  # of numbers
     (c, other, cz), steps = _fitted(number_of(surface.curvature), figure, _extent_mm(surface))

@@ -189,7 +189,7 @@ def reduced(values: FloatArray, step: int, by: np.ufunc) -> FloatArray:
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """What the depth of a plate means.
+    """How the depth of a plate is to be understood.
 
     Attributes:
         channel: the channel of depth; "" finds it. scale_m: metres in its unit; None takes 1, and refuses what does not

@@ -19,15 +19,12 @@ import ctypes
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.graph.compiler import c_source, load_compiled
-
-if TYPE_CHECKING:
-    from neurolens.pictures.flare.lights import Patch
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -160,8 +157,12 @@ class Smear(NamedTuple):
         return np.abs(picture[..., 0])
 
 
-def smear_of(patch: Patch, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
-    """The smear of a picture that moves by [2, 2] (right, down) along a patch's sides; None if it hardly moves."""
+def smear_of(weights: Doubles, disc: bool, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
+    """Return the smear of a picture that moves by [2, 2] (right, down) along a patch's sides; None if it hardly moves.
+
+    Args:
+        weights: the light of the cells of the patch (see `lights.Patch`). disc: whether only an ellipse in it is lit.
+    """
     size = float(np.abs(moved_px).sum(0).max())
     if not _LEAST < size < math.inf:
         return None
@@ -170,9 +171,9 @@ def smear_of(patch: Patch, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
     if abs(a[0] * b[1] - a[1] * b[0]) < _THIN * max(np.hypot(*a), np.hypot(*b)):
         wide, thin = (a, b) if np.hypot(*a) > np.hypot(*b) else (b, a)
         thin += _THIN / np.hypot(*wide) * np.array([-wide[1], wide[0]])
-    even = patch.round or np.ptp(patch.weights) < 0.01 * patch.weights.max()
-    weights = () if even else tuple(map(tuple, (patch.weights / patch.weights.max()).round(4).tolist()))
-    return Smear((float(a[0]), float(a[1]), float(b[0]), float(b[1])), weights, patch.round)
+    even = disc or np.ptp(weights) < 0.01 * weights.max()
+    shares = () if even else tuple(map(tuple, (weights / weights.max()).round(4).tolist()))
+    return Smear((float(a[0]), float(a[1]), float(b[0]), float(b[1])), shares, disc)
 
 
 def smeared(picture: Floats, kernel: Floats) -> Floats:

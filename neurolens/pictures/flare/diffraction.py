@@ -25,7 +25,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -37,11 +36,9 @@ from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.optics.lens.prescription import Lens
 from neurolens.pictures.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.pictures.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
+from neurolens.pictures.flare.job import FlareJob
 from neurolens.pictures.flare.lights import Floats, Light, patches
 from neurolens.pictures.render.colour import in_gamut
-
-if TYPE_CHECKING:
-    from neurolens.pictures.flare.layers import FlareJob
 
 _PER_CYCLE = 2.5  # cells a cycle of the field needs
 _NEAR, _FAR = 2.0, 4.0  # pixels from the centre: between these the sum over cells gives way to the outline
@@ -217,7 +214,7 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
     for number, patch in enumerate(parts):
         colours = spectral.response * spectral.spectrum(patch.light.rgb) / (spectral.bins * job.exposure)
         moved = raster.per_mm * image_moves(job.lens, patch, float(spectral.centres_nm.mean())) * (-1, 1)
-        smear = smear_of(patch, moved)
+        smear = smear_of(patch.weights, patch.round, moved)
         kernel = np.ones((1, 1), np.float32) if smear is None else smear.kernel(max(raster.width, raster.height) // 2)
         height, width = (n + k - 1 for n, k in zip((raster.height, raster.width), kernel.shape, strict=True))
         canvas = np.zeros((height, width, 3), np.float32)

@@ -9,38 +9,35 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import Kept
 from neurolens.base.progress import Progress, Report
-from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import in_order
 from neurolens.optics.lens.glass import inverse_square_um
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.trace.rays import Rays, Traced, trace
 from neurolens.pictures.flare import canvas
 from neurolens.pictures.flare.canvas import Doubles, Floats, Raster, Smear
 from neurolens.pictures.flare.diffraction import starburst_picture
 from neurolens.pictures.flare.ghosts import GhostTracer, Pair, ghost_pairs
 from neurolens.pictures.flare.grids import REACH, Grid, ghost_moves, grids_of
-from neurolens.pictures.flare.lights import Light, Patch, SceneLights, disc, keep, light_rays, patches, rays_across
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.lights import Light, Patch, SceneLights, keep, light_rays, patches, rays_across
 from neurolens.pictures.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.pictures.flare.steps import entering
-from neurolens.pictures.render.colour import SRGB, SpectralRange, in_gamut
+from neurolens.pictures.render.colour import SRGB, in_gamut
 from neurolens.pictures.render.film import check_memory, digest
 from neurolens.pictures.render.scene import Scene
-from neurolens.pictures.render.settings import LAYERS, FlareSettings
+from neurolens.pictures.render.settings import LAYERS
 
-_AXIS = 1 << 15  # rays that measure the exposure
 _AT_ONCE = 1 << 16  # photons in a call
 _ENOUGH = 200  # photons that a kernel gathers: a noise of 8%
 _COLOURED = 3200  # photons that a kernel of colour gathers: eyes see its noise in wider areas
@@ -60,69 +57,6 @@ _MUCH, _TRIALS = 1e7, 6  # cells that take seconds; groups whose time is measure
 _UNEVEN, _FAINT = 0.6, 5e-4
 Layers = dict[str, Floats]
 REST = "rest"
-
-
-@dataclass(frozen=True)
-class FlareJob:
-    """Everything that decides the flare of one picture.
-
-    Attributes:
-        lens: its film must be placed (`set_lens`).
-        wavelength_nm: range of light. threads: for the work.
-        ghosts: traces the ghosts of the same lens and stop; left out, all ghosts of two reflections.
-        single: names of the ghosts that become layers; the others are the layer "rest".
-        keep: picture beside which the photons of long work are kept until they are complete.
-        finer: how many times as many wavelengths ghosts may take as stars do.
-    """
-
-    lens: Lens
-    lights: Sequence[Light]
-    raster: Raster
-    settings: FlareSettings = FlareSettings()
-    wavelength_nm: tuple[float, float] = LIGHT_NM
-    threads: int = 2
-    ghosts: GhostTracer | None = None
-    single: tuple[str, ...] = ()
-    keep: Path | None = None
-    finer: int = 4
-
-    def spectral(self, finer: int = 1, least: int = 1) -> SpectralRange:
-        """Return the range of light in its wavelengths, each cut into `finer` or more, so that there are `least`."""
-        bins = self.settings.bins
-        return SpectralRange(*self.wavelength_nm, bins=bins * max(finer, -(-least // bins)))
-
-    @property
-    def exposure(self) -> float:
-        """The exposure: see `axis_irradiance`."""
-        return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm))
-
-    @cached_property
-    def tracer(self) -> GhostTracer:
-        """The tracer of its ghosts."""
-        return self.ghosts or GhostTracer(self.lens)
-
-
-@lru_cache(maxsize=32)
-def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
-    """Return the irradiance (sr) at the film's centre in uniform surroundings of radiance 1: the integral of T cos."""
-    film_z = lens.film_z_mm
-    assert film_z is not None  # a tracer's lens has one
-
-    def traced(sines: Doubles, power: bool) -> Traced:
-        d = torch.from_numpy(np.stack([*sines, -np.sqrt(1 - (sines**2).sum(0))]))
-        zero = torch.zeros_like(d[0])
-        return trace(lens, Rays(zero, zero, zero + film_z, *d), wavelength_nm, transmittance=power)
-
-    coarse, widest = disc(0, _AXIS), 1.0
-    for _ in range(3):  # narrows to a little more than the cone that passes
-        lit = (traced(widest * coarse, False).status == 0).numpy()
-        widest *= 1.02 * float(np.hypot(*coarse)[lit].max(initial=0.0)) if lit.any() else 0.3
-    found = traced(min(widest, 1.0) * coarse, True)
-    assert found.transmittance is not None
-    light = math.pi * widest**2 * float(torch.where(found.status == 0, found.transmittance, 0.0).mean())
-    if not light > 0:
-        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
-    return light
 
 
 class _Task(NamedTuple):
@@ -161,7 +95,7 @@ def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) 
     for light in job.lights:
         for patch, pair, grid, moves in _parts(job, tracer, light, nm.tolist()):
             response = np.asarray(unit * spectral.response * spectral.spectrum(patch.light.rgb), np.float64).T
-            smear = canvas.smear_of(patch, raster.per_mm * moves * (-1, 1))
+            smear = canvas.smear_of(patch.weights, patch.round, raster.per_mm * moves * (-1, 1))
             coarse = 1 if smear is None else smear.coarse
             grid = grid.coarser(coarse, _CELLS)
             task = _Task(patch.light, pair, grid, *_bands(nm, response, grid, job.finer * job.settings.bins))
@@ -457,7 +391,12 @@ def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
 
 
 class Choice(NamedTuple):
-    """What the flare of all a scene's frames shares: ghosts that become layers; whether lights fade (`keep`)."""
+    """What is chosen once for the flare of all frames of a scene.
+
+    Attributes:
+        single: names of the ghosts that become layers.
+        fade: whether lights fade where they leave the view (`keep`).
+    """
 
     single: tuple[str, ...]
     fade: bool

@@ -260,15 +260,16 @@ def _value(path: Path, place: str, name: str, given: Any) -> float:
 def light_rays(
     lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
 ) -> tuple[Floats, float]:
-    """Return rays [6, count] of a light from number `first` on, lens frame, and the area (mm^2) of all N rays together.
+    """Return rays [6, count] of a light in the lens frame, and the area (mm^2) that all N rays together stand for.
 
     Each of N rays carries the irradiance at the lens times area / N. The rays of a light far away are uniform across
     its direction, those of a near light in solid angle. An extended light divides its rays among points, one in each of
     its cells, in proportion to their light.
 
     Args:
-        shift: shifts the sequence, and the points of an extended light; each wavelength takes another. jitter: see
-            `disc`.
+        first: number of the first ray in the sequence of all N.
+        shift: shifts the sequence, and the points of an extended light, so that each wavelength has other rays.
+        jitter: see `disc`.
     """
     if light.shape is None:
         return rays_across(lens, light, disc(first, count, shift, jitter))

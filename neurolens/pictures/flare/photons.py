@@ -107,10 +107,10 @@ class PhotonTracer:
         self._call.restype = ctypes.c_size_t
 
     def turning(self, wavelength_nm: float, times: int) -> NDArray[np.float64]:
-        """Return boosts [surfaces, 2, LEVELS] that make photons turn round `times` times (at most `LEVELS` - 1).
+        """Return factors on reflectances [surfaces, 2, LEVELS] that make photons reflect `times` times, below `LEVELS`.
 
         Each surface ahead is chosen in proportion to its reflectance (a mean over angles of incidence), so that all
-        paths with that number of reflections have about the same weight. After that, photons go as they would.
+        paths with that number of reflections have about the same weight. Further ones are as frequent as in the lens.
         """
         share = self.stack.reflectance(wavelength_nm)
         boosts = np.ones((len(share), 2, LEVELS))

@@ -495,7 +495,10 @@ class Palette:
         self._flat = self._spectral.rotated(rows).reshape(self._spectral.lanes, -1)
 
     def look_up(self, row: Index, bins: Index) -> FloatArray:
-        """Return the values [lanes, N] of rows [N]; the first lane is at wavelength bins [N]."""
+        """Return the values [lanes, N] of spectra by their row numbers [N], at a bin of wavelength [N] each.
+
+        The first lane is at that bin, the others at its companions.
+        """
         where = row * self._spectral.bins
         where += bins
         return self._flat.take(where, axis=-1)

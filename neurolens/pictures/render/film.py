@@ -15,21 +15,14 @@ import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import CHUNK_BYTES, fingerprint_of, read_arrays, write_arrays
-from neurolens.base.settings import LIGHT_NM
-from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.optics.lens.shot import Shot
-from neurolens.pictures.render.settings import FilmSettings
-
-if TYPE_CHECKING:
-    from neurolens.pictures.render.job import Job
+from neurolens.cameras.contract import FloatArray
 
 BATCH = 32768  # paths; with fewer, calling numpy costs more than computing; the state of many more leaves the cache
 SAMPLES_A_PASS = 16
@@ -41,11 +34,8 @@ RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6
 BYTES_A_PIXEL = 8 * COLUMNS + 100
 # Larger deviations from square pixels are taken as mistakes, unless no whole number comes nearer.
 _ASPECT_TOLERANCE = 0.02
-# Settings of a camera that do not affect its rays: where it was read and notes.
-_NO_MATTER = ("model", "notes")
-_SCENES = ("film_mm", "wavelength_nm", "aperture", "clamp_f_number")  # of a shot's settings, those of its scene
 _NOTHING = "(nothing)"  # stands for a place that one of two identities lacks
-_PROBES, _DIGITS = 1024, 16
+_DIGITS = 16
 _FORMAT = 4
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _BRIGHTEST = 1e37  # the largest sum of a pixel, which float32 must hold after the white balance, too
@@ -236,27 +226,6 @@ class Film:
         return float(self.done.sum()) / (self.tiling.tiles * self.tiling.passes)
 
 
-def identity(job: Job) -> dict[str, Any]:
-    """Everything that the sums of a film depend on, except the number of samples.
-
-    The scene is its tables, textures and meshes; the camera its settings and its results for some rays.
-    """
-    scene, camera = job.scene, job.camera
-    # These are given separately, and may differ from the scene's.
-    asked: dict[str, Any] = {f.name: f.default for f in fields(Shot) if f.name not in _SCENES}
-    common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, **asked)
-    bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings(), sensor=None))
-    kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
-    identity = {
-        "neurolens": __version__,
-        "scene": digest(bare),
-        "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
-        "film_mm": list(job.grid.film_mm),
-        **job.picture_settings(),
-    }
-    return json.loads(json.dumps(identity, default=str))
-
-
 def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
     if not isinstance(tree, dict) or not tree:
         return {place: tree}
@@ -293,17 +262,6 @@ def _plain(value: Any) -> Any:
     if is_dataclass(value):
         return [type(value).__name__, {field.name: _plain(getattr(value, field.name)) for field in fields(value)}]
     return f"{type(value).__name__} {value!r}"
-
-
-def _rays(camera: Camera) -> str:
-    """Return a digest of the rays of a fixed set of samples, which tells cameras apart."""
-    random = np.random.default_rng(0)
-    film = ((random.random((2, _PROBES)) - 0.5) * np.array(camera.film_mm)[:, None]).astype(np.float32)
-    low, high = camera.wavelength_nm or LIGHT_NM
-    nm = np.linspace(low, high, _PROBES).astype(np.float32)
-    rays = camera.sample(film, random.random((2, _PROBES), np.float32), nm)
-    passed = rays.status == 0
-    return digest([rays.status, *(np.where(passed, p, 0) for p in (rays.origin_m, rays.direction, rays.weight))])
 
 
 def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: dict[str, float]) -> None:

@@ -1,22 +1,26 @@
-"""One render: the wavelengths that its paths carry, a pass of a tile, and the film developed into a picture."""
+"""One render: the wavelengths of its paths, a pass of a tile, the film developed into a picture, and its identity."""
 
 from __future__ import annotations
 
 import ctypes
+import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens import __version__
 from neurolens.base.errors import InputError, note
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.reduced import film_shift
 from neurolens.graph.compiler import c_source, has_compiler, load_compiled
+from neurolens.optics.lens.shot import Shot
 from neurolens.pictures.render import film as columns
 from neurolens.pictures.render.colour import (
     SRGB,
@@ -28,7 +32,7 @@ from neurolens.pictures.render.colour import (
     converted,
     illuminant,
 )
-from neurolens.pictures.render.film import Film, PixelGrid, Spill, Tiling
+from neurolens.pictures.render.film import Film, PixelGrid, Spill, Tiling, digest
 from neurolens.pictures.render.integrator import trace
 from neurolens.pictures.render.lights import sun_spectrum, total_spectrum
 from neurolens.pictures.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
@@ -443,3 +447,40 @@ def dispersion_px(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float
         length = (shift**2).sum(axis=0)
         worst = max(worst, float(np.sqrt(np.nanmean(length))) if np.isfinite(length).any() else 0.0)
     return worst
+
+
+# Settings of a camera that do not affect its rays: where it was read and notes.
+_NO_MATTER = ("model", "notes")
+_SCENES = ("film_mm", "wavelength_nm", "aperture", "clamp_f_number")  # of a shot's settings, those of its scene
+
+
+def identity(job: Job) -> dict[str, Any]:
+    """Everything that the sums of a film depend on, except the number of samples.
+
+    The scene is its tables, textures and meshes; the camera its settings and its results for some rays.
+    """
+    scene, camera = job.scene, job.camera
+    # These are given separately, and may differ from the scene's.
+    asked: dict[str, Any] = {f.name: f.default for f in fields(Shot) if f.name not in _SCENES}
+    common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, **asked)
+    bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings(), sensor=None))
+    kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
+    identity = {
+        "neurolens": __version__,
+        "scene": digest(bare),
+        "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
+        "film_mm": list(job.grid.film_mm),
+        **job.picture_settings(),
+    }
+    return json.loads(json.dumps(identity, default=str))
+
+
+def _rays(camera: Camera) -> str:
+    """Return a digest of the rays of a fixed set of samples, which tells cameras apart."""
+    random = np.random.default_rng(0)
+    film = ((random.random((2, _PROBES)) - 0.5) * np.array(camera.film_mm)[:, None]).astype(np.float32)
+    low, high = camera.wavelength_nm or LIGHT_NM
+    nm = np.linspace(low, high, _PROBES).astype(np.float32)
+    rays = camera.sample(film, random.random((2, _PROBES), np.float32), nm)
+    passed = rays.status == 0
+    return digest([rays.status, *(np.where(passed, p, 0) for p in (rays.origin_m, rays.direction, rays.weight))])

@@ -31,11 +31,10 @@ from neurolens.pictures.render.film import (
     PixelGrid,
     check_memory,
     difference,
-    identity,
     read_checkpoint,
     write_checkpoint,
 )
-from neurolens.pictures.render.job import Job, Layers, develop
+from neurolens.pictures.render.job import Job, Layers, develop, identity
 from neurolens.pictures.render.pictures import (
     COLOURS,
     read_channels,

@@ -84,7 +84,7 @@ class Plan:
 
     @property
     def what(self) -> str:
-        """What the seconds of its cameras are spent on, in words."""
+        """What the seconds of its cameras are for, in words: the whole picture, or the camera alone."""
         return "whole picture" if any(self.work.rest) else "camera"
 
     @property
@@ -103,7 +103,7 @@ class Plan:
         return "s" if self.unit == "ns" else "10^9 operations"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields but `probed`, JSON-able."""
+        """Return all fields but `probed` as JSON holds them."""
         fields = asdict(replace(self, probed=None))  # type: ignore[arg-type]
         del fields["probed"]
         shot = fields["asked"].pop("shot")

@@ -36,7 +36,8 @@ from neurolens.optics.lens.shot import Dispersion, Shot
 from neurolens.optics.setting.pupils import image_radius_mm
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
-from neurolens.pictures.flare.layers import FlareJob, flare_layers
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import flare_layers
 from neurolens.pictures.flare.lights import Light, SceneLights, highlights, keep
 from neurolens.pictures.render.colour import SpectralRange
 from neurolens.pictures.render.job import expected_light
@@ -283,7 +284,7 @@ class Probe:
 
     @cached_property
     def maps(self) -> Maps:
-        """The same with maps of the light that the lens adds, on more pixels; without these where it is not known."""
+        """`camera_maps`, and maps of the light that the lens adds, on more pixels, where that light is known."""
         with suppress(InputError):
             added = stray_light(self.scene, self.exact, self.overview)
             return self.camera_maps | {k: ("relative", v) for k, v in added.items()}
@@ -410,7 +411,10 @@ def passed_share(probed: Probe) -> Array:
 
 
 def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
-    """Return effects with their worth in this picture, largest first; `stray` adds the light that the lens adds."""
+    """Return the effects with their worth in this picture, largest first.
+
+    `stray`: whether ghosts, glare and stars are among them, which take seconds to draw.
+    """
     effects = []
     for name, (unit, value) in (probed.maps if stray else probed.camera_maps).items():
         budget = budget_px if unit == "px" else LIGHT

@@ -68,7 +68,12 @@ def test_opencv_projects_to_the_same_pixels(kind: str, tmp_path: Path) -> None:
     found = example(kind)
     direction = rays(min(found.widest_rad, 1.5))
     path = tmp_path / "camera.yaml"
-    files.write_projection(tmp_path / "camera", found, {"rms_px": 0.25})
+    told = files.FittedProjection(
+        camera="it", model=kind, size=list(SIZE), focal_px=[1.0, 1.0], centre_px=[0.0, 0.0], coefficients={},
+        rms_px=0.25, worst_px=1.0, worst_at_deg=1.0, light_at_worst=1.0, field_deg=1.0, turns_back_at_deg=None,
+        by_field=[], before_film_mm=[1.0, 1.0],
+    )  # fmt: skip
+    files.write_projection(tmp_path / "camera", found, told)
     stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix, numbers = (stored.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
     assert (stored.getNode("image_width").real(), stored.getNode("avg_reprojection_error").real()) == (1920, 0.25)
@@ -154,7 +159,7 @@ def test_blue_light_at_the_rim_does_not_bend_the_fit() -> None:
     field = field_of_camera(ROOT / "lenses" / "isshiki_fisheye_10.toml")
     _, left, told = files.fitted_projection("kannala-brandt", field, (384, 216), (36.0, 20.25), "here")
     assert all(worst < 0.002 for _, to, _, worst in left.by_field if to < 91)  # pixels; 0.03 with all points alike
-    assert left.rms_px < 0.04 and left.worst_at_deg > 111 and 0.001 < told["light_at_worst"] < 0.02
+    assert left.rms_px < 0.04 and left.worst_at_deg > 111 and 0.001 < told.light_at_worst < 0.02
 
 
 @pytest.mark.parametrize("camera", [GAUSS, ROOT / "models" / "nikon_zoom_14_24.ols-64.onnx"])

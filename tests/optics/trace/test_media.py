@@ -12,7 +12,7 @@ import torch
 
 from neurolens.cameras.exact import search_key
 from neurolens.graph.interpret import evaluate
-from neurolens.optics.analysis.field_curves import breathing
+from neurolens.optics.analysis.breathing import breathing
 from neurolens.optics.lens.glass import LINE_D_NM, index_of
 from neurolens.optics.lens.paraxial import chief_reach_mm, film_z_mm, first_order, image_z_mm
 from neurolens.optics.lens.prescription import Lens, Medium, Surface

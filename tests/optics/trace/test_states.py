@@ -9,7 +9,7 @@ import torch
 from shipped import NAMES, tabled, whole
 
 from neurolens.base.errors import InputError
-from neurolens.optics.analysis.field_curves import breathing, field_change
+from neurolens.optics.analysis.breathing import breathing, field_change
 from neurolens.optics.lens.glass import LINE_D_NM
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Coating, Lens, Surface

@@ -16,7 +16,7 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster, draw_edges, edges_of
 from neurolens.pictures.flare.ghosts import GhostTracer, ghost_pairs
 from neurolens.pictures.flare.grids import REACH, grids_of
-from neurolens.pictures.flare.layers import FlareJob
+from neurolens.pictures.flare.job import FlareJob
 from neurolens.pictures.flare.lights import Light, light_rays, rays_across
 from neurolens.pictures.flare.steps import LOST, entering
 from neurolens.pictures.render.colour import SRGB

@@ -22,7 +22,7 @@ from neurolens.optics.trace.rays import Rays, trace
 from neurolens.pictures.flare import diffraction as d
 from neurolens.pictures.flare import exit_pupil as p
 from neurolens.pictures.flare.canvas import Raster
-from neurolens.pictures.flare.layers import FlareJob, axis_irradiance
+from neurolens.pictures.flare.job import FlareJob, axis_irradiance
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.render.settings import FlareSettings
 from tests.pictures.flare.test_ghosts import lens_of, plate

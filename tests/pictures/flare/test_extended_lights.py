@@ -18,7 +18,8 @@ from neurolens.pictures.flare import layers
 from neurolens.pictures.flare.canvas import Raster, Smear
 from neurolens.pictures.flare.diffraction import starburst_picture
 from neurolens.pictures.flare.ghosts import GhostTracer, Pair, ghost_pairs, ghost_table
-from neurolens.pictures.flare.layers import FlareJob, ghost_layers, photon_picture
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import ghost_layers, photon_picture
 from neurolens.pictures.flare.lights import (
     CELLS,
     Light,

@@ -24,7 +24,8 @@ from neurolens.pictures import frames
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.diffraction import starburst_picture
 from neurolens.pictures.flare.ghosts import GhostTracer
-from neurolens.pictures.flare.layers import FlareJob, flare_layers
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import flare_layers
 from neurolens.pictures.flare.lights import Light, light_rays, with_disc
 from neurolens.pictures.render.colour import ACESCG, COLOUR_SPACES, SRGB, conversion
 from neurolens.pictures.render.pictures import read_colour_space, read_exr, read_layers, write_channels, write_exr

@@ -22,7 +22,8 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare import layers, lights
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import GhostTracer
-from neurolens.pictures.flare.layers import FlareJob, photon_picture
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import photon_picture
 from neurolens.pictures.flare.lights import Light, flat_shape, highlights, sides_across
 from neurolens.pictures.flare.photons import PhotonTracer
 from neurolens.pictures.render.pictures import read_exr, write_exr

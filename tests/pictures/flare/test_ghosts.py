@@ -20,7 +20,8 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import Rays, follow, trace, turning
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import GhostTracer, Pair, ghost_layout, ghost_pairs
-from neurolens.pictures.flare.layers import FlareJob, axis_irradiance, photon_picture
+from neurolens.pictures.flare.job import FlareJob, axis_irradiance
+from neurolens.pictures.flare.layers import photon_picture
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.flare.photons import PhotonTracer
 from neurolens.pictures.render.settings import FlareSettings

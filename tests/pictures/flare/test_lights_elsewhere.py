@@ -13,7 +13,8 @@ from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import GhostTracer, ghost_table
-from neurolens.pictures.flare.layers import FlareJob, flare_layers
+from neurolens.pictures.flare.job import FlareJob
+from neurolens.pictures.flare.layers import flare_layers
 from neurolens.pictures.flare.lights import Light, read_lights
 from neurolens.pictures.render.pictures import read_channels
 from neurolens.pictures.render.settings import FlareSettings

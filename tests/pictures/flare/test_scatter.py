@@ -14,7 +14,8 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import Rays, follow, turning
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import GhostTracer, ghost_pairs
-from neurolens.pictures.flare.layers import FlareJob, _smoothed, axis_irradiance, photon_picture
+from neurolens.pictures.flare.job import FlareJob, axis_irradiance
+from neurolens.pictures.flare.layers import _smoothed, photon_picture
 from neurolens.pictures.flare.lights import Light, light_rays
 from neurolens.pictures.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.pictures.render.colour import SRGB

@@ -27,7 +27,7 @@ from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import GhostTracer
-from neurolens.pictures.flare.layers import FlareJob
+from neurolens.pictures.flare.job import FlareJob
 from neurolens.pictures.flare.lights import Light
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import scene_from_tables

@@ -100,7 +100,7 @@ def _changed(props: Any, context: Any) -> None:
 
 
 class CameraSettings(bpy.types.PropertyGroup):
-    """What is chosen on a camera, and what there was before."""
+    """The lens settings of a camera, and Blender's own from before."""
 
     __annotations__ = {
         "lens": bpy.props.EnumProperty(name="Lens", items=_lens_items, update=_changed),
