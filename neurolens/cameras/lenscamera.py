@@ -437,9 +437,9 @@ class LensCamera:
                 graph.outputs |= graph.inline(lanes, same)
         if self.runtime == "c":
             try:
-                return _compiled(
-                    graph, numbers, self.film, lens, lambda how: self._told(f"compiled {self.name}, {kind}, {how}")
-                )
+                # Of a lens's programs one line is enough.
+                told = None if kind != "rays" else lambda how: self._told(f"compiled {self.name} {how}")
+                return _compiled(graph, numbers, self.film, lens, told)
             except InputError as error:  # a compiler that fails, or takes too long
                 if self._asked:
                     raise
@@ -515,7 +515,7 @@ class LensCamera:
 
 
 def _compiled(
-    graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph, told: Callable[[str], None]
+    graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph, told: Callable[[str], None] | None
 ) -> GraphRun:
     """Compile a graph of the camera to a function, which tests a mask in the stop on the rays that come back."""
     run = CompiledProgram.of(graph, numbers, padded(film.outline.table, 5), told)

@@ -34,7 +34,7 @@ class FlareJob:
         ghosts: traces the ghosts of the same lens and stop; left out, all ghosts of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".
         keep: picture beside which the photons of long work are kept until they are complete.
-        finer: how many times as many wavelengths ghosts may take as stars and photons do.
+        finer: how many times as many wavelengths ghosts may take as stars do.
     """
 
     lens: Lens
@@ -48,9 +48,10 @@ class FlareJob:
     keep: Path | None = None
     finer: int = 4
 
-    def spectral(self, finer: int = 1) -> SpectralRange:
-        """Return the range of light in its wavelengths, or in `finer` times as many."""
-        return SpectralRange(*self.wavelength_nm, bins=finer * self.settings.bins)
+    def spectral(self, finer: int = 1, least: int = 1) -> SpectralRange:
+        """Return the range of light in its wavelengths, each cut into `finer` or more, so that there are `least`."""
+        bins = self.settings.bins
+        return SpectralRange(*self.wavelength_nm, bins=bins * max(finer, -(-least // bins)))
 
     @property
     def exposure(self) -> float:

@@ -47,6 +47,7 @@ _STRIP = 1 << 22  # bytes of a strip of a picture, which one thread draws
 _ROOM = 1 << 26  # bytes of edges that wait to be drawn
 _EDGES = 176  # bytes of a cell's edges
 FEWEST = 4  # of wavelengths that stand for all
+_KNOWN = 30  # wavelengths, at least, at which light is known: coatings reflect some colours ten times as much as others
 _PATCH_DEG = 2.0  # side of a patch of an extended light: see `patches`
 # patches along a side, at most; cells of a ghost along a side, which stay where patches are many
 _PATCHES, _CELLS = (4, 6, 9), 48
@@ -81,13 +82,13 @@ def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) 
     """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
 
     Each ghost is drawn as the areas of a grid of rays (`pictures.flare.canvas`). Where a ghost's colours hardly part,
-    fewer wavelengths stand for all.
+    fewer wavelengths stand for all, each with the light of its neighbours.
 
     Args:
         layers: for each pair of the tracer, the layer that takes it. done: called with the share of the work that is
             done, and for long work with the seconds left, which a trial tells first.
     """
-    tracer, raster, spectral = job.tracer, job.raster, job.spectral(job.finer)
+    tracer, raster, spectral = job.tracer, job.raster, job.spectral(job.finer, _KNOWN)
     layer = dict(zip(tracer.pairs, layers, strict=True))
     unit, nm = raster.per_mm**2 / job.exposure / spectral.bins, spectral.centres_nm
     groups: dict[tuple[int, int, Smear | None], list[_Task]] = {}
@@ -97,7 +98,7 @@ def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) 
             smear = canvas.smear_of(patch.weights, patch.round, raster.per_mm * moves * (-1, 1))
             coarse = 1 if smear is None else smear.coarse
             grid = grid.coarser(coarse, _CELLS)
-            task = _Task(patch.light, pair, grid, *_bands(nm, response, grid))
+            task = _Task(patch.light, pair, grid, *_bands(nm, response, grid, job.finer * job.settings.bins))
             groups.setdefault((layer[pair], coarse, smear), []).append(task)
     ordered = [_Group(*key, tasks) for key, tasks in groups.items()]
     whole, expected = max(sum(group.work(raster) for group in ordered), 1.0), _expected_s(job, ordered)
@@ -230,16 +231,20 @@ def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
         yield batch
 
 
-def _bands(nm: Doubles, response: Doubles, grid: Grid) -> tuple[list[float], Doubles]:
+def _bands(nm: Doubles, response: Doubles, grid: Grid, most: int) -> tuple[list[float], Doubles]:
     """Choose wavelengths that stand for all of `nm` [W] in a ghost, with colours [K, 3] from responses [W, 3].
+
+    There are at most `most`.
 
     One wavelength is traced for each band. The other wavelengths of the band take its places on the film and have their
     own power, because a coating may reflect ten times as much at one end of a band as at the other. Ghosts with equally
     many bands share the traced wavelengths, unless a ghost is too dark at one of them to stand for its band.
     """
-    count = min(max(grid.wavelengths, FEWEST), len(nm))
+    count = min(max(grid.wavelengths, FEWEST), most)
     w = inverse_square_um(nm)  # glass spreads light about evenly in this
-    at = np.arange(count) if count == len(nm) else (count * (w[0] - w) / (1.000001 * (w[0] - w[-1]))).astype(int)
+    at = (
+        np.arange(count) if count == len(nm) else (count * (w[0] - w) / (1.000001 * (w[0] - w[-1]) + 1e-30)).astype(int)
+    )
     nodes, level = zip(*(grid.spectrum or ((nm[0], 1.0),)), strict=True)
     power = np.interp(nm, nodes, np.maximum(level, 1e-3 * max(level) + 1e-30))
     traced, colours = list[float](), list[Doubles]()
@@ -268,9 +273,11 @@ def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quiet
     Args:
         part: one of `PARTS`: photons that were reflected or scattered ("flare"), reflected twice at most ("ghosts"),
             reflected more often or scattered ("glare"), or neither ("image").
-        photons: for each light and wavelength. done: called with the share of the work.
+        photons: for each light and wavelength; few wavelengths are cut into more, which share their photons. done:
+            called with the share of the work.
     """
-    settings, raster, spectral = job.settings, job.raster, job.spectral()
+    settings, raster, spectral = job.settings, job.raster, job.spectral(least=_KNOWN)
+    photons = -(-photons * settings.bins // spectral.bins)
     lens, tracer, count = job.lens, PhotonTracer(job.lens, settings.scatter), spectral.bins
     edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
     firsts = range(0, photons, _AT_ONCE)
@@ -324,13 +331,14 @@ def _arrivals(
     tracer: PhotonTracer, part: str, rays: Floats, wavelength_nm: float, most_reflections: int, seed: int
 ) -> Iterator[tuple[Floats, Floats]]:
     """Yield places on the film [2, M] (mm) and weights [M] of the photons of a part."""
-    # For glare by surfaces alone photons are made to turn round; photons that scatter go as they would.
-    for scatters in (False, True)[: 1 + tracer.scatter.on] if part == "glare" else (None,):
-        boost = tracer.turning(wavelength_nm, LEVELS - 1) if scatters is False else 1.0
+    # Surfaces reflect so little that photons are made to turn round. Those that scatter, and the image, are not.
+    times = {"ghosts": (2,), "glare": (LEVELS - 1, 0), "flare": (2, 0)}.get(part, (0,))
+    for turns in times[: 1 + tracer.scatter.on]:
+        boost = tracer.turning(wavelength_nm, turns) if turns else 1.0
         photons = tracer.trace(rays, wavelength_nm, most_reflections=most_reflections, seed=seed, boost=boost)
         which = PARTS[part](photons)
-        if scatters is not None:
-            which &= (photons.scattered > 0) == scatters
+        if len(times) > 1:
+            which &= (photons.scattered > 0) == (turns == 0)
         # A film that sends light back is exposed by the light that it keeps.
         yield photons.film_xy_mm[:, which], photons.weight[which] / (1 - tracer.scatter.sensor)
 

@@ -109,8 +109,8 @@ class PhotonTracer:
     def turning(self, wavelength_nm: float, times: int) -> NDArray[np.float64]:
         """Return factors on reflectances [surfaces, 2, LEVELS] that make photons reflect `times` times, below `LEVELS`.
 
-        Each surface ahead is chosen in proportion to its reflectance at normal incidence, so that all paths with that
-        number of reflections have about the same weight. Further reflections are as frequent as in the lens.
+        Each surface ahead is chosen in proportion to its reflectance (a mean over angles of incidence), so that all
+        paths with that number of reflections have about the same weight. Further ones are as frequent as in the lens.
         """
         share = self.stack.reflectance(wavelength_nm)
         boosts = np.ones((len(share), 2, LEVELS))

@@ -49,6 +49,7 @@ ACTIONS: tuple[tuple[Action, int], ...] = (("T", 1), ("T", -1), ("R", 1), ("R", 
 Place = tuple[int, int]  # surface and action
 _UNIT = Medium(1.0, 1.0, 1.0)  # not air, for behind it there may be total reflection
 _FAINT = 2e-4  # ghosts of a smaller reflectance are not seen
+_ASLANT = 0.0, 0.1, 0.2, 0.3  # 1 - cosine of angles at which light meets surfaces
 _MASKS: dict[str, Floats] = {}  # masks of stops, which compiled code points to as long as it is loaded
 
 
@@ -165,19 +166,17 @@ def _coated(g: Graph, call: Value, cos_i: Value, cos_t: Value, n_step: Value) ->
 
 
 @lru_cache(maxsize=4096)  # equal for every frame, stop and tracer, and for surfaces that are coated alike
-def reflectance_fit(
-    layers: Layers, n_before: float, n_after: float, wavelength_nm: float, sense: int
-) -> tuple[float, ...]:
+def reflectance_fit(layers: Layers, n_before: float, n_after: float, wavelength_nm: float) -> tuple[float, ...]:
     """Fit a coating's reflectance by a polynomial in 1 - c, c the cosine on the lower index's side; lowest first.
 
     The squares of relative errors are least at Chebyshev nodes, because ghosts live on the little that is left near
-    normal incidence. Light of this sense (1: towards the film) meets `n_before` first.
+    normal incidence. Light from both sides has the same, for nothing is lost. `n_before` is on the scene's side.
     """
     c = 0.5 + 0.5 * np.cos((np.arange(64) + 0.5) * math.pi / 64)
     low, high = min(n_before, n_after), max(n_before, n_after)
     there = np.sqrt(1 - (low / high) ** 2 * (1 - c * c))
     cos_i = torch.from_numpy(c if n_before <= n_after else there)
-    exact = reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
+    exact = reflectance(cos_i, n_before, n_after, layers, wavelength_nm).numpy()
     return tuple(np.polynomial.polynomial.polyfit(1 - c, exact, DEGREE, w=1 / (exact + _FAINT)).tolist())
 
 
@@ -312,18 +311,22 @@ class Stack:
                 if s.coating and s.coating.layers and ACTIONS[which][0] == "R":
                     numbers[k, which, len(CALL) : PLAIN] = numbers[k, which - 2, len(CALL) : PLAIN]
                 elif s.coating and s.coating.layers:
-                    numbers[k, which, len(CALL) : PLAIN] = reflectance_fit(
-                        s.coating.layers, n[before], n[after], wavelength_nm, sense
-                    )
+                    fit = reflectance_fit(s.coating.layers, n[k], n[k + 1], wavelength_nm)
+                    numbers[k, which, len(CALL) : PLAIN] = fit
         assert lens.film_z_mm is not None
         return numbers, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
 
     def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Return the reflectances [surfaces] at normal incidence for light towards the film."""
+        """Return the reflectances [surfaces] for light towards the film.
+
+        Those of coatings are means over angles of incidence up to 46 degrees, for a coating that reflects nothing at
+        right angles still reflects light that comes aslant.
+        """
         numbers = self.numbers(wavelength_nm)[0][:, 0].astype(np.float64)
         n1, n2 = numbers[:, CALL.index("n_before")], numbers[:, CALL.index("n_after")]
         coated = [bool(s.coating and s.coating.layers) for s in self.lens.surfaces]
-        return np.where(coated, numbers[:, len(CALL)].clip(1e-9, 1), ((n1 - n2) / (n1 + n2)) ** 2)
+        aslant = [np.polynomial.polynomial.polyval(u, numbers[:, len(CALL) : PLAIN].T).clip(1e-9, 1) for u in _ASLANT]
+        return np.where(coated, np.mean(aslant, axis=0), ((n1 - n2) / (n1 + n2)) ** 2)
 
 
 def entering(rays: NDArray[np.floating]) -> Floats:

@@ -166,8 +166,8 @@ class FlareSettings:
 
     bins: int = setting(
         15,
-        "wavelengths of stars and photons, in equal steps over the range of light, 400 to 700 nm; ghosts take what "
-        "their colours need, at most four times as many (default: 15)",
+        "wavelengths of stars and photons, in equal steps over the range of light, 400 to 700 nm (fewer than 30 of "
+        "photons are cut into more); ghosts take what their colours need, at most four times as many (default: 15)",
         within=(1, 256),
         old=("wavelengths",), title=OF_PICTURE,
     )  # fmt: skip

@@ -210,7 +210,7 @@ def test_ghosts_that_rims_cut_have_fine_patches(name: str) -> None:
     (light,) = SceneLights(scene).seen(scene, lens.film_z_mm)
     (pair,), raster = [pair for pair in ghost_pairs(lens) if pair.name == name], Raster((36.0, 20.25), 160, 90)
     right = uniform_filter(ghost_by_chance(lens, light, pair, raster, 1 << 21), 11)
-    job = FlareJob(lens, [light], raster, FlareSettings(bins=1), ghosts=GhostTracer(lens, [pair]), finer=1)
+    job = FlareJob(lens, [light], raster, FlareSettings(bins=1), (549, 551), ghosts=GhostTracer(lens, [pair]), finer=1)
     picture = ghost_picture(job)[0].sum(-1)
     found, inside = uniform_filter(picture.astype(np.float64), 11), right > 0.3 * right.max()
     off = found[inside] / right[inside] * right[inside].sum() / found[inside].sum() - 1
