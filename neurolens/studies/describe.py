@@ -166,6 +166,7 @@ def white_rb(lens: Lens) -> tuple[float, float] | None:
 
 
 _ROUND = {"conic": 0.0, "asphere": {}, "cylinder": None, "across": None, "focal_mm": None}
+_PLACED = {"decentre_mm": "decentred by", "tilt_deg": "tilted by"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,6 +178,7 @@ class SurfaceRow:
         absorbs_as: the glass whose absorption is assumed.
         shape: the numbers of the figure; `asphere` is {power: coefficient}.
         figure: what the figure is, in words; empty for a sphere.
+        placement: how it is moved (mm) and turned (degrees) away from the axis, as the keys of lens files say.
     """
 
     surface: int
@@ -193,6 +195,7 @@ class SurfaceRow:
     absorption_per_mm: float | None
     shape: Mapping[str, Any] = field(metadata=PART)
     figure: str
+    placement: Mapping[str, list[float]] = field(metadata=PART)
     coating: Coating | None
 
     def words(self) -> str:
@@ -200,6 +203,10 @@ class SurfaceRow:
         coating = self.coating
         words = [
             self.figure,
+            *(
+                f"{_PLACED[key]} {' '.join(f'{v:.3g}' for v in values)} {'mm' if key.endswith('mm') else 'degrees'}"
+                for key, values in self.placement.items()
+            ),
             f"coating {coating.name}" if coating is not None and coating.origin != "assumed" else "",
             f"absorbs {self.absorption_per_mm:.3g}/mm" if self.absorption_per_mm else "",
         ]
@@ -218,7 +225,7 @@ def glass_table(lens: Lens) -> list[SurfaceRow]:
             diameter_mm=s.diameter_mm, stop=s.stop, material=s.material, glass=s.glass,
             n_d=float(s.n_d if glass is None else glass.n_d), V_d=s.V_d if glass is None else float(glass.V_d),
             absorbs_as=s.absorbs_as, absorption_per_mm=s.absorption_per_mm, shape=_ROUND | shape,
-            figure=s.figure.words(), coating=s.coating,
+            figure=s.figure.words(), placement=s.placement.record(), coating=s.coating,
         ))  # fmt: skip
     return rows
 

@@ -101,8 +101,8 @@ def _moves(turn: Turn | None) -> tuple[tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _checked(line: Line, placement: Placement) -> Placement:
-    if max(map(abs, (*placement.moved_mm, *placement.tilt_deg))) < _ROUNDING:
-        return CENTRED
+    x, y, z, a, b, c = (v if abs(v) >= _ROUNDING else 0.0 for v in (*placement.moved_mm, *placement.tilt_deg))
+    placement = Placement((x, y, z), (a, b, c))
     for what, values, most in (
         ("decentre", placement.moved_mm, MOST_DECENTRE_MM),
         ("tilt", placement.tilt_deg[:2], MOST_TILT_DEG),

@@ -13,6 +13,7 @@ from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.readers.breaks import Step, Turn, placements
 from neurolens.optics.readers.source import Line
 from neurolens.optics.trace.rays import Rays, trace
+from neurolens.studies.describe import glass_table
 
 TURNS = ((0.05, -0.3, 0.0), (12.0, -7.0, 30.0))
 ZEMAX_HEAD = """\
@@ -157,6 +158,7 @@ def test_code_v_turns_left_handed_and_zemax_right_handed(tmp_path: Path) -> None
     restored = CODE_V.replace("S -50 46", "S -50 -4").format(back="S 0 50; XDE 0.05; ADE -0.4; BDE 0.3; REV")
     lens = read(restored, tmp_path, "b.seq")
     assert lens.decentred == [1, 2] and lens.surfaces[2].thickness_mm == 46
+    assert glass_table(lens)[1].words() == "decentred by 0.05 0 mm, tilted by 0.4 -0.3 degrees"
 
 
 def test_optiland_finds_the_same_image(tmp_path: Path) -> None:
