@@ -167,6 +167,8 @@ def models() -> Answer:
             ),
             ("experiments/results/shots.md", "a model of one shot alone: `python -m experiments shots`"),
             ("experiments/results/ablations/laikin_double_gauss_50.md", "what each part of a fit is worth"),
+            ("experiments/results/phase.md", "the optical path of models: `python -m experiments phase`"),
+            ("experiments/results/copies.md", "models of decentred copies: `python -m experiments copies`"),
         ],
     )
 
