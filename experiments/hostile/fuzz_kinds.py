@@ -253,7 +253,7 @@ def _of_words(chance: Chance, folder: Path) -> Words:
 
 
 # Their value may be any amount of work, or of a network; help is no work at all.
-_LONG = ("--help", "-h", "--samples", "--max-depth", "--dask", "--rays", "--photons", "--glare", "--models")
+_LONG = "--help -h --samples --max-depth --dask --rays --photons --glare --ghosts --models".split()
 
 
 @cache

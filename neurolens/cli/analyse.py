@@ -325,7 +325,7 @@ def _seidel_text(found: Seidel) -> str:
 def _psf_text(found: Psf) -> str:
     off = found.spread
     columns = [
-        ("half width µm", _each(_three, found.half_width_um, [20 * spread for spread in off["half_width_um"]])),
+        ("picture ± µm", _each(_three, found.half_width_um, [20 * spread for spread in off["half_width_um"]])),
         ("Strehl ratio", _each(_fixed, found.strehl, _each(_digits, off["strehl"]))),
     ]
     head = f"Point spread ({found.wavelength_nm[0]:.0f} nm; Strehl ratio '-' where aberrations rule out diffraction)"

@@ -40,7 +40,7 @@ from neurolens.models.card import (
 )  # fmt: skip
 from neurolens.models.copied import Copied as Copied  # the cores of copies, which files may hold
 from neurolens.models.cores import CORES, Core
-from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
+from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_structure
 from neurolens.optics.lens.figures import figure_of
 from neurolens.optics.lens.prescription import Coating, Lens, Surface
 
@@ -245,7 +245,7 @@ def onnx_of(
     Raises:
         InputError: weights that float32 does not hold, and nodes whose graphs differ in more than numbers.
     """
-    graphs = [model_graph(node, ONNX) for node in with_one_angle(nodes)]
+    graphs = [model_graph(node, ONNX) for node in with_one_structure(nodes)]
     shapes = {}
     if derivatives:
         of = [name for name in ("scene_ray", "path_um") if name in graphs[0].outputs]
@@ -267,7 +267,7 @@ def coefficients_text(nodes: Sequence[LensModel]) -> str:
     Raises:
         InputError: a core that no file can hold.
     """
-    nodes = with_one_angle(nodes)
+    nodes = with_one_structure(nodes)
     first = nodes[0]
     data = {
         "schema": SCHEMA,
@@ -283,7 +283,7 @@ def coefficients_text(nodes: Sequence[LensModel]) -> str:
 
 def as_stored(nodes: Sequence[LensModel]) -> tuple[LensModel, ...]:
     """Return the models as their file will give them: with coefficients rounded to float32, and one angle for all."""
-    return tuple(replace(node, core=unpack(pack(node.core))) for node in with_one_angle(nodes))
+    return tuple(replace(node, core=unpack(pack(node.core))) for node in with_one_structure(nodes))
 
 
 def deflated(data: dict[str, Any]) -> str:

@@ -149,6 +149,7 @@ def test_photons_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatch: 
     beside, keep, started = tmp_path / "a.exr", tmp_path / "a.exr.flare.part", list[float]()
     plain = FlareJob(cooke(), [Light(5.0, 3.0)], Raster((36.0, 24.0), 36, 24), threads=1)
     monkeypatch.setattr(layers, "_KEEP_S", -1.0)
+    monkeypatch.setattr(layers, "_KNOWN", 1)  # six wavelengths, not thirty
     trace = PhotonTracer.trace
     monkeypatch.setattr(
         PhotonTracer, "trace", lambda self, r, nm, **k: (started.append(nm), trace(self, r, nm, **k))[1]

@@ -211,7 +211,7 @@ def test_a_cover_glass_moves_the_image_back_and_stays_out_of_the_picture() -> No
         ("thin", ("--cover-glass", "2"), "cover_glass_mm: got 2.0, expected left out"),
         ("thin", ("--cover-glass", "-1"), "from 0 to 100"),
         (str(MODEL), ("--cover-glass", "2"), "cover_glass_mm: got 2.0, expected left out"),
-        (str(SONNAR), ("--cover-glass", "6"), "expected at most 3.1"),
+        (str(SONNAR), ("--cover-glass", "6"), "expected at most 0.78"),
     ],
 )
 def test_bad_input_is_one_line(
