@@ -91,7 +91,7 @@ def focus_path(lens: Lens) -> dict[int, list[float]]:
     The last gap is the distance to the film.
 
     Raises:
-        InputError: a file without focus states.
+        InputError: a file without focus states, or a lens that diverges.
     """
     if not focus_states(lens):
         raise InputError(lens.path, "focus_mode", "internal", '"best" or "paraxial": the file has no focus states')
@@ -106,13 +106,20 @@ def focus_path(lens: Lens) -> dict[int, list[float]]:
         start = gaps_mm(lens, base)
         near = sorted(found, key=lambda c: -(c.object_distance_mm or math.inf))[-stages:]
         ends = [gaps_mm(lens, base, c) for c in near]
-        efl = paraxial.first_order(lens.with_gaps(start)).efl_mm
-        rows.append((math.log(efl), [end[k] - start[k] for end in ends for k in moved]))
+        rows.append((_log_efl(lens.with_gaps(start)), [end[k] - start[k] for end in ends for k in moved]))
     rows.sort()
-    place = math.log(paraxial.first_order(lens).efl_mm)
+    place = _log_efl(lens)
     place = min(max(place, rows[0][0]), rows[-1][0])
     flat = monotone([r[0] for r in rows], [r[1] for r in rows], place)
     return {k: [0.0, *flat[n :: len(moved)]] for n, k in enumerate(moved)}
+
+
+def _log_efl(lens: Lens) -> float:
+    efl = paraxial.first_order(lens).efl_mm
+    if not efl > 0:
+        expected = 'a focal length above 0 where groups move; focus_mode "best" moves the whole lens'
+        raise InputError(lens.path, "focal length", efl, expected)
+    return math.log(efl)
 
 
 def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = None) -> Lens:
@@ -155,7 +162,8 @@ def _rounded_up(value: float) -> float:
 def nearest_focus_m(lens: Lens) -> float:
     """Return the nearest distance from object to film that internal focusing reaches."""
     path, place = _mover(at_infinity(lens))
-    return 1 / _vergence(place(len(path[len(lens.surfaces) - 1]) - 1)) / 1000
+    nearest = _vergence(place(len(path[len(lens.surfaces) - 1]) - 1))
+    return 1 / nearest / 1000 if nearest else math.inf
 
 
 def reached_inside(lens: Lens, focus_m: float) -> bool:

@@ -419,6 +419,14 @@ def test_by_default_groups_move_where_the_file_says_how_and_the_lens_as_a_whole_
     assert focus_mode_of(tabled("laikin_double_gauss_50"), Shot.part(focus_m=2.0)) == "best"
 
 
+def test_groups_of_a_lens_that_diverges_are_refused() -> None:
+    """As a damaged file has it: the way between focus states goes by the logarithm of the focal length."""
+    lens = tabled("sony_fe_135mm_f1_8_gm")
+    turned = replace(lens, surfaces=tuple(replace(s, radius_mm=-s.radius_mm) for s in lens.surfaces))
+    with pytest.raises(InputError, match="focal length: got -.*above 0 where groups move"):
+        set_lens(turned, Shot.part(focus_m=2.0))
+
+
 # --- Breathing
 
 
