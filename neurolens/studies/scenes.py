@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError, NeurolensError, pip_install
 from neurolens.base.progress import Report
+from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera
@@ -23,7 +24,7 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.compiler import has_compiler
 from neurolens.models.model import Domain
 from neurolens.optics.analysis.plots import drawing, plain_log_ticks
-from neurolens.optics.lens.paraxial import first_order
+from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
 from neurolens.pictures.render.colour import SpectralRange
@@ -250,6 +251,17 @@ def scene_cameras(
     fitted = {name: OnnxCamera(load_model(file), real) for name, file in models.items()}
     thin, pinhole = (ideal_as(kind, exact.lens, real) for kind in ("thin:", "pinhole:"))
     return {EXACT: exact, **fitted, "thin lens": thin, "pinhole": pinhole}
+
+
+def check_focus(choice: RenderChoice, lens: Lens, domain: Domain) -> None:
+    """Raise InputError where a scene is focused at a distance that models of the domain do not reach."""
+    near, far = domain.film_z_mm
+    for path in choice.scenes:
+        focus_m = load_scene(path).settings.camera.focus_m
+        inside = min(domain.focus_m) <= focus_m <= max(domain.focus_m)
+        if not inside and not near / DOMAIN_SLACK <= film_z_mm(lens, focus_m) <= far * DOMAIN_SLACK:
+            expected = f"a focus within the domain, {min(domain.focus_m):g} m to {max(domain.focus_m):g} m"
+            raise InputError(str(path), "camera.focus_m", focus_m, expected)
 
 
 def render_all(

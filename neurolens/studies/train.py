@@ -42,7 +42,7 @@ from neurolens.studies.measure import (
 from neurolens.studies.pages import CLOSE_UM, exact_of, to_use, write_report
 from neurolens.studies.plots import illumination_plot, states_plot, trade_plot
 from neurolens.studies.rays import Illumination, pixel_um, relative_illumination
-from neurolens.studies.scenes import SETTINGS, Pictures, render_all
+from neurolens.studies.scenes import SETTINGS, Pictures, check_focus, render_all
 from neurolens.studies.speed import (
     EXACT,
     Race,
@@ -103,6 +103,7 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
     progress.plan(_plan(experiment))
     lens = experiment.lens.read()
     domain = experiment.domain.of(lens)
+    check_focus(experiment.render, lens, domain)
     for each in (models, pictures):  # late, so that an invalid lens leaves no folder
         each.mkdir(parents=True, exist_ok=True)
     settings = keep_inputs(experiment, folder)

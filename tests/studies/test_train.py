@@ -139,6 +139,7 @@ def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict
         ("render.seeds=2", "seeds"),
         ("model=[]", "model"),
         ("pairs.train=0", "pairs.train"),
+        ("domain.focus_m=[inf, 1e6]", "camera.focus_m: got .* within the domain, 1e.06 m to inf m"),
         ("lens.focal_length_mm=-3", "focal_length_mm"),
         ("domain.wavelength_nm=[700, 400]", "wavelength_nm"),
         ("nonsense=1", "nonsense"),

@@ -47,6 +47,11 @@ def test_rims_twice_too_wide_are_noticed_by_the_stop(suffix: str, tmp_path: Path
         assert a.diameter_mm == pytest.approx(b.diameter_mm, rel=1e-9)
 
 
+def test_a_comment_of_thousands_of_digits_states_no_count(tmp_path: Path) -> None:
+    found, assumed = read_text(f"# {'7' * 5000} surfaces, f/2\n" + DRAWN[".lens"](GAUSS), ".lens", tmp_path)
+    assert len(found.surfaces) == len(GAUSS.surfaces) and not any("777" in text for text in assumed)
+
+
 def test_rims_beyond_a_sphere_are_noticed_without_an_f_number(tmp_path: Path) -> None:
     wide = replace(GAUSS, surfaces=tuple(replace(s, diameter_mm=2 * s.diameter_mm) for s in GAUSS.surfaces))
     found, assumed = read_text(DRAWN[".lens"](wide), ".lens", tmp_path)

@@ -12,7 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics.analysis.breathing import breathing, field_change
 from neurolens.optics.lens.glass import LINE_D_NM
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
-from neurolens.optics.lens.prescription import Coating, Lens, Surface
+from neurolens.optics.lens.prescription import Coating, Configuration, Lens, Surface
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens, write_lens
 from neurolens.optics.setting.focusing import (
@@ -421,10 +421,11 @@ def test_by_default_groups_move_where_the_file_says_how_and_the_lens_as_a_whole_
 
 def test_groups_of_a_lens_that_diverges_are_refused() -> None:
     """As a damaged file has it: the way between focus states goes by the logarithm of the focal length."""
-    lens = tabled("sony_fe_135mm_f1_8_gm")
-    turned = replace(lens, surfaces=tuple(replace(s, radius_mm=-s.radius_mm) for s in lens.surfaces))
+    rows = Surface(-50.0, 4.0, 20.0, 1.5), Surface(math.inf, 10.0, 20.0, stop=True)
+    near = Configuration("near", None, ((1, 12.0),), object_distance_mm=900.0)
+    lens = Lens("diverging", "a test", rows, 4.0, configurations=(near,))
     with pytest.raises(InputError, match="focal length: got -.*above 0 where groups move"):
-        set_lens(turned, Shot.part(focus_m=2.0))
+        set_lens(lens, Shot.part(focus_m=2.0))
 
 
 # --- Breathing
