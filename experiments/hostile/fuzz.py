@@ -68,7 +68,7 @@ OPTIONS = (
 )
 
 
-# of a command whose --quiet was damaged, of one that assumes what is not given, and of one that says which lens words mean
+# of a command whose --quiet was damaged, of one that assumes what is not given, or says which lens some words mean
 _PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: |'.*' is )")
 
 
