@@ -68,8 +68,8 @@ OPTIONS = (
 )
 
 
-# of a command whose --quiet was damaged, and of one that assumes what is not given
-_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: )")
+# of a command whose --quiet was damaged, of one that assumes what is not given, or says which lens some words mean
+_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: |'.*' is )")
 
 
 @dataclass(frozen=True)
