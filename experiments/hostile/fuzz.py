@@ -68,8 +68,9 @@ OPTIONS = (
 )
 
 
-# of a command whose --quiet was damaged, of one that assumes what is not given, or says which lens some words mean
-_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: |'.*' is )")
+# of a command whose --quiet was damaged, and of one that assumes what is not given
+_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: )")
+_TOLD = re.compile(r"neurolens: (warning: |'.*' is )")  # a warning, or which lens some words mean
 
 
 @dataclass(frozen=True)
@@ -229,7 +230,7 @@ def _keep(place: Path, keep: Path, verdict: Verdict) -> None:
 
 def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memory: int) -> Iterator[str]:
     """The faults of how a command ended, by its exit code, its stderr and the names of its new files."""
-    lines = [line for line in said.splitlines() if not line.startswith("neurolens: warning: ")]
+    lines = [line for line in said.splitlines() if not _TOLD.match(line)]
     if code not in (0, 2) and not (code == 1 and argv[0] in _JUDGES):
         yield f"exit code {code}"
     if any(".neurolens-" in name for name in new):
