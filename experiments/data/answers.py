@@ -324,7 +324,8 @@ def speed() -> Answer:
         table,
         [("python -m experiments fused", "fused_speed.md"), ("python -m experiments gpu-day", "gpu_day.md")],
         f"Beside the tracer written by hand, a model is {short(hand[2])} times as fast at 2 refractions and "
-        f"{short(hand[33])} times at 33. Rays are complete: stop, rims, transmittance and status, in float32. Times "
+        f"{short(hand[33])} times at 33. Rays are complete: stop, rims, transmittance and status, in float32, of bare "
+        "glass: coatings, which lenses have by default since, cost both more. Times "
         "are the best of 20 rounds. " + MACHINE,
         [
             (
