@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     Shown = tuple[FloatArray, list[plans.CameraPicture]]
 
+_LEAST_S = 1e-3  # a picture's time is known no finer
 _BUDGETS = {"px": "pixels, as 0.25px", "s": "seconds, as 20s"}
 
 
@@ -174,7 +175,8 @@ def _dear(result: plans.Plan, took: float, every: bool) -> list[str]:
     if best is None or not any(result.work.rest) or took <= SHARE * best.seconds:
         return []
     why = "every camera was timed, as asked" if every else "setting up a lens takes seconds, however small the picture"
-    spent, times = (cli.number(float(f"{value:.2g}"), 3) for value in (took, took / best.seconds))
+    ratio = took / max(best.seconds, _LEAST_S)
+    spent, times = (cli.number(float(f"{value:.2g}"), 3) for value in (took, ratio))
     return [f"This plan took {spent} CPU seconds, {times} times its picture: {why}."]
 
 

@@ -37,6 +37,7 @@ _ASPECT_TOLERANCE = 0.02
 _NOTHING = "(nothing)"  # stands for a place that one of two identities lacks
 _DIGITS = 16
 _FORMAT = 4
+_MOST_S = 1e10  # of a render, all threads together: 300 years
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _BRIGHTEST = 1e37  # the largest sum of a pixel, which float32 must hold after the white balance, too
 _LONGEST = 80  # characters of a value in a message
@@ -312,9 +313,12 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
             ):  # squares of luminance are largest
                 if not (columns.min() >= -most and columns.max() <= most):
                     raise ValueError("impossible sums")
+            spent = {name: float(value) for name, value in about["spent"].items()}
+            if not all(0 <= value <= _MOST_S for value in spent.values()):
+                raise ValueError("impossible times")
             film.done[:] = done
             film.begin()
-            return {name: float(value) for name, value in about["spent"].items()}
+            return spent
     except InputError as error:
         raise InputError(path, error.field, error.value, f"{error.expected}, {_AGAIN}") from None
     except FileNotFoundError:

@@ -209,6 +209,8 @@ WRONG: dict[str, Callable[[Path], Any]] = {
     "another format": lambda p: rewritten(p, about(format=2)),
     "huge number of samples": lambda p: rewritten(p, about(samples=10**30)),
     "a time beyond floats": lambda p: rewritten(p, about(spent=dict.fromkeys(SPENT, 10**400))),
+    "a time of an age": lambda p: rewritten(p, about(spent=dict.fromkeys(SPENT, 1e308))),
+    "a time before the start": lambda p: rewritten(p, about(spent=dict.fromkeys(SPENT, -1.0))),
     "impossible time": lambda p: rewritten(p, about(spent={"seconds": float("inf")})),
 }
 
