@@ -20,7 +20,7 @@ from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.report import PART, Report
-from neurolens.base.settings import LIGHT_NM, positive, setting, wavelengths_nm
+from neurolens.base.settings import LIGHT_NM, between, positive, setting, wavelengths_nm
 from neurolens.cameras.build import near_of
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import Field, Frame, diagonal_points, field_of, frame_of, lit_points, shown_at, spectrum_of
@@ -132,7 +132,7 @@ class FieldCommand(PictureCommand):
     near: float | None = setting(
         None, "distance from the film to the nearest thing that is seen, of which is told what one centre leaves "
         "(default: the nearest that the lens focuses)",
-        kind=positive("a distance in metres"), metavar="M", common=True,
+        kind=between(1e-3, 1e6, "a distance in metres"), metavar="M", common=True,
     )  # fmt: skip
 
     def near_m(self, frame: Frame) -> float:

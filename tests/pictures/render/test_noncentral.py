@@ -191,4 +191,5 @@ def test_the_command_writes_the_table_where_one_centre_is_not_enough(
     assert len(run_json(capsys, *ideal)["files"]) == 2 and not (tmp_path / "b.noncentral.yaml").exists()
     said = failure(capsys, *words, "kannala-brandt", "--near", "0.1")
     assert "--near" in said and "the distance of the entrance pupil" in said
+    assert "a distance in metres from 0.001 to 1e+06" in failure(capsys, *words, "kannala-brandt", "--near", "1e308")
     assert "-o NAME" in failure(capsys, *words, "kannala-brandt", "--noncentral")
