@@ -40,7 +40,7 @@ _FIT, _FRESH, _BATCH, _CELLS = 12_000, 6_000, 8192, 256
 
 
 def measure_lens(file: Path) -> Row:
-    """One record: lens, terms and errors over both domains, Strehl ratios, CPU seconds.
+    """Return one record: lens, terms and errors over both domains, Strehl ratios, CPU seconds.
 
     Raises:
         InputError: a lens whose models have no path.
@@ -72,7 +72,7 @@ def _fitted(model: LensModel) -> tuple[LensModel, dict[str, float]]:
 
 
 def _strehls(model: LensModel) -> Row:
-    """Strehl ratios by the model and by traced rays, and CPU seconds of pupils and of a point spread."""
+    """Return Strehl ratios by the model and by traced rays, and CPU seconds of pupils and of a point spread."""
     widest = float(first_order(model.lens).f_number)
     places = np.array([[share * model.domain.film_radius_mm, 0.0] for share in _FIELDS])
     rows = []
@@ -106,13 +106,13 @@ def _strehl(pupil: ExitPupil) -> float:
 
 
 def _off(row: Row) -> float | None:
-    """The largest error of a Strehl ratio above `SEEN`; None without any."""
+    """Return the largest error of a Strehl ratio above `SEEN`; None without any."""
     offs = [abs(s["model"] - s["traced"]) for s in row["strehl"] if s["traced"] > SEEN]
     return max(offs, default=None)
 
 
 def page(rows: Sequence[Row]) -> str:
-    """The table, and how many lenses reach what was asked for."""
+    """Return the page: how many lenses reach each goal, and a row for each lens."""
     done = [r for r in rows if "whole" in r]
     columns = lab.columns(
         ("lens", "lens"), ("terms", "infinity.terms"), ("RMS, waves", "infinity.phase_rms_waves", ".4f"),

@@ -331,7 +331,7 @@ class Symmetric(Core):
 
 
 _CANCELLING = 50.0  # sum of the coefficients of powers, of which float32 rounds off 3e-6
-_UNSEEN = 2e-6  # a part of the transmittance that is left out of a series; as many as there are add up to 1e-5 RMS
+_UNSEEN = 2e-6  # coefficients of a series, in parts of the light, below which they are left out
 
 
 def chebyshev_rows(weight: Array) -> Array:

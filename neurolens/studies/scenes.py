@@ -253,23 +253,28 @@ def scene_cameras(
     return {EXACT: exact, **fitted, "thin lens": thin, "pinhole": pinhole}
 
 
-def check_focus(choice: RenderChoice, lens: Lens, domain: Domain) -> None:
-    """Raise InputError where a scene is focused at a distance that models of the domain do not reach."""
-    near, far = domain.film_z_mm
-    for path in choice.scenes:
-        focus_m = load_scene(path).settings.camera.focus_m
+def read_scenes(choice: RenderChoice, lens: Lens, domain: Domain) -> list[Scene]:
+    """Read the scenes of an experiment.
+
+    Raises:
+        InputError: a scene has a mistake, or is focused at a distance that models of the domain do not reach.
+    """
+    (near, far), scenes = domain.film_z_mm, [load_scene(path) for path in choice.scenes]
+    for path, scene in zip(choice.scenes, scenes, strict=True):
+        focus_m = scene.settings.camera.focus_m
         inside = min(domain.focus_m) <= focus_m <= max(domain.focus_m)
         if not inside and not near / DOMAIN_SLACK <= film_z_mm(lens, focus_m) <= far * DOMAIN_SLACK:
             expected = f"a focus within the domain, {min(domain.focus_m):g} m to {max(domain.focus_m):g} m"
             raise InputError(str(path), "camera.focus_m", focus_m, expected)
+    return scenes
 
 
 def render_all(
-    choice: RenderChoice, lens: Lens, domain: Domain, models: Mapping[str, Path], folder: Path, report: Report
-) -> Pictures:
+    choice: RenderChoice, scenes: Sequence[Scene], lens: Lens, domain: Domain, models: Mapping[str, Path],
+    folder: Path, report: Report,
+) -> Pictures:  # fmt: skip
     """Render every scene through every camera with several seeds, for the noise floor; pictures are their mean."""
     records, fused = Pictures(), choice.fused and has_compiler()
-    scenes = [load_scene(path) for path in choice.scenes]
     done, total = 0, len(scenes) * (3 + len(models)) * choice.seeds
     for scene in scenes:
         film = replace(scene.settings.film, wavelengths="one")  # so that all cameras share their random numbers

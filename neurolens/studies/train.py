@@ -42,7 +42,7 @@ from neurolens.studies.measure import (
 from neurolens.studies.pages import CLOSE_UM, exact_of, to_use, write_report
 from neurolens.studies.plots import illumination_plot, states_plot, trade_plot
 from neurolens.studies.rays import Illumination, pixel_um, relative_illumination
-from neurolens.studies.scenes import SETTINGS, Pictures, check_focus, render_all
+from neurolens.studies.scenes import SETTINGS, Pictures, read_scenes, render_all
 from neurolens.studies.speed import (
     EXACT,
     Race,
@@ -103,7 +103,7 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
     progress.plan(_plan(experiment))
     lens = experiment.lens.read()
     domain = experiment.domain.of(lens)
-    check_focus(experiment.render, lens, domain)
+    scenes = read_scenes(experiment.render, lens, domain)
     for each in (models, pictures):  # late, so that an invalid lens leaves no folder
         each.mkdir(parents=True, exist_ok=True)
     settings = keep_inputs(experiment, folder)
@@ -135,9 +135,9 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
             for name, file in shown.items()
         }
     drawn = Pictures()
-    if experiment.render.scenes:
+    if scenes:
         with progress.stage("render") as report:
-            drawn = render_all(experiment.render, lens, domain, shown, pictures, report)
+            drawn = render_all(experiment.render, scenes, lens, domain, shown, pictures, report)
     return {
         "lens": _describe_lens(lens),
         "domain": _describe_domain(lens, pairs),

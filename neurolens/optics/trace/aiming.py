@@ -154,6 +154,7 @@ def from_stop(
     h, a = height.reshape(-1), angle.reshape(-1)
     known = {float(v): sag_mm(stop, float(v), 0.0) if axis == "x" else sag_mm(stop, 0.0, float(v))
              for v in torch.unique(h)}  # fmt: skip
+    # A height that is no number, where a search has failed, is not equal to itself, and so not known.
     sag = torch.tensor([known.get(float(v), math.nan) for v in h[:: angle.shape[1]]], dtype=torch.float64)
     # The ray starts a millimetre before the stop's surface, so that it meets this too, and is refracted where it is
     # glass.

@@ -14,7 +14,7 @@ from neurolens.optics.lens.paraxial import first_order, stop_radius_mm
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.rims import RimRule, check_clearance, derive_rims, half_field_deg, narrowed_rims
-from neurolens.optics.trace.aiming import aim_at_stop, without_rims
+from neurolens.optics.trace.aiming import aim_at_stop, from_stop, without_rims
 from neurolens.optics.trace.rays import trace
 
 INF = math.inf
@@ -207,3 +207,11 @@ def test_a_field_that_no_ray_reaches_gives_the_widest_that_is() -> None:
     assert found.reached[:, 0].tolist() == [True, False]
     assert math.degrees(float(found.field_rad[0])) == pytest.approx(60.0)
     assert 88.5 < math.degrees(float(found.field_rad[1])) < 90.0
+
+
+def test_a_beam_whose_height_is_no_number_has_no_rays() -> None:
+    """As a damaged table leaves it, whose chief ray meets no stop; the other beam stays as it is."""
+    front = Lens("front", "a test", (Surface(50.0, 5.0, 20.0, 1.5), Surface(math.inf, 10.0, 20.0, stop=True)), 4.0)
+    heights, angles = (torch.tensor([[a], [b]], dtype=torch.float64) for a, b in ((math.nan, 1.0), (0.0, 0.0)))
+    exists = from_stop(front, heights, angles, "y", 587.56)[2]
+    assert exists.tolist() == [[False], [True]]
