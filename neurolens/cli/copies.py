@@ -77,7 +77,7 @@ examples:
         from neurolens.models.copied import Perturbed, copy_of
         from neurolens.models.export import export_onnx
         from neurolens.models.file import as_stored, read_model
-        from neurolens.models.perturbations import card_errors, copy_errors, with_perturbations
+        from neurolens.models.perturbations import copy_errors, with_perturbations, with_reach
 
         stored = read_model(self.file)
         if stored.axes:
@@ -89,8 +89,8 @@ examples:
             ready = model
             if not isinstance(model.core, Perturbed):
                 (ready,) = as_stored([with_perturbations(model, limits)])
-                errors = stored.card["errors"] | {"copies": card_errors(ready, limits)}
-                export_onnx(ready, self.out / f"{stem}-copies.onnx", errors)
+                ready, errors = with_reach(ready, limits)
+                export_onnx(ready, self.out / f"{stem}-copies.onnx", stored.card["errors"] | {"copies": errors})
             for n, (off, exact) in enumerate(draws_of(lens, limits, self.number, self.seed), 1):
                 copy = copy_of(ready, off, copy_name(lens, n))
                 yield export_onnx(copy, self._path(stem, n, ".onnx"), copy_errors(ready, copy, exact))

@@ -207,9 +207,13 @@ def state_graph(axes: Sequence[Axis]) -> tuple[Graph, Array]:
 
 def mixture_of(axes: Sequence[Axis]) -> Mixture:
     """Return how a program with a table for each node follows the state; its numbers are arguments (`state_names`)."""
-    graph, transform = state_graph(axes)
+    return mixture(*state_graph(axes), state_names(axes))
+
+
+def mixture(graph: Graph, transform: Array, names: Iterable[str]) -> Mixture:
+    """Return the mixture of the graph of a state, whose numbers are arguments of these names."""
     g = Graph()
-    g.outputs = g.inline(graph, {STATE: g.concat(*(g.input(name, per_call=True) for name in state_names(axes)))})
+    g.outputs = g.inline(graph, {STATE: g.concat(*(g.input(name, per_call=True) for name in names))})
     return Mixture(lower(g), transform)
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Self
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Exponents, Graph, Value
+from neurolens.models.axes import STATE
 from neurolens.models.cores import (
     ROUND,
     Array,
@@ -35,7 +36,7 @@ from neurolens.models.cores import (
     without_w,
 )
 from neurolens.models.model import LensModel
-from neurolens.optics.setting.copies import Off
+from neurolens.optics.setting.copies import Off, figure_names
 
 FORMS = 5  # I, p p', p u', u p', u u'
 
@@ -119,6 +120,7 @@ class Perturbed(Composite):
         exponents: [K, 4] its terms, and others below them.
         bends, leans: [V, 3, 5, K] and [V, G, 2, K] what each vector across the axis makes of f and h.
         ab, scalars: [P, 3, 2, K] and [P, 1 + G, K] what each figure that leaves the lens round adds to the polynomial.
+        limits: [F] how far each of `Off.figures` may be off where it is an input of exported files; 0 where it is none.
     """
 
     parts: tuple[InvariantPolynomial]
@@ -127,6 +129,7 @@ class Perturbed(Composite):
     leans: Array
     ab: Array
     scalars: Array
+    limits: Array
 
     def __post_init__(self) -> None:
         base = self.parts[0]
@@ -194,3 +197,35 @@ def copy_of(model: LensModel, off: Off, name: str = "") -> LensModel:
     named = replace(lens, name=name or f"{lens.name}, a copy")
     settings = {**model.settings, "copy": named.name}
     return replace(model, core=core.copy(off.vectors, off.scalars), lens=named, settings=settings)
+
+
+def copy_inputs(model: LensModel) -> dict[str, float]:
+    """Return what is off in a copy, as inputs of an exported model: names in their order, and how far each may be off.
+
+    None but models whose core is `Perturbed` have any.
+    """
+    if not isinstance(model.core, Perturbed):
+        return {}
+    pairs = zip(figure_names(model.lens), model.core.limits.tolist(), strict=True)
+    return {name: limit for name, limit in pairs if limit}
+
+
+def copy_nodes(model: LensModel) -> tuple[list[LensModel], Graph, Array]:
+    """Return models of one structure that are mixed into any copy, and how, as `axes.state_graph` does for a zoom.
+
+    A copy is a linear function of what is off. The first node has every figure at its limit, so that no coefficient is
+    0 that may be other than 0 in a copy; each of the others has one figure off by twice its limit.
+    """
+    core, inputs = model.core, copy_inputs(model)
+    assert isinstance(core, Perturbed) and inputs
+    limits, places = core.limits, np.flatnonzero(core.limits)
+    offs = [Off.of(model.lens, limits + each) for each in (0 * limits, *np.diag(limits)[places])]
+    nodes = [replace(model, core=core.copy(off.vectors, off.scalars)) for off in offs]
+    g, reach = Graph(), np.array(list(inputs.values()))
+    state = g.input(STATE, len(reach), per_call=True)
+    within = state.between(-reach, reach)
+    inside = reduce(lambda a, b: a & b, (within[k] for k in range(len(reach))))
+    g.outputs = {"features": g.concat(g.constant(1.0), state * (1 / reach) - 1.0), "inside": inside}
+    transform = np.eye(len(nodes))
+    transform[1:, 0] = -1
+    return nodes, g, transform

@@ -24,6 +24,7 @@ from neurolens.graph.onnx import write_onnx
 from neurolens.models.assemble import ONNX
 from neurolens.models.axes import STATE
 from neurolens.models.card import CARD_KEY, CARD_KIND, CARD_SCHEMA, MODEL_KEY, POLARISED, card_to_json
+from neurolens.models.copied import copy_inputs
 from neurolens.models.file import as_stored, coefficients_text, onnx_of
 from neurolens.models.inverse import (
     STEPS,
@@ -186,13 +187,13 @@ def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
 def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
     """Return the card of a model, JSON-able; `errors` are those on held-out rays, as the evaluation gives them."""
     stop, stopped = st.blocked(model.lens.stop_index, st.RIM), f"blocked by the stop, surface {model.lens.stop_index}"
-    phase = card_entry(model.core)
+    phase, copies = card_entry(model.core), copy_inputs(model)
     codes = {st.PASSED, st.OUTSIDE_DOMAIN, stop, *(g.status for g in model.gates)}
     return {
         "kind": CARD_KIND,
         "schema": CARD_SCHEMA,
         "lens": lens_facts(model.lens, model.domain),
-        "units": UNITS | ({"path_um": "um, see phase"} if phase else {}),
+        "units": UNITS | ({"path_um": "um, see phase"} if phase else {}) | ({STATE: list(copies)} if copies else {}),
         "transmittance": POLARISED,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
@@ -208,6 +209,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
             "seconds": model.fit_s,
         },
         **phase,
+        **({"copies": copies} if copies else {}),
         "errors": errors,
         "reference": reference_rays(model),
         "versions": {

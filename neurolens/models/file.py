@@ -38,7 +38,7 @@ from neurolens.models.card import (
     default_state,
     read_metadata,
 )  # fmt: skip
-from neurolens.models.copied import Copied as Copied  # the cores of copies, which files may hold
+from neurolens.models.copied import copy_inputs, copy_nodes
 from neurolens.models.cores import CORES, Core
 from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_structure
 from neurolens.optics.lens.figures import figure_of
@@ -245,6 +245,9 @@ def onnx_of(
     Raises:
         InputError: weights that float32 does not hold, and nodes whose graphs differ in more than numbers.
     """
+    state = state_graph(axes) if axes else None
+    if copy_inputs(nodes[0]):
+        nodes, *state = copy_nodes(nodes[0])  # type: ignore[assignment]
     graphs = [model_graph(node, ONNX) for node in with_one_structure(nodes)]
     shapes = {}
     if derivatives:
@@ -253,9 +256,9 @@ def onnx_of(
         for g, name, (by, rows) in product(graphs, of, DERIVATIVES.items()):
             g.outputs[f"{name}_d_{by}"] = g.concat(*(g.outputs.pop(derivative(name, row)) for row in rows))
         shapes = {f"scene_ray_d_{by}": (2, 6) for by in DERIVATIVES}
-    if not axes:
+    if state is None:
         return write_onnx(graphs, metadata or {}, shapes=shapes)
-    g, transform = state_graph(axes)
+    g, transform = state
     film_z = g.input("film_z_mm", per_call=True)
     g.outputs["film_z_mm"] = g.select(g.outputs.pop("inside"), film_z, _NOWHERE)
     return write_onnx(graphs, metadata or {}, Mixing(g, transform), shapes)

@@ -160,6 +160,7 @@ def with_perturbations(model: LensModel, limits: Tolerances | None = None) -> Le
     with pinned_threads(), torch.no_grad():
         rays, near = _rays(model)
         bent, turned = steps_of(model.lens, limits or Tolerances())
+        reach = [s.limit for s in bent for _ in "xy"] + [s.limit * bool(s.step) for s in turned]
         both = FilmRays(*(torch.cat(c) for c in zip(rays.columns(), near.inputs.columns(), strict=True)))
         vectors, scalars = (derivatives(model, steps, both) for steps in (bent, turned))
         fit = _Fit(model, core, both, len(rays), near, vectors.whole & scalars.whole)
@@ -167,7 +168,7 @@ def with_perturbations(model: LensModel, limits: Tolerances | None = None) -> Le
         ab, rows = fit.along(scalars, _deviations(turned))
     more = [(0, len(exponents) - len(core.exponents))]
     ab, rows = (np.pad(a, [(0, 0)] * (a.ndim - 1) + more) for a in (ab, rows))
-    return replace(model, core=Perturbed((core,), exponents, bends, leans, ab, rows))
+    return replace(model, core=Perturbed((core,), exponents, bends, leans, ab, rows, np.array(reach)))
 
 
 def _deviations(steps: Sequence[_Step]) -> Tensor:
@@ -335,11 +336,12 @@ def copy_errors(model: LensModel, copy: LensModel, lens: Lens) -> dict[str, floa
     }
 
 
-def card_errors(model: LensModel, limits: Tolerances) -> dict[str, float]:
-    """Return what a card says of copies: the worst errors of some copies within the limits, and how far they hold.
+def with_reach(model: LensModel, limits: Tolerances) -> tuple[LensModel, dict[str, float]]:
+    """Return a model whose inputs go as far as its copies hold, and what its card says of them.
 
-    Up to `decentre_mm` and `tilt_deg` together, and up to `others` times the other limits, at most `LEFT` of what
-    copies change is wrong, in the root mean square over copies.
+    That is the worst errors of some copies within the limits, and how far copies hold: up to `decentre_mm` and
+    `tilt_deg` together, and up to `others` times the other limits, at most `LEFT` of what copies change is wrong, in
+    the root mean square over copies.
     """
     across = Tolerances(limits.decentre_mm, limits.tilt_deg, 0, 0, 0, 0)
     along = replace(limits, decentre_mm=0, tilt_deg=0)
@@ -362,6 +364,9 @@ def card_errors(model: LensModel, limits: Tolerances) -> dict[str, float]:
             reach = times
         return reach
 
-    times, rows = holds(across), errors(limits, 1)
-    within = {"decentre_mm": times * limits.decentre_mm, "tilt_deg": times * limits.tilt_deg, "others": holds(along)}
-    return {name: max(row[name] for row in rows) for name in rows[0]} | within
+    times, others, rows, core = holds(across), holds(along), errors(limits, 1), model.core
+    assert isinstance(core, Perturbed)
+    factors = np.where(np.arange(len(core.limits)) < 2 * len(core.bends), times, others)
+    within = {"decentre_mm": times * limits.decentre_mm, "tilt_deg": times * limits.tilt_deg, "others": others}
+    found = {name: max(row[name] for row in rows) for name in rows[0]} | within
+    return replace(model, core=replace(core, limits=factors * core.limits)), found

@@ -33,8 +33,9 @@ from neurolens.graph.program import (
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import LANGUAGES, write_shading
 from neurolens.models.assemble import ALL, SCALARS, Parts, model_graph
-from neurolens.models.axes import mixture_of, state_names
+from neurolens.models.axes import mixture, mixture_of, state_names
 from neurolens.models.card import axes_of
+from neurolens.models.copied import copy_inputs, copy_nodes
 from neurolens.models.model import Domain, LensModel, with_one_structure
 from neurolens.optics.lens.glass import inverse_square_um
 
@@ -173,7 +174,7 @@ def export_source(
     """
     model, axes = models[0], axes_of(card)
     function_name = checked_name(language, model.lens.lens_id, name)
-    program = fused_program(models, parts, fix)
+    program = copies_program(models, parts, fix) if copy_inputs(model) else fused_program(models, parts, fix)
     if axes:
         program.mixture = mixture_of(axes)
     waves = [m.domain.wavelength_nm for m in ([model] if axes else models)]
@@ -227,6 +228,22 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     return lower(graphs, constants)
 
 
+def copies_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FREE) -> Program:
+    """Write the program of a model with derivatives by what is off in copies, which are arguments (`copy_inputs`).
+
+    Raises:
+        InputError: as `fused_program`; models of several wavelengths.
+    """
+    if len(models) > 1:
+        raise InputError(
+            "fix", "wavelengths", len(models), "one at most, for what is off in a copy is an argument, too"
+        )
+    nodes, graph, transform = copy_nodes(models[0])
+    program = fused_program(nodes, parts, fix)
+    program.mixture = mixture(graph, transform, copy_inputs(models[0]))
+    return program
+
+
 def identifier(text: str) -> str:
     """Make the name of a function from any text."""
     word = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:80]
@@ -256,6 +273,13 @@ def comment_of(
         lines.append(
             f"Argument state: NAME_at({', '.join(names)}) makes it, once for all rays of a state; zoom_mm is the focal "
             "length at infinity focus, focus_per_m is 1 / (distance from film to object in m), 0 at infinity."
+        )
+    if copies := card.get("copies"):
+        lines.append(
+            "Argument state: NAME_at makes it of what is off in a copy of the lens, once for all its rays; of "
+            "the lens itself all are 0. NAME_at takes, with their limits: "
+            + ", ".join(f"{name} {limit:.4g}" for name, limit in copies.items())
+            + "."
         )
     if len(waves) > 1:
         bands = ", ".join(f"{k}: {w[0]:g} nm" for k, w in enumerate(waves))

@@ -29,7 +29,7 @@ from neurolens.base.records import ExactRecord, Timing, break_even_rays
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.cameras.model import OnnxLens, load_model
-from neurolens.graph.c import Signature, in_double, write_blocks, write_c, write_double
+from neurolens.graph.c import Signature, in_double, literal, write_blocks, write_c, write_double
 from neurolens.graph.compiler import FLAGS, compile_c, has_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
@@ -296,21 +296,24 @@ class CompiledSource:
 
     Args:
         double: whether it computes in double precision, which is not for programs with lookups.
+        state: of a program with a mixture, its numbers.
 
     Raises:
         Unavailable: there is no compiler, or it fails; the message says how.
     """
 
-    def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS, double: bool = False) -> None:
+    def __init__(
+        self, program: Program, flags: tuple[str, ...] = FLAGS, double: bool = False, state: Sequence[float] = ()
+    ) -> None:
         self.signature, self._real = Signature.of(program, "lens"), np.float64 if double else np.float32
         self._folder = TemporaryFolder()
         library = Path(self._folder.name) / "lens.so"
         blocks = bool(program.own_tables)  # functions with lookups: loops over arrays do these apart
         if double:
-            text = write_double(program, "lens", ["A timed model."]) + in_double(self._wrapper(False))
+            text = write_double(program, "lens", ["A timed model."]) + in_double(self._wrapper(False, state))
         else:
             text = write_blocks(program, "lens") if blocks else write_c(program, "lens", ["A timed model."])
-            text += self._wrapper(blocks)
+            text += self._wrapper(blocks, state)
         try:
             self.warnings = compile_c(text, library, flags)
         except InputError as error:
@@ -318,7 +321,7 @@ class CompiledSource:
         self._run = ctypes.CDLL(str(library)).neurolens_run
         self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
 
-    def _wrapper(self, blocks: bool) -> str:
+    def _wrapper(self, blocks: bool, state: Sequence[float]) -> str:
         """Write a function that takes all arguments as one array of pointers, for ctypes is slow for each argument."""
         s = self.signature
         if blocks:
@@ -329,8 +332,12 @@ class CompiledSource:
             return f"void neurolens_run(size_t n, void **a) {{ {body} }}\n"
         kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
         kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
-        given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
-        return f"void neurolens_run(size_t n, void **a) {{ lens_rays(n, {given}); }}\n"
+        arguments, made = [kind.format(i) for i, kind in enumerate(kinds)], ""
+        if s.state:
+            arguments.insert(len(s.inputs), "&state")
+            numbers = ", ".join(literal(v) for v in state)
+            made = f"static lens_state state; if (!state.inside) state = lens_at({numbers}); "  # once
+        return f"void neurolens_run(size_t n, void **a) {{ {made}lens_rays(n, {', '.join(arguments)}); }}\n"
 
     def outputs(self, count: int) -> dict[str, NDArray[Any]]:
         """Return arrays for the results of `count` rays."""

@@ -4,8 +4,10 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 
@@ -13,15 +15,16 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.models import perturbations
-from neurolens.models.copied import Copied, Perturbed, copy_of
+from neurolens.models.copied import Copied, Perturbed, copy_inputs, copy_of
 from neurolens.models.cores import DIRECTION, STOP
+from neurolens.models.export import export_onnx
 from neurolens.models.file import as_stored, read_model
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import FilmRays, draw
 from neurolens.models.perturbations import copy_errors, derivatives, exact_answers, steps_of, with_perturbations
-from neurolens.models.source import at_wavelength, fused_program
+from neurolens.models.source import at_wavelength, copies_program, fused_program
 from neurolens.models.targets import film_equivalent
-from neurolens.optics.setting.copies import Off, Tolerances, draws_of, perturbed
+from neurolens.optics.setting.copies import Off, Tolerances, draws_of, figure_names, perturbed
 from neurolens.studies.speed import CompiledSource
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -170,6 +173,41 @@ def test_a_copy_in_every_form(model: LensModel, rays: FilmRays, drawn: Off) -> N
         np.testing.assert_allclose(found[name], row, atol=2e-6)
 
 
+def test_what_is_off_is_an_input(model: LensModel, rays: FilmRays, drawn: Off, tmp_path: Path) -> None:
+    """C and ONNX of one file make the copy of `copy_of`, and the lens itself; beyond a limit no ray passes."""
+    (model,) = as_stored([model])
+    assert isinstance(model.core, Perturbed)
+    inputs, limits = copy_inputs(model), model.core.limits
+    assert len(inputs) == 51 and inputs["decentre_y_mm_s02"] == pytest.approx(0.02)
+    assert "radius_percent_s05" not in inputs and "thickness_mm_s12" not in inputs  # the stop, and the film's place
+    names = figure_names(model.lens)
+    moved = replace(Off.none(model.lens), tilt_deg=np.eye(5, 2, -3) * [1, 0])
+    assert moved.figures[names.index("tilt_x_deg_s09")] == 1 and moved.figures.sum() == 1
+    assert np.array_equal(Off.of(model.lens, drawn.figures).figures, drawn.figures)
+    rows, stop, z = rays.rows.numpy().astype(np.float32), model.domain.stop_radius_mm, float(rays.film_z[0])
+    columns: dict[str, Any] = dict(
+        zip(("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm"), rows, strict=True)
+    ) | {"film_z_mm": z, "stop_radius_mm": stop}
+    file = export_onnx(model, tmp_path / "copies.onnx")
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    for off in (drawn, Off.none(model.lens)):
+        wanted = copy_of(model, off).predict(replace(rays, film_z=torch.full_like(rays.film_z, z)))
+        passed, state = (wanted.status == 0).numpy(), off.figures[limits != 0].astype(np.float32)
+        program = CompiledSource(copies_program([model]), state=state.tolist()).rays(columns)
+        call = {"rays": rows, "film_z_mm": [z], "stop_radius_mm": [stop], "state": state}
+        ray, _, crossing, status = session.run(None, {k: np.asarray(v, np.float32) for k, v in call.items()})
+        assert (program["status"] != wanted.status.numpy()).sum() <= 2 and (status != wanted.status.numpy()).sum() <= 2
+        for k, name in ((0, "x_mm"), (1, "y_mm"), (3, "dx"), (4, "dy")):
+            for found in (program[name], ray[k]):
+                np.testing.assert_allclose(found[passed], wanted.rays[k][passed], atol=2e-5 if k < 3 else 2e-6)
+        np.testing.assert_allclose(crossing[0, passed], wanted.stop_x[passed], atol=2e-5)
+    state[0] = 1.01 * limits[0]
+    call["state"] = state
+    assert set(session.run(["status"], {k: np.asarray(v, np.float32) for k, v in call.items()})[0]) == {1}
+    with pytest.raises(InputError, match="one at most"):
+        copies_program([model, model])
+
+
 def test_the_command_writes_models_of_copies(
     model: LensModel, rays: FilmRays, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -184,6 +222,11 @@ def test_the_command_writes_models_of_copies(
     ready = tmp_path / "a" / "laikin_double_gauss_50.ols-60-copies.onnx"
     errors = read_model(ready).card["errors"]
     assert errors["copies"]["decentre_mm"] == 5 * 0.02 and errors["copies"]["change_error_um"] < 1
+    assert read_model(ready).card["copies"]["decentre_x_mm_s00"] == pytest.approx(5 * 0.02)
+    assert main(["export", str(ready), "--to", "glsl", "-o", str(tmp_path / "a.glsl")]) == 0
+    text = (tmp_path / "a.glsl").read_text()
+    assert "_state laikin_double_gauss_50_at(float decentre_x_mm_s00, float decentre_y_mm_s00, " in text
+    assert "radius_percent_s12 0.5" in " ".join(text.replace("*", " ").split())
     assert main([*words[:1], str(ready), *words[2:], str(tmp_path / "b")]) == 0
     (copy,), (again,) = ([p for p in (tmp_path / f).glob("*-001.onnx")] for f in "ab")
     first, second = read_model(copy), read_model(again)

@@ -88,6 +88,18 @@ class Off:
         elements, surfaces = len(elements_of(lens)), len(lens.surfaces)
         return Off(*(np.zeros((elements, 2)) for _ in range(2)), *(np.zeros(surfaces) for _ in range(3)))
 
+    @staticmethod
+    def of(lens: Lens, figures: Array) -> Off:
+        """Return the differences of a list of all figures, in the order of `figure_names`."""
+        none = Off.none(lens)
+        parts = np.split(figures, np.cumsum([v.size for v in vars(none).values()])[:-1])
+        return Off(*(part.reshape(v.shape) for part, v in zip(parts, vars(none).values(), strict=True)))
+
+    @property
+    def figures(self) -> Array:
+        """Return [4 E + 3 S] all figures, in the order of `figure_names`."""
+        return np.concatenate([v.reshape(-1) for v in vars(self).values()])
+
     @property
     def vectors(self) -> Array:
         """Return [2 E, 2] vectors across the axis: the decentres (mm), then where the elements' axes lean (degrees).
@@ -100,6 +112,21 @@ class Off:
     def scalars(self) -> Array:
         """Return [3 S] figures that leave the lens round: thicknesses (mm), radii (percent), indices."""
         return np.concatenate([self.thickness_mm, self.radius_percent, self.index])
+
+
+def figure_names(lens: Lens) -> list[str]:
+    """Return the names of `Off.figures`: `decentre_x_mm_s03` is of the element whose first surface is number 3."""
+    firsts = [element[0] for element in elements_of(lens)]
+    across = (
+        f"{w}_{axis}_{unit}_s{k:02}"
+        for w, unit in (("decentre", "mm"), ("tilt", "deg"))
+        for k in firsts
+        for axis in "xy"
+    )
+    along = (
+        f"{what}_s{k:02}" for what in ("thickness_mm", "radius_percent", "index") for k in range(len(lens.surfaces))
+    )
+    return [*across, *along]
 
 
 def copies_of(lens: Lens, tolerances: Tolerances, number: int, seed: int) -> Iterator[Lens]:
