@@ -230,9 +230,9 @@ Kind = Literal["rays", "differentials", "hero", "companion"]
 # Takes film points, pupil squares [2, N] and wavelengths [1, N], by name, to what `camera_rays` takes.
 GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 
-# Cameras of more steps are not compiled. The largest camera of a model that ships has 2900; gcc 12 takes 48 s for 7100,
-# and its time grows faster than their number.
-MAX_STEPS = 12_000
+# Programs of more steps are not compiled. gcc 12 takes 48 s for 7100 steps in one loop, and its time grows faster than
+# their number; in parts (`PartWriter`) 20 s for 18,000: the gradients of an exact lens of 56 refractions.
+MAX_STEPS, MAX_STEPS_IN_PARTS = 12_000, 24_000
 _SAMPLES = 4096  # rays that derivatives of low order are fitted to
 _EDGES = (1e-4, 1e-3, 3e-3, 1e-2)  # distances from the square's edge of what counts as the pupil's edge
 _EDGE_RAYS = 2**16  # rays that find where light crosses the front surface
@@ -559,8 +559,9 @@ class CompiledProgram:
         self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray,
         told: Callable[[str], None] | None = None,
     ) -> None:  # fmt: skip
-        if len(program.steps) > MAX_STEPS:
-            raise InputError("compiled camera", "steps", len(program.steps), f"up to {MAX_STEPS} for a compiler")
+        most = MAX_STEPS_IN_PARTS if program.waits() else MAX_STEPS
+        if len(program.steps) > most:
+            raise InputError("compiled camera", "steps", len(program.steps), f"up to {most} for a compiler")
         self._rows = {name: (count, np.int32 if name == "status" else np.float32) for name, count in rows.items()}
         self._signature = s = Signature.of(program, "camera")
         self._numbers, self._table = np.array([numbers[name] for name in s.per_call], np.float32), table

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from neurolens.graph.program import Argument, Mixture, Program, Step
 
 BLOCK = 256  # rays in a block
-PART, ROWS = 28, 128  # steps of a part, and rays that it does at a time: its numbers stay in the first cache
+PART, ROWS = 56, 128  # steps of a part, and rays that it does at a time: its numbers stay in the first cache
+MOST_WAITING = 512  # numbers that wait between parts; where more do, half as many rays keep them in the second cache
 _DOUBLE = ContextVar("_DOUBLE", default=False)  # whether literals are those of double precision
 
 
@@ -245,8 +246,9 @@ class PartWriter(Writer):
                 lines.append(f"waiting[{self.row[k]}][i] = t{k};")
             written.append(self._function(number, lines, made))
         calls = "\n".join(call for _, call in written)
-        loop = part("parts.h", "in_parts", macro=self.macro, rows=max(1, rows), block=ROWS, calls=calls)
-        return "".join(text for text, _ in written), loop
+        loop = part("parts.h", "in_parts", macro=self.macro, rows=max(1, rows), calls=calls)
+        block = f"#define {self.macro}_ROWS {ROWS if rows <= MOST_WAITING else ROWS // 2}\n"
+        return block + "".join(text for text, _ in written), loop
 
     def _function(self, number: int, lines: Sequence[str], made: Sequence[str]) -> tuple[str, str]:
         """Write the function of one part, and its call."""
@@ -258,7 +260,7 @@ class PartWriter(Writer):
         rays, numbers = ([i for i in names if i in words] for names in (s.per_ray, s.per_call))
         arguments = [
             "size_t number",
-            f"float ({pointer} waiting)[{ROWS}]",
+            f"float ({pointer} waiting)[{self.macro}_ROWS]",
             *(f"const float {pointer} {i}" for i in rays),
         ]
         arguments += [f"float {i}" for i in numbers]

@@ -180,8 +180,8 @@ ${lines}
     }
 }
 //// in_parts
-    ${macro}_ALIGNED float waiting[${rows}][${block}];
-    for (size_t at = 0; at < count; at += ${block}) {
-        const size_t number = count - at < ${block} ? count - at : ${block};
+    ${macro}_ALIGNED float waiting[${rows}][${macro}_ROWS];
+    for (size_t at = 0; at < count; at += ${macro}_ROWS) {
+        const size_t number = count - at < ${macro}_ROWS ? count - at : ${macro}_ROWS;
 ${calls}
     }

@@ -172,7 +172,8 @@ class Program:
         mixture: mixes the tables by a state; without it `band` chooses one. Numbers that differ between tables that are
             mixed may be folded into sums alone.
         own_tables: numbers [cells, columns] that lookups read and that no caller gives, by name.
-        tanhs: steps that are the tanh of another step, and that step: their slope is known (`adjoint`).
+        functions: steps that are a function of one other step whose slope is known (`adjoint`): that step, and the
+            coefficients of a series, or none for tanh.
     """
 
     tables: int = 1
@@ -180,7 +181,7 @@ class Program:
     outputs: dict[str, Expr] = field(default_factory=dict)
     mixture: Mixture | None = None
     own_tables: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    tanhs: dict[int, int] = field(default_factory=dict)
+    functions: dict[int, tuple[int, tuple[float, ...]]] = field(default_factory=dict)
     _known: dict[Step, int] = field(default_factory=dict)
 
     def input(self, name: str, per_call: bool = False) -> Expr:
@@ -232,9 +233,7 @@ class Program:
         x = self.op("clamp", value, TANH_LIMIT)
         t = x * x
         found = x * self.horner(t, TANH_NUMERATOR) / self.horner(t, TANH_DENOMINATOR)
-        if isinstance(found.argument, int) and isinstance(value.argument, int):
-            self.tanhs[found.argument] = value.argument
-        return found
+        return self._function(found, value)
 
     def select(self, a: Number, b: Number, then: Number, otherwise: Number) -> Expr:
         """`then` where a <= b, else `otherwise`, which NaN chooses too."""
@@ -242,9 +241,17 @@ class Program:
 
     def horner(self, t: Expr, coefficients: Sequence[Number]) -> Expr:
         """Return a polynomial in t, lowest coefficient first."""
-        value = self.expr(coefficients[-1])
-        for c in reversed(coefficients[:-1]):
+        terms = [self.expr(c) for c in coefficients]
+        value = terms[-1]
+        for c in reversed(terms[:-1]):
             value = self.fma(value, t, c)
+        if self.tables == 1 and all(c.literal for c in terms):
+            return self._function(value, t, tuple(c.literal[0] for c in terms if c.literal))
+        return value
+
+    def _function(self, value: Expr, of: Expr, series: tuple[float, ...] = ()) -> Expr:
+        if isinstance(value.argument, int) and isinstance(of.argument, int):
+            self.functions[value.argument] = of.argument, series
         return value
 
     def _append(self, step: Step) -> Expr:
@@ -402,8 +409,9 @@ class Program:
             other = rule(k, step, given) if rule else None
             place[k] = other or found._append(replace(step, arguments=tuple(e.argument for e in given)))
         found.outputs = {name: moved(e.argument) for name, e in self.outputs.items()}
-        pairs = ((place[k].argument, place[a].argument) for k, a in self.tanhs.items() if k in place and a in place)
-        found.tanhs = {k: a for k, a in pairs if isinstance(k, int) and isinstance(a, int)}
+        for k, (a, series) in self.functions.items():
+            if k in place and a in place:
+                found._function(place[k], place[a], series)
         return found
 
     def _sums(self, least: int) -> dict[int, tuple[int, int]]:

@@ -225,7 +225,7 @@ class _Lens:
         self._tables = {"outline": camera.film.outline.table}
         if lens.aperture is not None and lens.aperture.mask is not None:
             self._tables["mask"] = lens.aperture.table
-        self.program = lower(graph)
+        self.program, self._backwards = lower(graph), dict[bool, Run]()
 
     def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
         """Origins and directions [3, N], weights and status [N] of rays; film and square are [N, 2], light is [N]."""
@@ -233,28 +233,36 @@ class _Lens:
             points, places = (np.ascontiguousarray(t.numpy().T) for t in (film, square))
             rays = self.camera.sample(points, places, np.ascontiguousarray(light.numpy()))
             return tuple(map(torch.from_numpy, (rays.origin_m, rays.direction, rays.weight, rays.status)))
-        found = self._forward(torch.stack([*film.T, *square.T, light]))
+        found = self.forward(torch.stack([*film.T, *square.T, light]))
         ray, weight, status = found[:6], found[6], found[7].int()
         passed, ahead = status == st.PASSED, film.new_tensor([[0], [0], [-1]])
         return torch.where(passed, ray[:3], 0.0), torch.where(passed, ray[3:], ahead), weight, status
 
-    def gradients(self, film: Tensor, square: Tensor, light: Tensor, outer: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """A number's gradients [N, 2], [N, 2], [N] by the inputs of `outputs`, from its gradients by the results."""
-        by = self._backward(torch.stack([*film.T, *square.T, light, *outer[0], *outer[1], outer[2]]))
-        return by[0:2].T, by[2:4].T, by[4]
+    def gradients(
+        self, film: Tensor, square: Tensor, light: Tensor, outer: Sequence[Tensor], by_light: bool = True
+    ) -> tuple[Tensor | None, ...]:
+        """A number's gradients [N, 2], [N, 2], [N] by the inputs of `outputs`, from its gradients by the results.
+
+        Those by the wavelength are None unless `by_light`: glasses and coatings have as many steps as the ray itself.
+        """
+        by = self.backward(by_light)(torch.stack([*film.T, *square.T, light, *outer[0], *outer[1], outer[2]]))
+        return by[0:2].T, by[2:4].T, by[4] if by_light else None
 
     @cached_property
-    def _forward(self) -> Run:
+    def forward(self) -> Run:
+        """The rays of rows [5, N] of what is given."""
         return self._run(self.program, _GIVEN)
 
-    @cached_property
-    def _backward(self) -> Run:
-        return self._run(self.adjoint, (*_GIVEN, *(f"{OUTER}{name}" for name in _FOUND)))
+    def backward(self, by_light: bool) -> Run:
+        """The gradients of rows [12, N]: what is given, and gradients by what is found."""
+        if by_light not in self._backwards:
+            program = self.adjoint(by_light)
+            self._backwards[by_light] = self._run(program, (*_GIVEN, *(f"{OUTER}{name}" for name in _FOUND)))
+        return self._backwards[by_light]
 
-    @cached_property
-    def adjoint(self) -> Program:
-        """The program of the gradients."""
-        return adjoint(self.program, _FOUND, _GIVEN)
+    def adjoint(self, by_light: bool) -> Program:
+        """The program of the gradients by what is given, with or without the wavelength."""
+        return adjoint(self.program, _FOUND, _GIVEN if by_light else _GIVEN[:-1])
 
     def _run(self, program: Program, rows: Sequence[str]) -> Run:
         """A program as a function of rows [R, N] of these names: a kernel on a GPU, C on the CPU, else in torch."""
@@ -328,7 +336,7 @@ class _Rays(torch.autograd.Function):
         slopes, outer = ctx.saved_tensors[4:], outer[:3]
         wanted: tuple[Tensor | None, ...] = (None, None, None)
         if any(ctx.needs_input_grad[2:5]):
-            wanted = ctx.lens.gradients(*given, outer)
+            wanted = ctx.lens.gradients(*given, outer, by_light=ctx.needs_input_grad[4])
         passed = status == st.PASSED
         pairs = zip(slopes, outer * (len(slopes) // 3), strict=True)
         totals = [torch.where(passed, by * o, 0.0).sum().double().cpu() for by, o in pairs]

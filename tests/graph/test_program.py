@@ -75,7 +75,7 @@ def test_a_program_that_waits_does_its_rays_in_parts(tmp_path: Path) -> None:
         assert {a for a in p.steps[k].arguments if isinstance(a, int)} <= made
         made.add(k)
     text = write_c(p, "f", [])
-    assert "f_part_3(number, waiting" in text and "f_part_0" not in write_c(program(), "f", [])
+    assert "f_part_1(number, waiting" in text and "f_part_0" not in write_c(program(), "f", [])
     if not has_compiler():
         pytest.skip("there is no C compiler")
     compile_c(text + _PARTS_CALL, tmp_path / "f.so")
