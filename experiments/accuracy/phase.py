@@ -27,7 +27,7 @@ from neurolens.models.model import LensModel
 from neurolens.models.pairs import passing_rays
 from neurolens.models.phase import TERMS, path_errors, with_phase
 from neurolens.models.wavefront import model_pupils
-from neurolens.optics.analysis.diffraction import irradiance, perfect_peak, pupils_at, spread
+from neurolens.optics.analysis.diffraction import cells_of, irradiance, perfect_peak, pupils_at, spread
 from neurolens.optics.analysis.exit_pupil import ExitPupil
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.paraxial import first_order
@@ -99,10 +99,10 @@ def _strehls(model: LensModel) -> Row:
 
 
 def _strehl(pupil: ExitPupil) -> float:
-    share = pupil.open_share(_CELLS)
+    field = cells_of(pupil, _CELLS)
     reach = max(4e-6 * pupil.wavelength_nm / float(pupil.half.max()), pupil.blur_mm)
     line = np.linspace(-reach, reach, 2 * _CELLS + 1)
-    return float(irradiance(pupil, line, line, share).max()) / perfect_peak(pupil, share)
+    return float(irradiance(pupil, line, line, field).max()) / perfect_peak(pupil, field)
 
 
 def _off(row: Row) -> float | None:

@@ -139,18 +139,20 @@ class _Known:
         if source is not None:
             shift = shift + ((source - self.front[:, None]) * way).sum(0)
         pupil = point + slope * back
+        parts = [{name: a[:, w * count : (w + 1) * count] for name, a in out.items()} for w in range(len(self.waves))]
+        for part in parts:  # the wavelengths have rays in the same directions, so that one design fits them all
+            near &= self._passes(part, pupil, _BEYOND * stop_mm, _BEYOND**2 - 1)
         found = list[ExitPupil | None]()
-        for w, nm in enumerate(self.waves):
-            part = {name: a[:, w * count : (w + 1) * count] for name, a in out.items()}
+        for nm, part in zip(self.waves, parts, strict=True):
             foot, _, _ = foot_of(self.core, part["ray"])
             places, energy = self._across(foot, seen[3:, 0], source)
             gates = part.get("gates", np.zeros((0, count))) + _RIM
             at = np.concatenate([part["stop"][None], stop[None], np.stack([gates, 0 * gates], 1)])
             limits = np.array([stop_mm, _ASIDE * stop_mm, *[_RIM] * len(gates)])
             wave = part["path_um"][0] / 1000 + shift - (foot * aside).sum(0)
-            known = near & self._passes(part, pupil, _BEYOND * stop_mm, _BEYOND**2 - 1)
-            own = Arrived(cosines, place[:, None], at, part["power"][0], known, limits, 0, wave)
-            found.append(fitted_pupil(self.scene.lens.aperture, own, places, energy, nm))
+            own = Arrived(cosines, place[:, None], at, part["power"][0], near, limits, 0, wave)
+            like = found[0] if found else None
+            found.append(fitted_pupil(self.scene.lens.aperture, own, places, energy, nm, like))
         return found
 
     def _chief(self, place: Array) -> tuple[Array, Array]:
@@ -180,7 +182,7 @@ class _Known:
         domain, lens, film_z = self.model.domain, self.scene.lens, self.scene.film_z_mm
         low, high = np.full(2, -domain.pupil_radius_mm), np.full(2, domain.pupil_radius_mm)
         for _ in range(2):
-            share = np.linspace(0, 1, 2 * _RAYS)
+            share = np.linspace(0, 1, _RAYS)
             pupil = low[:, None] + (high - low)[:, None] * np.stack(np.meshgrid(share, share)).reshape(2, -1)
             slope = (pupil - place[:, None]) / (domain.pupil_z_mm - film_z)
             cosines = slope / np.sqrt(1 + (slope * slope).sum(0))
@@ -188,7 +190,7 @@ class _Known:
             lit = self._passes(out, pupil, lens.stop_radius_mm)
             if not lit.any():
                 return None
-            step = (high - low) / (2 * _RAYS - 1)
+            step = (high - low) / (_RAYS - 1)
             low, high = pupil[:, lit].min(1) - step, pupil[:, lit].max(1) + step
         return cosines[:, lit].min(1), cosines[:, lit].max(1)
 

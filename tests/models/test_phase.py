@@ -24,7 +24,7 @@ from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
 from neurolens.models.phase import direction_at, path_errors, path_um, traced, unit_um, with_phase
 from neurolens.models.source import at_wavelength, fused_program
 from neurolens.models.wavefront import model_pupils
-from neurolens.optics.analysis.diffraction import irradiance, perfect_peak, pupils_at
+from neurolens.optics.analysis.diffraction import cells_of, irradiance, perfect_peak, pupils_at
 from neurolens.optics.analysis.exit_pupil import ExitPupil
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.prescription import Lens, Surface
@@ -182,10 +182,10 @@ def test_what_has_no_path_is_refused_by_name() -> None:
 
 
 def _strehl(pupil: ExitPupil, cells: int = 192) -> float:
-    share = pupil.open_share(cells)
+    field = cells_of(pupil, cells)
     reach = max(4e-6 * pupil.wavelength_nm / float(pupil.half.max()), pupil.blur_mm)
     line = np.linspace(-reach, reach, 101)
-    return float(irradiance(pupil, line, line, share).max()) / perfect_peak(pupil, share)
+    return float(irradiance(pupil, line, line, field).max()) / perfect_peak(pupil, field)
 
 
 @pytest.mark.parametrize(("f_number", "focus_m", "distance_m"), [(5.6, math.inf, math.inf), (8.0, 2.0, 1.9)])

@@ -2,9 +2,8 @@
 
 The field about an image point is U(x, y) = 1/lambda times the integral of sqrt(e) exp(i k (W + L x + M y)) dL dM over
 the exit pupil (`exit_pupil`; Debye; Born and Wolf, section 8.8). Here it is summed over square cells of the pupil, of
-which those on the edge of a rim or a blade count by their open share, with the chirp-z transform, whose points may
-have any distance. |U|^2 integrates to the light that arrives, so that shares of it need no scale. A pixel takes the
-mean over its area.
+which those on the edge of a rim or a blade count by their open share, as two products of matrices. |U|^2 integrates to
+the light that arrives, so that shares of it need no scale. A pixel takes the mean over its area.
 
 Far out of focus the fringes are finer than pixels, and the grid would need too many cells. There the rays of the same
 pupil are counted by pixels (`Spread.by_rays`). Where both are known, `Spread.differs` tells how much light they place
@@ -19,17 +18,17 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.polynomial import chebyshev
-from scipy.signal import CZT  # type: ignore[import-untyped]
+from numpy.typing import NDArray
 
 from neurolens.optics.analysis.bundles import Aim, Filled
-from neurolens.optics.analysis.exit_pupil import Array, Arrived, ExitPupil, arrived, fitted_pupil
+from neurolens.optics.analysis.exit_pupil import Array, Arrived, ExitPupil, arrived, fitted_pupil, phasor
 from neurolens.optics.analysis.fields import Scene
 
+Field = NDArray[np.complex64]
 _RAYS = 36  # rays along a side of the rectangle about what is lit
 _WIDER = 1.1  # the rectangle over what is lit
 _PER_CYCLE = 2.5  # cells a cycle of the field needs
-_FEWEST, FINEST = 192, 512  # cells across the pupil: the edges need so many even in focus
+_FEWEST, FINEST = 160, 512  # cells across the pupil: the edges need so many even in focus
 _RINGS = 6  # radii of the Airy disc that a window has at least
 _MOST_CELLS = 1024  # of the pupil along a side, whose rays are counted
 
@@ -171,7 +170,7 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
         energy += factor * total
         seen += factor * solid
         if not by_rays:
-            light += factor[:, None, None] * by_pixel(p, x, y, pixel_mm, share)
+            light += factor[:, None, None] * by_pixel(p, x, y, pixel_mm, cells_of(p, cells, share))
     whole = np.where(energy > 0, energy, 1.0)[:, None, None]
     light, counted = light / whole, counted / whole
     differs = math.nan if by_rays or not some else float(np.abs(light - counted).sum() / 2 / len(weights))
@@ -179,24 +178,27 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
     return Spread(light, centre, light.sum((1, 2)), seen, by_rays, differs)
 
 
-def irradiance(pupil: ExitPupil, x_mm: Array, y_mm: Array, open_share: Array) -> Array:
-    """Return the irradiance [Y, X] at evenly spaced places from the pupil's centre, for 1 at the lens.
-
-    `open_share` is that of the pupil's cells.
-    """
-    wave, cells = pupil.wavelength_nm * 1e-6, len(open_share)
-    found, size = open_share * pupil.field((middles(cells),) * 2), 2 * pupil.half / cells
-    for axis, place in ((0, x_mm), (1, y_mm)):
-        step = (place[-1] - place[0]) / max(len(place) - 1, 1)
-        turn = 2j * math.pi * size[axis] / wave
-        found = CZT(cells, len(place), w=np.exp(turn * step), a=np.exp(-turn * place[0]))(found, axis=axis)
-    return np.asarray(np.abs(found.T) ** 2 * (size.prod() / wave) ** 2)
+def irradiance(pupil: ExitPupil, x_mm: Array, y_mm: Array, field: Field) -> Array:
+    """Return the irradiance [Y, X] at places from the pupil's centre, for 1 at the lens, by its `cells_of`."""
+    wave, size = pupil.wavelength_nm * 1e-6, 2 * pupil.half / len(field)
+    x, y = (
+        phasor(np.outer(place, half / wave * middles(len(field))))
+        for half, place in zip(pupil.half, (x_mm, y_mm), strict=True)
+    )
+    found = (x @ field @ y.T).T
+    return np.asarray((found.real**2 + found.imag**2) * np.float32((size.prod() / wave) ** 2), np.float64)
 
 
-def perfect_peak(pupil: ExitPupil, open_share: Array) -> float:
+def cells_of(pupil: ExitPupil, cells: int, open_share: Array | None = None) -> Field:
+    """Return the field [cells, cells] of the pupil's cells, less what of them is shut."""
+    share = pupil.open_share(cells) if open_share is None else open_share
+    return np.asarray(share.astype(np.float32) * pupil.field((middles(cells),) * 2), np.complex64)
+
+
+def perfect_peak(pupil: ExitPupil, field: Field) -> float:
     """Return the irradiance in the middle of the image that the same pupil has without aberrations."""
-    amplitude = open_share * np.abs(pupil.field((middles(len(open_share)),) * 2))
-    return float((amplitude.sum() * np.prod(2 * pupil.half / len(open_share)) / (pupil.wavelength_nm * 1e-6)) ** 2)
+    total = float(np.abs(field).sum(dtype=np.float64) * np.prod(2 * pupil.half / len(field)))
+    return (total / (pupil.wavelength_nm * 1e-6)) ** 2
 
 
 def middles(cells: int) -> Array:
@@ -204,13 +206,13 @@ def middles(cells: int) -> Array:
     return (np.arange(cells) + 0.5) * 2 / cells - 1
 
 
-def by_pixel(pupil: ExitPupil, x_mm: Array, y_mm: Array, pixel_mm: float, open_share: Array) -> Array:
+def by_pixel(pupil: ExitPupil, x_mm: Array, y_mm: Array, pixel_mm: float, field: Field) -> Array:
     """Return the light [Y, X] on square pixels about places, for 1 at the lens, in mm^2."""
     # The square of a field is as fine as lambda over the width of the pupil; two samples of that in each pixel.
     parts = max(1, math.ceil(4 * float(pupil.half.max()) * pixel_mm / (pupil.wavelength_nm * 1e-6)))
     within = ((np.arange(parts) + 0.5) / parts - 0.5) * pixel_mm
     x, y = ((p[:, None] + within).reshape(-1) for p in (x_mm, y_mm))
-    fine = irradiance(pupil, x, y, open_share)
+    fine = irradiance(pupil, x, y, field)
     return np.asarray(fine.reshape(len(y_mm), parts, len(x_mm), parts).mean((1, 3)) * pixel_mm**2)
 
 
@@ -220,11 +222,10 @@ def _by_rays(
     """Return the light [Y, X] of rays by pixel, all light of the pupil (mm^2), and its open solid angle."""
     share = middles(len(open_share))
     area = float(np.prod(2 * pupil.half / len(share)))
-    light = open_share * np.abs(pupil.field((share, share))) ** 2 * area
-    wave, base = pupil.figures[..., 0], chebyshev.chebvander(share, len(pupil.figures) - 1)
+    light = open_share * pupil.light((share, share)) * area
     column, row = (
-        np.floor((-(base[:, : len(s)] @ s @ base[:, : s.shape[1]].T) / half - p[0]) / pixel_mm + 0.5).astype(int)
-        for s, half, p in ((chebyshev.chebder(wave, axis=k), pupil.half[k], (x_mm, y_mm)[k]) for k in (0, 1))
+        np.floor((hit - p[0]) / pixel_mm + 0.5).astype(int)
+        for hit, p in zip(pupil.hits((share, share)), (x_mm, y_mm), strict=True)
     )
     met = (column >= 0) & (column < len(x_mm)) & (row >= 0) & (row < len(y_mm)) & (light > 0)
     found = np.bincount(row[met] * len(x_mm) + column[met], light[met], len(x_mm) * len(y_mm))

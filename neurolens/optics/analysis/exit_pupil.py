@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve  # type: ignore[import-untyped]
 
 from neurolens.optics.analysis.fields import on_plane
 from neurolens.optics.lens.apertures import Aperture
@@ -29,7 +31,7 @@ Array = NDArray[np.floating[Any]]
 _DEGREE = 14  # of the polynomials
 _FEWEST = 240  # the fewest rays for their 120 terms
 _BEYOND = 1.15  # rays up to so many radii of a rim count for the polynomials
-_PARTS = 4  # of a cell along its side, where an edge crosses it
+_PARTS = 8  # of a cell along its side, where an edge crosses it
 _ROOM = 1.1  # the box of cosines over the rays that pass, between which edges lie
 _FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
 
@@ -68,7 +70,10 @@ class ExitPupil:
 
     def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
         """Whether light passes at points [2, N] of the box (-1 to 1); a tuple of two axes stands for their grid."""
-        at = self._at(places, slice(2, None))
+        return self._lets(self._at(places, slice(2, None)))
+
+    def _lets(self, at: Array) -> NDArray[np.bool_]:
+        """Whether light passes by its places [K, ...] at the rims."""
         inside = np.ones(at.shape[1:], bool)
         for x, y, limit in zip(at[::2], at[1::2], self.limits_mm, strict=True):
             inside &= x * x + y * y <= limit * limit
@@ -77,35 +82,63 @@ class ExitPupil:
         return inside
 
     def open_share(self, cells: int) -> Array:
-        """Return the share [cells, cells] of each cell of the box that light passes; cells on an edge are divided."""
-        nodes = np.linspace(-1, 1, cells + 1)
-        lit = self.passes((nodes, nodes))
+        """Return the share [cells, cells] of each cell of the box that light passes.
+
+        Cells on an edge are divided; places at the rims are linear between their corners.
+        """
+        at = self._at((np.linspace(-1, 1, cells + 1),) * 2, slice(2, None))
+        lit = self._lets(at)
         corners = np.stack([lit[:-1, :-1], lit[1:, :-1], lit[:-1, 1:], lit[1:, 1:]])
         share: Array = np.array(corners.all(0), np.float64)
-        edge = np.nonzero(corners.any(0) & ~corners.all(0))
+        i, j = edge = np.nonzero(corners.any(0) & ~corners.all(0))
         part = (np.arange(_PARTS) + 0.5) / _PARTS
-        at = [2 * (k[:, None, None] + step) / cells - 1 for k, step in zip(edge, (part[:, None], part), strict=True)]
-        places = np.stack([np.broadcast_to(a, (len(edge[0]), _PARTS, _PARTS)).reshape(-1) for a in at])
-        share[edge] = self.passes(places).reshape(len(edge[0]), -1).mean(1)
+        ways = [(1 - part[:, None]) * (1 - part), part[:, None] * (1 - part), (1 - part[:, None]) * part]
+        ways.append(part[:, None] * part)
+        ends = np.stack([at[:, i, j], at[:, i + 1, j], at[:, i, j + 1], at[:, i + 1, j + 1]], -1)
+        share[edge] = self._lets(ends @ np.stack(ways).reshape(4, -1)).mean(-1)
         return share
 
-    def field(self, places: Array | tuple[Array, Array]) -> NDArray[np.complex128]:
+    def field(self, places: Array | tuple[Array, Array]) -> NDArray[np.complex64]:
         """Return sqrt(e) exp(i k W) at points, which are as in `passes`."""
         w, e = self._at(places, slice(2))
-        return np.sqrt(np.maximum(e, 0)) * np.exp(2e6j * math.pi / self.wavelength_nm * w)
+        return phasor(w * (1e6 / self.wavelength_nm), np.sqrt(np.maximum(e, 0)))
 
-    def hits(self, places: Array) -> Array:
-        """Return where the rays of points [2, N] meet the film, [2, N] in mm from the centre."""
-        (u, v), wave = places, self.figures[..., 0]
-        return -np.stack([chebyshev.chebval2d(u, v, chebyshev.chebder(wave, axis=k)) / self.half[k] for k in (0, 1)])
+    def light(self, places: Array | tuple[Array, Array]) -> Array:
+        """Return the light per area of cosines (mm^2) at points, which are as in `passes`."""
+        return np.asarray(np.maximum(self._at(places, slice(1, 2))[0], 0))
+
+    def hits(self, places: Array | tuple[Array, Array]) -> Array:
+        """Return where the rays of points, which are as in `passes`, meet the film: [2, ...] in mm from the centre."""
+        wave, room = self.figures[..., 0], ((0, 1), (0, 0))
+        slopes = [np.pad(chebyshev.chebder(wave), room), np.pad(chebyshev.chebder(wave, axis=1), room[::-1])]
+        return -_summed(np.stack(slopes) / self.half[:, None, None], places)
 
     def _at(self, places: Array | tuple[Array, Array], rows: slice) -> Array:
         """Return the figures [K, ...] at points, which are as in `passes`."""
-        u, v = (chebyshev.chebvander(p, _DEGREE) for p in places)
-        figures = np.moveaxis(self.figures[..., rows], -1, 0)
-        if isinstance(places, tuple):
-            return np.asarray(u @ figures @ v.T)
-        return np.stack([((u @ figure) * v).sum(1) for figure in figures])
+        return _summed(np.moveaxis(self.figures[..., rows], -1, 0), places)
+
+
+def _summed(figures: Array, places: Array | tuple[Array, Array]) -> Array:
+    """Return Chebyshev series [K, D, D] at points, which are as in `ExitPupil.passes`."""
+    if isinstance(places, tuple):
+        u, v = (_on_line(p.tobytes()) for p in places)
+        return np.asarray(u @ figures @ v.T)
+    u, v = (chebyshev.chebvander(p, _DEGREE) for p in places)
+    return np.stack([np.einsum("nk,nk->n", u @ figure, v) for figure in figures])
+
+
+def phasor(cycles: Array, amplitude: Array | float = 1.0) -> NDArray[np.complex64]:
+    """Return amplitude exp(2 pi i cycles): parts of a cycle are taken before they are rounded."""
+    angle = ((cycles - np.rint(cycles)) * (2 * math.pi)).astype(np.float32)
+    found = np.empty(angle.shape, np.complex64)
+    found.real, found.imag = np.cos(angle) * amplitude, np.sin(angle) * amplitude
+    return found
+
+
+@lru_cache(maxsize=64)
+def _on_line(places: bytes) -> Array:
+    """Return the Chebyshev polynomials [N, D] at places, which most pupils have in common."""
+    return np.asarray(chebyshev.chebvander(np.frombuffer(places), _DEGREE))
 
 
 class Arrived(NamedTuple):
@@ -190,18 +223,9 @@ def _fitted(places: Array, half: Array, wave_mm: Array, disc_places: Array, powe
     The wavefront is fitted to its values [N] or its slopes [2 N] (dW/dL, then dW/dM), the light per area of cosines by
     the derivatives of the points on the disc.
     """
-    orders = np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE
-    # Chebyshev polynomials of each coordinate, and their slopes.
-    value = [chebyshev.chebvander(p, _DEGREE) for p in places]
-    turn = chebyshev.chebder(np.eye(_DEGREE + 1))
-    slope = [chebyshev.chebvander(p, _DEGREE - 1) @ turn for p in places]
-
-    def products(a: Array, b: Array) -> Array:
-        return (a[:, :, None] * b[:, None, :])[:, orders]
-
-    plain, by_u, by_v = products(*value), products(slope[0], value[1]), products(value[0], slope[1])
-    solved = _least(plain)
-    if len(wave_mm) == len(plain):
+    design = _design(np.ascontiguousarray(places).tobytes())
+    (by_u, by_v), solved = design.slopes, design.solved
+    if len(wave_mm) == places.shape[1]:
         wave = solved(wave_mm)[1:]
     else:
         wave = _least(np.concatenate([by_u / half[0], by_v / half[1]])[:, 1:])(wave_mm)
@@ -209,20 +233,44 @@ def _fitted(places: Array, half: Array, wave_mm: Array, disc_places: Array, powe
     (au, bu), (av, bv) = (by_u @ mapped).T / half[0], (by_v @ mapped).T / half[1]
     rest = solved(np.stack([power * np.abs(au * bv - av * bu), *at_mm], 1))
     figures = np.zeros((_DEGREE + 1, _DEGREE + 1, 1 + rest.shape[1]))
-    figures[orders] = np.concatenate([np.concatenate([[0.0], wave])[:, None], rest], 1)
+    figures[_ORDERS] = np.concatenate([np.concatenate([[0.0], wave])[:, None], rest], 1)
     return figures
+
+
+_ORDERS = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
+
+
+class _Design(NamedTuple):
+    """Polynomials at N points: their slopes [N, M] by u and v, and what fits them to values."""
+
+    slopes: tuple[Array, Array]
+    solved: Callable[[Array], Array]
+
+
+@lru_cache(maxsize=1)
+def _design(places: bytes) -> _Design:
+    """Return the design of points [2, N], which the wavelengths of a model have in common."""
+    # Chebyshev polynomials of each coordinate, and their slopes.
+    value = [chebyshev.chebvander(p, _DEGREE) for p in np.frombuffer(places).reshape(2, -1)]
+    turn = np.pad(chebyshev.chebder(np.eye(_DEGREE + 1)), [(0, 1), (0, 0)])
+    slope = [v @ turn for v in value]
+
+    def products(a: Array, b: Array) -> Array:
+        return a[:, _ORDERS[0]] * b[:, _ORDERS[1]]
+
+    return _Design((products(slope[0], value[1]), products(value[0], slope[1])), _least(products(*value)))
 
 
 def _least(a: Array) -> Callable[[Array], Array]:
     """Return what solves a x = b for any b by least squares.
 
-    The normal equations take a third of the time of a QR decomposition; a second step on what the first leaves
+    The normal equations take a fraction of the time of a QR decomposition; a second step on what the first leaves
     restores the digits that they lose.
     """
-    squares = np.linalg.inv(a.T @ a) @ a.T
+    squares = cho_factor(a.T @ a, overwrite_a=True, check_finite=False)
 
     def solved(b: Array) -> Array:
-        first = squares @ b
-        return np.asarray(first + squares @ (b - a @ first))
+        first = cho_solve(squares, a.T @ b, check_finite=False)
+        return np.asarray(first + cho_solve(squares, a.T @ (b - a @ first), check_finite=False))
 
     return solved

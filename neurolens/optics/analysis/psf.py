@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neurolens.base.report import BULK, Report, over
 from neurolens.optics.analysis.bundles import Filled
-from neurolens.optics.analysis.diffraction import FINEST, cells_needed, irradiance, perfect_peak, pupils
+from neurolens.optics.analysis.diffraction import FINEST, cells_needed, cells_of, irradiance, perfect_peak, pupils
 from neurolens.optics.analysis.exit_pupil import ExitPupil
 from neurolens.optics.analysis.fields import Array, Scene
 from neurolens.optics.analysis.spots import airy
@@ -95,14 +95,14 @@ def _images(filled: Filled, waves: Sequence[ExitPupil | None], level: int, least
         if pupil is not None and not math.isnan(half):
             cells = cells_needed(pupil, math.sqrt(2) * half)
         if pupil is not None and 0 < cells <= FINEST:
-            line, open_share = np.linspace(-half, half, _POINTS), pupil.open_share(cells << (level - 1))
+            line, field = np.linspace(-half, half, _POINTS), cells_of(pupil, cells << (level - 1))
             chief = np.array([float(c[k]) for c in filled.chief.film[:2]]) - pupil.centre_mm
             # Tangential is along -x or -y of the film, sagittal along the other axis.
             if filled.scene.axis == "x":
-                image = irradiance(pupil, chief[0] - centre[0] - line, chief[1] + centre[1] + line, open_share).T
+                image = irradiance(pupil, chief[0] - centre[0] - line, chief[1] + centre[1] + line, field).T
             else:
-                image = irradiance(pupil, chief[0] + centre[1] + line, chief[1] - centre[0] - line, open_share)
-            image = image / perfect_peak(pupil, open_share)
+                image = irradiance(pupil, chief[0] + centre[1] + line, chief[1] - centre[0] - line, field)
+            image = image / perfect_peak(pupil, field)
         rows.append((1000 * half, centre, image, float(cells)))
     return [np.array(column) for column in zip(*rows, strict=True)]
 

@@ -16,6 +16,7 @@ from neurolens.optics.analysis.bundles import bundle
 from neurolens.optics.analysis.diffraction import (
     by_pixel,
     cells_needed,
+    cells_of,
     irradiance,
     perfect_peak,
     pupils,
@@ -40,8 +41,8 @@ def pupil_of(scene: Scene, field_deg: float = 0.0) -> ExitPupil:
 
 def line_through(pupil: ExitPupil, x_mm: np.ndarray, cells: int = 256) -> np.ndarray:
     """Irradiance along x through the middle, over the peak of the same pupil without aberrations."""
-    open_share = pupil.open_share(cells)
-    return irradiance(pupil, x_mm, np.zeros(1), open_share)[0] / perfect_peak(pupil, open_share)
+    field = cells_of(pupil, cells)
+    return irradiance(pupil, x_mm, np.zeros(1), field)[0] / perfect_peak(pupil, field)
 
 
 def test_a_perfect_lens_has_airys_disc() -> None:
@@ -91,7 +92,7 @@ def test_the_image_has_the_mtf_of_closed_forms(waves: float) -> None:
     cut_off = 1e6 / (D * n)
     pupil = pupil_of(moved(given, waves * 8 * D * 1e-6 * n * n))
     x = np.linspace(-16e-6, 16e-6, 201) * D * n
-    image = irradiance(pupil, x, x, pupil.open_share(192))
+    image = irradiance(pupil, x, x, cells_of(pupil, 192))
     f = np.array([0.1, 0.25, 0.5, 0.7]) * cut_off
     contrast = np.abs(np.exp(2j * np.pi * f[:, None] * x) @ image.sum(0)) / image.sum()
     assert contrast == pytest.approx(hopkins(f, waves, cut_off), abs=0.025)  # 2% of the light falls beside the window
@@ -127,10 +128,10 @@ def test_all_light_is_in_the_image() -> None:
     assert large.inside[0] == pytest.approx(1, abs=3e-3)
     # Pixels tile: four small ones hold what a large one holds.
     x = np.arange(-6, 7) * 0.004
-    share = pupil.open_share(256)
-    fine = by_pixel(pupil, np.arange(-13, 13) * 0.002 + 0.001, np.arange(-13, 13) * 0.002 + 0.001, 0.002, share)
+    field = cells_of(pupil, 256)
+    fine = by_pixel(pupil, np.arange(-13, 13) * 0.002 + 0.001, np.arange(-13, 13) * 0.002 + 0.001, 0.002, field)
     tiles = fine.reshape(13, 2, 13, 2).sum((1, 3))
-    assert tiles == pytest.approx(by_pixel(pupil, x, x, 0.004, share), rel=1e-2, abs=1e-4 * tiles.max())
+    assert tiles == pytest.approx(by_pixel(pupil, x, x, 0.004, field), rel=1e-2, abs=1e-4 * tiles.max())
 
 
 def test_an_image_turns_with_its_place() -> None:
@@ -179,7 +180,7 @@ def test_twice_as_many_cells_give_the_same_image() -> None:
     given = library("nikon_zoom_14_24", f_number=4.0)
     [[pupil]] = pupils_at(given, np.array([[14.0, 8.0]]), [D])
     x = np.linspace(-0.03, 0.03, 61)
-    images = [irradiance(pupil, x, x, pupil.open_share(k * cells_needed(pupil, 0.043))) for k in (1, 2)]
+    images = [irradiance(pupil, x, x, cells_of(pupil, k * cells_needed(pupil, 0.043))) for k in (1, 2)]
     assert images[0] == pytest.approx(images[1], abs=3e-3 * images[1].max())
 
 
@@ -217,8 +218,8 @@ def test_optiland_sums_huygens_wavelets_to_the_same_images(
     given, line = Scene(replace(lens, film_z_mm=film_z_mm), rims=False), (np.arange(161) - 80) * 0.25e-3
     for [[pupil]], wanted in zip(pupils(given, [*fields], [546.074]), fields.values(), strict=True):
         assert pupil is not None
-        share = pupil.open_share(256)
-        image = irradiance(pupil, line, line, share) / perfect_peak(pupil, share)
+        field = cells_of(pupil, 256)
+        image = irradiance(pupil, line, line, field) / perfect_peak(pupil, field)
         row, column = np.unravel_index(image.argmax(), image.shape)
         widths = [0.25 * _full_width(image[:, column]), 0.25 * _full_width(image[row])]
         assert [image.max(), *widths] == pytest.approx(wanted, rel=0.035)
