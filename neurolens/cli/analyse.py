@@ -12,12 +12,16 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import numpy as np
+
 from neurolens.base.errors import InputError, warned
 from neurolens.base.report import PART, Report
-from neurolens.base.settings import WAVELENGTH_NM, between, said, setting, wavelengths_nm
+from neurolens.base.settings import WAVELENGTH_NM, between, read_config, said, setting, wavelengths_nm, whole
 from neurolens.cli import arguments as cli
+from neurolens.optics.setting.copies import Tolerances
 
 if TYPE_CHECKING:
+    from neurolens.optics.analysis.corners import Spread
     from neurolens.optics.analysis.field_curves import Colour, Curvature, Distortion, Illumination, Seidel
     from neurolens.optics.analysis.fields import FieldEdge, Scene
     from neurolens.optics.analysis.layout import Layout
@@ -65,6 +69,7 @@ class Analyse(cli.Figures):
 examples:
   neurolens analyse lenses/laikin_double_gauss_50.toml
   neurolens analyse lenses/shimizu_fisheye_220.toml distortion vignetting -o pictures
+  neurolens analyse lenses/laikin_double_gauss_50.toml --copies 200 --f-number 4 -o pictures
   neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focus-mode best --json"""
     kept = "finished pictures are kept"
     intermixed = True
@@ -86,6 +91,12 @@ examples:
         metavar="PER_MM", common=True,
     )  # fmt: skip
     axis: Literal["x", "y"] = setting("y", "plane of the field, for anamorphic lenses (default: y)")
+    copies: int | None = setting(
+        None, "show how so many copies of the lens differ: MTF, spots and best focus in the middle and at 80% of the "
+        "corners, drawn as by neurolens copies", kind=whole(2, 10_000), metavar="N", common=True,
+    )  # fmt: skip
+    seed: int = setting(0, "of the copies", kind=whole(0))
+    tolerances: Path | None = setting(None, "of the copies, as of `neurolens copies`", metavar="FILE.toml")
     out: Path | None = cli.output_path("FOLDER", "draw a picture of each in this folder", None)
     format: Literal["png", "pdf", "svg"] = setting("png", "of the pictures (default: png)")
     full: bool = setting(False, "with --json: also every ray and every pixel")
@@ -99,6 +110,8 @@ examples:
         """Print the requested analyses, and draw them if a folder is given."""
         if unknown := [w for w in self.what if w not in WHATS]:
             self.refuse("WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
+        if not self.copies and (self.seed or self.tolerances):
+            self.refuse("--seed, --tolerances", "(given)", "these options only with --copies")
         if self.full and not self.json:
             self.refuse("--full", "(given)", "this option only with --json")
         from neurolens.optics.analysis.layout import state_text
@@ -110,7 +123,7 @@ examples:
         doubts += [scene.edge.warning] if scene.edge.warning else []
         results: dict[str, Report] = {}
         pictures, notes = {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
-        for what in self.what or WHATS:
+        for what in (*(self.what or (() if self.copies else WHATS)), *(["copies"] if self.copies else [])):
             try:
                 results[what], picture = self._one(what, scene, doubts)
             except InputError as error:
@@ -153,6 +166,9 @@ examples:
             options = {"field_deg": self.field_points, "wavelength_nm": self.waves_nm}
             dark = check_light(scene, self.field_points, (self.waves_nm or scene.waves_nm)[0])
             doubts += [d for d in dark if d not in doubts]
+        elif what == "copies":
+            limits = Tolerances() if self.tolerances is None else read_config(Tolerances, self.tolerances)
+            options = {"limits": limits, "number": self.copies, "seed": self.seed, "progress": self.progress()}
         elif what == "mtf-height":
             options = {"frequency_per_mm": self.frequencies, "wavelength_nm": self.waves_nm}
         result = analysis.compute(scene, **{k: v for k, v in options.items() if v is not None})
@@ -201,6 +217,7 @@ class Analysed(Report):
 def analysis_of(what: str) -> Analysis:
     """Return the analysis of a name; torch and matplotlib are imported here, not when the command line starts."""
     from neurolens.optics.analysis import plots
+    from neurolens.optics.analysis.corners import spread
     from neurolens.optics.analysis.field_curves import colour, curvature, distortion, illumination, seidel
     from neurolens.optics.analysis.layout import layout_profile, lens_layout
     from neurolens.optics.analysis.psf import psf
@@ -218,6 +235,7 @@ def analysis_of(what: str) -> Analysis:
         "mtf-height": Analysis(mtf_over_height, plots.plot_mtf_over_height, partial(_mtf_text, over_height=True)),
         "seidel": Analysis(seidel, plots.plot_seidel, _seidel_text),
         "psf": Analysis(psf, plots.plot_psf, _psf_text),
+        "copies": Analysis(spread, plots.plot_spread, _spread_text),
     }[what]
 
 
@@ -330,6 +348,27 @@ def _psf_text(found: Psf) -> str:
     ]
     head = f"Point spread ({found.wavelength_nm[0]:.0f} nm; Strehl ratio '-' where aberrations rule out diffraction)"
     return _over_field(head, found, columns, every=True)
+
+
+def _spread_text(found: Spread) -> str:
+    """Every place of the picture with the design's figure and what 10%, 50% and 90% of the copies have."""
+    shares, last = (0.1, 0.5, 0.9), f"{found.frequency_per_mm[-1]:g}/mm"
+    header = ("place", "RMS µm", "10%", "half", "90%", f"MTF {last} T", "S", "both, 10%", "half", "90%")
+    rms, mtf = (np.quantile(v, shares, axis=0).T for v in (found.copy_rms_um, found.copy_contrast))
+    rows = [
+        (place, _three(found.rms_um[k]), *map(_three, rms[k]), _fixed(found.tangential[k, -1]),
+         _fixed(found.sagittal[k, -1]), *map(_fixed, mtf[k]))
+        for k, place in enumerate(found.place)
+    ]  # fmt: skip
+    turn = np.hypot(found.film_tilt_deg, found.film_swing_deg)
+    (row, place), (x, y) = found.softest, np.abs([found.x_mm[1], found.y_mm[1]])
+    return "\n".join([
+        f"Copies ({len(found.copy)}, seed {found.seed}; as designed, and what 10%, half and 90% of them have at most; "
+        f"corners at ±{x:.1f}, ±{y:.1f} mm of the picture)",
+        cli.table(header, rows),
+        f"focal plane turned by {_three(np.median(turn))}° (median), at most {_three(turn.max())}°; softest: copy "
+        f"{found.copy[row]}, {found.place[place]}, {_fixed(found.copy_contrast[row, place])} at {last}",
+    ])  # fmt: skip
 
 
 def _each(form: Callable[..., Any], *values: Iterable[Any]) -> list[Any]:

@@ -14,6 +14,7 @@ from neurolens.base.errors import NeurolensError, pip_install, without_controls
 from neurolens.base.files import atomic_path
 
 if TYPE_CHECKING:
+    from neurolens.optics.analysis.corners import Spread
     from neurolens.optics.analysis.field_curves import Colour, Curvature, Distortion, Illumination, Seidel
     from neurolens.optics.analysis.psf import Psf
     from neurolens.optics.analysis.spots import Fans, Mtf, Spots
@@ -221,6 +222,28 @@ def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> No
         rows[-1].set_xticks([*place[::step], len(place) + 0.5], [*map(str, place[::step]), "total"])
         rows[-1].set_xlabel("surface, counted from the scene")
         figure.legend(*rows[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+
+def plot_spread(data: Spread, path: str | Path, title: str, subtitle: str) -> None:
+    """Plot the shares of copies below each contrast, at each place, and how their focal planes are turned."""
+    frequency = f"{data.frequency_per_mm[-1]:g} cycles/mm"
+    text = f"{len(data.copy)} copies, seed {data.seed}; dashed: as designed; {subtitle}"
+    with drawing(path, 9.4, 4.8, title, text) as figure:
+        left, right = figure.subplots(1, 2)
+        share = 100 * (np.arange(len(data.copy)) + 0.5) / len(data.copy)
+        for k, place in enumerate(data.place):
+            left.plot(np.sort(data.copy_contrast[:, k]), share, color=FIELD_COLOURS[k], label=place)
+            left.axvline(data.contrast[k], color=FIELD_COLOURS[k], ls="--", lw=0.9)
+        left.set(xlabel=f"MTF at {frequency}, mean of both directions", ylabel="copies that have at most this (%)")
+        left.set(xlim=(0, 1), ylim=(0, 100))
+        right.plot(data.film_swing_deg, data.film_tilt_deg, "o", ms=3.5, mew=0, alpha=0.6, color=FIELD_COLOURS[0])
+        reach = 1.1 * float(np.abs([data.film_tilt_deg, data.film_swing_deg]).max()) or 1.0
+        right.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title="turn of the focal plane")
+        right.set(xlabel="film swing that follows it (degrees)", ylabel="film tilt that follows it (degrees)")
+        right.locator_params(nbins=5)
+        for axes in (left, right):
+            axes.grid(True)
+        left.legend()
 
 
 def _degrees(axes: Any, data: Any, across: bool = False) -> None:
