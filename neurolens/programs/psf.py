@@ -57,8 +57,7 @@ class PsfTask:
         model: of the lens, with optical path, whose rays are taken; None traces them.
 
     Raises:
-        InputError: the lens is not round about its axis, or the objects are not in front of it; as
-            `wavefront.checked_path`.
+        InputError: the objects are not in front of the lens; as `wavefront.checked_path`.
     """
 
     lens: Lens
@@ -71,8 +70,6 @@ class PsfTask:
 
     def __post_init__(self) -> None:
         lens, front_m = self.lens, float(self.lens.film_z_mm or 0) / 1000
-        if not lens.round:
-            raise InputError(lens.path, "surfaces", "(not round about the axis)", "a lens of rotational symmetry")
         if self.model is not None:
             from neurolens.models.wavefront import checked_path
 
@@ -103,7 +100,7 @@ def places_of(film_mm: tuple[float, float], grid: tuple[int, int]) -> tuple[tupl
 def point_spread(task: PsfTask) -> Arrays:
     """Return the arrays of a task as the file holds them, a row for each place off the axis.
 
-    Places that are mirror images of each other are computed once, where the stop is round.
+    Places that are mirror images of each other are computed once, where lens and stop are symmetric.
 
     Raises:
         InputError: no light of the axis reaches the film.
@@ -112,25 +109,30 @@ def point_spread(task: PsfTask) -> Arrays:
     from neurolens.optics.analysis.fields import Scene
 
     film = -np.array(task.places_mm)  # the picture is upright, the image on the film is not
-    mirrored = np.abs(film) if task.lens.aperture is None else film
+    symmetric = task.lens.aperture is None and not task.lens.decentred
+    mirrored = np.abs(film) if symmetric else film
     unique, number = np.unique(mirrored.round(9), axis=0, return_inverse=True)
     waves = sorted({nm for some in task.channels for nm in some})
     middle = task.channels[len(task.channels) // 2]
     waves.insert(0, waves.pop(waves.index(sorted(middle)[len(middle) // 2])))  # the reference comes first
     weights = np.array([[nm in some for nm in waves] for some in task.channels], np.float64)
     scene = Scene(task.lens, task.distance_m)
-    if task.model is None:
-        pupils = pupils_at(scene, unique, waves)
-    else:
+    if task.model is not None:
         from neurolens.models.wavefront import model_pupils
 
         pupils = model_pupils(task.model, scene, unique, waves)
+    elif task.lens.round:
+        pupils = pupils_at(scene, unique, waves)
+    else:
+        from neurolens.pictures.flare.exit_pupil import pupils_seen
+
+        pupils = pupils_seen(task.lens, task.distance_m, unique, waves)
     reach = max(reach_of(some) for some in pupils)
     side = task.side or min(2 * math.ceil(reach / task.pixel_mm) + 1, MOST_PX)
     found = [spread(some, weights, task.pixel_mm, side) for some in pupils]
     turned, centres = [], []
     for place, k in zip(film, number.reshape(-1), strict=True):
-        x, y = (-1 if a < -1e-9 and task.lens.aperture is None else 1 for a in place)
+        x, y = (-1 if a < -1e-9 and symmetric else 1 for a in place)
         turned.append(found[k].light[:, ::y, ::-x])  # columns of the picture run against x
         centres.append(-found[k].centre_mm * (x, y))
     every = [found[k] for k in number.reshape(-1)]

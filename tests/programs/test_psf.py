@@ -14,10 +14,14 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import library
 from neurolens.cameras.build import make_camera
 from neurolens.cli import main
+from neurolens.optics.analysis.diffraction import pupils_at, spread
+from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.lens.prescription import Lens, Placement
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.defocus.kernels import kernels_over
+from neurolens.pictures.flare.exit_pupil import pupils_seen
 from neurolens.pictures.render.pictures import read_channels
 from neurolens.pictures.render.settings import SensorSettings
 from neurolens.programs import psf as p
@@ -131,9 +135,34 @@ def test_bad_values_are_one_line(words: tuple[str, ...], said: str, capsys: pyte
     assert said in failure(capsys, *WORDS[:-1], *words)
 
 
-def test_a_lens_that_is_not_round_is_refused_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "a lens of rotational symmetry" in failure(capsys, "psf", "cooke_anamorphic_42", "--quiet")
-    assert not Path("cooke_anamorphic_42-psf.npz.parts").exists()
+def gauss(focus_m: float) -> Lens:
+    return set_lens(
+        read_lens(library() / "lenses" / f"{LENS}.toml"), Shot(film_mm=(36, 24), f_number=4, focus_m=focus_m)
+    )
+
+
+@pytest.mark.parametrize("distance_m", [2.0, math.inf])
+def test_a_lens_moved_aside_as_a_whole_has_its_image_moved(distance_m: float) -> None:
+    """It is no longer round: its object points are found another way. Far objects stay where they are."""
+    lens, aside = gauss(distance_m), (0.4, -0.3)
+    rows = [replace(s, placement=Placement((*aside, 0.0))) for s in lens.surfaces]
+    moved = replace(lens, surfaces=tuple(rows))
+    places = np.array([[0.0, 0.0], [11.0, -7.0]])
+    found = pupils_seen(moved, distance_m, places + aside, (546.0,))
+    for [was], [now] in zip(pupils_at(Scene(lens, distance_m), places, (546.0,)), found, strict=True):
+        assert was is not None and now is not None
+        assert now.centre_mm - aside == pytest.approx(was.centre_mm, abs=0.01)
+        one, other = (spread([x], np.ones((1, 1)), 0.006, 31) for x in (was, now))
+        assert 0.5 * np.abs(one.light - other.light).sum() < 0.01 * one.light.sum()
+        assert other.pupil == pytest.approx(one.pupil, rel=2e-3)
+
+
+def test_an_anamorphic_lens_has_both_symmetries(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = "schneider_anamorphic_31 --film 18x15 --grid 3x3 --pixel-um 6 --f-number 8 --wavelengths 550".split()
+    run_json(capsys, "psf", *words, "-o", tmp_path / "a.npz")
+    psf = p.read_psf(tmp_path / "a.npz")[1]["psf"][0, 0, :, :, 0]
+    assert psf[0, 0] == pytest.approx(psf[2, 2, ::-1, ::-1]) and psf[0, 2] == pytest.approx(psf[0, 0, :, ::-1])
+    assert np.abs(psf[0, 1] - psf[1, 0].T).max() > 0.05 * psf[0, 1].max()
 
 
 def test_a_file_of_other_arrays_is_refused(tmp_path: Path) -> None:

@@ -14,11 +14,14 @@ from contourpy import contour_generator
 from neurolens.base.errors import InputError
 from neurolens.optics.analysis.exit_pupil import Array, ExitPupil, arrived, fitted_pupil
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.trace.rays import Rays, passing
+from neurolens.optics.setting.pupils import camera_rays, pupil_plane_z_mm
+from neurolens.optics.trace.aiming import without_rims
+from neurolens.optics.trace.rays import Rays, passing, trace
 from neurolens.pictures.flare.lights import Light, Patch, disc, light_towards, rays_across
 
 CELLS = 1024  # cells across the pupil
 _SEARCH, _BOX = 1 << 16, 48  # rays that find where light passes; rays along a side, for the polynomials
+_STEP_MM, _NEWTON, _MET = 1e-4, 8, 1e-3  # of the search for chief rays: differences, steps, stop radii from the middle
 _BENT = 0.1  # sine of the smallest angle that counts as a corner
 
 
@@ -41,6 +44,45 @@ def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil |
     rays, area = rays_across(lens, light, places)
     found = arrived(lens, Rays(*torch.from_numpy(rays)), wavelength_nm)
     return fitted_pupil(lens.aperture, found, places, area / math.pi, wavelength_nm, like, box)
+
+
+def pupils_seen(
+    lens: Lens, distance_m: float, places_mm: Array, wavelengths_nm: Sequence[float]
+) -> list[list[ExitPupil | None]]:
+    """Return the exit pupils of the object points that are seen at film places, as `diffraction.pupils_at` does.
+
+    The lens need not be round. The ray from the place through the middle of the stop finds the object point.
+
+    Args:
+        lens: its film must be placed (`set_lens`). distance_m: of the plane of objects from the film, or inf.
+        places_mm: [P, 2] x and y on the film.
+    """
+    film_z, plane, open_lens = float(lens.film_z_mm or 0), pupil_plane_z_mm(lens), without_rims(lens)
+    film, at, step = torch.from_numpy(places_mm.T), torch.zeros(2, len(places_mm), dtype=torch.float64), _STEP_MM
+    for last in [False] * _NEWTON + [True]:
+        tried = torch.stack([at, at + torch.tensor([[step], [0]]), at + torch.tensor([[0], [step]])], 1).flatten(1)
+        (x, y), (u, v) = film.tile(1, 3), tried
+        rays = camera_rays(x, y, film_z, u, v, plane)
+        with torch.no_grad():
+            out = trace(open_lens, rays, wavelengths_nm[0], record=[lens.stop_index])
+        stop = torch.stack([out.crossings[lens.stop_index].x, out.crossings[lens.stop_index].y]).reshape(2, 3, -1)
+        slopes = ((stop[:, 1:] - stop[:, :1]) / step).permute(2, 0, 1)
+        if not last:
+            at = at - torch.linalg.solve(slopes.nan_to_num() + 1e-12 * torch.eye(2), stop[:, 0].T.nan_to_num()).T
+    met = (torch.hypot(*stop[:, 0]) < _MET * lens.stop_radius_mm) & (out.status[: len(places_mm)] == 0)
+    found = list[list[ExitPupil | None]]()
+    for ray, seen in zip(torch.stack(list(out.rays))[:, : len(places_mm)].T.numpy(), met.tolist(), strict=True):
+        towards, far = ray[3:], math.inf
+        if math.isfinite(distance_m):
+            towards = ray[:3] + ray[3:] * ((film_z - 1000 * distance_m - ray[2]) / ray[5])
+            far = float(np.linalg.norm(towards)) / 1000
+        light = light_towards(towards, (1, 1, 1), far) if seen else None
+        own = list[ExitPupil | None]()
+        for nm in wavelengths_nm:
+            like = own[0] if own else None
+            own.append(None if light is None or own[:1] == [None] else exit_pupil(lens, light, nm, like))
+        found.append(own)
+    return found
 
 
 def image_moves(lens: Lens, patch: Patch, wavelength_nm: float) -> Array:
