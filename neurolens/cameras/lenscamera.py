@@ -1,7 +1,7 @@
 """The camera class of lenses, exact or modelled: everything between the random numbers and the weighted ray.
 
-A camera is one graph, with that of its lens between the pupil and the weights (`cameragraph.whole_camera`). Two
-runtimes give the same rays, to rounding:
+A camera is one graph, with that of its lens between the pupil and the weights (`cameragraph.whole_camera`). It
+runs as C where the machine has a compiler, else in onnxruntime; both give the same rays, to rounding.
 """
 
 from __future__ import annotations
