@@ -116,8 +116,8 @@ release:
 	build/release/tools/bin/python -m build --outdir dist .
 	build/release/tools/bin/python -m twine check --strict dist/*
 	build/release/alone/bin/python -m pip install -q -c constraints.txt dist/*.whl
-	cd build/release/away && ../alone/bin/neurolens render experiments/scenes/room.toml --camera laikin_double_gauss_50.ols-36 \
-	    --width 96 -o first.exr && ../alone/bin/neurolens demo --width 96 --samples 4 && test -s first.png
+	cd build/release/away && ../alone/bin/neurolens render lights --camera canon_50mm_f1_2 --f-number 1.2 \
+	    --width 480 --samples 64 -o first.exr && ../alone/bin/neurolens demo --width 96 --samples 4 && test -s first.png
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

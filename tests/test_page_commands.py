@@ -110,8 +110,8 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
 # The README's lines run, some in a smaller size: what is printed, and what stands for it or follows it here.
 SMALLER = {
     "--width 3840": "--width 96",
-    "--width 480": "--width 24",
-    "--width 96 -o first.exr": "--width 24 --samples 1 -o first.exr",
+    "--width 480 --samples 64": "--width 24 --samples 1",
+    "--width 480 --film": "--width 24 --film",
     "-o flare.exr": "--width 24 --bins 3 --cell 64 -o flare.exr",
     "train --lens my_lens.toml": "train --lens my_lens.toml --rounds 0 --set 'model=[{method=\"ols\",terms=12}]'"
     " --set pairs.train=512 --set pairs.held_out=512 --set evaluation.vignetting_rays=2000",

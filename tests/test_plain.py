@@ -1,6 +1,7 @@
 """The plain line: each command with nothing but what it is about gives its result, and says what it assumed."""
 
 import math
+import shlex
 from argparse import _SubParsersAction
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from command_line import failure
 
+from neurolens.base.records import program
 from neurolens.cli import build_parser, main
 from neurolens.cli.defocus import Defocus
 from neurolens.optics.lens.shot import FILMS, film_size, film_within
@@ -133,6 +135,31 @@ def test_the_plain_line_works_and_says_what_it_assumed(name: str, capsys: pytest
     lines = [line for line in said if "assumed: " in line and "--distance" not in line]
     assert lines == ([f"neurolens: assumed: {assumed}"] if assumed else [])
     assert not written or Path(written).stat().st_size
+
+
+ALONE = {"demo", "models", "view"}  # which do something without any word
+ACTIONS = [["blender", "build"], ["blender", "add"]]
+
+
+@pytest.mark.parametrize("words", [[name] for name in COMMANDS if name not in ALONE] + ACTIONS, ids=" ".join)
+def test_a_command_alone_says_what_it_does_and_gives_an_example_that_runs(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whose inputs ship or are made by the line itself; a file of another program is in a checkout alone."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    about, example = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2 and about.endswith(".") and 20 < len(about) < 250, about
+    lines = example.removeprefix("Example: ").split(" && ")
+    made = set[str]()
+    for line in lines:
+        _, *words_of_line = shlex.split(line.replace(program(), "neurolens"))
+        args = vars(build_parser().parse_args(words_of_line))
+        for name in ("scene", "file", "folder", "plate") if words != ["mitsuba"] else ():  # Mitsuba has its own scene
+            for path in args[name] if isinstance(args.get(name), tuple | list) else [args.get(name)]:
+                assert path is None or (ROOT / path).exists() or str(path) in made, line
+        made.add(str(args.get("output")))
+    assert lines[-1].replace(program(), "neurolens").startswith(f"neurolens {words[0]} ")
 
 
 def test_view_alone_shows_six_lenses(monkeypatch: pytest.MonkeyPatch) -> None:

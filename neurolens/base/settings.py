@@ -238,7 +238,7 @@ def add_options(
         parser: a parser, or a group of its arguments.
         names: if any are given, only these fields. defaults: those of this command, where the fields have others.
         unset: whether all options have the default None.
-        texts: for some fields, what replaces {} in their help.
+        texts: for some fields, what replaces {} in their help, where otherwise nothing stands.
         root: the parser that gets the groups of arguments, where `parser` is a group.
     """
     hints, apart, texts = _hints(cls), dict[str, Any](), texts or {}
@@ -278,7 +278,7 @@ def _details(
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return the names and the other arguments for `add_argument`."""
     (kind, many), required = _kind(hint), default is dataclasses.MISSING
-    about = option.about if text is None else option.about.format(text)
+    about = option.about.replace("{}", text or "")
     if not (required or "default" in about or default is None or default is False or default == ()):
         about += f" (default: {f'{default:g}' if isinstance(default, float) else default})"
     details: dict[str, Any] = {"help": about}

@@ -84,7 +84,7 @@ class ExactCamera(LensCamera):
         shot: the settings of the camera; the d line stands in for the light of a lens without known dispersion.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
-        progress: shows the search for the outline, where no run has kept it (`kept_outline`), and what is compiled.
+        progress: shows the search for the outline, where no run has kept it (`kept_outline`).
 
     Raises:
         InputError: a focus nearer than four focal lengths, a lens that no ray passes, light of no known index.

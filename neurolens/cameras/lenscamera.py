@@ -354,7 +354,7 @@ class LensCamera:
     def start(self, runtime: Runtime | None, progress: Progress | None = None) -> None:
         """Choose what runs the camera; None takes C where the machine has a compiler that takes it, else onnxruntime.
 
-        `progress` shows what is compiled, which is done at once, and how long it took.
+        `progress` says where C is given up for onnxruntime.
 
         Raises:
             InputError: C is asked for, and there is no compiler, or it fails.
@@ -364,6 +364,12 @@ class LensCamera:
         if self.runtime == "c":
             self._run("rays")
         self.settings = self.settings | {"runtime": self.runtime}
+
+    def ready(self, wavelengths: int) -> None:
+        """Compile what `sample_spectrum` runs for so many wavelengths; what onnxruntime runs is of each process."""
+        if self.runtime == "c":
+            self._run("hero", wavelengths - 1)
+            self._run("companion")
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
         """Rays as `sample` does, for wavelengths [W, N] in nm, the first of which is the hero's; see the contract.
@@ -437,9 +443,7 @@ class LensCamera:
                 graph.outputs |= graph.inline(lanes, same)
         if self.runtime == "c":
             try:
-                # Of a lens's programs one line is enough.
-                told = None if kind != "rays" else lambda how: self._told(f"compiled {self.name} {how}")
-                return _compiled(graph, numbers, self.film, lens, told)
+                return _compiled(graph, numbers, self.film, lens)
             except InputError as error:  # a compiler that fails, or takes too long
                 if self._asked:
                     raise
@@ -514,11 +518,9 @@ class LensCamera:
         return {"rays": np.stack([*film, *pupil, wavelength])} | call, margin
 
 
-def _compiled(
-    graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph, told: Callable[[str], None] | None
-) -> GraphRun:
+def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph) -> GraphRun:
     """Compile a graph of the camera to a function, which tests a mask in the stop on the rays that come back."""
-    run = CompiledProgram.of(graph, numbers, padded(film.outline.table, 5), told)
+    run = CompiledProgram.of(graph, numbers, padded(film.outline.table, 5))
     mask = lens.aperture if lens.blades is None else None
     if mask is None:
         return run
@@ -552,31 +554,25 @@ class CompiledProgram:
         rows: how many rows each result has, which the program gives one by one.
         numbers: inputs of a whole call.
         table: of the outline.
-        told: as for `load_compiled`.
     """
 
-    def __init__(
-        self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray,
-        told: Callable[[str], None] | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray) -> None:
         most = MAX_STEPS_IN_PARTS if program.waits() else MAX_STEPS
         if len(program.steps) > most:
             raise InputError("compiled camera", "steps", len(program.steps), f"up to {most} for a compiler")
         self._rows = {name: (count, np.int32 if name == "status" else np.float32) for name, count in rows.items()}
         self._signature = s = Signature.of(program, "camera")
         self._numbers, self._table = np.array([numbers[name] for name in s.per_call], np.float32), table
-        self._call = load_compiled(write_blocks(program, "camera"), told).camera
+        self._call = load_compiled(write_blocks(program, "camera")).camera
         pointer = ctypes.c_void_p
         self._call.argtypes = [ctypes.c_size_t, pointer, pointer, pointer, ctypes.c_int, pointer, pointer]
         self._call.restype = None
 
     @classmethod
-    def of(
-        cls, graph: Graph, numbers: dict[str, float], table: FloatArray, told: Callable[[str], None] | None = None
-    ) -> CompiledProgram:
+    def of(cls, graph: Graph, numbers: dict[str, float], table: FloatArray) -> CompiledProgram:
         """Compile the program of a graph."""
         rows = {name: value.rows for name, value in graph.outputs.items()}
-        return cls(lower(graph).in_order_of_need(), rows, numbers, table, told)
+        return cls(lower(graph).in_order_of_need(), rows, numbers, table)
 
     def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         """Return the results [R, N] for inputs [R, N]; those of a camera are the input of `camera_rays`."""

@@ -76,20 +76,19 @@ _COMMANDS = {
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
 _EPILOG = """\
 examples:
-  neurolens lens lenses/laikin_double_gauss_50.toml --layout layout.png
-  neurolens convert lens.zmx -o lenses/lens.toml
-  neurolens train experiments/quickstart.toml
-  neurolens evaluate models/NAME.onnx
-  neurolens export models/NAME.onnx --to c -o lens.h
-  neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
+  neurolens find nikkor 50 1.2
+  neurolens lens laikin_double_gauss_50 --layout layout.png
+  neurolens render lights --camera canon_50mm_f1_2 --f-number 1.2 --width 480 --samples 64 -o first.exr
+  neurolens train --lens laikin_double_gauss_50
+  neurolens export laikin_double_gauss_50.ols-36 --to c -o gauss.h
 
-exit codes: 0 done, 1 a model breaks a promise or none has the error asked for, 2 bad input, 130 interrupted,
-70 a fault of neurolens itself, or no memory.
-Help of a command: neurolens COMMAND --help"""
+A command alone, as "neurolens render", prints what it does and an example; neurolens COMMAND --help has its options.
+Exit codes: 0 done; 1 a model breaks a promise, or none has the error asked for; 2 bad input; 70 a fault of neurolens
+itself, or no memory; 130 interrupted."""
 
 # What `neurolens` alone prints: what to type first, for each of the three ways in.
 _FIRST = """\
-A first picture:      neurolens demo
+A first picture:      neurolens render lights --camera canon_50mm_f1_2 --f-number 1.2 --width 480 --samples 64 -o first.exr
 To find a lens:       neurolens find nikkor 50 1.2
 To light or comp:     neurolens handover laikin_double_gauss_50 --film 36x20.25 --width 3840 --focus 2 -o shot/
 To do research:       neurolens analyse laikin_double_gauss_50 -o gauss

@@ -67,10 +67,10 @@ class Analyse(cli.Figures):
 
     epilog = """\
 examples:
-  neurolens analyse lenses/laikin_double_gauss_50.toml
-  neurolens analyse lenses/shimizu_fisheye_220.toml distortion vignetting -o pictures
-  neurolens analyse lenses/laikin_double_gauss_50.toml --copies 200 --f-number 4 -o pictures
-  neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focus-mode best --json"""
+  neurolens analyse laikin_double_gauss_50 -o charts
+  neurolens analyse shimizu_fisheye_220 distortion vignetting -o pictures
+  neurolens analyse laikin_double_gauss_50 --copies 200 --f-number 4 -o pictures
+  neurolens analyse brendel_tessar_100 spots mtf --f-number 5.6 --focus-mode best --json"""
     kept = "finished pictures are kept"
     intermixed = True
 

@@ -30,6 +30,7 @@ from neurolens.base.settings import (
     with_changes,
 )
 from neurolens.base.units import as_float
+from neurolens.graph.compiler import compiled_so_far
 from neurolens.optics.lens.shot import BY_LENSES, Shot, StopShape, film_size
 
 if TYPE_CHECKING:
@@ -44,9 +45,9 @@ cameras:
   MODEL.onnx                   an exported model of a lens
   thick:LENS                   its principal planes and pupils: ideal imaging, no rims
   thin:LENS, pinhole:LENS      a thin lens, a point: the plane in focus has the lens's size
-  thin, pinhole                the same of any focal length (--focal-length)
+  thin, pinhole                the same of 50 mm and f/4, or of --focal-length and --f-number
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
-                               points with these projections; --field sets the picture's circle"""
+                               points with these projections, of 14 mm; --field sets the picture's circle"""
 _SUFFIXES = {
     "png": (".png", ".pdf", ".svg"),
     "html": (".html", ".htm"),
@@ -86,6 +87,7 @@ class Parser(argparse.ArgumentParser):
     Attributes:
         intermixed: whether options may stand before and between the arguments of a list.
         whole: whether help shows all options.
+        alone: whether it has something to do without any word.
         renamed: words at the start of a command line, and the words that have replaced them.
     """
 
@@ -94,7 +96,7 @@ class Parser(argparse.ArgumentParser):
         # Abbreviations are refused, because one may become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # numbers are no options: -12,3 is a value, as -12 is
-        self.intermixed = self.whole = False
+        self.intermixed, self.whole, self.alone = False, False, True
         self.renamed: Mapping[str, Sequence[str]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -102,12 +104,16 @@ class Parser(argparse.ArgumentParser):
         args = sys.argv[1:] if args is None else list(args)
         args = [*self.renamed.get(args[0], args[:1]), *args[1:]] if args else args
         args = self._sizes(args)
+        if not (args or self.alone):
+            first = re.split(r"(?<=\.)\s", " ".join(self.in_short().split()))[0]
+            example = re.sub(r" *\\\n *", " ", first_example(self.epilog or ""))
+            self.exit(2, f"{first}\nExample: {re.sub('^neurolens|(?<=&& )neurolens', program(), example)}\n")
         if self.intermixed:
-            self.intermixed = False  # argparse comes back here for its two passes
+            alone, self.alone, self.intermixed = self.alone, True, False  # argparse comes back here for its two passes
             try:
                 found, rest = self.parse_known_intermixed_args(args, namespace)
             finally:
-                self.intermixed = True
+                self.alone, self.intermixed = alone, True
             if rest:
                 self.error(f"unrecognized arguments: {' '.join(rest)}")
             return found, rest
@@ -125,6 +131,10 @@ class Parser(argparse.ArgumentParser):
             args = [*args[:at], f"--width={found[1]}", f"--height={found[2]}", *args[at + 1 + (word != words) :]]
         return args
 
+    def in_short(self) -> str:
+        """Return the first paragraph of the description, as sentences."""
+        return re.split(":?\n\n", self.description or "")[0].rstrip(".") + "."
+
     def format_help(self) -> str:
         """Format the help. Where there are many options, it shows the common ones, unless --help-all asks for more."""
         options = [a for a in self._actions if a.option_strings and a.help != argparse.SUPPRESS]
@@ -134,7 +144,7 @@ class Parser(argparse.ArgumentParser):
         shown = [a for a in self._actions if a not in rare]
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, shown, [])
-        formatter.add_text(re.split(":?\n\n", self.description or "")[0].rstrip(".") + ".")
+        formatter.add_text(self.in_short())
         for part in self._action_groups:
             formatter.start_section(part.title)
             formatter.add_arguments([a for a in part._group_actions if a in shown])
@@ -161,12 +171,14 @@ class Command:
         epilog: the end of the help, whose first example the short help has, too.
         kept: tells what an interrupted command leaves (see also `keeps`).
         intermixed: whether options may stand before and between the arguments of a list.
+        alone: whether it has something to do without any word; else it then says what it does, with that example.
     """
 
     called: ClassVar[str]
     epilog: ClassVar[str] = ""
     kept: ClassVar[str] = "nothing is written"
     intermixed: ClassVar[bool] = False
+    alone: ClassVar[bool] = False
     told: str = field(default="", compare=False, repr=False)  # what was assumed, which a `Note` says with the answer
 
     def __init_subclass__(cls) -> None:
@@ -185,6 +197,7 @@ class Command:
         parser.description, parser.epilog, parser.intermixed = inspect.getdoc(cls), cls.epilog, cls.intermixed
         cls.add_options(parser)
         if parser.add_help:  # a call has none
+            parser.alone = cls.alone
             parser.add_argument("--help-all", action=WholeHelp, nargs=0, dest="help", help=argparse.SUPPRESS)
         parser.set_defaults(run=lambda args: cls.of(args).run(), kept=cls.kept)
 
@@ -274,8 +287,8 @@ class Reporting(Command):
         """Print a report, or a mapping with its `text`, as JSON if --json asks for it, else as text; returns the exit
         code. `full`: with what a report has in bulk."""
         text = text or found.text  # type: ignore[union-attr]  # of a report
-        if self.told:
-            note(self.told)
+        for said in filter(None, (self.told, compiled_so_far())):
+            note(said)
         if self.tell is not None:
             self.tell(plain(found, strict=False, full=full), text())
         elif self.json:
@@ -388,7 +401,7 @@ def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: b
 def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
     """Return -o and --output, the file or folder that a command writes; it is named where there is no default."""
     if assumed := default is ...:
-        default, about = None, f"{about} (default: a name of what is read, in this folder)"
+        default, about = None, f"{about} (default: named after the input, in this folder)"
     return setting(
         default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title,
         written=True, common=True, assumed=assumed,

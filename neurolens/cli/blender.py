@@ -53,6 +53,8 @@ class Blender(cli.Command):
     """Real lenses as cameras of Blender's Cycles (4.5 and later): an extension with a panel at the
     camera's data, where a lens is put on with one click and taken off with one."""
 
+    epilog = "examples:\n  neurolens blender build --lens laikin_double_gauss_50 -o neurolens.zip"
+
     @classmethod
     def add_options(cls, parser: cli.Parser) -> None:
         """Add the command's actions to its parser."""
@@ -73,6 +75,7 @@ class Build(cli.Reporting):
 
     kept = "no zip was written; finished shaders are kept for the next run"
     called = "neurolens blender build"
+    epilog = Blender.epilog
 
     out: Path = cli.output_path("OUT.zip", "default: neurolens.zip", Path("neurolens.zip"))
     models: Path | None = setting(None, "default: the models that ship", metavar="DIR")
@@ -129,6 +132,7 @@ class Add(cli.Reporting):
 
     kept = "nothing was added"
     called = "neurolens blender add"
+    epilog = "examples:\n  neurolens blender add laikin_double_gauss_50.ols-36 --extension neurolens.zip"
 
     file: Path = cli.lens(models=True, positional=True)
     extension: Path | None = setting(

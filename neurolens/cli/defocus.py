@@ -30,8 +30,8 @@ _MOST = 64  # fields along a side, at most
 
 @dataclass(frozen=True, kw_only=True)
 class Defocus(cli.Reporting):
-    """Give a sharp picture with depth the blur of a lens with its widest stop, focused on what its middle shows: by
-    field, depth and colour, with its distortion and vignetting.
+    """Give a sharp picture with depth the blur, distortion and vignetting of a lens, with its widest stop, focused on
+    what the middle of the picture shows.
 
     PLATE.exr is a pinhole's picture: R, G, B and a channel Z with the distance along the axis in metres (0, 1e9
     and more, inf: sky), without motion blur; depth without antialiasing is best. Its pinhole stands where
@@ -43,8 +43,9 @@ class Defocus(cli.Reporting):
     epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
-  neurolens defocus plate.exr --lens lenses/laikin_double_gauss_50.toml --film 36x20.25 --focus 2 \\
-      --f-number 2 -o out.exr
+  neurolens render room --camera pinhole:laikin_double_gauss_50 --width 400 --samples 16 -o plate.exr && \\
+      neurolens defocus plate.exr --lens laikin_double_gauss_50 -o blurred.exr
+  neurolens defocus plate.exr --lens laikin_double_gauss_50 --film 36x20.25 --focus 2 --f-number 2 -o out.exr
   neurolens defocus beauty.exr --depth Depth.Z --lens models/NAME.onnx --film 36x24 --focus 1.2 -o out.exr"""
     kept = "no picture was written; older files of that name are untouched"
 
@@ -71,7 +72,7 @@ examples:
     exposure: float = cli.exposure()
     sensor: SensorSettings = group("sensor (any of these adds what it reads as channels raw)", unset=True)
     seed: int = setting(0, "seed of the sensor's noise, for each frame another (default: 0)", kind=whole(0))
-    state: cli.LensState = cli.camera_state()
+    state: cli.LensState = cli.camera_state(texts={"focus_m": "what the middle of the plate shows, else "})
     threads: int = cli.threads()
 
     def assumed(self) -> Any:
@@ -138,8 +139,8 @@ def _defocus_text(data: dict[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Bokeh(PictureCommand):
-    """Write the kernels of the blur of a lens with its widest stop, at 5 x 3 places of the picture, float32 OpenEXR,
-    for ZDefocus and Bokeh in Nuke and for programs of your own:
+    """Write the blur of a lens as kernels for ZDefocus and Bokeh in Nuke or a program of your own: float32 OpenEXR, for
+    5 x 3 places of the picture, with the widest stop:
 
       OUT.0.8m.exr     for things 0.8 m from the film, one kernel a field, in columns and rows as in the picture
       OUT.0.8m.png     the same, each kernel as bright as the others, to be looked at
@@ -151,9 +152,9 @@ class Bokeh(PictureCommand):
     epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
-  neurolens bokeh lenses/laikin_double_gauss_50.toml --width 1920 --film 36x20.25 --focus 2 --f-number 2 \\
+  neurolens bokeh laikin_double_gauss_50 --width 1920 --film 36x20.25 --focus 2 --f-number 2 \\
       --distance 0.8 --distance 5 --distance inf -o bokeh
-  neurolens bokeh lenses/leica_summilux_m_35mm_f1_4_asph_v1.toml --width 3840 --film 36x24 --focus 0.7 \\
+  neurolens bokeh leica_summilux_m_35mm_f1_4_asph_v1 --width 3840 --film 36x24 --focus 0.7 \\
       --distance inf --grid 1x1 --ring-height 5 -o rings
   neurolens bokeh models/NAME.onnx --width 3840 --film 36x24 --focus 1 --distance inf --grid 1x1 -o kernel"""
 

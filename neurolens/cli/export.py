@@ -39,7 +39,7 @@ _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 
 @dataclass(frozen=True, kw_only=True)
 class Export(cli.Reporting):
-    """Write an exported model in another form, as C unless --to says otherwise: a self-contained C99 header (one
+    """Write a model or a lens as source code, as C unless --to says otherwise: a self-contained C99 header (one
     function for a ray, one for arrays that compilers vectorise), a function in a shading language, or an ONNX file.
 
     Domain guard, stop, rims, transmittance and status codes are those of the model; the card is a comment at the top,
@@ -58,7 +58,7 @@ values fixed by a scene are folded into fewer operations (--fix, repeatable):
   stop=4.5 | f_number=5.6   stop radius in mm, or the f-number it gives
 
 examples:
-  neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
+  neurolens export laikin_double_gauss_50.ols-60 --to c -o gauss.h
   neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
   neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
   neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface
@@ -66,24 +66,30 @@ examples:
   neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
     model: str = cli.lens(
-        also="; or a file of neurolens plan; of --to onnx models alone", models=True, cameras=True, positional=True,
+        also="; or a file of neurolens plan; --to onnx takes models alone", models=True, cameras=True, positional=True,
         metavar="MODEL",
     )  # fmt: skip
     to: Literal[(*source.WRITERS, source.OSL, "onnx")] = setting(  # type: ignore[valid-type]
         "c", "form to write (default: c)"
     )
     out: Path = cli.output_path("FILE", "file to write")
-    fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE", common=True)
+    fix: tuple[str, ...] = setting(
+        (), "fix an input, as focus=2 or wavelengths=450,550,650; repeatable", metavar="KEY=VALUE", common=True
+    )
     only: tuple[str, str, str, str, str] = setting(
         _PARTS, f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
         kind=cli.words_of(_PARTS, "ray"), metavar="PARTS",
     )  # fmt: skip
     name: str | None = setting(None, "of the function (default: the lens's id)")
-    derivatives: bool = setting(False, "of ONNX and with --whole-camera: additional outputs for ray differentials")
+    derivatives: bool = setting(False, "add outputs for ray differentials (with --to onnx or --whole-camera)")
     inverse: bool = setting(
-        False, "of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked"
+        False,
+        "write the inverse maps, too (film and stop point to ray; scene ray to film), fitted and checked "
+        "(with --to onnx)",
     )
-    whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA, common=True)
+    whole_camera: bool = setting(
+        False, "write the whole camera, from film to scene", old=("camera",), title=_CAMERA, common=True
+    )
     film: tuple[float, float] = cli.film(title=_CAMERA)
     state: cli.LensState = group(_CAMERA, names={*BY_LENSES, *LensCamera.takes}, unset=True)
 

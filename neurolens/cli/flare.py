@@ -78,8 +78,8 @@ def _gain(text: str) -> tuple[str, list[float]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Flare(cli.Figures):
-    """Print the brightest ghosts of a lens that is focused at infinity, and with -o, or of the lens alone, write a
-    picture of its flare.
+    """Print the brightest ghosts of a lens that is focused at infinity, and write a picture of its flare (with -o, or
+    where only a lens is given).
 
     Ghosts are traced exactly: light that two surfaces reflect on its way to the film, with the reflectance of
     Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. They are
@@ -96,17 +96,18 @@ class Flare(cli.Figures):
 
     epilog = """\
 examples:
+  neurolens flare laikin_double_gauss_50 --light 15,8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --path g08-06 path.png
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating quarter-wave --blades 6 --f-number 8 -o flare.exr
-  neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,3/2.5/1.5 --layers 8 -o flare.exr
+  neurolens flare ogawa_zoom_70_200 --zoom 100 --light -12,3,3/2.5/1.5 --layers 8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
   neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr"""
 
     file: Path = cli.lens(positional=True)
     light: tuple[str, ...] = setting(
-        (), "degrees to the right of and above the axis, as the camera sees it; irradiance at the lens, radiance "
-        "times solid angle in sr, as a number or R/G/B, of a point (default: the sun's disc with pi, which lights a "
-        "white card to radiance 1); and distance in metres (default: inf); repeatable",
+        (), "a light: degrees to the right of the axis and above it, as the camera sees it; the irradiance of a point "
+        "at the lens, a number or R/G/B, which is radiance times solid angle in sr (default: the sun's disc with pi, "
+        "which lights a white card to radiance 1); its distance in metres (default: inf); repeatable",
         metavar="AZ,EL[,E[,M]]", title=OF_LIGHTS, common=True,
     )  # fmt: skip
     lights: tuple[Path, ...] = setting(
@@ -116,8 +117,8 @@ examples:
         title=OF_LIGHTS,
     )  # fmt: skip
     image: Path | None = setting(
-        None, "connected regions of this picture by the same lens, film and focus that reach --threshold, as lights "
-        "far away; # in its name stands for the frame's digits", metavar="PLATE.exr", title=OF_LIGHTS,
+        None, "a picture by the same lens, film and focus, whose connected regions above --threshold are lights far "
+        "away; # in its name stands for the frame's digits", metavar="PLATE.exr", title=OF_LIGHTS,
     )  # fmt: skip
     threshold: float = setting(
         2.0, "of --image: value of a colour, where a white card of radiance 1 is 1; pixels count in full from 2 T on, "

@@ -29,8 +29,10 @@ _KINDS = "opencv", "opencv-rational", "kannala-brandt", "f-theta"
 
 @dataclass(frozen=True, kw_only=True)
 class Handover(StMap):
-    """Write a lens (or model, or any other camera), focused at infinity with its widest stop, as the files of the
-    programs that follow a render, to FOLDER:
+    """Write a lens, model or other camera as files for compositing and tracking: Nuke, Blender, USD, OpenTrackIO,
+    lensfun, OpenCV. A lens is focused at infinity with its widest stop.
+
+    It writes to FOLDER:
 
       shot.undistort.exr, shot.redistort.exr, shot.illumination.exr   ST maps, see neurolens stmap
       shot.nk, shot.blender.py     the maps as node groups of Nuke and Blender, with the pinhole to render CG with

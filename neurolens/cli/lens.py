@@ -28,9 +28,9 @@ _Sort = Literal["maker", "focal-length", "speed", "year", "cats-eye", "swirl", "
 
 @dataclass(frozen=True, kw_only=True)
 class Lens(cli.Figures):
-    """Print what follows from a lens file as it stands, focused at infinity with its widest stop: focal length,
-    pupils, film plane, image circle, how much of the light gets through and what stops the rest, and anything
-    doubtful about it.
+    """Print what follows from a lens file: focal length, pupils, film plane, image circle, how much light gets through
+    and what stops the rest, and what is doubtful about the file. The lens is focused at infinity, with its widest
+    stop.
 
     Several files, or folders (of all formats that "neurolens convert" reads), are
     a table with one line for each lens, in milliseconds a lens; after the word "list" each of them is
@@ -43,11 +43,11 @@ class Lens(cli.Figures):
     epilog = """\
 examples:
   neurolens lens laikin_double_gauss_50
-  neurolens lens lenses/brendel_tessar_100.toml --focal-length 50 --focus 1.5 --layout tessar.png
-  neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
+  neurolens lens brendel_tessar_100 --focal-length 50 --focus 1.5 --layout tessar.png
+  neurolens lens ogawa_zoom_70_200 --zoom 135mm --json
   neurolens lens downloads/ --json
   neurolens lens list --sort swirl
-  neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
+  neurolens lens brendel_tessar_100 --derive-rims -o tessar.toml"""
     kept = "only a finished --layout picture is written"
     intermixed = True
 

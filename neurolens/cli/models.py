@@ -40,7 +40,8 @@ class Models(cli.Figures):
 examples:
   neurolens models
   neurolens models double_gauss --within 0.5um
-  neurolens models lenses/cooke_triplet_50.toml --within 0.1px --json"""
+  neurolens models cooke_triplet_50 --within 0.1px --json"""
+    alone = True
 
     lens: str | None = setting(
         None, "lens file, or part of a lens's name or id", positional=True, metavar="LENS", nargs="?"
@@ -246,7 +247,7 @@ class Evaluate(cli.Figures):
 
     epilog = """\
 examples:
-  neurolens evaluate models/laikin_double_gauss_50.ols-36.onnx
+  neurolens evaluate laikin_double_gauss_50.ols-36
   neurolens evaluate runs/quickstart/models/ols-60.onnx --rays 100000 --seed 5
   neurolens evaluate my.onnx --lens my_lens.toml --json
 

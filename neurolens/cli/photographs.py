@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Verify(cli.Figures):
-    """Compare a lens file with photographs: lensfun's measured profiles of 1,300 lenses, found by maker, focal length,
-    f-number and name (what the file says it is believed to be, its name, the file's own name).
+    """Compare a lens file with photographs: with the profiles that lensfun measured of 1,300 lenses.
 
-    Compared are the shape of the distortion over image height, lateral colour over broad bands as a camera's, and light
-    by aperture. A profile leaves the scale of the picture free, and it is taken out. Rays come from infinity; the
-    photographs' distance is not known. Needs the extras "train" and "photographs" (lensfunpy, which brings the
-    profiles; their licence is CC BY-SA 3.0)."""
+    The profile is found by maker, focal length, f-number and name: the product that the file is believed to be, its
+    name, or the name of the file itself. The command compares the shape of the distortion over image height, lateral
+    colour in the broad bands of a camera, and light by aperture. A profile leaves the scale of the picture free, so the
+    scale is taken out. Rays come from infinity; the distance of the photographs is not known. Needs the extras "train"
+    and "photographs" (lensfunpy, which brings the profiles; their licence is CC BY-SA 3.0)."""
 
     epilog = """\
 examples:
-  neurolens verify lenses/sony_sonnar_55.toml -o sonnar.png
+  neurolens verify sony_sonnar_55 -o sonnar.png
   neurolens verify "Nikon AF Nikkor 28mm f1.4D.zmx" --json
   neurolens verify my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --lens-file my_verified_lens.toml"""
     kept = "only a finished picture or lens file is written"
@@ -97,16 +97,16 @@ def _row(c: Comparison) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Rims(cli.Figures):
-    """Fit the rims of a lens file to photographs: on each side of the stop either the rims are scaled, or a ring of the
-    mount is added, so that the light over image height is the measured one at all apertures together.
+    """Fit the rims of a lens file to photographs, so that the light falls off towards the corners as it was measured.
 
-    Nothing cuts the beam of the axis, and no rim is wider than its neighbours allow. What is left has other causes: the
-    sensor's shading, or a product that differs from the table. The profile is found as `neurolens verify` finds it.
-    Needs the extras "train" and "photographs"."""
+    On each side of the stop either the rims are scaled, or a ring of the mount is added; the fit takes all apertures
+    together. Nothing cuts the beam of the axis, and no rim is wider than its neighbours allow. What is left has other
+    causes: the sensor's shading, or a product that differs from the table. The profile is found as by `neurolens
+    verify`. Needs the extras "train" and "photographs"."""
 
     epilog = """\
 examples:
-  neurolens rims lenses/nikon_zoom_70_200.toml -o zoom.toml
+  neurolens rims nikon_zoom_70_200 -o zoom.toml
   neurolens rims my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --unused 1.4 2"""
     kept = "only a finished lens file is written"
 

@@ -38,10 +38,9 @@ def _budget(text: str) -> tuple[str, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(cli.Figures):
-    """Look through the exact lens at a scene, say what each of its effects is worth there in pixels, and choose
-    the cheapest camera whose error stays within the budget: a pinhole, with or without its picture warped
-    afterwards, a thin or thick lens, a model that ships, a polynomial fitted for this shot alone, or the
-    exact lens. Needs the extra "train" (torch).
+    """Say how many pixels each effect of a lens is worth in a scene, and choose the cheapest camera whose error stays
+    within a budget. The choice is among a pinhole, with or without its picture warped afterwards, a thin or thick lens,
+    a model that ships, a polynomial fitted for this shot alone, and the exact lens. Needs the extra "train" (torch).
 
     Errors are distances between the pictures of a point by a camera and by the exact lens, the least RMS way on which
     light moves, and the relative error of light, of which 1% is allowed; 95% of the picture keep both. The cost of a
@@ -51,9 +50,9 @@ class Plan(cli.Figures):
 
     epilog = """\
 examples:
-  neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --budget 0.25px
+  neurolens plan garden --lens laikin_double_gauss_50 --budget 0.25px
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
-  neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --trade
+  neurolens plan garden --lens laikin_double_gauss_50 --trade
 
 -o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
 models/ with what was fitted, and plan.toml: 'render' and 'export' take it for the camera, and 'train' fits a

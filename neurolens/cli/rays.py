@@ -30,9 +30,8 @@ _MOST_LAYERS = 64  # samples that an EXR may have as layers
 
 @dataclass(frozen=True, kw_only=True)
 class Rays(PictureCommand):
-    """Write the rays of a lens (or model, or any other camera), focused at infinity with its widest stop: origin,
-    direction, weight and wavelength of 16 samples of every pixel, in the frame and arrays of the program that takes
-    them, which is OpenGL's unless --to says otherwise.
+    """Write the rays of a camera for another program: origin, direction, weight and wavelength of 16 samples of every
+    pixel, in the frame of OpenGL unless --to names a program. A lens is focused at infinity with its widest stop.
 
     The value of a pixel is the mean of weight times radiance over its samples. Film, pupil and light are sampled
     together, and one seed gives the same rays to every program.

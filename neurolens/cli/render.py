@@ -62,14 +62,13 @@ class Render(cli.Reporting):
     epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
-  neurolens render experiments/scenes/room.toml --camera lenses/laikin_double_gauss_50.toml -o exact.exr
-  neurolens render experiments/scenes/grid.toml --camera lenses/ogawa_zoom_70_200.toml \\
-      --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
-  neurolens render experiments/scenes/room.toml --camera thin --samples 64 --keep-checkpoint -o room.exr
-  neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more
-  neurolens render experiments/scenes/room.toml --camera thin --tile 1/2 -o room.exr   # and 2/2 elsewhere
+  neurolens render lights --camera canon_50mm_f1_2 --f-number 1.2 --width 480 --samples 64 -o first.exr
+  neurolens render grid --camera ogawa_zoom_70_200 --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
+  neurolens render room --camera thin --samples 64 --keep-checkpoint -o room.exr
+  neurolens render room --camera thin --samples 256 -o room.exr   # 192 more
+  neurolens render room --camera thin --tile 1/2 -o room.exr   # and 2/2 elsewhere
   neurolens render --merge room.tile-*.exr -o room.exr
-  neurolens render experiments/scenes/room.toml --camera models/NAME.onnx --frames 1:48 \\
+  neurolens render room --camera models/NAME.onnx --frames 1:48 \\
       --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
     kept = "no picture was written; older files of that name are untouched"
 
@@ -107,7 +106,7 @@ examples:
         False, "keep OUT.exr.part, so that the same command with more --samples adds them (from a multiple of 16)",
         title=_LONG,
     )  # fmt: skip
-    state: cli.LensState = cli.camera_state()
+    state: cli.LensState = cli.camera_state(texts=dict.fromkeys(("focus_m", "f_number"), "the scene's, else "))
     threads: int = cli.threads("workers, each pinned to a core if there are as many as cores")
 
     def assumed(self) -> Any:
@@ -275,7 +274,9 @@ class Demo(cli.Command):
     lens and a pinhole that show the plane in focus at the same size, then through a fisheye's model,
     and write them on one page, each with its command. Needs no checkout: the library ships."""
 
+    epilog = "examples:\n  neurolens demo --width 160 -o small/"
     kept = "pictures so far are kept; the same command goes on"
+    alone = True
 
     out: Path = cli.output_path("FOLDER", "default: neurolens-demo", Path("neurolens-demo"))
     width: int = setting(480, "(default: 480)", within=(1, 4096), metavar="PIXELS")

@@ -80,9 +80,9 @@ class PictureCommand(cli.Reporting):
     kept = "files that were written are whole"
     usual_px: ClassVar[int] = 1920
 
-    camera: str = cli.lens(also=", see below", models=True, cameras=True, positional=True)
+    camera: str = cli.lens(models=True, cameras=True, positional=True)
     width: int | None = setting(
-        None, "width of the lens's picture (default: from --height and the film's shape, else as said)",
+        None, "width of the lens's picture (default: by --height, else one that the command states)",
         within=(1, _LARGEST), metavar="PIXELS", common=True,
     )  # fmt: skip
     height: int | None = setting(
@@ -130,7 +130,7 @@ class FieldCommand(PictureCommand):
     """A command about the place of things in the picture of a lens, which says what one centre leaves of it."""
 
     near: float | None = setting(
-        None, "distance from the film to the nearest thing that is seen, of which is told what one centre leaves "
+        None, "distance from the film to the nearest thing in view, whose parallax the command states in pixels "
         "(default: the nearest that the lens focuses)",
         kind=between(1e-3, 1e6, "a distance in metres"), metavar="M", common=True,
     )  # fmt: skip
@@ -168,8 +168,8 @@ class TracedFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class StMap(FieldCommand):
-    """Write ST maps of a lens (or model, or any other camera), focused at infinity with its widest stop, for
-    compositing, float32 OpenEXR:
+    """Write the ST maps of a camera for compositing, as float32 OpenEXR. A lens is focused at infinity with its widest
+    stop:
 
       SHOT.undistort.exr     makes the undistorted picture from that of the lens (the plate)
       SHOT.redistort.exr     makes the picture of the lens from an undistorted one, as CG is rendered
@@ -187,15 +187,15 @@ class StMap(FieldCommand):
     epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
-  neurolens stmap lenses/laikin_double_gauss_50.toml --width 3840 --film 36x20.25 --focus 2 -o shot
+  neurolens stmap laikin_double_gauss_50 --width 3840 --film 36x20.25 --focus 2 -o shot
   neurolens stmap models/NAME.onnx --width 1920 --film 24x13.5 --frames 1:48 --key focus=1:1.2,48:3 -o pull
   neurolens stmap lenses/NAME.toml --width 1920 --film 36x20.25 --lateral-colour -o shot   # and per channel
-  neurolens stmap lenses/isshiki_fisheye_10.toml --width 2000 --film 18x18 --projection equidistant -o fisheye"""
+  neurolens stmap isshiki_fisheye_10 --width 2000 --film 18x18 --projection equidistant -o fisheye"""
 
     out: Path = cli.output_path("SHOT", "start of the files' names")
     projection: Literal["rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"] = setting(
         "rectilinear",
-        "of the undistorted picture (default: rectilinear, a plane: fields up to 85 degrees from the axis)",
+        "of the undistorted picture (default: rectilinear, a plane, which holds 85 degrees from the axis)",
         common=True,
     )  # fmt: skip
     distance: float | None = setting(
@@ -203,7 +203,7 @@ examples:
         kind=positive("a distance in metres", infinite=True), metavar="M",
     )  # fmt: skip
     lateral_colour: bool = setting(
-        False, "maps for each channel too, SHOT.undistort.red.exr and so on, of the --wavelengths", common=True
+        False, "write maps for each channel, too (SHOT.undistort.red.exr, ...), of the --wavelengths", common=True
     )
     wavelengths: tuple[float, float, float] = setting(
         _CHANNELS_NM, "those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
@@ -370,8 +370,8 @@ def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Projection(FieldCommand, cli.Figures):
-    """Fit a lens (or model, or any other camera), focused at infinity with its widest stop, with a projection of
-    other programs, and say what it leaves in pixels:
+    """Describe a camera by a projection of another program (OpenCV, nerfstudio, NVIDIA), and say how many pixels that
+    is off. A lens is focused at infinity with its widest stop:
 
       opencv            fx fy cx cy, k1 k2 p1 p2 k3      opencv-rational   and k4 k5 k6
       kannala-brandt    OpenCV's fisheye, k1 k2 k3 k4    f-theta           NVIDIA's polynomials, both ways

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Train(cli.Reporting):
-    """Run an experiment, or with --lens the default one for a lens: trace ray pairs of the lens, fit the surrogates,
-    export them as ONNX, measure errors and speed against the exact tracer, render the scenes, and write one report.
-    Needs the extra "train" (torch).
+    """Fit models to a lens (--lens), or run an experiment file: trace pairs of rays, fit the models, write them as
+    ONNX, measure their errors and speed against the exact tracer, render scenes, and write one report. Needs the extra
+    "train" (torch).
 
     Without an experiment file, --lens fits a polynomial and a network to that lens in its default state: full aperture,
     its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated for less; one where no
@@ -41,11 +41,12 @@ class Train(cli.Reporting):
 
     epilog = """\
 examples:
+  neurolens train --lens cooke_triplet_50 --within 5um
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
-  neurolens train --lens lenses/cooke_triplet_50.toml --within 0.1px --rounds 0
+  neurolens train --lens cooke_triplet_50 --within 0.1px --rounds 0
   neurolens train --lens lenses/*_50.toml -o runs/fifties
-  neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range -o runs/zoom
+  neurolens train --lens nikon_zoom_70_200 --zoom-range -o runs/zoom
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
 lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
@@ -177,14 +178,16 @@ def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Survey(cli.Reporting):
-    """Read every lens file of a folder (all formats of `neurolens convert`, and folders inside), check it against its
-    own statements, derive rims where it gives none, fit a polynomial by the default settings, and measure it on
-    rays that the fit has not seen. Nothing is left out silently: what cannot be read is one line with the reason.
+    """Read every lens file of a folder and of the folders inside it, check it, fit a polynomial to it, and measure the
+    polynomial on rays that the fit has not seen.
 
-    Every file is a process of its own. A finished file is not done again: the same command goes on."""
+    All formats of `neurolens convert` are read. A file is checked against its own statements, and gets rims where it
+    gives none. Nothing is left out silently: what cannot be read is one line with the reason. Every file is a process
+    of its own. A finished file is not done again: the same command goes on."""
 
     epilog = """\
 examples:
+  neurolens survey experiments/fuzz_seeds --no-fit
   neurolens survey lenses/
   neurolens survey my_patents/ -o runs/patents --jobs 8
   neurolens survey my_patents/ --no-fit

@@ -45,14 +45,15 @@ _SIX = (  # without any lens
 
 @dataclass(frozen=True, kw_only=True)
 class View(cli.Reporting):
-    """Write one page for a browser, which needs neither server nor network: lenses traced exactly and their
-    models as GLSL in a path tracer of WebGPU, or of WebGL2 where the browser has no WebGPU, side by side or
-    as their difference, at any focus, stop, blades and wavelength; their layout with the rays of a pixel,
-    their error and what a ray costs there.
+    """Write one page that renders through lenses and their models in a browser, without server or network.
 
-    LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
-    model, shown with the lens of its name. Without any, six lenses with
-    the best polynomial and the best network of each."""
+    The page traces lenses exactly, and runs models as GLSL, in a path tracer of WebGPU (or WebGL2). It shows them side
+    by side or as their difference, at any focus, stop, blades and wavelength, with the layout, the rays of a pixel, the
+    error, and what a ray costs there.
+
+    LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/. MODEL is an exported model,
+    which is shown with the lens of its name. Without any the page has six lenses, each with its best polynomial and its
+    best network."""
 
     epilog = """\
 examples:
@@ -61,6 +62,7 @@ examples:
   neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html
   neurolens view laikin_double_gauss_50 --ghosts -o flare.html"""
     kept = "nothing was written"
+    alone = True
 
     lenses: tuple[Path, ...] = cli.lens((), models=True, positional=True, metavar="LENS|MODEL", nargs="*")
     out: Path = cli.output_path("FILE.html", "page (default: view.html)", Path("view.html"))

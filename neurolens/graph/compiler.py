@@ -14,7 +14,6 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -30,6 +29,7 @@ FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-m
 _SECONDS = 300  # the largest models known compile in ten
 _ROOM = 2**20
 _KEPT = 64  # libraries of 50 to 200 kB
+_TAKEN_S: list[float] = []  # by each compilation of this process, see `compiled_so_far`
 _ONE_AT_A_TIME = threading.RLock()  # threads that need the same library do not both compile it
 if hasattr(os, "register_at_fork"):  # not under Windows
     os.register_at_fork(after_in_child=_ONE_AT_A_TIME._at_fork_reinit)  # type: ignore[attr-defined]
@@ -131,10 +131,18 @@ def c_source(file: str, **constants: object) -> str:
     return defines + (Path(__file__).parents[1] / file).read_text(encoding="utf-8")
 
 
-def load_compiled(source: str, told: Callable[[str], None] | None = None) -> ctypes.CDLL:
-    """Load the library of a source, which is compiled once for this machine and kept in `cache_folder`.
+def compiled_so_far() -> str:
+    """Return what this process has compiled since the last call, in words; nothing where all libraries were there."""
+    with _ONE_AT_A_TIME:
+        number, taken_s = len(_TAKEN_S), sum(_TAKEN_S)
+        _TAKEN_S.clear()
+    programs = f"{number} programs" if number > 1 else "a program"
+    said = f"compiled {programs} in {duration(taken_s)}, kept for the next time in {cache_folder()}"
+    return said if number else ""
 
-    `told` is called after a compilation, with the end of a line: how long it took and where the library is kept.
+
+def load_compiled(source: str) -> ctypes.CDLL:
+    """Load the library of a source, which is compiled once for this machine and kept in `cache_folder`.
 
     A library of another user, or a damaged one, is compiled again. Where the disk of the cache is full, it goes to the
     folder of temporary files, for this process; a compiler itself works in whichever of the two has room.
@@ -143,10 +151,10 @@ def load_compiled(source: str, told: Callable[[str], None] | None = None) -> cty
         InputError: as `compile_c`, and where a library cannot be loaded.
     """
     with _ONE_AT_A_TIME:
-        return _loaded(source, told)
+        return _loaded(source)
 
 
-def _loaded(source: str, told: Callable[[str], None] | None) -> ctypes.CDLL:
+def _loaded(source: str) -> ctypes.CDLL:
     library = cache_folder() / f"{_key(source)}.so"
     if sealed_bytes(library) is not None:
         with suppress(OSError):  # another run has just removed it
@@ -157,8 +165,7 @@ def _loaded(source: str, told: Callable[[str], None] | None) -> ctypes.CDLL:
     with atomic_path(library) as temporary:
         compile_c(source, temporary, FLAGS)
         seal(temporary, 0o700)
-    if told is not None:
-        told(f"in {duration(time.monotonic() - began)}, kept for the next time in {library.parent}")
+    _TAKEN_S.append(time.monotonic() - began)
     try:
         loaded = ctypes.CDLL(str(library))
     except OSError as error:

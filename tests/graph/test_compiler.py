@@ -33,6 +33,17 @@ def test_compiled_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert compiler.load_compiled(SOURCE).answer() == 42
 
 
+def test_what_was_compiled_is_said_once_with_the_time_of_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    compiler.compiled_so_far()
+    times = iter([1.0, 2.5, 10.0, 12.5])
+    monkeypatch.setattr(compiler.time, "monotonic", lambda: next(times, 12.5))
+    for source in (SOURCE, SOURCE.replace("42", "43"), SOURCE):
+        compiler.load_compiled(source)
+    said = compiler.compiled_so_far()
+    assert said == f"compiled 2 programs in 4.0 s, kept for the next time in {tmp_path / 'neurolens'}"
+    assert compiler.compiled_so_far() == ""
+
+
 def test_other_sources_flags_and_compilers_make_other_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
     compiler.load_compiled(SOURCE)
     assert compiler.load_compiled(SOURCE.replace("42", "43")).answer() == 43

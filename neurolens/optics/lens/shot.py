@@ -84,21 +84,20 @@ class Shot:
 
     film_mm: tuple[float, float]
     focus_m: float = setting(
-        math.inf, "distance from the film to the object in focus, or inf (default: the scene's, or inf)",
+        math.inf, "distance from the film to the object in focus, or inf (default: {}inf)",
         within=(1e-6, math.inf), unit="a distance in metres", common=True,
     )  # fmt: skip
     f_number: float | None = setting(
-        None, "focal length over entrance-pupil diameter at infinity focus (default: the scene's, or the widest; 4 for "
-        "thin)", within=F_NUMBER, unit="an f-number", metavar="N", common=True,
+        None, "focal length over entrance-pupil diameter, focused at infinity (default: {}the widest)",
+        within=F_NUMBER, unit="an f-number", metavar="N", common=True,
     )  # fmt: skip
     focal_length_mm: float | None = setting(
-        None, "scale the whole lens to this focal length (default: as tabled; 50 for thin and pinhole, 14 for "
-        "fisheyes; a model has its own)", within=FOCAL_MM, unit="a focal length in mm", old=("efl",),
-        apart="size", common=True,
+        None, "scale the whole lens to this focal length (default: that of its table)", within=FOCAL_MM,
+        unit="a focal length in mm", old=("efl",), apart="size", common=True,
     )  # fmt: skip
     zoom: str | float | None = setting(
-        None, "state of the lens file by name, or a focal length in mm between its states (derived: its table and "
-        "interpolated gaps); default: the state of the table", old=("configuration",), metavar="STATE", common=True,
+        None, "zoom state of the lens file by its name, or a focal length in mm between its states, whose gaps are "
+        "interpolated (default: the state of the table)", old=("configuration",), metavar="STATE", common=True,
     )  # fmt: skip
     field_deg: float | None = setting(
         None, "scale the whole lens so that its image circle sees this full field of view, traced",

@@ -155,6 +155,13 @@ class Job:
         columns, rows = (math.ceil(reach * count / length) + 1 for reach, count, length in sides)
         return rows * self.grid.width + columns
 
+    def ready(self) -> None:
+        """Compile what all workers run, before they are forked: each would compile it for itself."""
+        if self.mode == "companions":
+            _light_of_tile(self.spectral.bins)
+            if ready := getattr(getattr(self.camera, "camera", self.camera), "ready", None):
+                ready(self.spectral.lanes)
+
     def picture_settings(self) -> dict[str, Any]:
         """Return the settings besides scene and camera that decide the picture, for its metadata and its checkpoint."""
         settings = asdict(self.settings)

@@ -297,6 +297,7 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
     Raises:
         NeurolensError: a worker failed or was killed; whole tiles are on the film.
     """
+    job.ready()
     forks = _FORKS and not multiprocessing.current_process().daemon  # a worker of Dask, for one, may have no children
     alone = workers == 1 and watch is None
     with Here() if alone else Forked(job.render_tile, workers) if forks else ThreadPoolExecutor(workers) as executor:
