@@ -88,7 +88,7 @@ itself, or no memory; 130 interrupted."""
 
 # What `neurolens` alone prints: what to type first, for each of the three ways in.
 _FIRST = """\
-A first picture:      neurolens render lights --camera canon_50mm_f1_2 --f-number 1.2 --width 480 --samples 64 -o first.exr
+A first picture:      neurolens render lights --camera canon_50mm_f1_2 --f-number 1.2 --width 480 --samples 64
 To find a lens:       neurolens find nikkor 50 1.2
 To light or comp:     neurolens handover laikin_double_gauss_50 --film 36x20.25 --width 3840 --focus 2 -o shot/
 To do research:       neurolens analyse laikin_double_gauss_50 -o gauss
