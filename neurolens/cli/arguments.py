@@ -53,8 +53,6 @@ _SUFFIXES = {
     "html": (".html", ".htm"),
     "npz": (".npz", ".safetensors", ".exr"),
 }  # of files that a placeholder stands for
-
-
 _FEW = 10  # options; the help of more shows those that are marked as common
 
 
@@ -105,7 +103,7 @@ class Parser(argparse.ArgumentParser):
         args = [*self.renamed.get(args[0], args[:1]), *args[1:]] if args else args
         args = self._sizes(args)
         if not (args or self.alone):
-            first = re.split(r"(?<=\.)\s", " ".join(self.in_short().split()))[0]
+            first = re.split(r"(?<=\.)\s", " ".join(self._in_short().split()))[0]
             example = re.sub(r" *\\\n *", " ", first_example(self.epilog or ""))
             self.exit(2, f"{first}\nExample: {re.sub('^neurolens|(?<=&& )neurolens', program(), example)}\n")
         if self.intermixed:
@@ -131,8 +129,7 @@ class Parser(argparse.ArgumentParser):
             args = [*args[:at], f"--width={found[1]}", f"--height={found[2]}", *args[at + 1 + (word != words) :]]
         return args
 
-    def in_short(self) -> str:
-        """Return the first paragraph of the description, as sentences."""
+    def _in_short(self) -> str:  # the first paragraph of the description
         return re.split(":?\n\n", self.description or "")[0].rstrip(".") + "."
 
     def format_help(self) -> str:
@@ -144,7 +141,7 @@ class Parser(argparse.ArgumentParser):
         shown = [a for a in self._actions if a not in rare]
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, shown, [])
-        formatter.add_text(self.in_short())
+        formatter.add_text(self._in_short())
         for part in self._action_groups:
             formatter.start_section(part.title)
             formatter.add_arguments([a for a in part._group_actions if a in shown])
