@@ -97,7 +97,7 @@ def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
 
 def units_of(model: LensModel, series: DirectionSeries, form: Form) -> Units:
     """Return the units of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
-    return Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale, model.chebyshev)
+    return Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
 
 
 def add_outputs(

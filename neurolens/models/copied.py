@@ -105,7 +105,7 @@ class Copied(Symmetric):
             out = along(first + 1, ab[v]) * field.p + along(first + 3, ab[3 + v]) * field.u
             vectors.append(out + across[first] if first in across else out)
         gates = [along(3 * FORMS + 2 * k, scalars[1 + k]) for k in range(count - 1)]
-        light = self.light(g, field, units.chebyshev)
+        light = self.light(g, field)
         through = scalars[0] if light is None else scalars[0] + light
         return CoreValues((vectors[0], vectors[1], vectors[2]), through, g.concat(*gates) if gates else None)
 

@@ -40,7 +40,7 @@ from neurolens.models.card import (
 )  # fmt: skip
 from neurolens.models.copied import copy_inputs, copy_nodes
 from neurolens.models.cores import CORES, Core
-from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_structure
+from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 from neurolens.optics.lens.figures import figure_of
 from neurolens.optics.lens.prescription import Coating, Lens, Surface
 
@@ -248,7 +248,7 @@ def onnx_of(
     state = state_graph(axes) if axes else None
     if copy_inputs(nodes[0]):
         nodes, *state = copy_nodes(nodes[0])  # type: ignore[assignment]
-    graphs = [model_graph(node, ONNX) for node in with_one_structure(nodes)]
+    graphs = [model_graph(node, ONNX) for node in with_one_angle(nodes)]
     shapes = {}
     if derivatives:
         of = [name for name in ("scene_ray", "path_um") if name in graphs[0].outputs]
@@ -270,7 +270,7 @@ def coefficients_text(nodes: Sequence[LensModel]) -> str:
     Raises:
         InputError: a core that no file can hold.
     """
-    nodes = with_one_structure(nodes)
+    nodes = with_one_angle(nodes)
     first = nodes[0]
     data = {
         "schema": SCHEMA,
@@ -286,7 +286,7 @@ def coefficients_text(nodes: Sequence[LensModel]) -> str:
 
 def as_stored(nodes: Sequence[LensModel]) -> tuple[LensModel, ...]:
     """Return the models as their file will give them: with coefficients rounded to float32, and one angle for all."""
-    return tuple(replace(node, core=unpack(pack(node.core))) for node in with_one_structure(nodes))
+    return tuple(replace(node, core=unpack(pack(node.core))) for node in with_one_angle(nodes))
 
 
 def deflated(data: dict[str, Any]) -> str:

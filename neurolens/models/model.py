@@ -225,7 +225,6 @@ class LensModel:
             `targets.with_angle`. A ray whose direction vector comes out longer, as a network's may far from the rays of
             its fit, lies outside the domain. Where all rays point forwards the angle stays below a right one. A
             `Refracted` core's angle is that inside the glass. With pi no ray is refused.
-        chebyshev: as `Units` has it; set where another model of the same structure needs it.
     """
 
     lens: Lens
@@ -239,7 +238,6 @@ class LensModel:
     fit_s: float = 0.0
     direction: Literal["angle", "slope"] = "angle"
     angle: float = math.pi
-    chebyshev: bool = False
 
     def predict(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         """Evaluate the model in the dtype of `rays`.
@@ -283,10 +281,10 @@ class LensModel:
         return low / DOMAIN_SLACK, high * DOMAIN_SLACK
 
 
-def with_one_structure(models: Sequence[LensModel]) -> list[LensModel]:
-    """Give models of one structure the largest angle of them all and one way to sum the light, as one graph needs."""
-    angle, chebyshev = max(model.angle for model in models), any(model.core.cancels for model in models)
-    return [replace(model, angle=angle, chebyshev=chebyshev) for model in models]
+def with_one_angle(models: Sequence[LensModel]) -> list[LensModel]:
+    """Give models of one structure the largest angle of them all, so that their graphs are of one structure, too."""
+    angle = max(model.angle for model in models)
+    return [replace(model, angle=angle) for model in models]
 
 
 def mixed(nodes: Sequence[LensModel], weights: Array) -> LensModel:

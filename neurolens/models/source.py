@@ -36,7 +36,7 @@ from neurolens.models.assemble import ALL, SCALARS, Parts, model_graph
 from neurolens.models.axes import mixture, mixture_of, state_names
 from neurolens.models.card import axes_of
 from neurolens.models.copied import copy_inputs, copy_nodes
-from neurolens.models.model import Domain, LensModel, with_one_structure
+from neurolens.models.model import Domain, LensModel, with_one_angle
 from neurolens.optics.lens.glass import inverse_square_um
 
 DOUBLE = "c-double"
@@ -224,7 +224,7 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     fix.check(models[0].domain)
     fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
     constants = {name: value for name, value in fixed.items() if value is not None}
-    graphs = [model_graph(model, SCALARS, parts) for model in with_one_structure(models)]
+    graphs = [model_graph(model, SCALARS, parts) for model in with_one_angle(models)]
     return lower(graphs, constants)
 
 

@@ -16,7 +16,7 @@ from neurolens.cameras.exact import state_of
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.interpret import evaluate
 from neurolens.models.card import read_card
-from neurolens.models.cores import InvariantPolynomial, Residual
+from neurolens.models.cores import InvariantPolynomial, LightField, Residual
 from neurolens.models.file import read_model
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
@@ -120,6 +120,19 @@ def test_float32_carries_the_light_at_the_ends_of_the_spectrum(name: str) -> Non
     assert passed.sum() > 500
     off = np.abs(single["transmittance"] - double["transmittance"])[0, passed]
     assert off.max() < 6e-6
+
+
+@pytest.mark.parametrize("degree", [1, 3, 4, 20])
+def test_cubics_and_chebyshev_polynomials_have_the_same_sum_as_powers(degree: int) -> None:
+    exponents = np.array([[0, 0, 0, k] for k in range(degree + 1)] + [[1, 0, 0, degree]])
+    rng = np.random.default_rng(degree)
+    scalars, w = rng.normal(size=(1, len(exponents))), np.linspace(-1, 1, 50)
+    core = InvariantPolynomial(exponents, np.zeros((3, 2, len(exponents))), scalars)
+    p, u = torch.from_numpy(rng.normal(size=(2, 2, 50)))
+    found = core(LightField(p, u, torch.from_numpy(w)))[1][0].numpy()
+    rho = (p**2).sum(0).numpy()
+    wanted = np.polynomial.polynomial.polyval(w, scalars[0, :-1]) + scalars[0, -1] * rho * w**degree
+    np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-11)
 
 
 def test_another_lens_is_refused() -> None:

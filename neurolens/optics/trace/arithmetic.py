@@ -117,11 +117,10 @@ class Arithmetic:
 
     def chebyshev(self, x: Any, coefficients: Sequence[Any]) -> Any:
         """Return the sum of Chebyshev's polynomials with these coefficients, lowest first, by Clenshaw's recurrence."""
-        later: Any = 0.0
-        latest: Any = 0.0
-        for c in coefficients[:0:-1]:
-            later, latest = self.fma(x, later, c - latest, 2.0), later
-        total = self.fma(x, later, coefficients[0] - latest)
+        total, later = coefficients[-1], None
+        for k in range(len(coefficients) - 2, -1, -1):
+            c = coefficients[k] if later is None else coefficients[k] - later
+            total, later = self.fma(x, total, c, 2.0 if k else 1), total
         return total + x * 0.0 if is_number(total) else total
 
 
