@@ -104,7 +104,7 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
     assert parse(f"merge {tiles}".split()) == parse(f"render --merge {tiles}".split())
     assert parse("stmap thin --size 9x6 --film 36x24 -o a".split()).size == (9, 6)
     words = "a.toml --lens cooke_triplet_50".split()
-    assert parse(["trade", *words]) == parse(["plan", *words, "--trade"])
+    assert parse(["trade", *words]) == parse(["plan", *words, "--explain"])
 
 
 # Bad input

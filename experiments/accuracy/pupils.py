@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,11 @@ from neurolens.cameras.shaders.osl import osl_program
 from neurolens.cameras.shaders.pupil_fit import light_lost
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
-from neurolens.studies.plan.costs import cycles_ns
+
+# Of a camera ray of a shader in Cycles under a white sky, experiments/results/osl_speed.md: a base, each of its
+# operations, and what a division or a root takes besides. Fitted to the least times of the six lenses there: within
+# 3.5%.
+_SHADER_NS, _STEP_NS, _DEAR_NS, _DEAR = 90.66, 0.2295, 2.772, ("div", "sqrt")
 
 
 @dataclass(frozen=True)
@@ -269,7 +273,7 @@ _SHADERS_TEXT = """\
 By `python -m experiments pupils --shaders`: share of the samples that pass the lens, from film points that have light
 at that stop, all over film, focus and wavelength; light that no sample has, in the worst zone of film and stop;
 operations of a ray through a round stop; what they make a ray cost in Cycles under a white sky
-(`studies/plan/costs.py`) for each that passes, the stop open; CPU to make the shader. The pupil of the biconvex lens
+(`cycles_ns`) for each that passes, the stop open; CPU to make the shader. The pupil of the biconvex lens
 folds far off the axis: one wide disc holds it."""
 
 
@@ -290,13 +294,18 @@ def shaders(args: argparse.Namespace) -> None:
     )
 
 
+def cycles_ns(kinds: Mapping[str, int]) -> float:
+    """The nanoseconds of a ray of a shader in Cycles, from its operations."""
+    return _SHADER_NS + _STEP_NS * sum(kinds.values()) + _DEAR_NS * sum(kinds.get(k, 0) for k in _DEAR)
+
+
 def shader_row(file: Path) -> lab.Row:
     """The row of a model's shader, in its worst state."""
     begun = time.process_time()
     with Progress(quiet=True).stage(file.stem) as report:
         _, lens, _ = lens_of(file, None, report)
     shares = dict(zip(("open", "stopped_2", "stopped_4"), lens.passing().values(), strict=True))
-    cpu, program = time.process_time() - begun, osl_program(lens, {"count": 0.0})
+    cpu, kinds = time.process_time() - begun, osl_program(lens, {"count": 0.0}).count()
     lost = max(light_lost(state, pupil) for state, pupil in lens.states())
-    measured = {"operations": sum(program.count().values()), "ns": cycles_ns(program) / shares["open"], "cpu_s": cpu}
+    measured = {"operations": sum(kinds.values()), "ns": cycles_ns(kinds) / shares["open"], "cpu_s": cpu}
     return {"model": file.stem, **shares, "lost_per_mille": 1e3 * lost, **measured}

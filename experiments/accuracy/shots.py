@@ -22,12 +22,13 @@ from experiments.pictures.plans import suited
 from neurolens.base.progress import Report
 from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.shaders.source import camera_program
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.setting.focusing import near_limit_m
 from neurolens.pictures.render.scene import load_scene
 from neurolens.studies.plan import footprints as prints
 from neurolens.studies.plan.candidates import shot_fits
-from neurolens.studies.plan.costs import glsl_operations, ns_a_ray
+from neurolens.studies.plan.costs import ns_a_ray
 from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe, probe
 
 # All kinds: wide to long, f/1 to f/5.4, simple and not, from plastic, a zoom's default state.
@@ -81,7 +82,7 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
         probed = probe(scene, lens)
         shipped = _measured(probed, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
         own = _smallest(probed, shipped, folder)
-        facts = {"shot": sitting.name, "f_number": probed.asked.f_number, "focus_m": probed.asked.shot.focus_m}
+        facts = {"shot": sitting.name, "f_number": probed.asked.f_number, "focus_m": probed.asked.focus_m}
         shots.append(facts | {"shipped": asdict(shipped), "own": asdict(own)})
         report((number + 1) / len(SITTINGS))
     return {"lens": name, "shots": shots}
@@ -104,7 +105,7 @@ def _smallest(probed: Probe, shipped: Model, folder: Path) -> Model:
 
 
 def _onnx(probed: Probe, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
-    return OnnxCamera(load_model(file), replace(probed.asked.shot, runtime=runtime))
+    return OnnxCamera(load_model(file), replace(probed.shot, runtime=runtime))
 
 
 def _errors(probed: Probe, camera: OnnxCamera) -> tuple[float, float]:
@@ -120,7 +121,8 @@ def _measured(probed: Probe, file: Path, terms: int) -> Model:
     camera = _onnx(probed, file)
     um, light = _errors(probed, camera)
     ns = ns_a_ray(_onnx(probed, file, "c"), probed.places)["min"]
-    return Model(terms, um, light, glsl_operations(camera), ns)
+    operations = sum(camera_program(camera.film, camera.lens_graph(), own_table=False).count().values())
+    return Model(terms, um, light, operations, ns)
 
 
 # ---- The page. -------------------------------------------------------------------------------------------------------

@@ -297,7 +297,7 @@ def _of_long_runs(chance: Chance, folder: Path) -> Words:
         ),
         "scene.toml": (
             (1, ("plan", "scene.toml", *lens)),
-            (1, ("plan", "scene.toml", *lens, "--trade", "--samples", "1")),
+            (1, ("plan", "scene.toml", *lens, "--explain")),
         ),
         "lens.toml": (
             (1, ("view", "lens.toml", "--json")),

@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
+from experiments.pictures.plans import camera_of
 from neurolens.cameras.build import as_c, ideal_as
 from neurolens.cameras.contract import Camera
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import Scene, load_scene
 from neurolens.studies.plan import plan as plans
-from neurolens.studies.plan.candidates import EXACT, camera_of
+from neurolens.studies.plan.candidates import EXACT
 
 SCENES, LENS, MODEL, PLAIN = ("garden", "room", "lights"), "laikin_double_gauss_50", "ols-36", "thick + ST map"
 _COUNTED = 95.0  # percentile of squared differences above which the rarest lights are left to chance
@@ -79,10 +80,10 @@ def case(name: str, args: argparse.Namespace) -> list[lab.Row]:
     rows: list[lab.Row] = []
     for choice in made.choices:
         if choice.name in (EXACT, PLAIN) or choice.name.endswith(MODEL):
-            camera: Any = camera_of(made.probed, choice)
+            camera: Any = camera_of(choice, made.probed, None)
             area = getattr(camera, "area", 1.0)
             if choice.name == PLAIN:  # the map is applied afterwards, to a larger picture
-                camera = as_c(ideal_as("thick:", made.probed.exact.lens, made.probed.asked.shot))
+                camera = as_c(ideal_as("thick:", made.probed.exact.lens, made.probed.shot))
             render(scene, camera, threads=1, samples=1)  # compiles what it needs
             seconds, variance = rendered(scene, camera)
             rows.append({"scene": name, "camera": choice.name.rpartition(".")[2] or choice.name,

@@ -33,7 +33,7 @@ from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
-_RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--trade")}  # names that commands had, which still work
+_RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--explain")}  # names that commands had, which still work
 # The commands under the titles of the help: module and class of each, and its line in the help.
 _COMMANDS = {
     "lenses": {

@@ -12,7 +12,6 @@ only if its file lies inside the folder. Missing values are shown as a dash.
 
 from __future__ import annotations
 
-import base64
 import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -182,7 +181,6 @@ class Figure(NamedTuple):
     caption: str
     links: Mapping[str, str]
     wide: bool
-    inside: bool
 
 
 def number(record: Mapping[str, Any], key: str) -> float | None:
@@ -254,24 +252,18 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-def figures_of(folder: Path, figures: Iterable[Mapping[str, Any]], inside: bool = False) -> list[Figure]:
+def figures_of(folder: Path, figures: Iterable[Mapping[str, Any]]) -> list[Figure]:
     """Make figures of records with "file" and maybe "title", "caption", "links" and "wide".
 
     A picture or link whose file is not in `folder` has no address.
-
-    Args:
-        inside: whether PNG files become part of the page, which then needs no other files.
     """
     shown = []
     for figure in figures:
         url = local_url(folder, figure.get("file"))
-        if url is not None and inside:
-            data = base64.b64encode((folder / str(figure["file"])).read_bytes()).decode("ascii")
-            url = f"data:image/png;base64,{data}"
         links = {label: local_url(folder, file) for label, file in (figure.get("links") or {}).items()}
         existing = {label: link for label, link in links.items() if link}
         file, title, caption = (str(figure.get(key) or "") for key in ("file", "title", "caption"))
-        shown.append(Figure(url, file, title, caption, existing, bool(figure.get("wide")), inside))
+        shown.append(Figure(url, file, title, caption, existing, bool(figure.get("wide"))))
     return shown
 
 

@@ -19,17 +19,12 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.ideal import Pinhole
 from neurolens.cameras.reduced import Warped
-from neurolens.cameras.shaders import blender_shader, pupil_fit
-from neurolens.cameras.shaders.blender_shader import lens_of
-from neurolens.cameras.shaders.osl import OslLens, osl_program
 from neurolens.cli import main
-from neurolens.cli.plan import _dear, _sentences
+from neurolens.cli.plan import Planned
 from neurolens.models.cores import InvariantPolynomial
 from neurolens.models.file import read_model
 from neurolens.models.pairs import domain_of
 from neurolens.optics.lens.apertures import Aperture
-from neurolens.optics.lens.designs import coated
-from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting import focusing
@@ -37,10 +32,9 @@ from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.render.pictures import read_exr
 from neurolens.pictures.render.scene import load_scene, scene_from_tables
 from neurolens.studies.plan import candidates as tried
-from neurolens.studies.plan import costs
-from neurolens.studies.plan import plan as plans
+from neurolens.studies.plan import costs, effects_plot
 from neurolens.studies.plan.candidates import Target, candidates
-from neurolens.studies.plan.costs import Work, noise, shader_cost
+from neurolens.studies.plan.costs import ALONE, Work, noise
 from neurolens.studies.plan.footprints import (
     Footprints,
     blur_mm,
@@ -213,7 +207,10 @@ def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: flo
     found = planned(budget, distance_m, f_number)
     assert found.best is not None and found.best.light_error <= 0.01
     assert found.best.name in (("exact",) if budget == 0 else ("pinhole + ST map", "thick + ST map"))
-    assert all(c.cost >= found.best.cost for c in found.choices if c.within)
+    assert all(c.seconds >= found.best.seconds for c in found.choices if c.meets(budget))
+    bright = [c for c in found.choices if c.light_error <= 0.01 and math.isfinite(c.seconds)]
+    better = {c.name: [o for o in bright if o.seconds <= c.seconds and o.error_px < c.error_px] for c in bright}
+    assert sorted(found.front) == sorted(name for name, others in better.items() if not others)
     again = decided(found.probed, found.choices, budget, "render", Work((1e6, 1e6)))
     assert again.best is not None and again.best.name == "exact" and {found.best.name, "exact"} <= set(again.alike)
     coloured = [replace(c, noise=c.noise * (1 + c.disperses)) for c in found.choices]
@@ -247,20 +244,12 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def fitted_once() -> Iterator[None]:
-    """The shader of a lens, whose pupil takes many seconds to fit, is the same in all tests, and found by fewer rays.
-    Flare and glare are those of test_probe_light."""
+def quick() -> Iterator[None]:
+    """Focus is found by fewer rays. Flare and glare are those of test_probe_light."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Probe, "maps", property(lambda probed: probed.camera_maps))
-        patch.setattr(pupil_fit, "_RAYS", 3000)
         patch.setattr(focusing, "_RINGS", 96)
-        patch.setattr(tried, "lens_of", lambda file, zoom, report: shader_of(file.name, zoom))
         yield
-
-
-@cache
-def shader_of(name: str, zoom: str | None) -> tuple[str, OslLens, list[str]]:
-    return lens_of(Path("lenses") / name, zoom, lambda done, left=None: None)
 
 
 @cache
@@ -268,44 +257,14 @@ def garden() -> Probe:
     return probe(load_scene(Path("experiments/scenes/garden.toml")), set_lens(read_lens(GAUSS)), across=4)
 
 
-def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blender's own thin lens costs less than any shader, and as C a thick one less than any polynomial."""
+def test_a_thick_lens_whose_picture_is_warped_is_cheapest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As C it costs less than any polynomial; onnxruntime runs polynomials alone."""
     found = garden()
     monkeypatch.setattr(tried, "TERMS", (8,))
-    targets: tuple[Target, ...] = ("render", "osl")
-    best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t).best for t in targets}
-    assert best["osl"] is not None and best["osl"].name == "thin + ST map" and best["osl"].error_px < 1
-    assert best["render"] is not None and best["render"].name == "thick + ST map" and best["render"].error_px < 1
-
-
-def test_shaders_cost_what_cycles_took(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The exact lens against the time measured, and 1.08 times the rays: the luminance of its wavelengths' colours.
-
-    The shader that was timed had neither coatings nor absorption."""
-
-    def clear(file: Path) -> Lens:
-        bare = coated(read_lens(file), "bare")
-        return replace(bare, surfaces=tuple(replace(s, absorbs_as=None) for s in bare.surfaces))
-
-    monkeypatch.setattr(blender_shader, "read_any", clear)
-    rows = json.loads(Path("experiments/results/osl_speed.json").read_text(encoding="utf-8"))["rows"]
-    (measured,) = (r for r in rows if (r["scene"], r["camera"]) == ("sky", "exact, 12 refractions"))
-    found = garden()
-    lens = lens_of(Path(GAUSS), None, lambda done, left=None: None)[1]
-    asked = found.asked
-    ns, times = shader_cost(lens, found.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
-    count = sum(osl_program(lens, {"count": 0.0}).count().values())
-    # The shader that was timed had some more products and sums.
-    since = measured["operations"] - count
-    assert 0 <= since < 0.05 * count
-    assert ns == pytest.approx(measured["ns_min"] - costs._STEP_NS * since, rel=0.035)  # as good as the fit is
-    place = (np.arange(1000) + 0.5) / 1000
-    colour = np.stack([3 * (1 - place) ** 2, 6 * place * (1 - place), 3 * place**2])
-    y = np.array([0.2126, 0.7152, 0.0722]) @ colour
-    passes = min(lens.passing().values())
-    assert (y**2).mean() < times < (y**2).mean() / passes * 1.01
-    too_near = shader_cost(lens, found.places, asked.shot.film_mm, asked.f_number, 0.15)
-    assert math.isinf(too_near[1])
+    targets: tuple[Target, ...] = ("c", "onnx")
+    best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t, ALONE).best for t in targets}
+    assert best["c"] is not None and best["c"].name == "thick + ST map" and best["c"].error_px < 1
+    assert best["onnx"] is not None and best["onnx"].name.endswith("shot-ols-8") and best["onnx"].error_px < 1
 
 
 def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
@@ -330,7 +289,7 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
     drawn = list[object]()
-    monkeypatch.setattr(plans, "plot_effects", lambda made, path, title: drawn.append(path.name))
+    monkeypatch.setattr(effects_plot, "plot_effects", lambda made, path, title: drawn.append(path.name))
     monkeypatch.setattr(tried, "TERMS", (6,))
     scene, folder = tmp_path / "scene.toml", tmp_path / "plan"
     film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "width": 64, "height": 36, "samples": 2}
@@ -339,6 +298,12 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
     lens.write_bytes(Path(LENS).read_bytes())
     asked = ["--lens", str(lens), "--budget", "0.03px", "--for", "onnx", "-o", str(folder), "--quiet"]
     assert main(["plan", str(scene), *asked]) == 0 and drawn == ["effects.png"]
+    record = json.loads((folder / "plan.json").read_text())
+    assert record["best"]["name"] in record["front"] and record["best"] in record["choices"]
+    assert (
+        record["asked"]["f_number"] == pytest.approx(5, rel=1e-3)
+        and record["best"]["error_px"] <= record["budget_px"] == 0.03
+    )
     file, model = folder / "plan.toml", next((folder / "models").glob("*.onnx"))
     quick = ["--quiet", "--set", "evaluation.vignetting_rays=2000"]
     assert main(["train", str(file), "--output", str(tmp_path / "run"), *quick]) == 0
@@ -366,10 +331,10 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
     shaped = read_lens(GAUSS).with_aperture(Aperture(blades=5, rotation_deg=20.0))
     found = probe(scene_from_tables(wall(1.0, 4.0)), shaped, across=3)
     model = Path("models/laikin_double_gauss_50.ols-60.onnx")
-    asked = replace(found.asked, shot=replace(found.asked.shot, aperture=None))
+    shot = replace(found.shot, aperture=None)
     own, bare = (
         next(c for c in tried.candidates(seen, (0.01,), "onnx", models=[model]) if c.camera == str(model))
-        for seen in (found, replace(found, asked=asked))
+        for seen in (found, replace(found, shot=shot))
     )
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
 
@@ -377,13 +342,13 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
 def test_a_plan_prints_one_price_and_says_first_where_it_took_more_than_a_tenth_of_it() -> None:
     found = planned(0.0, 4.0, None)
     assert found.best is not None
-    found = replace(found, work=Work((10.0, 10.0), (1.0, 1.0)), best=replace(found.best, seconds=20.0))
-    told = "\n".join(_sentences(found))
-    assert told.count("about 20 s") == 1 and " ns" not in told and "operations" not in told
-    assert _dear(found, 1.9, every=False) == []
-    (dear,) = _dear(found, 300.0, every=False)
-    assert "300 CPU seconds, 15 times" in dear
-    assert _dear(replace(found, work=costs.ALONE), 300.0, every=False) == []  # the time of the picture is not known
+    work = Work((10.0, 10.0), (1.0, 1.0))
+    told = Planned("", "", replace(found, work=work, best=replace(found.best, seconds=20.0)), 1.9, "", True, Path(), [])
+    text = told.text()
+    assert text.count("about 20 s") == 1 and " ns" not in text and text.startswith("f/")
+    assert replace(told, plan_s=300.0).text().startswith("This plan took 300 CPU seconds, 15 times its picture")
+    alone = replace(told, plan_s=300.0, plan=found)
+    assert alone.text().startswith("f/")  # the time of the picture is not known
 
 
 @pytest.mark.parametrize("shot", [(96, 54, 16), (640, 360, 16), (640, 360, 256), (1920, 1080, 1024), (8, 1, 1)])

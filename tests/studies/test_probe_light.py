@@ -76,7 +76,7 @@ def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
     found = probe(wall(camera={"f_number": 1.8}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")), across=8)
     unit, taken = found.camera_maps["vignetting"]
     fall = found.camera_maps["natural fall-off"][1]
-    x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.shot.film_mm, taken.shape[::-1], strict=True))
+    x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.film_mm, taken.shape[::-1], strict=True))
     side = torch.linspace(-35, 35, 251, dtype=torch.float64)
     u, v = (a.reshape(-1) for a in torch.meshgrid(side, side, indexing="ij"))
     film = torch.full_like(u, x), torch.full_like(u, y), torch.full_like(u, found.lens.film_z_mm)

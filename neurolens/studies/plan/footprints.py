@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +22,12 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import Camera, CameraRays
 
 Array = NDArray[np.float64]
-_Real = TypeVar("_Real", bound=np.floating[Any])
 
 _LINES = 8  # directions of the sliced distance
 _QUANTILES = 64
 # how far outside the pupil's outline light is looked for, in pupil radii; points there
 _BESIDE, _BESIDE_POINTS = 0.005, 24
 _STEP = 1e-3  # step of the first-order map, as a share of the film's width
-EFFECTS = (
-    "distortion", "defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
-    "longitudinal colour", "lateral colour",
-)  # fmt: skip
 AFTERWARDS = ("distortion", "defocus")  # what compositing may do to a picture later
 
 
@@ -166,7 +160,7 @@ def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
 
 
 def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, Array]:
-    """Return the parts of the exact camera's footprints, `EFFECTS` by name, [N] RMS mm on the film.
+    """Return the effects of the lens, by name: parts of the exact camera's footprints, [N] RMS mm on the film.
 
     A thin lens framed as the lens has the defocus of each depth. What else the exact footprint has is expanded in the
     pupil point by degree. Each part is orthogonal to those below it over the light that passes, as Zernike's
@@ -282,17 +276,3 @@ def _expanded(prints: Footprints, centre: Array) -> tuple[Array, Array]:
     square = (factors**2).sum(-1)
     rest = np.maximum((wanted**2).sum((-1, -2)) - square.sum(-1), 0.0)
     return linear.transpose(3, 2, 0, 1), np.stack([square[..., 3:6].sum(-1), square[..., 6:].sum(-1), rest])
-
-
-def upright(film: NDArray[_Real]) -> NDArray[_Real]:
-    """Turn rows by rising y and columns by rising x of the film (lens frame) by 180 degrees, as a picture shows them.
-
-    The top left of the picture is at +x, -y.
-    """
-    return film[:, ::-1]
-
-
-def cell_centres(film_mm: tuple[float, float], shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Return x and y in mm of the centres of equal cells of the film; `shape` is rows and columns."""
-    x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(shape[::-1], film_mm, strict=True))
-    return x, y

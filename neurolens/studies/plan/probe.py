@@ -15,8 +15,8 @@ import math
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Literal
+from functools import cached_property, partial
+from typing import Literal
 
 import numpy as np
 
@@ -24,13 +24,13 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.field import Field, field_of
+from neurolens.cameras.field import field_of
 from neurolens.graph.compiler import has_compiler
 from neurolens.models.model import Domain
 from neurolens.models.pairs import domain_of
 from neurolens.optics.analysis.field_curves import illumination
 from neurolens.optics.analysis.fields import Scene as Fields
-from neurolens.optics.lens.paraxial import PupilBounds, colours, first_order
+from neurolens.optics.lens.paraxial import colours, first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Dispersion, Shot
 from neurolens.optics.setting.pupils import image_radius_mm
@@ -46,7 +46,7 @@ from neurolens.pictures.render.scene import Scene
 from neurolens.pictures.render.settings import FlareSettings
 from neurolens.pictures.render.world import shared_worlds
 from neurolens.studies.plan import footprints as prints
-from neurolens.studies.plan.footprints import AFTERWARDS, Array, Footprints, Places, cell_centres, upright
+from neurolens.studies.plan.footprints import AFTERWARDS, Array, Footprints, Places
 from neurolens.studies.scenes import seen_depths_m
 
 ACROSS = 48  # pixels of the small picture along its longer side
@@ -135,7 +135,7 @@ def parts_of(nm: Array, seen: Array, first: int, last: int, count: int) -> tuple
     return np.bincount(part, seen * nm, count)[lit] / share[lit], share[lit] / share[lit].sum()
 
 
-def stray_light(scene: Scene, camera: Any, seen: Overview) -> dict[str, Array]:
+def stray_light(scene: Scene, camera: ExactCamera, seen: Overview) -> dict[str, Array]:
     """Return the light that the lens adds, relative to the small picture, [H, W] by name of `STRAY`.
 
     It is that of the colour with most. The lights are those of the scene, in view or not, and highlights of the picture
@@ -166,7 +166,7 @@ def stray_light(scene: Scene, camera: Any, seen: Overview) -> dict[str, Array]:
     return {effect: layers[name].max(-1) / base if name in layers else none for name, effect in STRAY.items()}
 
 
-def _highlights(camera: Any, seen: Overview, known: list[Light]) -> list[Light]:
+def _highlights(camera: ExactCamera, seen: Overview, known: list[Light]) -> list[Light]:
     """Find bright regions of the picture that are not where a known light is."""
     threshold = _HIGHLIGHT * float(seen.rgb.mean())
     if not threshold > 0 or not (seen.rgb.max(-1) >= threshold).any():
@@ -180,7 +180,8 @@ def _highlights(camera: Any, seen: Overview, known: list[Light]) -> list[Light]:
 
 
 COUNTED = 95.0  # percentile over the picture at which a budget is counted
-Maps = dict[str, tuple[Literal["px", "relative"], Array]]
+Unit = Literal["px", "relative"]
+Maps = dict[str, tuple[Unit, Array]]
 LIGHT = 0.01  # relative error of light that a plan allows beside its budget of error
 _FOCUS_SPARE = 0.25  # of a pixel of blur: how far a model may place its film from the lens's film
 _FIELDS = 17  # fields from the axis to the edge of the film at which vignetting is traced
@@ -192,37 +193,33 @@ _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vigne
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SceneNeeds:
     """What a camera must serve in a scene and its shot.
 
     Attributes:
-        shot: of the lens at its zoom, with an f-number no wider than the lens opens. pixel_mm: pitch.
+        f_number: no wider than the lens opens. pixel_mm: pitch.
         nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
         distant: share of the picture that shows things without a distance. dark: share that the lens leaves dark.
         light_nm: range of all but 0.2% of the scene's light, as the eye weighs it.
-        filter_px: side of the pixel filter, which is a box.
         afterwards: which of `footprints.AFTERWARDS` compositing makes.
         denoised: whether noise is removed later, so that cameras are not charged for it.
         zoom: state of the lens.
     """
 
-    shot: Shot
+    film_mm: tuple[float, float]
+    focus_m: float
+    f_number: float
+    wavelength_nm: tuple[float, float]
     pixel_mm: float
     nearest_m: float | None
     farthest_m: float | None
     distant: float
     dark: float
     light_nm: tuple[float, float]
-    filter_px: float = 1.0
     afterwards: tuple[str, ...] = ()
     denoised: bool = False
     zoom: str | None = None
-
-    @property
-    def f_number(self) -> float:
-        """The f-number of the shot."""
-        return float(self.shot.f_number or math.nan)
 
 
 @dataclass(frozen=True)
@@ -240,7 +237,7 @@ class Effect:
     worth: float
     median: float
     over: float
-    unit: Literal["px", "relative"]
+    unit: Unit
     needed: bool
     why: str = ""
 
@@ -250,7 +247,8 @@ class Probe:
     """A scene's places as the exact lens sees them, with its camera, its footprints there, and a thin lens's.
 
     Attributes:
-        scene, lens, domain: the lens is stopped down and focused; the domain is that of models of this shot.
+        shot: of the lens at its zoom, with the dispersion that cameras are to have.
+        lens, domain: the lens is stopped down and focused; the domain is that of models of this shot.
         places: those with light, among `shape` rows and columns over the film.
         seen, thin_seen: footprints of the exact camera and of a thin lens.
         wanted: the footprints that a camera should have: `seen` without the effects that are made afterwards.
@@ -258,6 +256,7 @@ class Probe:
 
     scene: Scene
     asked: SceneNeeds
+    shot: Shot
     lens: Lens
     domain: Domain
     exact: ExactCamera
@@ -267,15 +266,6 @@ class Probe:
     thin_seen: Footprints
     wanted: Footprints
     overview: Overview
-
-    @cached_property
-    def exact_field(self) -> Field:
-        """The field of the exact camera, for maps of its picture; making it takes seconds.
-
-        Raises:
-            InputError: as `field_of`.
-        """
-        return field_of(self.exact, self.asked.shot.focus_m)
 
     @cached_property
     def camera_maps(self) -> Maps:
@@ -293,10 +283,10 @@ class Probe:
     def on_film(self, value: Array) -> Array:
         """Values [N] of places as a picture [rows, columns], upright as prints are; NaN where there is no place."""
         film = np.full(self.shape, np.nan)
-        at = self.places.film_mm / np.array(self.asked.shot.film_mm)[:, None] + 0.5
+        at = self.places.film_mm / np.array(self.asked.film_mm)[:, None] + 0.5
         column, row = (np.minimum((at[k] * n).astype(int), n - 1) for k, n in enumerate(self.shape[::-1]))
         film[row, column] = np.broadcast_to(value, row.shape)
-        return upright(film)
+        return film[:, ::-1]  # the top left of a picture is at +x, -y of the film
 
 
 def probe(
@@ -322,26 +312,28 @@ def probe(
     f_number = max(shot.f_number or widest, widest)
     stopped, domain = set_lens(lens, f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
     real = Shot(film, shot.focus_m, f_number, aperture=lens.aperture, wavelength_nm=shot.wavelength_nm)
-    exact = exact_camera(lens, real, domain.bounds)
-    shape = small_raster(film, across)[::-1]
-    points = _grid(film, shape)
+    exact = ExactCamera(lens, real, bounds=domain.bounds)
+    columns, rows = shape = small_raster(film, across)
+    centres = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(shape, film, strict=True))
+    points = np.stack(np.meshgrid(*centres)).reshape(2, -1)
     with shared_worlds():
         small, depth = overview(scene, exact), seen_depths_m(scene, exact, points)
     far = np.where(np.isnan(depth), np.inf, depth)
     places = prints.places_of(exact, points, far, small.wavelength_nm, small.share)
     if not places.film_mm.shape[1]:
         raise InputError(scene.name, "camera", lens.name, "a lens that lights some of this film")
-    thin = ideal_as("thin:", exact.lens, real)
     met = depth[np.isfinite(depth)]
-    nearest, farthest = (float(met.min()), float(met.max())) if met.size else (None, None)
     asked = SceneNeeds(
-        replace(real, dispersion=dispersion), film[0] / shot.width, nearest, farthest,
-        float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1], small.range_nm,
+        film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelength_nm,
+        pixel_mm=film[0] / shot.width, nearest_m=float(met.min()) if met.size else None,
+        farthest_m=float(met.max()) if met.size else None, distant=float(np.isinf(depth).mean()),
+        dark=1 - places.film_mm.shape[1] / points.shape[1], light_nm=small.range_nm,
         afterwards=tuple(sorted(afterwards)), denoised=denoised, zoom=zoom,
     )  # fmt: skip
-    seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
+    seen, ideal = (prints.footprints(c, places) for c in (exact, ideal_as("thin:", exact.lens, real)))
     wanted = prints.left_to(seen, ideal, places.share, afterwards)
-    return Probe(scene, asked, stopped, domain, exact, places, shape, seen, ideal, wanted, small)
+    own = replace(real, dispersion=dispersion)
+    return Probe(scene, asked, own, stopped, domain, exact, places, (rows, columns), seen, ideal, wanted, small)
 
 
 def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
@@ -356,10 +348,10 @@ def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
     move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, in 1/mm
     vergence = 1e-3 / shot.focus_m
     ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
-    options: dict[str, Any] = {"film_radius_mm": radius, "wavelength_nm": shot.wavelength_nm}
+    made = partial(domain_of, stopped, film_radius_mm=radius, wavelength_nm=shot.wavelength_nm)
     with suppress(InputError):
-        return domain_of(stopped, focus_m=ends, **options)
-    return domain_of(stopped, focus_m=(shot.focus_m, shot.focus_m), **options)
+        return made(focus_m=ends)
+    return made(focus_m=(shot.focus_m, shot.focus_m))
 
 
 def effect_maps(probed: Probe) -> Maps:
@@ -399,7 +391,7 @@ def passed_share(probed: Probe) -> Array:
 
     def along(axis: Literal["x", "y"], height_mm: Array) -> Array:
         try:
-            data = illumination(Fields(probed.lens, probed.asked.shot.focus_m, axis), fields=_FIELDS)
+            data = illumination(Fields(probed.lens, probed.shot.focus_m, axis), fields=_FIELDS)
         except InputError:  # no chief rays: the natural fall-off then includes what the rims take
             return np.ones_like(height_mm)
         known = np.isfinite(data.passed)
@@ -427,13 +419,3 @@ def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Eff
         why = "not known" if stray else "not looked for: --explain does, in seconds"
         effects.append(Effect("flare", math.inf, math.inf, 1.0, "relative", True, why))
     return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
-
-
-def exact_camera(lens: Lens, shot: Shot, bounds: PupilBounds) -> ExactCamera:
-    """Make the exact camera."""
-    return ExactCamera(lens, shot, bounds=bounds)
-
-
-def _grid(film_mm: tuple[float, float], shape: tuple[int, int]) -> Array:
-    """Return the centres of equal cells of the film, [2, N] mm, row after row."""
-    return np.stack(np.meshgrid(*cell_centres(film_mm, shape))).reshape(2, -1)

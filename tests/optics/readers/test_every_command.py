@@ -33,7 +33,7 @@ COMMANDS = {
     "analyse": "analyse {} spots",
     "flare": "flare {} --light 5,3",
     "plan": "plan SCENE --lens {}",
-    "trade": "plan SCENE --lens {} --trade",
+    "trade": "plan SCENE --lens {} --explain",
     "stmap": "stmap {} --size 30x20 --film 24x16 -o NAME",
     "bokeh": "bokeh {} --width 30 --film 24x16 --distance inf --grid 1x1 -o NAME",
     "handover": "handover {} --size 30x20 --film 24x16 -o NAME",

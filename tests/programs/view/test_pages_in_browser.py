@@ -163,28 +163,6 @@ def test_report(browser: Any, tmp_path: Path) -> None:
     assert text.count(ATTACK) > 12
 
 
-def test_trade_of_a_plan(browser: Any, folder: Path, tmp_path: Path) -> None:
-    seeds = ROOT / "experiments" / "fuzz_seeds"
-    for name in ("sky.exr", "mask.png", "lamp.csv"):
-        shutil.copy(seeds / name, tmp_path)
-    text = (seeds / "scene.toml").read_text().partition("[textures.tile]")[0].replace("width = 4\nheight = 4", "")
-    text = text.replace('[illuminants.LAMP]\nfile = "lamp.csv"', "")
-    scene = tmp_path / f"{NAMES[0]}.toml"
-    scene.write_text(text.replace("samples = 1", "samples = 1\nwidth = 24\nheight = 24") + SPHERES)
-    lens = folder / "lenses" / f"{NAMES[0]}.toml"
-    words = ["plan", str(scene), "--lens", str(lens), "--trade", "--samples", "1", "--no-fit", "--quiet"]
-    assert main([*words, "-o", str(tmp_path / "out")]) == 0
-    assert NAMES[0] in opened(browser, tmp_path / "out" / "trade.html")
-
-
-SPHERES = """
-[[spheres]]
-centre_m = [0.0, 0.0, 0.0]
-radius_m = 0.5
-emission = [0.5, 0.5, 0.5]
-"""
-
-
 def test_view(browser: Any, folder: Path, tmp_path: Path) -> None:
     lens = folder / "lenses" / "hostile.toml"
     shutil.copy(card_with_scripts(tmp_path), folder / "lenses" / "hostile.ols.onnx")
