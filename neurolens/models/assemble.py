@@ -39,14 +39,14 @@ _GRAZING = 1e-12  # least squared cosine of a ray that leaves the front surface
 
 @dataclass(frozen=True)
 class Form:
-    """How a graph is to be written, by what reads it.
+    """How a graph is written, which depends on what reads it.
 
     Attributes:
         gate_scale: factor on all tests of rims, so large in ONNX that any failure exceeds every status code.
-        sag_terms: most terms of a series for the front surface, used where a square root costs more; 0: no series.
+        sag_terms: most terms of a series for the front surface, which then replaces a square root; 0 keeps the root.
         exact: whether series hold 1e-14, for float64.
-        monic: whether to scale v so that series are monic. That saves a pass over the rays, except where a product and
-            a sum are one operation.
+        monic: whether to scale the direction vector so that series are monic. That saves a pass over the rays, except
+            where a product and a sum are one operation.
         wavelength: whether rays always come with a wavelength, which then is tested.
     """
 

@@ -60,18 +60,18 @@ class Axis:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Least and largest value."""
+        """Return the least and the largest value."""
         return self.knots[0], self.knots[-1]
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Least and largest value accepted: the range with its slack."""
+        """Return the least and the largest value accepted: the range with its slack."""
         slack = _SLACK * max(abs(v) for v in self.range)
         return self.range[0] - slack, self.range[1] + slack
 
     @cached_property
     def nodes(self) -> tuple[float, ...]:
-        """[K] ascending values, the knots among them bit for bit."""
+        """Return the nodes [K], rising; the knots are among them bit for bit."""
         cosines = [math.cos(math.pi * (1 - j / self.degree)) for j in range(1, self.degree)]
         values = [self.knots[0]]
         for low, high in zip(self.knots, self.knots[1:], strict=False):
@@ -83,7 +83,7 @@ class Axis:
 
     @property
     def pieces(self) -> tuple[Array, Array]:
-        """[P] factor and offset of each piece: its own coordinate is clip(factor * coordinate + offset, -1, 1)."""
+        """Return factor and offset [P]: the coordinate of each piece is clip(factor * coordinate + offset, -1, 1)."""
         ends = np.array([self._coordinate(v) for v in self.knots])
         factor = 2 / np.diff(ends)
         return factor, -factor * (ends[:-1] + ends[1:]) / 2
@@ -92,7 +92,7 @@ class Axis:
         return 1 / value if self.reciprocal else value
 
     def features(self, value: float) -> Array:
-        """[K] basis of the interpolation: 1, then T_1(t) - T_1(-1) of each piece, then T_2(t) - T_2(-1), and so on.
+        """Return the basis of the interpolation [K]: 1, then T_1(t) - T_1(-1) of each piece, then T_2(t) - T_2(-1) ...
 
         T_j are Chebyshev polynomials, t is the coordinate of the piece. Every continuous function that is a polynomial
         on each piece is a sum of these.
@@ -105,11 +105,11 @@ class Axis:
 
     @cached_property
     def to_features(self) -> Array:
-        """[K, K] matrix from values at the nodes to factors of the features."""
+        """Return the matrix [K, K] from values at the nodes to factors of the features."""
         return np.asarray(np.linalg.inv(np.stack([self.features(v) for v in self.nodes])), dtype=np.float64)
 
     def weights(self, value: float) -> Array:
-        """Return [K] weights of the nodes at a value: 1 at a node itself. Raises InputError: a value out of range."""
+        """Return the weights [K] of the nodes at a value. Raises InputError: a value out of range."""
         low, high = self.limits
         if not low <= value <= high:
             expected = f"{self.range[0]:.6g} to {self.range[1]:.6g} {self.unit}"
@@ -180,7 +180,7 @@ def state_numbers(axes: Sequence[Axis], state: ArrayLike) -> tuple[float, ...]:
 
 
 def state_names(axes: Sequence[Axis]) -> tuple[str, ...]:
-    """Names of the state's numbers as arguments of functions: `zoom_mm`, `focus_per_m`."""
+    """Return the names of the state's numbers as arguments of functions: `zoom_mm`, `focus_per_m`."""
     return tuple(f"{a.name}_{a.unit.replace('1/', 'per_')}" for a in axes)
 
 

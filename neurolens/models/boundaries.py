@@ -50,7 +50,7 @@ Features = Callable[[LightField], Tensor]  # [M, N] of N rays
 
 
 def features_of(exponents: Exponents, hidden: Features | None = None) -> Features:
-    """A function from light fields to features: those of a hidden layer, if any, then monomials of invariants."""
+    """Return a function from light fields to features: a hidden layer's, if any, then monomials of invariants."""
 
     def features(field: LightField) -> Tensor:
         own = [] if hidden is None else [hidden(field)]
@@ -126,8 +126,8 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidde
     Forward selection goes by the gain of all those boundaries together, in squares of the error that each may have.
 
     Args:
-        first: the exponents before growth, which serves position and direction alone. Where these meet the stop
-            crossing better than is asked, it is to be met as well.
+        first: the exponents before growth, which serves position and direction alone. Where these fit the stop
+            crossing better than asked, all terms together must fit it as well.
         hidden: the features of a network's last hidden layer; with them the errors asked for are smaller.
     """
     added = further(invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive), exponents)
@@ -179,7 +179,7 @@ class _BoundaryFit:
 def needed_for(sweep: Sweep, error: float) -> list[int]:
     """Return the smallest set of columns (A and B of a vector) whose squared residual is at most `error`.
 
-    Where even all columns leave more than that, a set is enough that leaves hardly more than all do.
+    Where even all columns leave more than that, the set may leave hardly more than all columns do.
     """
     sweep.restart([])
     terms = sweep.count // 2
@@ -258,7 +258,8 @@ class GateFit:
         Args:
             features: [M, N] of those rays.
             values: [G, N] of the gates. `reached` [G, N]: whether the ray gets so far that the value is known. A gate
-                is never made to block a ray that it is known to let pass; a gate that a ray does not reach may be.
+                is never made to block a ray that it is known to let pass; a gate that a ray does not reach may block
+                it.
         """
         blocks = (values > 0) | ~reached
         if not values.numel():

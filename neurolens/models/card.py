@@ -113,7 +113,7 @@ def card_in(file: Any, metadata: dict[str, str], expected: str = CARD_KIND) -> d
 
 
 def card_to_json(card: dict[str, Any]) -> str:
-    """Strict JSON: a number that is not finite is an error, never the word NaN.
+    """Return a card as strict JSON, in which a number that is not finite is an error, never the word NaN.
 
     Raises:
         InputError: a value that JSON cannot hold, with its place in the card; more than `MAX_CARD` characters, which no
@@ -237,7 +237,7 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
         file: what an error names.
 
     Raises:
-        ModelError: the first place that is missing or holds something else, and what belongs there.
+        ModelError: something is missing or wrong; the message names the first such place and what belongs there.
     """
     _check_places(f"{file}: card", card, _RULES)
     if card.get("states") is None:
@@ -281,7 +281,7 @@ def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
     """Return low, high and half [3, R] of the boxes in a card's bounds.
 
     Raises:
-        InputError: no three lists of equal length, or numbers that float32 cannot hold.
+        InputError: the bounds are not three lists of equal length, or float32 cannot hold their numbers.
     """
     rows = np.array([bounds["low_mm"], bounds["high_mm"], bounds["half_mm"]], dtype=np.float32)
     if rows.ndim != 2 or rows.shape[1] < 2 or not np.isfinite(rows).all():

@@ -5,9 +5,9 @@ by the most general form that the symmetry of a round lens leaves:
 
     (f1 I + f2 p p' + f3 p u' + f4 u p' + f5 u u') e,   a gate by  (h1 p + h2 u) . e,
 
-with functions f and h of the invariants. All perturbations share the terms of f and h, so that those of a copy are sums
-of e, one vector a term: a copy costs the same however many figures are off. What leaves a lens round (a thickness, a
-radius, an index) changes the coefficients of its own polynomial.
+with functions f and h of the invariants. All perturbations share the terms of f and h. So each
+coefficient of a copy is a sum over its perturbations, and a copy costs the same however many figures are off. What
+leaves a lens round (a thickness, a radius, an index) changes the coefficients of its own polynomial.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class Copied(Symmetric):
 
     Attributes:
         exponents, ab, scalars: as of `InvariantPolynomial`.
-        bends: [3, 5, 2, M] for each vector what x and y of e, summed over all perturbations, make of f1 to f5.
+        bends: [3, 5, 2, M] for each vector the coefficients of f1 to f5, times x and y of e, summed over all
+            perturbations.
         leans: [G, 2, 2, M] the same for each gate, of h1 and h2.
     """
 
@@ -91,7 +92,8 @@ class Copied(Symmetric):
         def along(k: int, row: Value) -> Value:
             """Add to a row the products of p and u with the vectors k and k + 1.
 
-            Row by row, for ONNX makes scalar products of squares of sums, which lose the digits of unlike factors.
+            The products are summed row by row: ONNX makes a scalar product of squares of sums, which loses digits where
+            the factors differ much in size.
             """
             for number, ray in ((k, field.p), (k + 1, field.u)):
                 if number in across:
@@ -118,7 +120,7 @@ class Perturbed(Composite):
     Attributes:
         parts: the round core, of M terms.
         exponents: [K, 4] its terms, and others below them.
-        bends, leans: [V, 3, 5, K] and [V, G, 2, K] what each vector across the axis makes of f and h.
+        bends, leans: [V, 3, 5, K] and [V, G, 2, K] the coefficients of f and h for each vector across the axis.
         ab, scalars: [P, 3, 2, K] and [P, 1 + G, K] what each figure that leaves the lens round adds to the polynomial.
         limits: [F] how far each of `Off.figures` may be off where it is an input of exported files; 0 where it is none.
     """
@@ -170,7 +172,7 @@ class Perturbed(Composite):
 
     @cached_property
     def _widened(self) -> InvariantPolynomial:
-        """The round core with coefficients of 0 for the other terms."""
+        """Return the round core with coefficients of 0 for the other terms."""
         base, more = self.parts[0], len(self.exponents) - len(self.parts[0].exponents)
         ab, scalars = (np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, more)]) for a in (base.ab, base.scalars))
         return InvariantPolynomial(self.exponents, ab, scalars)
@@ -202,7 +204,7 @@ def copy_of(model: LensModel, off: Off, name: str = "") -> LensModel:
 def copy_inputs(model: LensModel) -> dict[str, float]:
     """Return what is off in a copy, as inputs of an exported model: names in their order, and how far each may be off.
 
-    None but models whose core is `Perturbed` have any.
+    Only models whose core is `Perturbed` have any.
     """
     if not isinstance(model.core, Perturbed):
         return {}

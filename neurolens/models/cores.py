@@ -183,7 +183,7 @@ class Core:
 
     @property
     def coefficients(self) -> int:
-        """The number of coefficients that are not 0; of a network, the number of its weights."""
+        """Return the number of coefficients that are not 0; of a network, the number of its weights."""
         raise NotImplementedError
 
     @property
@@ -192,7 +192,7 @@ class Core:
         return self.coefficients
 
     def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        """Vectors [3, 2, N] and scalars [1 + G, N] of a light field of tensors, in its precision."""
+        """Return vectors [3, 2, N] and scalars [1 + G, N] of a light field of tensors, in its precision."""
         import torch
 
         out = evaluate(self._graph, {"p": field.p, "u": field.u, "w": field.w[None]})
@@ -214,9 +214,9 @@ class Core:
 
 
 def symmetric(rows: Value, field: Field, scalars: int, light: Value | None = None) -> CoreValues:
-    """Make vectors A p + B u and scalars of rows: A of each vector, B of each (with mirrors of x, then y), scalars.
+    """Make vectors A p + B u and scalars of rows, which are A of each vector, B of each, then the scalars.
 
-    `light` is what else belongs to the transmittance.
+    With two planes of symmetry each A and each B is two rows, for x and y. `light` is added to the transmittance.
     """
     g, wide = rows.graph, (rows.rows - scalars) // 6
     *ab, transmittance, gates = g.split(rows, [wide] * 6 + [1, scalars - 1])
@@ -325,7 +325,7 @@ def in_cubics(weight: Array) -> Array:
 @stored_as("invariants")
 @dataclass(frozen=True, eq=False)
 class InvariantPolynomial(Symmetric):
-    """out = A p + B u, with A, B and the scalars polynomials in rho, sigma, tau, w.
+    """The polynomial of a round lens: out = A p + B u; A, B and the scalars are polynomials in rho, sigma, tau, w.
 
     Attributes:
         exponents: [M, 4] int64 of rho, sigma, tau, w; rows are unique.
@@ -442,7 +442,7 @@ class Composite(Core):
 
     @property
     def coefficients_per_vector(self) -> int:
-        """The coefficients of all parts together."""
+        """Return the coefficients of all parts together."""
         return sum(part.coefficients_per_vector for part in self.parts)
 
     @property
@@ -453,7 +453,7 @@ class Composite(Core):
 @stored_as("residual")
 @dataclass(frozen=True, eq=False)
 class Residual(Composite):
-    """The sum of a polynomial and a network on what the polynomial leaves, both on the same invariants.
+    """The sum of a polynomial and a network that is fitted to what the polynomial leaves, on the same invariants.
 
     The polynomial takes the bulk, which is smooth and of low degree, the network the fine structure of every output.
     """

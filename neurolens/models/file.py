@@ -183,7 +183,7 @@ def check_size(core: Any) -> None:
 
 
 def _check_reference(model: ModelFile) -> None:
-    """Compute the card's reference rays at every state that has some, where a changed coefficient shows."""
+    """Compute the card's reference rays at every state that has some: they show whether a coefficient has changed."""
     states = model.card.get("states") or {}
     references = [(default_state(model.card), model.card.get("reference"))]
     references += [(tuple(r["state"]), r) for r in states.get("reference", ())]
@@ -312,7 +312,7 @@ def inflated(text: str) -> bytes:
 
 
 def pack(value: Any) -> Any:
-    """Arrays, tuples and cores as JSON has them: floats in float32, integers in bytes.
+    """Return arrays, tuples and cores as JSON holds them: floats in float32, integers in bytes.
 
     Raises:
         InputError: a core that no file can hold, or a term of a degree beyond it.
@@ -403,7 +403,7 @@ def _plain(value: Any) -> Any:
 
 
 def unpacked_lens(packed: dict[str, Any]) -> Lens:
-    """The inverse of `packed_lens`. Raises ValueError, KeyError, TypeError: damaged, or larger than lenses are."""
+    """Return the lens of `packed_lens`. Raises ValueError, KeyError, TypeError: damaged, or larger than lenses are."""
     surfaces: list[Surface] = []
     if len(packed["surfaces"]) > _MAX_SURFACES:
         raise ValueError(f"{len(packed['surfaces'])} surfaces, expected at most {_MAX_SURFACES}")

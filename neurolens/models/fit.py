@@ -199,7 +199,7 @@ class StateSpace:
 
     @cached_property
     def _planes_mm(self) -> Array:
-        """Find the tightest pupil plane at every knot of the axes."""
+        """Find, at every knot of the axes, the plane on which the pupil is smallest."""
         return np.array([self._domain(state, None).pupil_z_mm for state in product(self._knots)])
 
     def _settings(self, state: Sequence[float]) -> tuple[str | float | None, float | None]:
@@ -220,7 +220,8 @@ class StateSpace:
     def domain_at(self, state: Sequence[float]) -> Domain:
         """Return the domain of a state: the full lit film, and the film positions that focusing by the film needs.
 
-        Its pupil plane is interpolated linearly between the knots: the tightest plane of every state would jump.
+        Its pupil plane is interpolated linearly between the knots: the plane of the smallest pupil jumps between
+        states.
         """
         return self._domain(state, float(weights(self._knots, state) @ self._planes_mm))
 
@@ -268,7 +269,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
 
 
 def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree: int = FOCUS_DEGREE) -> Axis:
-    """The axis of internal focus: vergence (1/m) from infinity to the near limit of all the zoom positions given.
+    """Return the axis of internal focus: vergence (1/m) from infinity to the near limit of all zoom positions given.
 
     Raises:
         InputError: a file without focus states.
@@ -321,7 +322,7 @@ class StateModel:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """The state variables."""
+        """Return the state variables."""
         return self.space.axes
 
     @property

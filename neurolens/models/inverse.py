@@ -369,7 +369,7 @@ def _pupil_rays(e: Encoding, film: Value, u: Value, wavelength: Value) -> Value:
 
 
 def scene_system(model: LensModel) -> Graph:
-    """The system of the scene ray: its position and direction vector less those asked for, in the model's scales.
+    """Return the system of the scene ray: position and direction vector less those asked for, in the model's scales.
 
     Inputs `unknown`: u, then p: directions follow p most and positions u, and the solver wants that order; `wanted`,
     `wavelength_nm`. Output `residual`.

@@ -146,7 +146,7 @@ class Encoding:
 
     @staticmethod
     def mixed(encodings: Sequence[Encoding], weights: Array) -> Encoding:
-        """The encoding of a state: planes are mixed as they are, scales by their reciprocals, as in the graph."""
+        """Return a state's encoding: planes are mixed as they are, scales by their reciprocals, as in the graph."""
 
         def mean(value: Callable[[Encoding], float]) -> float:
             return float(weights @ np.array([value(e) for e in encodings]))
@@ -256,7 +256,7 @@ class LensModel:
         return {"rays": rays.rows, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
 
     def checked_radius_mm(self, stop_radius_mm: float | None) -> float:
-        """The stop radius asked for, or the domain's. Raises InputError: it is wider than the model was fitted for."""
+        """Return the stop radius asked for, or the domain's. Raises InputError: one wider than that of the fit."""
         if stop_radius_mm is not None and not 0 <= stop_radius_mm <= DOMAIN_SLACK * self.domain.stop_radius_mm:
             expected = f"0 to {self.domain.stop_radius_mm:.6g} mm, the widest stop of the fit"
             raise InputError(self.method, "stop_radius_mm", stop_radius_mm, expected)

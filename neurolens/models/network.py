@@ -1,4 +1,4 @@
-"""Fits small networks with the symmetry of the lens (after NeuroLens, Zheng and Zheng 2017b); trainings can go on.
+"""Fits small networks with the symmetry of the lens (after NeuroLens, Zheng and Zheng 2017b).
 
 Several starts run on few rays; then the best goes on, on as many rays as it takes not to overfit: a smooth lens is
 learnt from 2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on rays that the fit
@@ -196,7 +196,7 @@ class _Course:
 
 
 class _Training:
-    """One training, which can be left at any burst and taken up again."""
+    """One training, which can be stopped after any burst and continued later."""
 
     def __init__(
         self,
@@ -206,7 +206,7 @@ class _Training:
         checkpoint: Kept,
         progress: Callable[[float], object],
     ) -> None:
-        """Start, or go on from a checkpoint; `enough` is a loss below the rounding of float32 evaluation."""
+        """Start, or continue from a checkpoint; `enough` is a loss below the rounding of float32 evaluation."""
         self._problem, self._settings, self._enough = problem, settings, enough
         self._checkpoint, self._progress = checkpoint, progress
         halvings = max(0, (len(problem) // FEWEST_RAYS).bit_length() - 1)

@@ -135,7 +135,7 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
     lit = [(i * step, low, high, half) for i, (low, high, half) in enumerate(rows) if low < high]
 
     def spread(distance: float) -> float:
-        """The disc's radius over the distance from the film, whose square follows the disc's share of solid angle."""
+        """Return the disc's radius over its distance from the film; its square grows as the disc's solid angle."""
         s = distance / here
         boxes = ((r + (low - r) * s, r + (high - r) * s, half * s) for r, low, high, half in lit)
         return max(max(abs(a), abs(b), math.hypot((a + b) / 2, h)) for a, b, h in boxes) / distance
@@ -149,7 +149,7 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
-    """The z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film z, to first order."""
+    """Return z (mm, lens frame; -inf at infinity) of the object plane in focus for each film z, to first order."""
     data = first_order(lens)
     front, rear = data.front_efl_mm, data.efl_mm
     extension = film_z - data.rear_principal_z_mm - rear  # Newton: f f' / extension is how far beyond the front focus
@@ -159,7 +159,7 @@ def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
 
 
 def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmRays:
-    """Rays of a domain: uniform on the film and pupil discs and in wavelength, film positions in `_FILM_PLANES` steps.
+    """Draw rays uniform on the film and pupil discs and in wavelength, on `_FILM_PLANES` film planes of the domain.
 
     Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
     so that splits never share a ray.
@@ -238,7 +238,7 @@ def lit_share(domain: Domain) -> float:
 
 
 def _boxes(domain: Domain) -> tuple[Tensor, ...]:
-    """The edges [K + 1] of rings of the film, and low, high, half, area [K] of each ring's box of passing rays."""
+    """Return edges [K + 1] of rings of the film, and low, high, half, area [K] of each ring's box of passing rays."""
     b = domain.bounds
     low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (b.low_mm, b.high_mm, b.half_mm))
     dark = low >= high
@@ -424,8 +424,9 @@ def make_pairs(
 def _batches(
     lens: Lens, domain: Domain, seed: int, first: int, size: int = _BATCH
 ) -> Iterator[tuple[PairSet, Tensor, float]]:
-    """Trace a domain from the ray of the number `first` on: batches without the light's power, which of their rays
-    pass, how many rays of the domain each stands for."""
+    """Trace rays of a domain in batches, beginning with ray number `first`, without the light's power.
+
+    With each batch come which of its rays pass, and how many rays of the domain it stands for."""
     drawn = found = 0
     while drawn <= 10000 * (found + 10):
         inputs, stands_for = draw(domain, size, seed, first + drawn)
@@ -441,7 +442,7 @@ def passing_rays(
     lens: Lens, domain: Domain, count: int, seed: int, first: int = _BATCH,
     report: Callable[[int], object] = lambda found: None, batch: int = _BATCH,
 ) -> PairSet:  # fmt: skip
-    """So many rays of a domain that the lens passes, from the number `first` on; a fit takes those of the first batch.
+    """Return `count` rays of a domain that the lens passes, searched from ray number `first` on.
 
     `report` is called with the number of rays found so far. `batch` is how many rays are traced at a time.
 
@@ -473,7 +474,7 @@ def blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
 
 
 def reached(pairs: PairSet) -> Tensor:
-    """[S, N] bool: whether each camera ray arrives at each surface, having met and passed the glass of those before."""
+    """Return whether each ray arrives at each surface [S, N]: it has met all surfaces before and refracted there."""
     goes_on = ((pairs.meets > 0) & (pairs.refracts > 0)).flip(0)  # camera rays meet the last surface first
     before = torch.cat([torch.ones_like(goes_on[:1]), goes_on[:-1]])
     # A ray that meets the far half of a sphere, or a plane from behind, ends there with a positive discriminant.
@@ -496,5 +497,5 @@ def _unreached_as_zero(lost: PairSet) -> PairSet:
 
 
 def join_pairs(sets: list[PairSet]) -> PairSet:
-    """One set of all the rays, in order."""
+    """Join sets into one of all their rays, in order."""
     return PairSet.of_columns(torch.cat(c, -1) for c in zip(*(s.columns() for s in sets), strict=True))

@@ -95,7 +95,7 @@ class _Step(NamedTuple):
 
 
 def steps_of(lens: Lens, limits: Tolerances) -> tuple[list[_Step], list[_Step]]:
-    """Return steps in the order of `Off.vectors`, of their x alone, and in that of `Off.scalars`.
+    """Return the steps of all figures: in the order of `Off.vectors`, along x alone, then in that of `Off.scalars`.
 
     Figures that no lens or no copy has, such as a plane's radius, have steps of 0.
     """
@@ -126,7 +126,7 @@ def steps_of(lens: Lens, limits: Tolerances) -> tuple[list[_Step], list[_Step]]:
 
 
 def derivatives(model: LensModel, steps: Sequence[_Step], inputs: FilmRays) -> Answers:
-    """Return the derivatives [V, ...] of the exact answers by each figure, and which rays go through with all."""
+    """Return the derivatives [V, ...] of the exact answers by each figure, and which rays pass with every step."""
     found, whole = list[list[Tensor]](), torch.ones(len(inputs), dtype=torch.bool)
     for off, step, _ in steps:
         if not step:
@@ -309,9 +309,10 @@ _HELD_OUT, _COPIES, LEFT, _TIMES = 3000, 4, 0.05, (0.1, 0.3, 1, 3, 10, 30)
 def copy_errors(model: LensModel, copy: LensModel, lens: Lens) -> dict[str, float]:
     """Return the errors of a copy of a model beside the exact copy, on rays that the fit has not seen.
 
-    RMS on the film in um, by first order, the larger of that at infinity and that in the nearest focused plane: of the
-    copy (`rms_um`), and of how the copy differs from its lens (`change_um`), of which `change_error_um` is wrong beside
-    what the round model errs. Shares of rays that pass or are blocked wrongly.
+    Lengths are RMS on the film in um, to first order, at infinity or in the nearest focused plane, whichever is larger.
+    `rms_um` is the copy's error. `change_um` is how far the copy differs from its lens, and `change_error_um` how far
+    the model is wrong about that, apart from the round model's own error. The others are shares of rays that pass or
+    are blocked wrongly.
     """
     rays, _ = draw(model.domain, _HELD_OUT, seed=int(model.settings.get("rays_seed") or 0) + 78)
     with torch.no_grad():
@@ -339,7 +340,7 @@ def copy_errors(model: LensModel, copy: LensModel, lens: Lens) -> dict[str, floa
 def with_reach(model: LensModel, limits: Tolerances) -> tuple[LensModel, dict[str, float]]:
     """Return a model whose inputs go as far as its copies hold, and what its card says of them.
 
-    That is the worst errors of some copies within the limits, and how far copies hold: up to `decentre_mm` and
+    The card gives the worst errors of some copies within the limits, and how far copies hold: up to `decentre_mm` and
     `tilt_deg` together, and up to `others` times the other limits, at most `LEFT` of what copies change is wrong, in
     the root mean square over copies.
     """

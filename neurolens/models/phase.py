@@ -97,7 +97,7 @@ def unit_um(lens: Lens) -> float:
 
 
 def traced(lens: Lens, core: Phased, pupil_z_mm: float, rays: FilmRays) -> Waves:
-    """Trace rays that the lens passes from the focal plane, and the axis for their paths."""
+    """Trace rays that the lens passes, from the focal plane on; their paths are less that of the axis."""
     toward = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, pupil_z_mm)
     start = on_plane(toward, core.focal_z_mm)
     zero = torch.zeros_like(start.x)

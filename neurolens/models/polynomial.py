@@ -144,7 +144,7 @@ def _grown_on(
     """Choose in more rounds, each among the chosen terms and their products; returns exponents and columns.
 
     Rounds end where directions err by less than `FINE_DEG`, or where one takes off less than `_LEAST_FALL`. Each
-    searches with several widths, from the chosen terms and from none, because each search ends in another place.
+    round searches with several widths, from the chosen terms and from none, for each search ends in another place.
     """
     fine = math.radians(FINE_DEG) * film_equivalent_weights(data.pairs.lens, data.pairs.domain)[1]
     for _ in range(_MORE_ROUNDS):
@@ -248,7 +248,6 @@ def fit_planes(pairs: RayPairs, encoding: Encoding, terms: int, position_weight:
 
     A ray's crossings with any two planes carry the same information, and a polynomial of full degree in them spans the
     same functions, because the change is linear. A sparse one does not: its variables should follow the lens's own (its
-    same functions, because the change is linear. A sparse one does not: its variables should follow the lens's own (its
     field, and where the ray crosses its stop). So the search moves the p plane, and the multiple of p that is taken
     from u, to the least film-equivalent residual of a sparse fit. Nothing changes in the evaluator. The encoding itself
     is among the trials; it comes back where none does better, or where there are too few rays for a trial to mean
@@ -292,7 +291,7 @@ def _mirror_columns(exponents: Exponents, axis: int, field: LightField) -> Tenso
 
 
 def mirror_exponents(degree: int, axis: int, *, dispersive: bool = True) -> Exponents:
-    """[M, 7] exponents of the monomials that multiply p and u of one axis, up to a total `degree` in the invariants.
+    """Return exponents [M, 7] of the monomials that multiply p and u of one axis, up to a `degree` in the invariants.
 
     The x of a vector is odd in (p_x, u_x) and even in (p_y, u_y), the y the other way about. Terms of x are p_x or u_x
     times a monomial of `LightField.invariants` without p_x u_x (p_x (p_x u_x) is p_x^2 u_x, which is there), and with

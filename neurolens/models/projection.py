@@ -53,12 +53,12 @@ class Problem:
 
     @property
     def rows(self) -> int:
-        """Outputs of the network: A and B of each vector, then the scalars."""
+        """Return the number of outputs of the network: A and B of each vector, then the scalars."""
         return 2 * len(self.vectors) + len(self.scalars)
 
     @property
     def tensors(self) -> list[Tensor]:
-        """All the data, in the order of the fields."""
+        """Return all the data, in the order of the fields."""
         return [getattr(self, f.name) for f in fields(self)]
 
     def every(self, step: int, first: int = 0) -> Problem:
@@ -79,20 +79,20 @@ class Problem:
 
     @cached_property
     def pull(self) -> Tensor:
-        """[N, rows] the negated slope of half a ray's loss where all outputs are zero."""
+        """Return the negated slope of half a ray's loss where all outputs are zero, [N, rows]."""
         dots = torch.stack([(self.vectors * self.p).sum(1), (self.vectors * self.u).sum(1)], 1)  # [V, 2, N]
         vectors = (self.vector_weights**2)[:, None] * dots
         return torch.cat([vectors.flatten(0, 1), self.scalar_weights**2 * self.scalars]).T.contiguous()
 
     @cached_property
     def ridge(self) -> Tensor:
-        """[V + S] penalty on the squared last-layer weights of each vector and scalar."""
+        """Return the penalty [V + S] on the squared last-layer weights of each vector and scalar."""
         vectors = self.curvature[:, : 3 * len(self.vectors)].sum(0).reshape(-1, 3)[:, ::2].mean(1)
         # The tiny constant keeps an output that no ray weighs solvable (as zero).
         return _RIDGE * torch.cat([vectors, self.curvature[:, 3 * len(self.vectors) :].sum(0)]) + 1e-30
 
     def loss(self, outputs: Tensor) -> float:
-        """Mean weighted squared residual of outputs [N, rows]."""
+        """Return the mean weighted squared residual of outputs [N, rows]."""
         n = 2 * len(self.vectors)
         ab = outputs[:, :n].T.reshape(-1, 2, 1, len(self))
         error = (ab[:, 0] * self.p + ab[:, 1] * self.u - self.vectors) * self.vector_weights[:, None]
@@ -205,7 +205,7 @@ class OptimiserState:
 def minimise(
     problem: Problem, start: OptimiserState, steps: int, progress: Progress = lambda share: None
 ) -> tuple[Projection, OptimiserState]:
-    """Levenberg-Marquardt on the hidden weights (damping after Nielsen 1999), scaled by the diagonal (Marquardt 1963).
+    """Minimise over the hidden weights by Levenberg and Marquardt's method, with damping by Nielsen (1999).
 
     Args:
         steps: steps tried; fewer when the loss no longer falls.
@@ -248,7 +248,7 @@ def _moved(hidden: list[Tensor], step: Tensor) -> list[Tensor]:
 
 
 def normal_equations(problem: Problem, at: Projection) -> tuple[Tensor, Tensor, Tensor]:
-    """Gauss-Newton for half the summed loss, with the last layer eliminated.
+    """Return the Gauss-Newton equations of half the summed loss, with the last layer eliminated.
 
     Returns the matrix [P, P] and the gradient [P] in the hidden weights, layer by layer, and the matrix's diagonal [P]
     before elimination, by which damping is scaled.

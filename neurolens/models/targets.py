@@ -61,14 +61,14 @@ STOPPED_DOWN = 0.25
 
 
 def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
-    """Return of which rays a gate's value is known [G, N]: they get as far as its surface (and to its rim)."""
+    """Return for which rays each gate's value is known [G, N]: those that get as far as its surface, or to its rim."""
     arrives = reached(pairs)
     rows = [arrives[g.surface] & (pairs.meets[g.surface] > 0 if g.reason == st.RIM else True) for g in gates]
     return torch.stack(rows) if rows else torch.empty((0, len(pairs)), dtype=torch.bool)
 
 
 def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
-    """The exact values [G, N] of the gates: positive where the surface stops the ray, 0 where it never gets there."""
+    """Return exact values [G, N] of gates: positive where the surface stops the ray, 0 where it never gets there."""
     rows = []
     for gate in gates:
         k = gate.surface
@@ -122,7 +122,7 @@ def _near(distance: Tensor) -> Tensor:
 
 
 def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
-    """Return the rays to which gates are fitted: those near the rims, and lost rays where a gate is about those."""
+    """Return the rays to which gates are fitted: those near the rims, and lost rays where a gate stops those."""
     if all(gate.reason == st.RIM for gate in gates) or not len(pairs.edge):
         return pairs.rim
     both = join_pairs([pairs.rim, pairs.edge])
@@ -364,7 +364,7 @@ _SERIES_DEGREE, _SERIES_ERROR = 8, 3e-8  # of the index: float32's last bit
 
 
 def grazes(pairs: RayPairs) -> bool:
-    """Whether any of the rays to fit leaves the front surface at a grazing angle, and models can refract there."""
+    """Return whether any ray to fit leaves the front surface at a grazing angle, and models can refract there."""
     flattest = float(pairs.train.refracts[0].min()) if len(pairs.train) else 1.0
     return flattest < GRAZING**2 and tilt_series(pairs.lens.surfaces[0]) is not None
 
@@ -457,7 +457,7 @@ def with_angle(model: LensModel) -> LensModel:
 
 
 def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
-    """Leave out the gates that block (next to) nothing that the others and the stop let through.
+    """Leave out the gates that block almost no ray that the other gates and the stop let through.
 
     A status may then name another surface: the first of those left. `share`: see `IDLE_SHARE`.
     """

@@ -37,7 +37,7 @@ ROUNDING = 2.0**-24  # of float32
 
 
 def powers(variables: int, degree: int) -> list[tuple[int, ...]]:
-    """Exponents of all monomials up to a total degree."""
+    """Return the exponents of all monomials up to a total degree."""
     if not variables:
         return [()]
     return [(k, *rest) for k in range(degree + 1) for rest in powers(variables - 1, degree - k)]
@@ -178,7 +178,7 @@ class Sweep:
 
     @staticmethod
     def joined(sweeps: Sequence[Sweep]) -> Sweep:
-        """One sweep of several problems with the same candidates."""
+        """Join several problems with the same candidates into one sweep."""
         whole = copy(sweeps[0])
         whole._starts = [start for sweep in sweeps for start in sweep._starts]
         whole.restart([])
@@ -186,7 +186,7 @@ class Sweep:
 
     @property
     def residuals(self) -> Floats:
-        """[R] the squared residual of every output, of the first problem."""
+        """Return the squared residual [R] of every output, of the first problem."""
         return np.diag(self._tables[0])[self.count :]
 
     @property
