@@ -46,7 +46,7 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
 
 
 def film_of(spec: str | Path, **size: Any) -> tuple[tuple[float, float], str]:
-    """The film that a camera's lens covers, and its name (`film_within`); of a camera without a lens full frame.
+    """Return the film that a camera's lens covers, and its name (`film_within`); full frame for one without a lens.
 
     `size`: what zooms or scales a lens file, as of `Shot`. Raises InputError as `make_camera`.
     """
@@ -63,9 +63,9 @@ def film_of(spec: str | Path, **size: Any) -> tuple[tuple[float, float], str]:
 
 
 def near_of(spec: str | Path, **size: Any) -> float:
-    """The distance in metres from the film to the nearest thing that a camera's lens focuses; arguments as `film_of`.
+    """Return the distance (m) from the film to the nearest object that a camera's lens focuses; arguments as `film_of`.
 
-    A model's card states it; of a lens file and an ideal camera it is usual, 14 focal lengths or more.
+    A model's card states it. For a lens file or an ideal camera a usual distance is taken, 14 focal lengths or more.
     """
     kind, path = resolve(spec)
     if path is None:
@@ -193,7 +193,7 @@ def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
 
 
 def _doubts(lens: Lens) -> list[str]:
-    """Return what a check of the lens against its source doubts; nothing without torch, which traces its chief rays."""
+    """Return the doubts of a check of the lens against its source; none without torch, which traces its chief rays."""
     if find_spec("torch") is None:
         return []
     from neurolens.optics.setting.check import check_lens, doubts

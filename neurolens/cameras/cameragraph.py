@@ -125,8 +125,8 @@ def weight_graph(
 ) -> Graph:
     """Write the graph that turns rays of a lens into weighted rays in the camera's frame.
 
-    The weight w is T A cos^4 / Z^2 over the exposure on the axis; see `cameras.contract`. Film points that nothing
-    reaches (area 0 or NaN) are outside the domain. What does not pass weighs nothing and has no ray.
+    The weight w is T A cos^4 / Z^2 over the exposure on the axis; see `cameras.contract`. Film points that no light
+    reaches (area 0 or NaN) are outside the domain. A ray that does not pass has the weight 0.
 
     Args:
         derivatives: names of derivatives of `scene_ray`, which become inputs and outputs too.
@@ -174,7 +174,7 @@ def concentric_disk(square: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(function: Callable[[Array], Array]) -> Array:
-    """Fit a function of squares of angles up to pi / 4, in units of that, by a polynomial, to float32's last bit."""
+    """Fit a function of the squared angle, up to pi / 4 and in that unit, by a polynomial to float32's last bit."""
     fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
     return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
 
@@ -184,7 +184,7 @@ _SIN = _series(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))
 
 
 class LensGraph(NamedTuple):
-    """The graph of a lens, with what its camera's graph takes from it.
+    """The graph of a lens, and what the graph of its camera needs besides.
 
     Attributes:
         graph: its inputs are `rays` [5] (film point, pupil point and wavelength), `film_z_mm` and `stop_radius_mm`; its
@@ -192,7 +192,7 @@ class LensGraph(NamedTuple):
         stop_radius_mm: radius of the lens's round stop.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
         stopped: status of rays that the shape blocks.
-        unit: whether directions are sure to be of unit length.
+        unit: whether directions are known to be of unit length.
     """
 
     graph: Graph

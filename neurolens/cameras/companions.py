@@ -51,8 +51,8 @@ class Shift(NamedTuple):
             [2], the points (mm) of the same scene ray at the companion wavelength, and the `ratio` of its light to the
             hero's. Here `film_mm` and `film_there` are points of the upright film plane.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
-        edge: three numbers. A companion passes if the hero passes and crosses the pupil farther inside it than the
-            first number (mm), than the second times d, and than the third times -d. Here d is by how much its 1 /
+        edge: three numbers. A companion passes if the hero passes and its distance inside the pupil's edge (mm) is more
+            than the first number, than the second times d, and than the third times -d. Here d is by how much its 1 /
             wavelength^2 (um) exceeds the hero's, with the sign changed on the far side of the pupil's middle, for
             dispersion moves rays to one side.
     """

@@ -149,7 +149,7 @@ class Camera(Protocol):
     settings: dict[str, Any]
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm (lens frame), pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        """Return rays of film points [2, N] (mm, lens frame), pupil samples [2, N] in [0, 1), wavelengths [N] (nm)."""
         ...
 
 
@@ -161,7 +161,7 @@ class DifferentialCamera(Camera, Protocol):
         ...
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points for scene points [3, N] in m (camera frame), pupil samples [2, N] and wavelengths [N] in nm.
+        """Return film points for scene points [3, N] (m, camera frame), pupil samples [2, N] and wavelengths [N] (nm).
 
         The pupil sample chooses the point on the front of the lens at which the scene point's light is aimed; it is not
         the sample for which `sample` returns the same ray.
@@ -172,9 +172,9 @@ class DifferentialCamera(Camera, Protocol):
         ...
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """The part [N] of the weights of `sample` that is the cos^4 law (of a fisheye projection, its own law).
+        """Return the part [N] of the weights of `sample` that is the cos^4 law, or a fisheye projection's own law.
 
-        For every ray, passed or not; what is left of a weight after division is area and transmittance.
+        It is given for every ray, passed or not. A weight divided by it is area times transmittance.
         """
         ...
 
@@ -190,7 +190,7 @@ class SpectralCamera(Camera, Protocol):
     companion_reach_mm: tuple[float, float] | None
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's.
+        """Return rays as `sample` does, for wavelengths [W, N] in nm, of which the first is the hero's.
 
         Raises:
             InputError: the camera cannot place companions.
@@ -199,7 +199,7 @@ class SpectralCamera(Camera, Protocol):
 
 
 def towards(vector: FloatArray, slope: FloatArray, fixed: FloatArray) -> RayDifferentials:
-    """Differentials of rays along `vector` [3, N] (of any length), whose derivatives are `slope` [3, 2, N].
+    """Return differentials of rays along `vector` [3, N] (of any length), whose derivatives are `slope` [3, 2, N].
 
     `fixed`: [3, N] origins, which do not move.
     """

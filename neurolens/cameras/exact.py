@@ -118,7 +118,7 @@ class ExactCamera(LensCamera):
 
     @property
     def front(self) -> Surface:
-        """The first surface of the lens."""
+        """Return the first surface of the lens."""
         return self.lens.surfaces[0]
 
     def _traced_back(
@@ -175,7 +175,7 @@ class ExactCamera(LensCamera):
     def _outline(
         self, scene: LensScene, pupil_z_mm: float, bounds: PupilBounds | None, shot: Shot, progress: Progress | None
     ) -> PupilOutline | None:
-        """The outline of what passes the lens with a round stop, from the cache where an earlier run has kept it."""
+        """Return the outline of what passes the lens with a round stop, from the cache where an earlier run kept it."""
         lens, planes, light = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm), self._light_nm
         covered = FilmPose.of(shot).covers_mm(self.film_mm, scene.film_z_mm - pupil_z_mm)
         # A lens that is not round takes a search at many azimuths, for one outline that fits none closely: so it is
@@ -204,7 +204,7 @@ class ExactCamera(LensCamera):
 
 
 def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float | None = None) -> dict[str, Any]:
-    """The table `lens_state` of a lens that `set_lens` has placed; `nominal_mm` is its focal length at infinity."""
+    """Return the table `lens_state` of a lens placed by `set_lens`; `nominal_mm` is its focal length at infinity."""
     data, film_z = first_order(lens), lens.film_z_mm
     assert film_z is not None
     through = axial_transmittance(lens, [float(np.clip(LINE_D_NM, *wavelength_nm))], wavelength_nm).item()
@@ -238,7 +238,7 @@ def axial_transmittance(lens: Lens, at_nm: Sequence[float], wavelength_nm: tuple
 
 @lru_cache(maxsize=16)  # a camera, its T-stop and its tint ask for the same
 def _graph_of_matrices(lens: Lens, wavelength_nm: tuple[float, float]) -> Graph:
-    """In double precision films are matrices, not polynomials, which may miss 0.02% a surface."""
+    """Return the graph in which coatings are matrices: their polynomials may miss 0.02% of the light a surface."""
     return exact_graph(lens, pupil_plane_z_mm(lens), wavelength_nm, double=True)
 
 

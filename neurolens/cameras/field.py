@@ -175,7 +175,7 @@ def _pupil_samples(rings: int, around: int) -> tuple[Array, Array]:
 
 
 def _on_object(origin: Array, way: Array, frame: Frame, target: str, distance_m: float) -> Array:
-    """Directions [3, ...] from the ideal camera's point to where rays (camera frame, m) meet the object; z ahead."""
+    """Return directions [3, ...], z ahead, from the ideal camera's point to where rays (m) meet the object."""
     flip, pupil = np.array([1.0, 1.0, -1.0])[:, None, None], 1e-3 * np.array(frame.pupil_mm)
     with np.errstate(all="ignore"):
         if target == RECTILINEAR:
@@ -216,7 +216,7 @@ def _directions(place: Complex, frame: Frame, target: str) -> Array:
 
 
 def is_round(camera: Any) -> bool:
-    """Test whether a camera is round: places and light agree at azimuths of which none is another's mirror image."""
+    """Test whether places and light of a camera agree at several azimuths, none of which mirrors another."""
     corner = math.hypot(*camera.film_mm) / 2
     angle = np.arange(_AZIMUTHS) * 0.83
     turn = np.exp(1j * np.tile(angle, len(_TRIED)))
@@ -340,7 +340,7 @@ class Field:
         return _directions(self.ideal(point), self.frame, self.target)
 
     def point(self, direction: Array) -> Complex:
-        """The picture points of directions [3, N], as `directions` gives them; NaN where the ideal camera sees none."""
+        """Return the picture points of directions [3, N] as `directions` gives them; NaN where the camera sees none."""
         behind = direction[2] <= 0 if self.target == RECTILINEAR else direction[2] < -1 + 1e-9
         with np.errstate(all="ignore"):
             return self.picture(np.where(behind, np.nan, _undistorted(direction, self.frame, self.target)))
@@ -396,7 +396,7 @@ def field_of(
 
 
 def shown_at(camera: Any, field: Field, point: Complex, distance_m: float) -> Complex:
-    """Return where a field, of one centre, has what picture points [N] show at this distance; NaN where it is dark."""
+    """Return the picture points that a field gives to what points [N] show at this distance; NaN where it is dark."""
     seen = traced_light(camera, point, field.spectrum, field.frame, field.target, distance_m)
     found: Complex = np.where(seen.light > 0, field.picture(seen.place), np.nan)
     return found
@@ -408,7 +408,7 @@ def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> 
 
 
 def diagonal_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
-    """Return the points of `film_points` along the diagonal, for pictures that are not alike in all directions."""
+    """Return points as `film_points` does, along the diagonal, for pictures that are not round."""
     return film_points(field, film_mm, count) * (complex(*film_mm) / math.hypot(*film_mm))
 
 
@@ -462,7 +462,7 @@ def _check_plane(camera: Any, widest_deg: float, bright: bool, end_mm: float) ->
 
 
 def _filled(place: Complex) -> Complex:
-    """Continue places [R, A] straight, at each azimuth, beyond the end of the light."""
+    """Continue places [R, A] along a straight line, at each azimuth, beyond the end of the light."""
     for k in range(place.shape[1]):
         dark = np.flatnonzero(~np.isfinite(place[:, k]))
         if dark.size and dark[0] > 1:
@@ -475,7 +475,7 @@ def _filled(place: Complex) -> Complex:
 
 
 def _inverted(forward: Polar) -> Polar:
-    """Return the map back, by Newton's method from rings to where they come from."""
+    """Return the inverse of a map, by Newton's method on its rings."""
     rings, azimuths = forward.ratio.shape
     finer = _FINER[azimuths > 1]
     rings, azimuths = finer * (rings - 1) + 1, finer * azimuths if azimuths > 1 else 1

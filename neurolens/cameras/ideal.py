@@ -18,7 +18,7 @@ entrance pupils of real fisheyes nearly do. Relative to the axis E is then
     equisolid       rho = 2 sin(theta/2)       1                  to 180 degrees
     stereographic   rho = 2 tan(theta/2)       cos^4(theta/2)     up to 180 degrees, on a film without end
 
-Source of the projections: Miyamoto 1964, "Fish Eye Lens", J. Opt. Soc. Am. 54(8).
+The projections are those of Miyamoto 1964, "Fish Eye Lens", J. Opt. Soc. Am. 54(8).
 """
 
 from __future__ import annotations
@@ -426,7 +426,7 @@ class Fisheye:
         return replace(rays, differentials=RayDifferentials(np.zeros_like(moves), moves))
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """Return the whole weight, for it is the projection's own law."""
+        """Return the whole weight, which is the projection's own law."""
         return self.sample(film_mm, pupil, wavelength_nm).weight
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:

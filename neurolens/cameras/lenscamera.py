@@ -91,7 +91,7 @@ class LensScene:
 
     @property
     def stopped(self) -> int:
-        """The status of rays that the stop's shape blocks."""
+        """Return the status of rays that the stop's shape blocks."""
         return st.blocked(self.lens.stop_index, st.RIM)
 
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
@@ -114,7 +114,7 @@ class LensScene:
         return passed
 
     def axial_transmittance(self, wavelength_nm: tuple[float, float]) -> float | None:
-        """The transmittance of the axial ray at the wavelength nearest the d line; None where the stop blocks it."""
+        """Return the axial ray's transmittance at the wavelength nearest the d line; None if the stop blocks it."""
         axis = np.zeros((2, 1), np.float32)
         out = self(axis, axis, np.clip([LINE_D_NM], *wavelength_nm).astype(np.float32))
         through = float(out.transmittance[0])
@@ -319,7 +319,7 @@ class LensCamera:
 
     @property
     def front(self) -> Surface | None:
-        """The surface at which light from scene points is aimed; None is the plane z = 0."""
+        """Return the surface at which light from scene points is aimed; None is the plane z = 0."""
         raise NotImplementedError
 
     def _traced_back(
@@ -331,7 +331,7 @@ class LensCamera:
 
     @cached_property
     def _front_discs(self) -> FrontDiscs:
-        """Where the film's light crosses the front, by rays at the pupil's edge, half of them from the film's edge."""
+        """Find where the film's light crosses the front by rays at the pupil's edge, half of them from the film's."""
         rng, ray = np.random.default_rng(0), np.arange(_EDGE_RAYS)
         film = (rng.random((2, _EDGE_RAYS)) - 0.5) * np.array(self.film_mm)[:, None]
         film[:, ::2] *= 0.5 / np.abs(film[:, ::2] / np.array(self.film_mm)[:, None]).max(0)
@@ -366,7 +366,7 @@ class LensCamera:
         self.settings = self.settings | {"runtime": self.runtime}
 
     def ready(self, wavelengths: int) -> None:
-        """Compile what `sample_spectrum` runs for so many wavelengths; what onnxruntime runs is of each process."""
+        """Compile what `sample_spectrum` runs for so many wavelengths; each process opens onnxruntime for itself."""
         if self.runtime == "c":
             self._run("hero", wavelengths - 1)
             self._run("companion")
@@ -400,7 +400,7 @@ class LensCamera:
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """The bound of `SpectralCamera`; None if too few rays pass, or no polynomial follows the shift."""
+        """Return the bound of `SpectralCamera`; None if too few rays pass, or no polynomial follows the shift."""
         return self._shift.reach_mm if self._shift else None
 
     def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
@@ -454,7 +454,7 @@ class LensCamera:
 
     @cached_property
     def _shift(self) -> Shift | None:
-        """The shift of companions, fitted once."""
+        """Fit the shift of companions, once."""
         given, margin = self._film_samples()
         samples = {name: values.astype(np.float64) for name, values in given.items()}
         companions = np.random.default_rng(1).permutation(samples["rays"][4])
@@ -462,7 +462,7 @@ class LensCamera:
 
     @cached_property
     def _sure(self) -> float:
-        """The `sure` (`lanes_graph`) above which companions need no ray; none where the stop's shape has edges."""
+        """Return the `sure` (`lanes_graph`) above which companions need no ray; inf where the stop has edges."""
         return 0.0 if self.lens_graph().aperture is None else math.inf
 
     def _of_the_lens(self) -> dict[str, float]:
@@ -506,7 +506,7 @@ class LensCamera:
         return axis + off * np.minimum(1, share * self.film.outline.film_radius_mm / np.hypot(*place))
 
     def _film_samples(self) -> tuple[dict[str, FloatArray], NDArray[np.float64]]:
-        """Inputs of the lens's graph for rays all over film, pupil and light, and their margins (`lanes_graph`)."""
+        """Return inputs of the lens's graph for rays all over film, pupil and light, and margins (`lanes_graph`)."""
         rng, outline = np.random.default_rng(0), self.film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self.film_mm)[:, None]
         film = self._within(film, 0.99)

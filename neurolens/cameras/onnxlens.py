@@ -60,7 +60,7 @@ def open_session(
 
 
 def _shapes(tensors: Any) -> dict[str, tuple[Any, ...]]:
-    """Type and dimensions by name, None for a dimension that has a name; a name that is no UTF-8 raises an error."""
+    """Return type and dimensions by name; a named dimension is None. A name that is no UTF-8 raises an error."""
     return {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in tensors}
 
 
@@ -216,7 +216,7 @@ class OnnxLens(LensRun):
 
     @cached_property
     def fitted(self) -> LensModel:
-        """The model of this state: its coefficients, its encoding and its domain."""
+        """Return the model of this state: its coefficients, its encoding and its domain."""
         return self.file.at(self.state)
 
     def graph(self, form: Form = SCALARS) -> Graph:

@@ -22,7 +22,7 @@ _HAIR = 1e-18  # mm; added so that the axis stays finite
 
 @dataclass(frozen=True)
 class FilmPose:
-    """How a film stands; all 0 is upright and centred, and false.
+    """How a film stands. All 0 is upright and centred; such a pose is false where a truth is asked for.
 
     Attributes:
         tilt, swing: turns (rad) as `Shot.film_tilt_deg` and `Shot.film_swing_deg` state them.
@@ -44,12 +44,12 @@ class FilmPose:
 
     @property
     def turned(self) -> bool:
-        """Whether the film is not square to the axis."""
+        """Return whether the film is not square to the axis."""
         return bool(self.tilt or self.swing)
 
     @cached_property
     def axes(self) -> NDArray[np.float64]:
-        """The film's x, its y and its normal as columns [3, 3] in the lens frame."""
+        """Return the film's x, its y and its normal as columns [3, 3] in the lens frame."""
         (sin, cos), (sway, stay) = ((math.sin(a), math.cos(a)) for a in (self.tilt, self.swing))
         return np.array([[stay, -sway * sin, -sway * cos], [0.0, cos, -sin], [sway, stay * sin, stay * cos]])
 

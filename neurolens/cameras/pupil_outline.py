@@ -87,7 +87,7 @@ class PupilOutline:
 
     @property
     def graph(self) -> Graph:
-        """The outline's `pupil_graph`."""
+        """Write the outline's `pupil_graph`."""
         return pupil_graph(self.x.shape[2] - 1, len(self.x), self.lean is not None)
 
     def radii(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -243,7 +243,7 @@ def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
 
 
 class _Found(NamedTuple):
-    """What passes of lattices: boxes [3, M] about it, a step wider (low > high if nothing does); its mean along x."""
+    """What passes of lattices: boxes [3, M] about it, a step wider (low > high if none does), and its mean along x."""
 
     boxes: Float64Array
     centre: Float64Array
@@ -391,7 +391,7 @@ def _boundary(
 def _flat(
     radius: Float64Array, centre: Float64Array, direction: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Film radius [M], origin [2, M] and direction [2, M] of all directions [2, R, D] from the centres of rows."""
+    """Return film radius [M], origin and direction [2, M] of all directions [2, R, D] from the centres of rows."""
     count = direction.shape[2]
     origin = np.stack([np.repeat(centre, count), np.zeros(centre.size * count)])
     return np.repeat(radius, count), origin, direction.reshape(2, -1)
@@ -455,7 +455,7 @@ def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array
 def _pushed_out(
     outline: PupilOutline, passes: Passes, shares: tuple[float, ...], report: Callable[[float], object]
 ) -> PupilOutline:
-    """Return the outline with its vertices moved outwards until it holds what passes in between, in all three ways."""
+    """Return the outline, moved outwards until it holds what passes between rows, vertices and wavelengths."""
     needed = np.ones(outline.x.shape)
     both = len(outline.wavelength_nm) > 1
     for done, share in enumerate(shares if both else (0.0,)):
@@ -533,7 +533,7 @@ def leaning(outline: PupilOutline, passes: Passes, reach: float) -> PupilOutline
 
 
 def _keep_largest(needed: Float64Array, found: Float64Array, step: float) -> None:
-    """Raise what vertices [..., R, K + 1] need to what was found [rows, edges], between rows where `step` is not 0."""
+    """Raise what vertices [..., R, K + 1] need to what was found [rows, edges]; `step` is the place between rows."""
     rows = len(found)
     for row in (slice(0, rows), slice(1, 1 + rows)) if step else (slice(0, rows),):
         for edge in (slice(0, -1), slice(1, None)):

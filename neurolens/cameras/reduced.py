@@ -151,7 +151,7 @@ class ReducedDispersion:
             self._fit(light)
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Return the camera's rays at the one wavelength, of the film points that show what these show at theirs."""
+        """Return rays of the one wavelength, from the film points that show there what these points show at theirs."""
         base = self._base(film_mm, wavelength_nm)
         return self._tinted(self.camera.sample(base, pupil, self._reference(film_mm)), wavelength_nm)
 
@@ -161,7 +161,7 @@ class ReducedDispersion:
         return self._tinted(self.camera.sample_differentials(base, pupil, self._reference(film_mm)), wavelength_nm)
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Rays as `sample` does, for wavelengths [W, N] in nm, the first of which is the hero's; see the contract."""
+        """Sample rays as `sample` does, for wavelengths [W, N] in nm; the first is the hero's (see the contract)."""
         base = self._base(film_mm, wavelength_nm[0])
         plain = self.camera.sample(base, pupil, self._reference(film_mm))
         rays = self._tinted(plain, wavelength_nm[0])
@@ -208,7 +208,7 @@ class ReducedDispersion:
         return film_mm - self._shifts(film_mm, wavelength_nm[None])[0] if self.lateral else film_mm
 
     def _shifts(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """The ways [W, 2, N] from film points of the one wavelength to those of the same thing at others [W, N]."""
+        """Return the shift [W, 2, N] from film points of the one wavelength to those of others [W, N]."""
         shift = np.zeros((len(wavelength_nm), *film_mm.shape), np.float32)
         if not self.lateral:
             return shift
@@ -222,7 +222,7 @@ class ReducedDispersion:
         return shift
 
     def _wave(self, wavelength_nm: Any) -> Any:
-        """Return the variable that stands for wavelengths, 0 at the one of the rays."""
+        """Return the variable that stands for wavelengths; it is 0 at the wavelength of the rays."""
         with np.errstate(divide="ignore"):  # what is no light has no rays
             wave = np.square(1000 / wavelength_nm) - (1000 / self._nm) ** 2
         return np.clip(np.nan_to_num(wave), -10, 10).astype(np.float32)
@@ -328,7 +328,7 @@ class Vignetted:
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """The bound of the camera inside; None if that cannot place companions."""
+        """Return the bound of the camera inside; None if that cannot place companions."""
         return getattr(self.camera, "companion_reach_mm", None)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:

@@ -47,7 +47,7 @@ class FrontDiscs:
 
     @staticmethod
     def of(leaving: NDArray[np.float64], shape: Surface | None) -> FrontDiscs:
-        """The discs of scene rays [6, N] (mm, lens frame); `shape` is that of the surface, None the plane z = 0."""
+        """Return the discs of scene rays [6, N] (mm, lens frame); `shape` is the surface's, None the plane z = 0."""
         x, y = meet_front(shape, *leaving)
         side = np.hypot(leaving[3], leaving[4])
         angle, azimuth = np.arctan2(side, -leaving[5]), (leaving[3] + 1j * leaving[4]) / np.maximum(side, 1e-12)
@@ -62,7 +62,7 @@ class FrontDiscs:
         return FrontDiscs(float(width), discs * [1.0, _ROOM], _ROOM * far, _ROOM * math.hypot(far, depth))
 
     def aim(self, point_mm: NDArray[np.float64], square: FloatArray) -> tuple[NDArray[np.float64], ...]:
-        """X, y (mm), and the area (mm^2) for the whole square, [N] each, for scene points [3, N] (mm, lens frame)."""
+        """Return x, y (mm) and the area of the whole square (mm^2), [N] each, for scene points [3, N] (mm)."""
         point_mm = np.where(np.isfinite(point_mm).all(0), point_mm, 0.0)
         side, distance = np.hypot(point_mm[0], point_mm[1]), np.sqrt((point_mm**2).sum(0))
         angle = np.arctan2(side, -point_mm[2])
@@ -157,7 +157,7 @@ def ahead(depth: NDArray[np.float64]) -> NDArray[np.int32]:
 
 
 def common_light(known_nm: tuple[float, float], light_nm: tuple[float, float]) -> tuple[float, float]:
-    """The part of a range of light that a lens knows, or where there is none, the end of its own that is nearest."""
+    """Return the part of a range of light that a lens knows; where there is none, the nearest end of the lens's own."""
     low, high = known_nm
     return min(max(low, light_nm[0]), high), max(min(high, light_nm[1]), low)
 

@@ -66,7 +66,7 @@ class Shader:
 
 
 def shader_of(file: Path, *, zoom: str | float | None = None, name: str | None = None, quiet: bool = False) -> Shader:
-    """The shader of a model (.onnx) or of a lens file.
+    """Return the shader of a model (.onnx) or of a lens file.
 
     Args:
         file: the model or lens file.
@@ -108,7 +108,7 @@ def shader_of(file: Path, *, zoom: str | float | None = None, name: str | None =
 
 
 def lens_of(file: Path, zoom: str | float | None, report: Report) -> tuple[str, OslLens, list[str]]:
-    """The id of a model (.onnx) or lens file, the lens as a shader has it, and lines that describe it. Arguments and
+    """Return the id of a model or lens file, the lens as a shader has it, and lines that describe it. Arguments and
     errors are those of `shader_of`."""
     return _of_model(file, zoom, report) if is_model(file) else exact_lens(file, zoom, report)
 
@@ -125,7 +125,7 @@ def _of_model(file: Path, zoom: str | float | None, report: Report) -> tuple[str
 
 
 def exact_lens(file: Path, zoom: str | float | None, report: Report) -> tuple[str, OslLens, list[str]]:
-    """A lens with every surface traced: its id, the lens as a shader has it, and lines that describe it.
+    """Return id, lens and lines as `lens_of` does, of a lens with every surface traced.
 
     It focuses by its groups where its file tells how they move, else by its film, to ten focal lengths.
 

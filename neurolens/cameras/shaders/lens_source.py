@@ -133,7 +133,7 @@ def lens_program(
 
 
 def pupil_planes_mm(nodes: Sequence[Lens], axes: Sequence[Axis]) -> list[float]:
-    """The plane of the pupil points at each node; of a range it is straight between knots, for the best one jumps."""
+    """Return the plane of pupil points at each node; of a range it is linear between knots, for the best one jumps."""
     if not axes:
         return [pupil_plane_z_mm(node) for node in nodes]
     (axis,) = axes

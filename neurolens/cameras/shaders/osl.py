@@ -90,7 +90,7 @@ class OslCamera:
         limit_m: nothing nearer is in focus; 0 where the film does not move.
         entrance_mm: z of the entrance pupil, lens frame.
         margin: by how much the stop's blades are widened for samples, in units of the stop's radius.
-        unit: whether directions are sure to be of unit length.
+        unit: whether directions are known to be of unit length.
     """
 
     lens: ShaderLens
@@ -105,7 +105,7 @@ class OslCamera:
 
     @cached_property
     def per_exposure(self) -> Array:
-        """The exposure, see `_per_exposure`."""
+        """Return the exposure; see `_per_exposure`."""
         return _per_exposure(self)
 
 
@@ -125,18 +125,18 @@ class OslLens:
 
     @property
     def near_m(self) -> tuple[float, float]:
-        """The nearest distance in focus in the state that focuses nearest, and in that which does least; 0 if fixed."""
+        """Return the nearest distance in focus of the best and of the worst state; 0 where the focus is fixed."""
         limits = [c.limit_m for c in self.nodes]
         return min(limits), max(limits)
 
     @property
     def f_number(self) -> float:
-        """The widest f-number of all states."""
+        """Return the widest f-number of all states."""
         return min(c.lens.f_number for c in self.nodes)
 
     @property
     def film_radius_mm(self) -> float:
-        """The radius of the picture that all states fill."""
+        """Return the radius of the picture that all states fill."""
         return min(c.pupil.film_radius_mm for c in self.nodes)
 
     def states(self) -> list[tuple[ShaderLens, PupilCircles]]:
@@ -186,14 +186,14 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
-    """Write a camera's shader and count a ray's operations with a round stop, as compilers know the blades."""
+    """Write a camera's shader and count a ray's operations with a round stop, for compilers fold known blades."""
     program = osl_program(lens).with_shorter_sums().in_order_of_need()
     text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
     return text, sum(osl_program(lens, {"count": 0.0}).count().values())
 
 
 def osl_program(lens: OslLens, fixed: Mapping[str, float] | None = None) -> Program:
-    """The camera as a program, some inputs fixed; inputs are those of `osl_graph`, and `zoom_mm` for a zoom's range."""
+    """Return the camera as a program with inputs as of `osl_graph`, some fixed, and `zoom_mm` for a zoom's range."""
     program = lower([osl_graph(camera) for camera in lens.nodes], fixed).with_shared_inverses()
     program.mixture = _mixture(lens) if lens.axes else None
     return program

@@ -113,7 +113,7 @@ class PupilCircles:
 
     @cached_property
     def graph(self) -> Graph:
-        """The graph of `sampler` for a round stop."""
+        """Return the graph of `sampler` for a round stop."""
         return self.sampler()
 
     def sampler(self, blades: type[Blades] | None = None, margin: float = 0.0) -> Graph:

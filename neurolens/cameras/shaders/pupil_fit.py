@@ -229,7 +229,7 @@ def _with_circles(pupil: PupilCircles, exponents: Exponents, numbers: Array) -> 
 
 
 def _exponents(anamorphic: bool) -> Exponents:
-    """Exponents [M, 5] of film x, y, film position, stop x, y for terms that mirrors keep, linear in the stop point."""
+    """Return exponents [M, 5] of film x, y, film position, stop x, y: even under mirrors, linear in the stop point."""
     terms, degree = [], _DEGREE[anamorphic]
     for i in range(degree + 1):
         for j in range(degree + 1 if anamorphic else 1):
@@ -304,7 +304,7 @@ def _lost(rays: _Rays, within: Array) -> float:
 
 
 def _missed(rays: _Rays, within: Array) -> Array:
-    """Return counts [2, zones] of the rays that pass, and of those among them that lie outside."""
+    """Return two counts by zone [2, zones]: rays that pass, and those of them that lie outside."""
     out = rays.passed & (within < 0).any(0)
     return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
 
@@ -321,7 +321,7 @@ def light_lost(lens: ShaderLens, pupil: PupilCircles) -> float:
 
 
 def _beside(lens: ShaderLens, image: StopImage) -> float:
-    """The share of random rays that pass far from the image of their point of the stop, in the worst part of the film.
+    """Return the share of passing rays far from the image of their point of the stop, in the worst part of the film.
 
     Where an image folds, two pupil points show one point of the stop.
     """

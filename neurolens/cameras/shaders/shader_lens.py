@@ -59,7 +59,7 @@ class ShaderLens:
 
     @property
     def film_radius_mm(self) -> float:
-        """The radius beyond which the model knows no ray."""
+        """Return the radius beyond which the model knows no ray."""
         return self.table.film_radius_mm
 
     def end_of_light_mm(self) -> float:
@@ -108,7 +108,7 @@ class ShaderLens:
 
     @cached_property
     def _status(self) -> Graph:
-        """The graph that gives the status alone."""
+        """Return the graph that gives the status alone."""
         return replace(self.graph, outputs={"status": self.graph.outputs["status"]})
 
 
@@ -341,7 +341,7 @@ def _lowest(exponents: NDArray[np.int64]) -> int:
 
 
 def _radial(radius: Array, exponents: Exponents) -> Array:
-    """The factors of the film radius for choosing terms: Chebyshev's polynomials, which differ more than powers."""
+    """Return factors of the film radius for choosing terms: Chebyshev polynomials, which differ more than powers."""
     pairs = [(_lowest(e), (int(e[1]) - _lowest(e)) // 2) for e in exponents]
     factors = {(least, degree): radius**least * _chebyshev(degree)(radius**2) for least, degree in set(pairs)}
     return np.stack([factors[pair] for pair in pairs])
