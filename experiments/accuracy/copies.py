@@ -235,7 +235,7 @@ _COLUMNS = lab.columns(
     ("inputs", "inputs", "d"),
 )
 OPTIONS = (
-    lab.count("number", 50, "copies of each lens (default 50)"), lab.count("seed", 0, "of the draws", least=0),
+    lab.count("number", 1000, "copies of each lens (default 1000)"), lab.count("seed", 0, "of the draws", least=0),
     lab.ONLY, lab.out(),
 )  # fmt: skip
 

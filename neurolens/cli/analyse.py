@@ -93,7 +93,7 @@ examples:
     axis: Literal["x", "y"] = setting("y", "plane of the field, for anamorphic lenses (default: y)")
     copies: int | None = setting(
         None, "show how so many copies of the lens differ: MTF, spots and best focus in the middle and at 80% of the "
-        "corners, drawn as by neurolens copies", kind=whole(2, 10_000), metavar="N", common=True,
+        "corners, drawn as by neurolens copies", kind=whole(2, 10_000), metavar="N",
     )  # fmt: skip
     seed: int = setting(0, "of the copies", kind=whole(0))
     tolerances: Path | None = setting(None, "of the copies, as of `neurolens copies`", metavar="FILE.toml")
@@ -168,7 +168,13 @@ examples:
             doubts += [d for d in dark if d not in doubts]
         elif what == "copies":
             limits = Tolerances() if self.tolerances is None else read_config(Tolerances, self.tolerances)
-            options = {"limits": limits, "number": self.copies, "seed": self.seed, "progress": self.progress()}
+            options = {
+                "limits": limits,
+                "number": self.copies,
+                "seed": self.seed,
+                "wavelength_nm": self.waves_nm,
+                "progress": self.progress(),
+            }
         elif what == "mtf-height":
             options = {"frequency_per_mm": self.frequencies, "wavelength_nm": self.waves_nm}
         result = analysis.compute(scene, **{k: v for k, v in options.items() if v is not None})

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neurolens.base.report import PART, Report
-from neurolens.base.settings import setting
+from neurolens.base.settings import WAVELENGTH_NM, changed, said, setting, wavelengths_nm, whole
 from neurolens.cli import arguments as cli
 
 if TYPE_CHECKING:
+    from neurolens.optics.photographs.copy import FittedCopy
     from neurolens.optics.photographs.rims import FittedRims
     from neurolens.optics.photographs.verify import Comparison, Verified
 
@@ -102,12 +103,16 @@ class Rims(cli.Figures):
     On each side of the stop either the rims are scaled, or a ring of the mount is added; the fit takes all apertures
     together. Nothing cuts the beam of the axis, and no rim is wider than its neighbours allow. What is left has other
     causes: the sensor's shading, or a product that differs from the table. The profile is found as by `neurolens
-    verify`. Needs the extras "train" and "photographs"."""
+    verify`. Needs the extras "train" and "photographs".
+
+    With --copy it finds what is off in one copy instead, from the contrasts that its photographs show in the middle and
+    in the corners: the decentre of one element, tilt and swing of the film, its focus."""
 
     epilog = """\
 examples:
   neurolens rims nikon_zoom_70_200 -o zoom.toml
-  neurolens rims my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --unused 1.4 2"""
+  neurolens rims my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --unused 1.4 2
+  neurolens rims my_lens.toml --copy sharpness.csv --f-number 4 -o my_copy.toml"""
     kept = "only a finished lens file is written"
 
     file: Path = cli.lens(positional=True)
@@ -116,10 +121,48 @@ examples:
         (), "f-numbers that the fit leaves out, to see what it is worth for them", within=(0.1, 100.0), nargs="+",
         metavar="N",
     )  # fmt: skip
+    copy: Path | None = setting(
+        None, "contrasts of one copy, as CSV or JSON with the columns x_mm, y_mm (in the picture, to the right and up "
+        "from its middle), frequency_per_mm, tangential, sagittal", metavar="FILE", kind=Path, common=True,
+    )  # fmt: skip
+    element: int | None = setting(
+        None, "with --copy: the first surface of the element that is off (default: each is tried)", kind=whole(0)
+    )
+    wavelengths: tuple[tuple[float, ...], ...] = setting(
+        (), f"with --copy: the light in which it was measured, {said(WAVELENGTH_NM)} nm (default: d, F and C)",
+        kind=wavelengths_nm, nargs="+", metavar="NM",
+    )  # fmt: skip
+    state: cli.LensState = cli.lens_state()
     out: Path | None = cli.output_path("OUT.toml", "write the lens with these rims", None)
 
     def run(self) -> int:
         """Fit, tell, write."""
+        if self.copy and (self.profile or self.unused):
+            self.refuse("--profile, --unused", "(given)", "these options only without --copy")
+        if not self.copy and (self.element is not None or self.wavelengths or changed(self.state, unset=True)):
+            self.refuse("--element, --f-number, ...", "(given)", "these options only with --copy")
+        return self._rims() if self.copy is None else self._copy(self.copy)
+
+    def _copy(self, measured: Path) -> int:
+        """Fit what is off in one copy."""
+        from neurolens.optics.analysis.fields import Scene
+        from neurolens.optics.photographs.copy import fit_copy, read_measured
+        from neurolens.optics.readers.any_format import read_any
+        from neurolens.optics.readers.lensfile import write_lens
+        from neurolens.optics.setting.states import focus_of, set_lens
+
+        tabled, shot = read_any(self.file), self.state.shot()
+        lens = set_lens(tabled, shot)
+        scene, light = Scene(lens, focus_of(lens, shot)), [nm for some in self.wavelengths for nm in some]
+        found = fit_copy(scene, read_measured(measured), self.element, light)
+        if self.out is not None:
+            said = f"What is off is fitted by neurolens rims to {measured.name}."
+            write_lens(replace(found.lens(tabled), notes=" ".join(filter(None, (tabled.notes, said)))), self.out)
+        output = None if self.out is None else str(self.out)
+        return self.answer(FoundCopy(str(self.file), tabled.name, str(measured), found, output))
+
+    def _rims(self) -> int:
+        """Fit rims to a profile."""
         from neurolens.optics.photographs.rims import fit_rims, with_fitted_rims
         from neurolens.optics.photographs.verify import found_for
         from neurolens.optics.readers.any_format import read_any
@@ -136,6 +179,31 @@ examples:
             write_lens(replace(lens, notes=" ".join(filter(None, (lens.notes, said)))), self.out)
         output = None if self.out is None else str(self.out)
         return self.answer(Fitted(str(self.file), tabled.name, match.profile.model, match.certainty, found, output))
+
+
+@dataclass(frozen=True)
+class FoundCopy(Report):
+    """What is off in a copy, by its measured sharpness, and the lens file that has it."""
+
+    file: str
+    name: str
+    measured: str
+    found: FittedCopy = field(metadata=PART)
+    output: str | None
+
+    def text(self) -> str:
+        """What is off, with standard errors, and how well it fits."""
+        found, off = self.found, self.found.error
+        rows = [(name, cli.number(getattr(found, name), 4), cli.number(error, 2)) for name, error in off.items()]
+        factors = ", ".join(f"{value:.3f} at {per_mm:g}/mm" for per_mm, value in found.factor.items())
+        lines = [
+            f"{self.name}: element of surfaces {found.element[0]}-{found.element[1]}",
+            cli.table(("what is off", "fitted", "±"), rows),
+            f"contrasts differ by {found.rms:.4f} (RMS; {found.rms_before:.4f} as designed)",
+            f"of the sensor and the rest: {factors}",
+            f"render it with --film-tilt {found.film_tilt_deg:.4g} --film-swing {found.film_swing_deg:.4g}",
+        ]
+        return "\n".join([*lines, *([f"Warning: {found.doubt}"] if found.doubt else [])])
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
@@ -24,12 +25,14 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.copies import Tolerances, draws_of
 from neurolens.optics.setting.pupils import camera_rays, pupil_bounds
 from neurolens.optics.trace.arrays import follow
+from neurolens.optics.trace.rays import trace
 from neurolens.optics.trace.surfaces import Rays
 
 PER_MM = (20.0, 40.0)
 PLACES = ("middle", "top left", "top right", "bottom left", "bottom right")  # of the picture
 _SHARE, _SIDES = 0.8, (3.0, 2.0)  # where the corners lie: of the image's radius, in a picture with such sides
-_GRID, _WIDER, _ROWS, _POINTS = 20, 1.05, 5, 96  # of pupil points; how the pupil is found
+GRID, FINE = 20, 48  # pupil points a side: contrasts are within 0.004, and within 0.001, of those of more points
+_WIDER, _ROWS, _POINTS = 1.05, 5, 96  # how the pupil is found
 _STEP_MM = 1e-3  # of film points, for the derivatives
 
 
@@ -49,8 +52,16 @@ class Spot(NamedTuple):
 class Corners:
     """Traces a lens that is set, and its copies, from points of the film."""
 
-    def __init__(self, scene: Scene, picture_mm: Array | None = None) -> None:
-        """`picture_mm` [P, 2] are points of the picture, to the right and up from its middle; None takes `PLACES`.
+    def __init__(
+        self, scene: Scene, picture_mm: Array | None = None, wavelength_nm: Sequence[float] | None = None,
+        grid: int = GRID,
+    ) -> None:  # fmt: skip
+        """Find the rays.
+
+        Args:
+            picture_mm: [P, 2] points of the picture, to the right and up from its middle; None takes `PLACES`.
+            wavelength_nm: of the light, all alike; None takes `Scene.waves_nm`.
+            grid: pupil points a side.
 
         Raises:
             InputError: a point from which no ray passes.
@@ -62,17 +73,16 @@ class Corners:
         self.picture_mm = np.asarray(picture_mm, np.float64)
         self.film_mm = -self.picture_mm.T  # the picture stands upside down on the film
         radius = np.hypot(*self.film_mm)
-        waves, z = scene.waves_nm, scene.film_z_mm
+        waves, z = wavelength_nm or scene.waves_nm, scene.film_z_mm
         reach = max(float(radius.max()), 1e-3)
         bounds = pupil_bounds(lens, reach, (z, z), (min(waves), max(waves)), rows=_ROWS, points=_POINTS)
         self._plane = bounds.pupil_z_mm
-        rows = [
-            np.interp(radius, np.linspace(0, reach, _ROWS), v) for v in (bounds.low_mm, bounds.high_mm, bounds.half_mm)
-        ]
-        low, high, half = (v[:, None, None] for v in rows)
-        line = ((np.arange(_GRID) + 0.5) / _GRID * 2 - 1) * _WIDER
+        radii = np.linspace(0, reach, _ROWS)
+        sides = [np.asarray(np.interp(radius, radii, v)) for v in (bounds.low_mm, bounds.high_mm, bounds.half_mm)]
+        low, high, half = (side[:, None, None] for side in sides)
+        line = ((np.arange(grid) + 0.5) / grid * 2 - 1) * _WIDER
         u, v = (low + high) / 2 + (high - low) / 2 * line[:, None], half * line
-        u, v = (np.broadcast_to(a, (len(radius), _GRID, _GRID)).reshape(len(radius), -1) for a in (u, v))
+        u, v = (np.broadcast_to(a, (len(radius), grid, grid)).reshape(len(radius), -1) for a in (u, v))
         self.radial = np.where(radius > 0, self.film_mm / np.maximum(radius, 1e-300), [[0.0], [1.0]])
         c, s = np.where(radius > 0, self.radial, [[1.0], [0.0]]).reshape(2, -1, 1)
         self._pupil = (
@@ -81,6 +91,7 @@ class Corners:
         self._waves = np.repeat(waves, u.shape[1])
         self._towards: Array | None = None
         self._inverse = np.eye(2)[None].repeat(len(radius), 0)
+        self._light = self._transmittance()
         start = self._ends(lens)
         if not start.weight.any(1).all():
             dark = self.picture_mm[~start.weight.any(1)][0].tolist()
@@ -100,16 +111,27 @@ class Corners:
         found = self._ends(lens)
         return found._replace(off_mm=-np.einsum("pij,jpr->ipr", self._inverse, found.off_mm))
 
+    def _rays(self, film_z: float, moved_mm: Array | float = 0.0, shift: float = 0.0) -> Rays:
+        x, y = self.film_mm + moved_mm
+        x, y = (np.repeat(v, self._pupil.shape[2]) for v in (x, y))
+        u, v = self._pupil.reshape(2, -1)
+        return camera_rays(x, y, film_z, u, v, self._plane + shift)
+
+    def _transmittance(self) -> Array:
+        """Return what surfaces and glass let through [P, R] in the lens as designed, which a copy hardly changes."""
+        rays = Rays(*map(torch.from_numpy, self._rays(self.scene.film_z_mm)))
+        waves = torch.from_numpy(np.tile(self._waves, len(self.picture_mm)))
+        with torch.no_grad():
+            found = trace(self.scene.lens, rays, waves, transmittance=True).transmittance
+        return np.asarray(found).reshape(self._pupil.shape[1:])
+
     def _ends(self, lens: Lens, moved_mm: Array | float = 0.0) -> Spot:
         """Return where camera rays end: at points of the object, or in directions across the mean ones."""
         shift = _focus_z_mm(lens) - _focus_z_mm(self.scene.lens)
-        film_z, (x, y) = self.scene.film_z_mm + shift, self.film_mm + moved_mm
-        shape = self._pupil.shape[1:]
-        x, y = (np.broadcast_to(v[:, None], shape).ravel() for v in (x, y))
-        u, v = self._pupil.reshape(2, -1)
-        rays = camera_rays(x, y, film_z, u, v, self._plane + shift)
+        film_z, shape = self.scene.film_z_mm + shift, self._pupil.shape[1:]
+        rays = self._rays(film_z, moved_mm, shift)
         found = follow(lens, rays, np.tile(self._waves, shape[0]))
-        weight = np.where(found.status == 0, rays.dz**4, 0.0).reshape(shape)
+        weight = np.where(found.status == 0, rays.dz**4, 0.0).reshape(shape) * self._light
         slope = np.stack([rays.dx, rays.dy]).reshape(2, *shape) / rays.dz.reshape(shape)
         return Spot(np.where(weight > 0, self._seen(found.rays, film_z, shape), 0.0), slope, weight)
 
@@ -192,13 +214,16 @@ class Spread(Report):
         return np.asarray((self.copy_tangential + self.copy_sagittal)[..., -1] / 2)
 
 
-def spread(scene: Scene, limits: Tolerances, number: int, seed: int, progress: Progress | None = None) -> Spread:
+def spread(
+    scene: Scene, limits: Tolerances, number: int, seed: int, *, wavelength_nm: Sequence[float] | None = None,
+    progress: Progress | None = None,
+) -> Spread:  # fmt: skip
     """Trace copies that are drawn as `neurolens copies` draws them.
 
     Raises:
         InputError: as `copies.copies_of` and `Corners`.
     """
-    corners = Corners(scene)
+    corners = Corners(scene, wavelength_nm=wavelength_nm)
 
     def rows() -> Iterator[tuple[Array, Array, Array]]:
         lenses = [scene.lens, *(lens for _, lens in draws_of(scene.lens, limits, number, seed))]
