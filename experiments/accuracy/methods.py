@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from experiments.accuracy.published import PUBLISHED, fit_any
-from experiments.speed.exact_race import COMPILED, exact_candidates
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import fingerprint_of, read_kept, sha256_of, write_kept
@@ -27,7 +26,7 @@ from neurolens.optics.setting.pupils import image_radius_mm
 from neurolens.studies.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.studies.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.studies.rays import REFERENCE_RADIUS_MM
-from neurolens.studies.speed import EXACT, Race, model_candidates, race
+from neurolens.studies.speed import EXACT, Race, exact_c_candidate, exact_records, model_candidates, race
 
 GROUPS = {
     "paraxial": "what renderers use today",
@@ -161,7 +160,6 @@ class BenchSettings:
     domain: DomainChoice
     pairs: PairSettings
     evaluation: EvaluationChoice
-    compiled: bool = True  # whether the exact tracer compiled by torch runs, too
 
 
 @dataclass(frozen=True)
@@ -213,7 +211,7 @@ def run_bench(
     slow = (*NETWORKS, "neurolens2017")
     for bench in benches:
         progress.plan({f"{bench.name}: {r.name}": 40.0 if r.settings.method in slow else 4.0 for r in rows})
-        progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compiled else 15.0})
+        progress.plan({f"{bench.name}: race": 15.0})
     for bench in benches:
         records = []
         with warnings.catch_warnings():
@@ -289,14 +287,13 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
     if not s.rounds or not files:
         return
     hashes = {name: sha256_of(file) for name, file in sorted(files.items())}
-    mark = fingerprint_of([hashes, s.rounds, bench.settings.compiled])
+    mark = fingerprint_of([hashes, s.rounds])
     if all(record.get("race") == mark for record in records if record["method"] in files):
         return
     domain = bench.domain
-    candidates = exact_candidates(
-        bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=bench.settings.compiled
-    )
-    candidates += model_candidates(files, domain)  # "NAME fused" too, where a C compiler makes one
+    lens = bench.lens.with_stop_radius(domain.stop_radius_mm)
+    # "NAME fused" too, where a C compiler makes one. Torch's tracer takes microseconds for a coated ray.
+    candidates = [exact_c_candidate(lens, domain), *model_candidates(files, domain)]
     timed = race(candidates, domain, rounds=s.rounds, report=report)
     for i, (row, record) in enumerate(zip(rows, records, strict=True)):
         if row.name in files:
@@ -311,15 +308,14 @@ def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
 
 
 def _times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
-    """Times of one model for its record, held against the fastest exact tracer of the same race.
+    """Times of one model for its record, held against the exact lens as C of the same race.
 
     Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading pay off; "never"
-        where the exact tracer is as fast), the same with "fused_" before, and exact: the tracers' times.
+        where the exact tracer is as fast), the same with "fused_" before, and exact: that lens's time.
     """
-    best = COMPILED if COMPILED in timed.ns else EXACT[0]
     found = dict[str, Any]()
     for prefix, name in (("", record["method"]), ("fused_", f"{record['method']} fused")):
-        gain = timed.gain(name, best, record["fit_s"], record["load_s"])
+        gain = timed.gain(name, EXACT[1], record["fit_s"], record["load_s"])
         never = "never" if gain.speedup is not None else None
         found |= {
             f"{prefix}ns_per_ray": gain.ns_per_ray,
@@ -328,5 +324,5 @@ def _times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
         }
     return {
         **found,
-        "exact": [timed.record(n) for n in (EXACT[0], COMPILED) if n in timed.ns or n in timed.unavailable],
+        "exact": exact_records(timed),
     }

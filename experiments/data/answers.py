@@ -255,8 +255,8 @@ def as_c(refractions: int) -> tuple[float, float, float]:
 
 
 def by_hand(refractions: int) -> float:
-    """Nanoseconds of the tracer written by hand, at its best, which averages polarisation; rims and status alike."""
-    rows = results("avx512/tracer_race")["rows"]
+    """Nanoseconds of the tracer written by hand, at its best: bare glass, mean polarisation; rims and status alike."""
+    rows = results("tracer_race")["rows"]
     return float(
         min(r["ns"]["min"] for r in rows if r["refractions"] == refractions and r["name"].startswith("by hand"))
     )
@@ -324,12 +324,12 @@ def speed() -> Answer:
         table,
         [("python -m experiments fused", "fused_speed.md"), ("python -m experiments gpu-day", "gpu_day.md")],
         f"Beside the tracer written by hand, a model is {short(hand[2])} times as fast at 2 refractions and "
-        f"{short(hand[33])} times at 33. Rays are complete: stop, rims, transmittance and status, in float32, of bare "
-        "glass: coatings, which lenses have by default since, cost both more. Times "
-        "are the best of 20 rounds. " + MACHINE,
+        f"{short(hand[33])} times at 33. Rays are complete: stop, rims, transmittance and status, in float32. Glass is "
+        "coated, but for the tracer written by hand and the GPU, where it is bare. Times are the best of 20 rounds. "
+        + MACHINE,
         [
             (
-                "experiments/results/avx512/tracer_race.md",
+                "experiments/results/tracer_race.md",
                 "the exact lens as C beside a tracer written by hand: `python -m experiments tracer`",
             ),
             ("experiments/results/gpu_day.md", "whole cameras, gradients and other programs on that GPU"),

@@ -251,7 +251,7 @@ def camera_row(name: str, own: Passes, exact: Passes, halves: Sequence[Floats], 
 _INTRO = """\
 # Equal time and equal samples
 
-`python -m experiments equal-time`: {lens} exact and through surrogates in onnxruntime, both as compiled
+`python -m experiments equal-time`: {lens} exact and through models in onnxruntime, both as compiled
 C (fused), and as a thin lens of its focal length and f-number. Against the exact lens with other seeds and {reference}
 samples per pixel, in two halves. Every camera draws the same random numbers, one wavelength per path. Times are the
 render's own seconds (best; median in brackets), threads: {threads}, {width} x {height} pixels; making a camera, its fit

@@ -1,9 +1,9 @@
-"""Fused models against the exact lens, both written as C by the same means, and against torch and onnxruntime.
+"""Fused models against the exact lens, both written as C by the same means, and against onnxruntime.
 
 For each lens the smallest polynomial within 1 um RMS on the film, and a small network, with and without what a scene
 fixes. All race in turn in one process on one thread, float32, doing the same rays, in two kinds of work: position and
-direction only, and with stop, rims and transmittance. A minute per lens more where torch compiles its tracer. Needs a C
-compiler and the extra "train" (torch). Writes fused_speed.md and fused_speed.json; rows of other lenses are kept.
+direction only, and with stop, rims and the transmittance of coated glass. Needs a C compiler and the extra "train"
+(torch). Writes fused_speed.md and fused_speed.json; rows of other lenses are kept.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import numpy as np
 
 from experiments import lab
 from experiments.lab import Report, Row
-from experiments.speed.exact_race import exact_candidates
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxlens import open_session
 from neurolens.graph.compiler import FLAGS, find_compiler
@@ -46,7 +45,7 @@ POLYNOMIALS = tuple(ModelSettings("ols", terms=n, idle_gates=IDLE) for n in TERM
 NETWORKS = tuple(ModelSettings("mlp", units=n, layers=1, idle_gates=IDLE) for n in (4, 5, 6, 7, 8, 9, 10, 12, 16))
 WAVELENGTH_NM = 550.0
 _STOPPED = math.sqrt(0.5)  # one stop down, where a stop is fixed
-EXACTS = ("exact C", "exact torch")
+EXACT = "exact C"
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def small_enough(prepared: Prepared, choices: Sequence[ModelSettings]) -> tuple[
     return model, rms
 
 
-def measure(case: Case, rounds: int, torch_compiled: bool, report: Report) -> list[Row]:
+def measure(case: Case, rounds: int, report: Report) -> list[Row]:
     """Fit, race and hold against the exact tracers; one row per candidate and kind of work."""
     lens = case.lens()
     domain = domain_of(lens, film_radius_mm=case.film_radius_mm, focus_m=(math.inf, case.near_m))
@@ -104,10 +103,8 @@ def measure(case: Case, rounds: int, torch_compiled: bool, report: Report) -> li
 
     for work, parts in (("ray", RAY_ONLY), ("whole", ALL)):
         program = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole"))
-        add(EXACTS[0], work, program_candidate("", program, domain), program)
-        add(f"{EXACTS[0]}, AVX2", work, program_candidate("", program, domain, flags=AVX2), program)
-        if torch_compiled:
-            add(EXACTS[1], work, exact_candidates(lens, domain, transmittance=work == "whole")[1])
+        add(EXACT, work, program_candidate("", program, domain), program)
+        add(f"{EXACT}, AVX2", work, program_candidate("", program, domain, flags=AVX2), program)
         for model, error in fitted:
             known = {"rms_um": error, "coefficients": model.core.coefficients}
             for name, models, fixed in _forms(model):
@@ -121,7 +118,7 @@ def measure(case: Case, rounds: int, torch_compiled: bool, report: Report) -> li
             add(name, "whole", model_candidate(name, load_model(file), domain.stop_radius_mm), rms_um=error)
             add(name, "ray", ray_candidate(name, file), rms_um=error)
         return lab.race_rows(
-            rows, field, domain, rounds, lambda name: {exact: f"{exact}, {rows[name]['work']}" for exact in EXACTS},
+            rows, field, domain, rounds, lambda name: {EXACT: f"{EXACT}, {rows[name]['work']}"},
             lambda share, left=None: report(0.3 + 0.7 * share),
         )  # fmt: skip
 
@@ -162,9 +159,8 @@ Rays uniform over film and pupil disc of the domain, blocked ones included. "ray
 the front surface, direction and domain guard out. "whole": with stop, rims and transmittance.
 
 - Models test no rim that alone blocks fewer than {idle:.2g} of the rays.
-- exact C: the exact trace as C from the same writer as the models, compiled alike ({flags}), every surface bare; "ray"
-  tests no rim. `python -m experiments tracer` holds it against a tracer that was written by hand.
-- exact torch: the project's own tracer compiled by torch, rims tested in both kinds of work.
+- exact C: the exact trace as C from the same writer as the models, compiled alike ({flags}), every surface coated;
+  "ray" tests no rim. `python -m experiments tracer` holds it against a tracer that was written by hand.
 - onnxruntime, "ray": the part of the exported graph that gives position and direction, without the domain guard.
 - AVX2: without AVX-512. Fixed: {wavelength:g} nm; film at the farthest focus, one stop down.
 - Operations: float operations per ray, a fused multiply-add is one; in brackets, how many are divisions and square
@@ -198,10 +194,9 @@ def goals(rows: Sequence[Row]) -> list[lab.Goal]:
     ]
     return made + [
         lab.Goal(
-            f"times as fast as {exact}, {count} refractions, {kind}, {work}", least,
-            fastest(count, work, ending)["speedup"].get(exact), at_least=True,
+            f"times as fast as {EXACT}, {count} refractions, {kind}, {work}", least,
+            fastest(count, work, ending)["speedup"].get(EXACT), at_least=True,
         )
-        for exact in EXACTS
         for kind, ending, work, wanted in _RATIO_GOALS
         for count, least in zip((12, 33), wanted, strict=True)
     ]  # fmt: skip
@@ -211,19 +206,16 @@ _COLUMNS = lab.columns(
     ("lens", "lens"), ("refractions", "refractions"), ("candidate", "name"), ("work", "work"),
     ("RMS um", "rms_um", ".2g"), ("coefficients", "coefficients"),
     ("operations", lambda r: f"{r['operations']} ({r['roots']})" if r.get("operations") else None), ("bytes", "bytes"),
-    ("ns per ray", lab.times_of), *((f"over {exact}", f"speedup.{exact}", ".2f") for exact in EXACTS),
+    ("ns per ray", lab.times_of), (f"over {EXACT}", f"speedup.{EXACT}", ".2f"),
 )  # fmt: skip
-OPTIONS = (
-    lab.option("--quick", action="store_true", help="without the tracer compiled by torch, few rounds"),
-    lab.ONLY, lab.ROUNDS, lab.out(),
-)  # fmt: skip
+OPTIONS = (lab.ONLY, lab.ROUNDS, lab.out())
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure lens by lens; the table is written after each."""
     lab.quiet_glasses()
     find_compiler()
-    rounds = args.rounds or (5 if args.quick else 20)
+    rounds = args.rounds or 20
     cases = {Path(c.file).stem: c for c in lab.chosen(CASES, lambda c: c.file, args.only, "fused")}
 
     def page(rows: Sequence[Row]) -> str:
@@ -232,7 +224,7 @@ def run(args: argparse.Namespace) -> None:
         return lab.page(*head, lab.goal_table("goal", goals(rows)), lab.table(_COLUMNS, rows))
 
     lab.resume(
-        args, "fused_speed", cases, lambda case, report: measure(case, rounds, not args.quick, report),
+        args, "fused_speed", cases, lambda case, report: measure(case, rounds, report),
         lambda row: row["lens"], page, facts={"machine": lab.machine(), "flags": list(FLAGS)}, again=True,
         about=lambda rows: {"rounds": rounds, "goals": goals(rows)}, order=[Path(c.file).stem for c in CASES],
     )  # fmt: skip

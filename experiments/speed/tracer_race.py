@@ -3,8 +3,9 @@
 The hand-written tracer (shared/data/reference_tracer, beside this project; without it only ours is timed) is C++ with
 intrinsics for spheres: one to three vectors interleaved, with divisions and roots by estimates and Newton's steps, or
 by the machine's own. It takes the mean of both polarisations at each surface; ours follows the polarisation, and is
-timed with the mean, too, which is the same work, and in double precision. Glasses are by n_d and V_d; aspheres and
-cylinders of the longest lens are spheres here. Writes tracer_race.md and tracer_race.json.
+timed with the mean, too, which is the same work, and in double precision. Glass is bare and clear, as in the other,
+and goes by n_d and V_d; aspheres and cylinders of the longest lens are spheres here. Writes tracer_race.md and
+tracer_race.json.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ extern "C" void run(size_t n, float fz, float sr, void **a)
 
 
 def by_figures(surface: Surface) -> Surface:
-    """The surface as a sphere with its glass by n_d and V_d."""
-    surface = replace(surface, figure=SPHERE)
+    """The surface as a bare sphere with its glass by n_d and V_d."""
+    surface = replace(surface, figure=SPHERE, coating=None, absorbs_as=None)
     if surface.glass is None:
         return surface
     d, f, c = (float(index_of(surface, nm)) for nm in (LINE_D_NM, LINE_F_NM, LINE_C_NM))
@@ -191,8 +192,9 @@ _COLUMNS = lab.columns(
 )  # fmt: skip
 _NOTES = """\
 One thread, {wide}, float32, {rounds} rounds in turn in one process (best; median in brackets), each at its best batch.
-Rays uniform over film and pupil disc of the domain, blocked ones included; of {rays} of them those with another status
-than ours are counted (in double precision: of the same rays before they are rounded). Ours by {compiler} {flags}."""
+Glass is bare and clear in both. Rays uniform over film and pupil disc of the domain, blocked ones included; of {rays}
+of them those with another status than ours are counted (in double precision: of the same rays before they are
+rounded). Ours by {compiler} {flags}."""
 OPTIONS = (lab.ONLY, lab.ROUNDS, lab.out())
 
 

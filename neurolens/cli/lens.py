@@ -274,6 +274,15 @@ class Described(Report):
         plots = {"Layout": self.layout, "Focus breathing": self.breathing_plot}
         return "\n\n".join([*parts, *(f"{what} drawn in {file}" for what, file in plots.items() if file)])
 
+    def _focusing(self) -> tuple[str, str]:
+        reach_m = self.facts.groups_reach_m
+        if reach_m is None:
+            return "whole lens", "nothing in the file says that groups move"
+        return (
+            "by groups",
+            f"to {reach_m:.3g} m from the film; nearer, and in models of one state, the whole lens moves",
+        )
+
     def _light(self) -> str:
         facts = self.facts
         stated, anamorphic = facts.half_field_deg, facts.efl_x_mm is not None
@@ -285,6 +294,7 @@ class Described(Report):
             ("image radius", f"{cli.number(facts.image_radius_mm)} mm", f"from {facts.image_radius_from}"),
             ("half field", half, f"reached at the edge of the film{along}{states}"),
             *((("", half_x, "along x"),) if anamorphic else ()),
+            ("focusing", *self._focusing()),
             ("rays that pass", f"{100 * facts.passing_share:.1f}%", share_of),
             *(("", f"{100 * e.share:.1f}%", e.text) for e in facts.ended),
             ("T-stop", "-" if facts.t_stop is None else f"T{cli.number(facts.t_stop)}", "of the axial ray, d line"),

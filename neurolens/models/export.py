@@ -160,6 +160,9 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
     facts = [lens_facts(node.lens, node.domain) for node in model.nodes]
     for fact, node in zip(facts, model.nodes, strict=True):  # at infinity focus, as photographers count
         fact["f_number"] = float(first_order(at_infinity(node.lens)).f_number)
+    if any(a.name == "focus" for a in model.axes):
+        for fact in (card["lens"], *facts):
+            fact["focusing"] = "groups"
     card["units"] = {**card["units"], STATE: [f"{a.name} {a.unit}" for a in model.axes]}
     card["states"] = {
         "axes": [a.to_dict() for a in model.axes],
@@ -242,6 +245,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "film_z_mm": near if lens.film_z_mm is None else min(max(float(lens.film_z_mm), near), far),
         "dispersive": lens.dispersive,
         "coatings": lens.coatings,
+        "focusing": "whole lens",  # `export_states` knows better
         **({"believed_to_be": lens.believed_to_be} if lens.believed_to_be else {}),
         **({"measured": dict(lens.measured)} if lens.measured else {}),
         **({"licence": LENSFUN} if lens.measured or lens.rims == "photographs" else {}),

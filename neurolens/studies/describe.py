@@ -37,7 +37,7 @@ from neurolens.optics.lens.paraxial import FirstOrder, FirstOrderLight, first_or
 from neurolens.optics.lens.prescription import Coating, Lens, Medium
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.check import Check, check_lens, doubts, verdict
-from neurolens.optics.setting.focusing import at_infinity
+from neurolens.optics.setting.focusing import at_infinity, groups_reach_m
 from neurolens.optics.setting.pupils import camera_rays, image_radius_mm
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import trace
@@ -73,6 +73,7 @@ class LensFacts(Report):
             along y); None where none does. half_field_reached_x_deg is None for a round lens, too.
         passing_share: share of rays uniform over the domain's film and pupil discs that pass.
         coatings: as `Lens.coatings`.
+        groups_reach_m: how near (m, from the film) the lens focuses by its groups; None where it moves as a whole.
         t_stop: f-number over the root of the share of light at the d line that the axial ray keeps; None where that ray
             does not pass.
         white_rb: R/G and B/G (linear sRGB) of a white card on the axis in daylight D65; None without visible light.
@@ -102,6 +103,7 @@ class LensFacts(Report):
     half_field_reached_x_deg: float | None
     passing_share: float
     coatings: str
+    groups_reach_m: float | None
     t_stop: float | None
     white_rb: tuple[float, float] | None
     ended: list[Ended]
@@ -146,6 +148,7 @@ def lens_facts(lens: Lens, domain: Domain) -> LensFacts:
         half_field_reached_x_deg=reached_x if squeezed else None,
         passing_share=passing,
         coatings=lens.coatings,
+        groups_reach_m=groups_reach_m(lens),
         t_stop=state_of(lens, lens.light_nm)["t_stop"],
         white_rb=white_rb(lens),
         ended=ended,

@@ -54,7 +54,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 def row(file: str, entry: str, mark: str = "", rms_um: float = 2.0) -> dict[str, Any]:
     figures = dict.fromkeys((*make_models._KEPT, "position_rms_um_at_21_6"), 1.0)
-    timed = {"ns_per_ray": {"min": 20.0}, "speedup_over_compiled": 2.0}
+    timed = {"ns_per_ray": {"min": 20.0}, "speedup_as_c": 2.0}
     return {
         "file": file,
         "entry": entry,

@@ -68,7 +68,9 @@ def write_lens(
         if lens.configurations:
             lines.append("One zoom position: its gaps are numbers in the code (--zoom range makes it an argument).")
     if focus_states(lens):
-        lines.append("Groups stand at infinity focus: the film focuses, for how groups move is no graph.")
+        lines.append(
+            "Groups stand as at infinity focus: unlike in the product, the whole lens moves to focus (film_z_mm)."
+        )
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes, double=to == DOUBLE)
     constants, functions = followed(axes, numbers(nodes, planes))

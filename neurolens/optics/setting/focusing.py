@@ -168,9 +168,14 @@ def nearest_focus_m(lens: Lens) -> float:
 
 def reached_inside(lens: Lens, focus_m: float) -> bool:
     """Whether the groups of a lens move for a distance (m): its file has focus states, which reach that near."""
-    if math.isinf(focus_m) or not focus_states(lens):
-        return False
-    return 0 < nearest_focus_m(lens) <= focus_m * (1 + 1e-9)
+    reach_m = None if math.isinf(focus_m) else groups_reach_m(lens)
+    return reach_m is not None and reach_m <= focus_m * (1 + 1e-9)
+
+
+def groups_reach_m(lens: Lens) -> float | None:
+    """Return how near (m, from the film) the groups of a lens focus; None where the lens moves as a whole."""
+    reach_m = nearest_focus_m(lens) if focus_states(lens) else math.inf
+    return reach_m if 0 < reach_m < math.inf else None
 
 
 def near_limit_m(lens: Lens) -> float:

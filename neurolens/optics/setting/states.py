@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, note
 from neurolens.optics.lens import paraxial
 from neurolens.optics.lens.designs import coated, with_assumptions
 from neurolens.optics.lens.prescription import Configuration, Lens
@@ -25,6 +25,7 @@ from neurolens.optics.setting.focusing import (
     best_focused,
     focused_inside,
     gaps_mm,
+    groups_reach_m,
     infinity_states,
     monotone,
     reached_inside,
@@ -64,6 +65,10 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
     lens, light_nm = at_infinity(lens), shot.wavelength_nm or lens.light_nm
     lens = _sized(_zoomed_to(lens, shot.zoom), shot)
     mode = focus_mode_of(lens, shot)
+    if mode != shot.focus_mode and mode == "best" and shot.focus_m is not None and math.isfinite(shot.focus_m):
+        reach_m = groups_reach_m(lens)
+        if reach_m is not None and shot.focus_m < reach_m:
+            note(f"{lens.path}: its groups focus to {reach_m:.3g} m; nearer, the whole lens moves")
     lens = lens.with_aperture(shot.aperture or lens.aperture)
     if shot.f_number is not None:
         far = at_infinity(lens)
