@@ -1,8 +1,8 @@
-"""How sharp a picture is at some of its points, of a lens and of its copies, and how their best foci lie.
+"""Sharpness at points of the picture, of a lens and of its copies, and the plane of their best focus.
 
-Camera rays leave each point through a grid on the pupil plane. Were they to come from one point of the scene, they
-would meet the film where their ends in the scene say, by the derivatives of the lens as designed: that is the spot. A
-copy is focused as its lens is: its film moves by as much as its paraxial focus.
+Camera rays leave each point through a grid on the pupil plane. In the scene they do not end in one point; the
+derivatives of the lens as designed turn the differences into distances on the film, which are the spot. A copy is
+focused as its lens is: its film moves by as much as its paraxial focus.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class Spot(NamedTuple):
     """The spots of P points of the film, R rays each.
 
     Attributes:
-        off_mm, slope: [2, P, R] along x and y on the film, and by how much that grows where the film is farther away.
+        off_mm, slope: [2, P, R] distances along x and y on the film, and how much they grow for each mm that the film
+            is farther away.
         weight: [P, R] of the rays.
     """
 

@@ -190,7 +190,7 @@ def irradiance(pupil: ExitPupil, x_mm: Array, y_mm: Array, field: Field) -> Arra
 
 
 def cells_of(pupil: ExitPupil, cells: int, open_share: Array | None = None) -> Field:
-    """Return the field [cells, cells] of the pupil's cells, less what of them is shut."""
+    """Return the field [cells, cells] of the pupil's cells, each times its open share."""
     share = pupil.open_share(cells) if open_share is None else open_share
     return np.asarray(share.astype(np.float32) * pupil.field((middles(cells),) * 2), np.complex64)
 

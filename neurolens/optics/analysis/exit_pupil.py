@@ -65,7 +65,7 @@ class ExitPupil:
 
     @property
     def blur_mm(self) -> float:
-        """The greatest distance of a ray from the centre on the film."""
+        """Return the greatest distance of a ray from the centre on the film."""
         return float(np.hypot(*self.hits_mm).max())
 
     def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
@@ -73,7 +73,7 @@ class ExitPupil:
         return self._lets(self._at(places, slice(2, None)))
 
     def _lets(self, at: Array) -> NDArray[np.bool_]:
-        """Whether light passes by its places [K, ...] at the rims."""
+        """Return whether light passes, from its places [K, ...] at the rims."""
         inside = np.ones(at.shape[1:], bool)
         for x, y, limit in zip(at[::2], at[1::2], self.limits_mm, strict=True):
             inside &= x * x + y * y <= limit * limit
@@ -241,7 +241,7 @@ _ORDERS = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)
 
 
 class _Design(NamedTuple):
-    """Polynomials at N points: their slopes [N, M] by u and v, and what fits them to values."""
+    """Polynomials at N points: their slopes [N, M] by u and v, and the function that fits them to values."""
 
     slopes: tuple[Array, Array]
     solved: Callable[[Array], Array]
@@ -262,7 +262,7 @@ def _design(places: bytes) -> _Design:
 
 
 def _least(a: Array) -> Callable[[Array], Array]:
-    """Return what solves a x = b for any b by least squares.
+    """Return a function that solves a x = b for any b by least squares.
 
     The normal equations take a fraction of the time of a QR decomposition; a second step on what the first leaves
     restores the digits that they lose.

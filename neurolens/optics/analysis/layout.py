@@ -195,7 +195,7 @@ def draw_section(axes: Any, layout: Layout, **axis: Any) -> None:
 
 
 def _limits(layout: Layout) -> tuple[tuple[float, float], float]:
-    """The z from a little before the glass (rays come from there) to a little behind the film, and greatest height."""
+    """Return z from a little before the glass to a little behind the film, and the greatest height."""
     height = max(s.semi_diameter_mm for s in layout.surfaces)
     z = np.concatenate([*(s.arc()[:, 0] for s in layout.surfaces), [layout.film_z_mm]])
     ends = float(z.min() - 0.55 * height - 0.04 * np.ptp(z)), float(z.max() + 0.06 * np.ptp(z) + 0.05 * height)
@@ -254,7 +254,7 @@ def thumbnail(layout: Layout) -> str:
     width, height = scale * (right - left), max(2 * scale * top, _LEAST)
 
     def path(lines: Iterable[Array], look: str, close: str = "") -> str:
-        """Lines as steps in tenths of a pixel, which take half of the letters of places."""
+        """Write lines as steps in tenths of a pixel, which take half as many letters as places do."""
         text = ""
         for points in lines:
             x = np.clip(scale * (points[:, 0] - left), -9 * _WIDTH, 9 * _WIDTH)

@@ -182,7 +182,7 @@ class Lens:
 
     @property
     def visible(self) -> bool:
-        """Whether the source designs the lens for visible light: by one of its wavelengths, by their range, or by none.
+        """Whether the lens is for visible light: its source states a visible wavelength or range, or no wavelength.
 
         Files often name one wavelength, as 550 nm, or the d line rounded to 587.6 nm, and mean a lens for the eye.
         """
@@ -339,7 +339,7 @@ class Lens:
         return replace(self, surfaces=tuple(surfaces), configurations=tuple(states), infinity_mm=infinity, **stated)
 
     def half_field_in(self, state: Configuration) -> float | None:
-        """Return the half field in a state: its own; None where an image circle tells it; else the lens's."""
+        """Return the half field in a state: the state's own, else the lens's; None where an image circle gives it."""
         return state.half_field_deg or (self.half_field_deg if self.image_radius_mm is None else None)
 
     def with_stop_radius(self, radius_mm: float) -> Lens:

@@ -219,7 +219,7 @@ def film_size(text: str) -> tuple[float, float]:
 
 
 def film_within(radius_mm: float) -> tuple[tuple[float, float], str]:
-    """The film that an image circle covers: the largest of `FILMS` but for narrow ones, and its name; else 3:2, ""."""
+    """Return the largest of `FILMS`, narrow ones apart, in an image circle, and its name; else a 3:2 film and ""."""
     films = {name: film_size(text) for name, text in FILMS.items()}
     fitting = {name: film for name, film in films.items() if math.hypot(*film) / 2 <= _COVERS * radius_mm}
     named = max(fitting, key=lambda name: math.hypot(*fitting[name]), default="")

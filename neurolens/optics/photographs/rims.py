@@ -54,7 +54,7 @@ _DARK = -4.0  # stops, for no light
 
 
 def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
-    """Return the lens at infinity focus, a zoom at a profile's focal length; names round the ends of a zoom."""
+    """Return the lens at infinity focus, a zoom at a profile's focal length or at the end of its range next to that."""
     states = [c.efl_mm for c in lens.configurations if c.efl_mm and c.object_distance_mm is None]
     if len(states) > 1 and max(states) > 1.05 * min(states):
         low, high = min(states), max(states)

@@ -146,8 +146,8 @@ def shapes(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) ->
     """Return measured and computed shapes of the distortion, and the size of the picture with which they agree best.
 
     Shapes are percent relative to the mean of the heights at which both exist; NaN where no chief ray reaches. Crop
-    factors are rounded, and a patent's example seldom has the product's very focal length, so that heights are free by
-    some percent.
+    factors are rounded, and a patent's example seldom has the product's very focal length, so the scale of heights is
+    free within some percent.
 
     Args:
         measured: [H] the measured image height over that of the ideal picture, to a scale.

@@ -167,7 +167,7 @@ def nearest_focus_m(lens: Lens) -> float:
 
 
 def reached_inside(lens: Lens, focus_m: float) -> bool:
-    """Whether the groups of a lens move for a distance (m): its file has focus states, which reach that near."""
+    """Return whether the groups of a lens move for a distance (m): its file has focus states that reach it."""
     reach_m = None if math.isinf(focus_m) else groups_reach_m(lens)
     return reach_m is not None and reach_m <= focus_m * (1 + 1e-9)
 
@@ -246,7 +246,7 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
 def _least_spot_mm(
     lens: Lens, object_z_mm: float, wavelength_nm: tuple[float, float] | None, stops_mm: Sequence[float] | None = None
 ) -> NDArray[np.float64]:
-    """The film planes of an axial point's least spot, behind the stop as it is or behind round ones of some radii."""
+    """Return film planes of an axial point's least spot, behind the stop as it is or round ones of some radii."""
     # Without dispersion all light behaves as one colour.
     one = (lens.reference_nm, lens.reference_nm)
     wavelengths, weights = paraxial.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)

@@ -35,7 +35,7 @@ AGREE = 5e-4  # share of a figure's scale by which two levels may differ: half o
 
 
 class Nodes(NamedTuple):
-    """Points of a plane, each [B, N], with the areas they stand for; points on the outline itself stand for none."""
+    """Points of a plane, each [B, N], with the areas they stand for; points on the outline itself have the area 0."""
 
     u: Tensor
     v: Tensor
@@ -156,8 +156,8 @@ def converged(
 
     Args:
         compute: gives the arrays of a level, from 0, for some of the fields.
-        figures: gives of all arrays, by name, the figures that are shown, [F, ...], and the scale on which their three
-            digits count: the figures themselves, or 1 for shares of 1.
+        figures: takes all arrays and gives, by name, the figures that are shown, [F, ...], and the scale on which their
+            errors count: the figures themselves, or 1 for shares of 1.
         fields: the number of fields, F.
         first: the level to begin with.
 

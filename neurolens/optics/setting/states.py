@@ -276,7 +276,7 @@ def _varying_gaps(lens: Lens) -> list[int]:
 
 
 def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) -> Vector:
-    """Return the groups' places for this focal length, the paraxial image on the film: Gauss-Newton, least moves."""
+    """Find the groups' places for this focal length, with the image on the film, by Gauss and Newton's least moves."""
     x = [math.log(s.efl_mm) for s in states]
     target = min(max(math.log(efl_mm), x[0]), x[-1])
     known = np.array([s.places for s in states])

@@ -137,7 +137,7 @@ def trace(
 def optical_path(
     lens: Lens, points: Sequence[Rays], wavelength_nm: Tensor | float, towards: Towards = "film"
 ) -> Tensor:
-    """Return the optical path [N] in mm along rays: their start, `Traced.path`, and then their end, if it counts."""
+    """Return the optical path [N] in mm along the `points` of rays: their start, then `Traced.path`, then any end."""
     length = torch.zeros_like(points[0].x)
     order = media(lens, wavelength_nm)[:: 1 if towards == "film" else -1]
     for medium, before, after in zip(order, points, points[1:], strict=False):
@@ -252,7 +252,7 @@ class Tracing:
         self.tests, self.rays = self._start(rays, lit, entering)
 
     def _start(self, rays: Rays, lit: Tensor | None, entering: int) -> tuple[Survival, Rays]:
-        """The rays with optical direction cosines, and the tests, which hold that directions are unit vectors."""
+        """Return the rays with optical direction cosines, and the tests, which begin with that for unit directions."""
         o = self.o
         length2 = o.dot(rays[3:], rays[3:])
         sound = at_most((length2 - 1).abs(), UNIT_SLACK)

@@ -197,8 +197,8 @@ def _meet_quadric(o: Arithmetic, r: Rays, m: Quadric, c: Quadric, sense: int, be
     """Find where rays meet cx x^2 + cy y^2 + cz z^2 = 2 z, at the root next to the vertex.
 
     Returns:
-        The square of the left side's derivative along the ray, which is positive where there is a root; what the
-        parameter of the ray is divided by; and this parameter, from the ray's nearest approach `m`.
+        The square of the left side's derivative along the ray, which is positive where there is a root; the divisor of
+        the ray's parameter; and this parameter, counted from the ray's nearest approach `m`.
     """
     p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
     if cx is cy or (is_number(cx) and is_number(cy) and cx == cy):

@@ -41,14 +41,15 @@ def exact_graph(
     lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True, path: bool = False,
     polarised: bool = True, double: bool = False,
 ) -> Graph:  # fmt: skip
-    """Film and pupil points in, scene ray and status out: inputs and outputs are those of a model's graph.
+    """Write the graph of a lens with every surface; its inputs and outputs are those of a model's graph.
 
     Args:
         pupil_z_mm: plane of the pupil points. wavelength_nm: range of the light, for coatings and absorption; a single
             wavelength fixes the indices. Outside `light_limits` the status says so, and where the stop has no radius.
         whole: with stop, rims, domain and transmittance; else the ray alone, and whether it gets through.
         polarised: as in `Passage`. double: as in `Graphs`.
-        path: an output more, `path` [2 K]: z and y of the crossing with each surface, that next to the film first.
+        path: whether there is a further output, `path` [2 K]: z and y of the crossing with each surface, that next to
+            the film first.
     """
     g = Graph()
     o = Graphs(g, double=double)
@@ -136,7 +137,7 @@ class GraphPassage(Passage):
         self.range_nm = range_nm
 
     def absorption(self, k: int) -> Value | None:
-        """Napierian absorption (1/mm) of the medium before surface k, in the range; None where there is none."""
+        """Return the Napierian absorption (1/mm) of the medium before surface k, in the range; None without any."""
         (low, high), surface = self.range_nm, self.lens.surfaces[k - 1]
         end = absorption_of(surface, high) if k else None
         if end is None:
@@ -151,7 +152,7 @@ class GraphPassage(Passage):
         return total
 
     def transmitted(self, depth: Value) -> Value:
-        """exp(-depth)."""
+        """Return exp(-depth)."""
         return transmitted(depth)
 
     def coated(self, k: int, met: Hit, q: Value, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
@@ -207,13 +208,13 @@ class GraphPassage(Passage):
 
 
 def transmitted(depth: Value) -> Value:
-    """exp(-depth) as (1 - t) / (1 + t) with t = tanh(depth / 2), which every writer has."""
+    """Return exp(-depth) as (1 - t) / (1 + t) with t = tanh(depth / 2), which every writer has."""
     t = (depth * 0.5).tanh()
     return (1.0 - t) / (1.0 + t)
 
 
 def _cos_and_sinc(phase2: Value, low: float, high: float) -> tuple[Value, Value]:
-    """cos and sin x / x of the root of a square from `low` to `high`: those of an evanescent wave where it is below 0.
+    """Return cos x and sin x / x for a square x^2 from `low` to `high`, which is below 0 for evanescent waves.
 
     They are entire functions of the square: series at a part of the phase, which is then doubled.
     """

@@ -216,7 +216,7 @@ class Passage:
         return turned([times(c, before.n2) for c in other], normal, q * met.q, times(across, before.n))
 
     def _skewness(self, r: Rays) -> Any:
-        """X dy - y dx with directions times the index; surfaces that are round about the axis do not change it."""
+        """Return x dy - y dx, with directions times the index, which surfaces round about the axis do not change."""
         if self._skew is None:
             self._skew = r.x * r.dy - r.y * r.dx
         return self._skew

@@ -97,7 +97,7 @@ def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDAr
 
 
 def moves(response: Array, grooves: Grooves) -> Array:
-    """By how many mm [2, N] grooves on all aspheres move light on the film; `response` is that of `responses`."""
+    """Return how far (mm, [2, N]) grooves on all aspheres move light on the film; `response` is of `responses`."""
     height, slope = grooves.heights(response[:, 0])
     return np.asarray((response[:, 1:3] * slope[:, None] + response[:, 3:] * height[:, None]).sum(axis=0))
 
@@ -240,7 +240,7 @@ class _Aimed:
     film_by_plate: Array
 
     def on_grid(self, waves: int, cells: int) -> _Aimed:
-        """The rays as grids; their places are extrapolated from `_RIM` to the outline, along the pupil's radii."""
+        """Return the rays as grids; places are extrapolated from `_RIM` to the outline, along the pupil's radii."""
         place, weight, slope = (
             v.reshape(*v.shape[:-1], waves, cells + 1, -1) for v in (self.place, self.weight, self.slope)
         )
@@ -308,7 +308,7 @@ def _aimed(
     wanted, axes = np.array(target)[:, None], np.eye(2)[..., None]
 
     def seen(*places: Array) -> list[tuple[Array, Array, Array]]:
-        """What rays from each of some places see, in one call of the camera: there are few rays."""
+        """Return what rays from several places see, by one call of the camera, because there are few rays."""
         count = len(places)
         lines = table.at(np.concatenate(places, 1), np.tile(pupil, count), np.tile(waves, count)).astype(np.float64)
         return [(part[:2] + w * part[2:4], part[4], part[2:4]) for part in np.split(lines.T, count, axis=1)]

@@ -123,7 +123,7 @@ def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float6
 
 
 def _sizes(plate: Plate, spread: NDArray[np.float64], samples: int) -> NDArray[np.uint8]:
-    """Log2 of each pixel's number of samples [H, W], from the widest disc that reaches it and the light in it."""
+    """Return log2 of each pixel's number of samples [H, W], by the widest disc that reaches it and its light."""
     width, height = plate.size
     places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
     nodes = [
@@ -350,7 +350,7 @@ def defocus(
         highlights: whether to spread pixels far brighter than their surroundings as discs, without noise.
 
     Warns:
-        NeurolensWarning: some light of the picture is none that the plate has.
+        NeurolensWarning: some light of the picture lies behind the edges of things or outside of the plate.
 
     Raises:
         InputError: the camera sees 85 degrees from its axis or more; there is no C compiler.

@@ -73,7 +73,7 @@ class PlatePinhole:
     before_film_mm: float
 
     def lines(self, origin_m: FloatArray, direction: FloatArray) -> FloatArray:
-        """Rays [3, N] in the camera frame as lines [4, N] in the plate: x = ax + bx w, y = ay + by w, w in 1/m."""
+        """Return rays [3, N] (camera frame) as lines [4, N] in the plate: x = ax + bx w, y = ay + by w, w in 1/m."""
         slope = direction[:2] / -direction[2]
         ahead = -origin_m[2] - np.float32(1e-3 * self.before_film_mm)
         offset = origin_m[:2] - slope * ahead
@@ -150,7 +150,7 @@ def _lesser(step: FloatArray, axis: int) -> FloatArray:
 
 
 def _unmixed(w: FloatArray) -> FloatArray:
-    """Return inverse depth where pixels on edges take that of the nearer side: theirs is a mean of both sides."""
+    """Return inverse depth in which pixels on edges, whose own is a mean of both sides, have that of the nearer."""
     found = w.copy()
     for axis in (0, 1):
         if w.shape[axis] < 5:
@@ -169,7 +169,7 @@ def _unmixed(w: FloatArray) -> FloatArray:
 
 
 def _pyramid(w: FloatArray) -> list[FloatArray]:
-    """Least and largest values [h, w, 2] in cells of `FINEST` pixels a side, then of twice that, up to one cell."""
+    """Return least and largest values [h, w, 2] in cells of `FINEST` pixels a side, of twice that, up to one cell."""
     least = most = w
     levels, step = list[FloatArray](), FINEST
     while True:
@@ -340,7 +340,7 @@ def _finite(path: Path, rgb: FloatArray) -> FloatArray:
 def _inverse_depth(
     path: Path, metres: FloatArray, depth: DepthSettings, pinhole: PlatePinhole, pinhole_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Inverse depth from the pinhole (1/m, below 0 where a layer has nothing), and the cosine of each pixel's ray.
+    """Return inverse depth from the pinhole (1/m, below 0 where there is nothing), and the cosine of each pixel's ray.
 
     `pinhole_m`: how far before the place from which depth counts the pinhole lies.
     """
@@ -397,7 +397,7 @@ def turned(square: NDArray[Any], angle_rad: NDArray[Any]) -> FloatArray:
 
 
 def turns_pupil(camera: Camera) -> bool:
-    """Return whether a camera's pupil samples turn about the axis with the film point, as those of round lenses do."""
+    """Test whether a camera's pupil samples turn about the axis with the film point, as those of round lenses do."""
     reach = 0.01 * min(camera.film_mm)
     film = np.repeat(np.array([[reach, 0.0], [0.0, reach]], np.float32), 2, axis=1)
     pupil = np.tile(np.array([[0.9, 0.5], [0.5, 0.9]], np.float32), 2)

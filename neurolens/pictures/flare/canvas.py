@@ -196,7 +196,7 @@ def smeared(picture: Floats, kernel: Floats) -> Floats:
 
 
 def enlarged(picture: Floats, factor: int, height: int, width: int) -> Floats:
-    """Enlarge a picture by a factor into pixels [height, width] about the same middle; it is linear between its own."""
+    """Enlarge a picture by a factor to pixels [height, width] about its middle, by linear interpolation."""
     if factor == 1:
         return picture
     for axis, size in enumerate((height, width)):

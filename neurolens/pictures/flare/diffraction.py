@@ -56,7 +56,7 @@ def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
 
 
 def far_field(pupil: ExitPupil, lines: Sequence[Array], x_mm: Array, y_mm: Array) -> Array:
-    """The irradiance [Y, X] on the film, for 1 at the lens, at x and y from the pupil's centre, summed over cells.
+    """Return the irradiance [Y, X] on the film, for 1 at the lens, at x and y from the pupil's centre, by its cells.
 
     Args:
         lines: `outline` of the pupil at any wavelength.

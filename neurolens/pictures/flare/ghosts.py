@@ -60,7 +60,7 @@ class Pair(NamedTuple):
 
 
 def ghost_pairs(lens: Lens) -> tuple[Pair, ...]:
-    """All ghosts of two reflections: pairs of surfaces that reflect."""
+    """Return all ghosts of two reflections: pairs of surfaces that reflect."""
     at = [k for k in range(len(lens.surfaces)) if reflects(lens, k)]
     return tuple(Pair(i, j) for j in at for i in at if i < j)
 

@@ -164,7 +164,7 @@ def ghost_moves(tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavel
 
 
 class _Look(NamedTuple):
-    """How the scouts see a ghost.
+    """A ghost as its first, coarse rays (the scouts) see it.
 
     Attributes:
         along_u, along_v: light that cells of one density put beside its place, times the number of cells along a side.
@@ -269,7 +269,7 @@ def _corners(a: NDArray[Any], of: Callable[[Any, Any], Any]) -> NDArray[Any]:
 
 
 def _around(kept: NDArray[np.bool_], look: _Look, error: float, least: int) -> Grid:
-    """The grid about the cells that are kept [S, S], so fine that the light beside its place is `error` each way.
+    """Return the grid about the cells that are kept [S, S], so fine that `error` of the light lies beside its place.
 
     It has at least `least` wavelengths.
     """

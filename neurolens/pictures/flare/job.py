@@ -1,4 +1,4 @@
-"""What decides the flare of one picture: lens, lights, raster, settings; and the exposure that values are over."""
+"""What decides the flare of one picture: lens, lights, raster, settings; and the exposure that divides its values."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class FlareJob:
 
     @cached_property
     def tracer(self) -> GhostTracer:
-        """The tracer of its ghosts."""
+        """Return the tracer of its ghosts."""
         return self.ghosts or GhostTracer(self.lens)
 
 

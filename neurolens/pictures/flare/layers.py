@@ -1,4 +1,4 @@
-"""The layers of flare, which are added to a render of the same lens, film and focus, and what makes them.
+"""Makes the layers of flare, which are added to a render of the same lens, film and focus.
 
 Values are those of a render: film irradiance over the irradiance that a white card of radiance 1 makes on the axis.
 Each maker makes one picture, and others, by name, that are parts of it. A layer that is switched off is absent.
@@ -135,7 +135,7 @@ class _Group(NamedTuple):
 
 
 def _add(job: FlareJob, group: _Group, picture: Floats) -> Iterator[float]:
-    """Add a group of ghosts to a picture of its size; yields the work done each time."""
+    """Add a group of ghosts to a picture of its size, ghost by ghost; yields the work done since the last one."""
     raster, kernel, drawing = job.raster, None, picture
     if group.smear is not None:
         kernel = group.smear.kernel(max(raster.width, raster.height) // 2, group.coarse)

@@ -119,7 +119,7 @@ def light_towards(
 
 
 def flat_shape(towards: NDArray[np.floating[Any]], sides: NDArray[np.floating[Any]], round_: bool = False) -> Shape:
-    """The shape of even radiance about a direction [3]: the parallelogram of sides [2, 3], or the ellipse in it."""
+    """Return a shape of even radiance about a direction [3]: a parallelogram of sides [2, 3] or the ellipse in it."""
     at = np.linspace(-0.5, 0.5, CELLS + 1)
     corners = towards + at[:, None, None] * sides[0] + at[:, None] * sides[1]
     middle = (np.arange(CELLS) + 0.5) / CELLS - 0.5
@@ -394,7 +394,7 @@ class SceneLights:
 
 
 class KeptLights(NamedTuple):
-    """The lights that are kept, brightest first, `of` how many, and the share of the energy that is left out."""
+    """The lights that are kept, brightest first, the number `of` all, and the share of the energy that is left out."""
 
     lights: list[Light]
     of: int

@@ -73,7 +73,7 @@ class Photons(NamedTuple):
 
     @property
     def glare(self) -> NDArray[np.bool_]:
-        """[M] Whether a photon belongs to neither image nor ghosts: it scattered, or was reflected more than twice."""
+        """Return whether photons [M] belong to neither image nor ghosts: scattered, or reflected more than twice."""
         return (self.scattered > 0) | (self.reflections > 2)
 
 

@@ -291,7 +291,7 @@ class Stack:
 
     @lru_cache(maxsize=256)  # noqa: B019  a few stacks are kept, which are small
     def numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
-        """The numbers of all steps [surfaces, actions, width], and the distance from last surface to film (mm)."""
+        """Return the numbers of all steps [surfaces, actions, width], and the distance (mm) to the film."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
         n = [float(glass.index_of(medium, wavelength_nm)) for medium in lens.media]
         a = [0.0, *(float(glass.absorption_of(s, wavelength_nm) or 0.0) for s in lens.surfaces)]

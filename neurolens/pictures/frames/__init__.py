@@ -326,7 +326,7 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
 
 
 def _flaring(camera: Any) -> Lens | None:
-    """Return the lens of a camera whose flare can be followed: to an upright film alone."""
+    """Return the lens of a camera whose flare can be followed, which is so for upright films alone."""
     return None if any(camera.settings.get(name) for name in POSES) else getattr(camera, "lens", None)
 
 

@@ -56,7 +56,7 @@ Index = NDArray[np.intp]
 
 
 def xyz_of(xy: ArrayLike) -> Matrix:
-    """CIE XYZ [3] of a chromaticity (x, y) with Y = 1."""
+    """Return CIE XYZ [3] of a chromaticity (x, y), with Y = 1."""
     x, y = np.asarray(xy, np.float64)
     return np.array([x / y, 1.0, (1 - x - y) / y])
 
@@ -66,7 +66,7 @@ def _solve(matrix: Matrix, right: Matrix) -> Matrix:
 
 
 def adaptation(xyz_from: ArrayLike, xyz_to: ArrayLike) -> Matrix:
-    """The matrix [3, 3] on XYZ that turns one white into another (XYZ [3] each) at equal luminance (Bradford)."""
+    """Return the matrix on XYZ that turns one white into another (XYZ [3] each) at equal luminance (Bradford)."""
     source, target = (np.asarray(white, np.float64) / np.asarray(white)[1] for white in (xyz_from, xyz_to))
     scale = np.diag(BRADFORD @ target / (BRADFORD @ source))
     return _solve(BRADFORD, scale @ BRADFORD)
@@ -109,7 +109,7 @@ COLOUR_SPACES = {space.name: space for space in (SRGB, ACESCG)}
 
 
 def conversion(source: ColourSpace, target: ColourSpace) -> Matrix:
-    """Matrix [3, 3] from one linear RGB to another; white stays white."""
+    """Return the matrix [3, 3] from one linear RGB to another; white stays white."""
     adapt = adaptation(xyz_of(source.white), xyz_of(target.white))
     return _solve(target.to_xyz, adapt @ source.to_xyz)
 
@@ -127,7 +127,7 @@ def converted(colours: NDArray[np.floating], matrix: ArrayLike) -> NDArray[np.fl
 
 
 def balance(white_rgb: ArrayLike) -> Matrix:
-    """Matrix [3, 3] on linear sRGB that makes the colour `white_rgb` [3] neutral and keeps its luminance."""
+    """Return the matrix [3, 3] on linear sRGB that makes the colour `white_rgb` [3] neutral and keeps its luminance."""
     white = SRGB.to_xyz @ np.asarray(white_rgb, np.float64)
     return _solve(SRGB.to_xyz, adaptation(white, xyz_of(SRGB.white)) @ SRGB.to_xyz)
 
@@ -145,13 +145,13 @@ def in_gamut(colours: NDArray[np.floating], space: ColourSpace = SRGB) -> FloatA
 
 
 def srgb_to_linear(encoded: NDArray[np.floating]) -> FloatArray:
-    """Linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
+    """Return the linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
     encoded = np.asarray(encoded, np.float32)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def linear_to_srgb(linear: NDArray[np.floating]) -> FloatArray:
-    """sRGB encoding of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
+    """Return the sRGB encoding of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
     clipped = np.clip(np.nan_to_num(np.asarray(linear, np.float32), nan=0.0), 0.0, 1.0)
     return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055).astype(np.float32)
 
@@ -240,7 +240,7 @@ def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None
 
 
 def planck(wavelength_nm: ArrayLike, kelvin: float) -> FloatArray64:
-    """Spectral radiance of a black body by Planck's law, 1 at 560 nm."""
+    """Return the spectral radiance of a black body by Planck's law, 1 at 560 nm."""
     nm = np.asarray(wavelength_nm, np.float64)
 
     def exponent(length_nm: ArrayLike) -> FloatArray64:
@@ -331,7 +331,7 @@ class SpectralRange:
         self.response = response.astype(np.float32)
 
     def _quantiles(self, light_nm: FloatArray64, light: FloatArray64) -> FloatArray64:
-        """Edges [bins + 1] between which wavelengths are equally probable."""
+        """Return edges [bins + 1] between which wavelengths are equally probable."""
         nm = np.linspace(self.low_nm, self.high_nm, _STEPS + 1)
         seen = np.sqrt(np.sum(self.response.astype(np.float64) ** 2, axis=0))
         importance = np.interp(nm, self.centres_nm, seen) * np.interp(nm, light_nm, light)
@@ -344,7 +344,7 @@ class SpectralRange:
         return edges
 
     def means(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
-        """Mean [bins] over each bin of a spectrum given at wavelengths and linear in between."""
+        """Return the mean [bins] over each bin of a spectrum given at wavelengths and linear in between."""
         nm, values = np.asarray(nm, np.float64), np.asarray(values, np.float64)
         if self.low_nm == self.high_nm:
             return np.interp(self.centres_nm, nm, values)
@@ -364,7 +364,7 @@ class SpectralRange:
         return wavelengths
 
     def bin_of(self, sample: FloatArray) -> NDArray[np.intp]:
-        """Bins [N] of uniform samples [N] in [0, 1)."""
+        """Return the bins [N] of uniform samples [N] in [0, 1)."""
         return (sample * np.float32(self.bins)).astype(np.intp)
 
     def rotated(self, table: NDArray[Any]) -> NDArray[Any]:

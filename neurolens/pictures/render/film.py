@@ -70,7 +70,7 @@ class PixelGrid:
             raise InputError("picture", "width x height", (self.width, self.height), f"the shape of the film, {shape}")
 
     def film_points(self, pixel: NDArray[np.intp], jitter: FloatArray) -> FloatArray:
-        """Film points [2, N] in mm of pixels [N], numbered row by row from the top left, and places [2, N] in them."""
+        """Return film points [2, N] (mm) of places [2, N] in pixels [N], numbered row by row from the top left."""
         row, column = np.divmod(pixel, self.width)
         points = np.empty((2, len(pixel)), np.float32)
         across, down = (column + jitter[0]) / self.width, (row + jitter[1]) / self.height
@@ -109,12 +109,12 @@ class Tiling:
 
     @classmethod
     def of(cls, pixels: int, samples: int) -> Tiling:
-        """Tiles of about `BATCH` paths per pass."""
+        """Return tiles of about `BATCH` paths per pass."""
         step = min(samples, SAMPLES_A_PASS)
         return cls(pixels, samples, max(1, BATCH // step), step)
 
     def around(self, first: int, stop: int) -> Tiling:
-        """The whole tiles that hold the pixels from `first` up to `stop`: other batches might round differently."""
+        """Return the whole tiles that hold pixels `first` up to `stop`; other batches might round differently."""
         start = first - first % self.tile
         return replace(self, pixels=min(-(-stop // self.tile) * self.tile, self.pixels) - start, start=start)
 
@@ -248,7 +248,7 @@ def difference(there: dict[str, Any], here: dict[str, Any]) -> tuple[str, Any, s
 
 
 def digest(value: Any) -> str:
-    """Hexadecimal digest of a value made of dataclasses, mappings, sequences, arrays and plain values."""
+    """Return the hexadecimal digest of a value made of dataclasses, mappings, sequences, arrays and plain values."""
     return fingerprint_of([_plain(value)])[:_DIGITS]
 
 

@@ -62,7 +62,7 @@ def _opened(file: str | Path, field: str, path: Path, most: int, pixels: int = M
 
 @contextmanager
 def _decoded(file: str | Path, field: str, path: Path) -> Iterator[bytes]:
-    """The content of a picture's file; errors of decoding it inside the block become InputError."""
+    """Give the content of a picture's file to the block, in which errors of decoding become InputError."""
     try:
         yield read_bytes(path, _LARGEST_FILE, "a picture", (file, field))
     except (InputError, MemoryError):
