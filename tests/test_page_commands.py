@@ -30,6 +30,7 @@ WRITTEN = {
     "breathing",
     "fit",
     "plot",
+    "csv",
 }  # what options name that a command writes
 
 

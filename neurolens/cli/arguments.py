@@ -146,7 +146,8 @@ class Parser(argparse.ArgumentParser):
             formatter.start_section(part.title)
             formatter.add_arguments([a for a in part._group_actions if a in shown])
             formatter.end_section()
-        formatter.add_text(f"example:\n  {first_example(self.epilog or '')}")
+        if example := first_example(self.epilog or ""):
+            formatter.add_text(f"example:\n  {example}")
         formatter.add_text(f"All {len(options)} options, and more examples: {self.prog} --help-all")
         return formatter.format_help()
 
@@ -436,10 +437,10 @@ def film_shaped(
     return film, f"{film[0]:g}x{film[1]:g} (the shape of {name} within {said})"
 
 
-def within(about: str, default: Any = None, title: str = "") -> Any:
+def within(about: str, default: Any = None, **details: Any) -> Any:
     """Return --within, an RMS error with its unit, of the type `rms_error`."""
     old = {f"target-{unit}": partial(lambda unit, text: rms_error(text + unit), unit) for unit in ("um", "px")}
-    return setting(default, about, metavar="ERROR", kind=rms_error, old=old, title=title)
+    return setting(default, about, metavar="ERROR", kind=rms_error, old=old, **details)
 
 
 def dask(title: str = "") -> Any:

@@ -121,7 +121,7 @@ class Build(cli.Reporting):
         data |= {"lenses": {p.lens_id: [f.model or f.kind for f in p.forms] for p in packed}}
         data |= {"left_out": {file.name: why for file, why in left.items()}, "seconds": time.perf_counter() - began}
         shaders = sum(len(p.forms) for p in packed)
-        return self.answer(data, lambda: f"{self.out}: {len(packed)} lenses, {shaders} shaders")
+        return self.answer(data, lambda: f"{self.out}: {len(packed)} lens{'es' * (len(packed) > 1)}, {shaders} shaders")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,8 +43,8 @@ class Defocus(cli.Reporting):
     epilog = f"""{cli.CAMERAS_HELP}
 
 examples:
-  neurolens render room --camera pinhole:laikin_double_gauss_50 --width 400 --samples 16 -o plate.exr && \\
-      neurolens defocus plate.exr --lens laikin_double_gauss_50 -o blurred.exr
+  neurolens render room --camera pinhole:laikin_double_gauss_50 --film 45x25.3125 --width 400 -o plate.exr && \\
+      neurolens defocus plate.exr --lens laikin_double_gauss_50 --film 36x20.25 --focus 3.9 -o blurred.exr
   neurolens defocus plate.exr --lens laikin_double_gauss_50 --film 36x20.25 --focus 2 --f-number 2 -o out.exr
   neurolens defocus beauty.exr --depth Depth.Z --lens models/NAME.onnx --film 36x24 --focus 1.2 -o out.exr"""
     kept = "no picture was written; older files of that name are untouched"

@@ -20,7 +20,8 @@ _CHECKED = {"certain": "photographs", "likely": "photographs, a likely match"}
 class Find(cli.Reporting):
     """Find lenses of the library by words: product, maker, focal length, f-number, mount, year or decade, nickname,
     and what a lens is known for (swirl, bubbles, soft, flare, cat's eye: the strongest first). Accents and
-    capitals do not matter. Where no lens has all words, the three nearest are shown.
+    capitals do not matter. Where no lens has all words, the three nearest are shown. --json adds each lens's file, its
+    drawing and its figures.
 
     Every command takes such words where it takes a lens, if one lens is meant by them."""
 
@@ -54,10 +55,11 @@ def _row(entry: Entry) -> dict[str, Any]:
 
 
 def _text(found: Found, rows: Sequence[Mapping[str, Any]]) -> str:
-    header = ("lens", "name", "light", "year", "checked by", "thumbnail")
+    header = ("lens", "name", "light", "year", "checked by")
     text = cli.table(header, [_cells(row) for row in rows[:_SHOWN]], left=len(header))
     if not found.hits:
-        text = f"no lens has all these words; the nearest:\n{text}"
+        scaled = "\nother commands scale any lens: --focal-length MM" * bool(rows)
+        text = f"no lens has all these words; the nearest:\n{text}{scaled}"
     elif len(rows) > _SHOWN:
         text += f"\n{len(rows) - _SHOWN} more: further words leave fewer, --json shows all"
     if found.chosen and len(rows) > 1:
@@ -68,4 +70,4 @@ def _text(found: Found, rows: Sequence[Mapping[str, Any]]) -> str:
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     light = f"T{row['t_stop']:.3g}" if row["t_stop"] else f"f/{row['f_number']:.3g}" if row["f_number"] else "-"
     checked = _CHECKED.get(row["match"], "no photographs") + ", doubtful" * (row["verdict"] == "doubtful")
-    return row["lens"], one_line(row["name"], 50), light, str(row["year"] or "-"), checked, row["thumbnail"] or "-"
+    return row["lens"], one_line(row["name"], 50), light, str(row["year"] or "-"), checked

@@ -42,6 +42,7 @@ class Train(cli.Reporting):
     epilog = """\
 examples:
   neurolens train --lens cooke_triplet_50 --within 5um
+  neurolens train --lens cooke_triplet_50 --set 'model=[{method="ols",terms=40}]'
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
   neurolens train --lens cooke_triplet_50 --within 0.1px --rounds 0
@@ -62,18 +63,21 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         "DIR", "run folder, made if needed (default: runs/NAME of the experiment or lens file)", None
     )
     set: tuple[str, ...] = setting(
-        (), "change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
-        metavar="KEY=VALUE",
+        (), "change a setting of the experiment file, as --set pairs.train=10000; values are TOML; repeatable",
+        metavar="KEY=VALUE", common=True,
     )  # fmt: skip
     zoom_range: bool = setting(
-        False, 'of --lens: one model of all focal lengths between the file\'s zoom states (input "state", in mm)'
+        False,
+        'of --lens: one model of all focal lengths between the file\'s zoom states (input "state", in mm)',
+        common=True,
     )
     internal_focus: bool = setting(
         False, 'of --lens: one model of internal focus, infinity to the near limit (input "state", in 1/m)'
     )
     within: tuple[str, float] | None = cli.within(
         "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
-        "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)"
+        "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)",
+        common=True,
     )
     phase: bool = setting(False, "models have the optical path, too, for point spread by diffraction (neurolens psf)")
     pixels_across: int = setting(
@@ -81,7 +85,12 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         "4000: 9 um each for a radius of 21.6 mm)", within=(1, 10**6),
     )  # fmt: skip
     rounds: int | None = setting(
-        None, "of the race, 0 for none (default: the setting's)", kind=whole(0), metavar="N", old={"no-race": 0}
+        None,
+        "rounds in which models race the exact lens, 0 for no times (default: the setting's)",
+        kind=whole(0),
+        metavar="N",
+        old={"no-race": 0},
+        common=True,
     )
 
     def run(self) -> int:

@@ -117,9 +117,11 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
         best = to_use(models, within, exact=exact, rest=rest)
         if best is None or not (best is exact or best.get("file")):
             continue
-        if exact is not None and best is exact:
+        untimed = exact is None and not time_of(best) and not best.get("states")
+        if best is exact or rest and untimed:
             name, file = "the exact lens", str(lens) if whole else ""
-            why = _why_exact(exact, to_use(models, within), within, rest)
+            why = "as C it takes a small part of a picture's time, without error"
+            why = why if exact is None else _why_exact(exact, to_use(models, within), within, rest)
         else:
             name, file = str(best["name"]), str(folder / best["file"])
             why = _why_model(best, exact, within)
