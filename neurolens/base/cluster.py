@@ -167,7 +167,7 @@ def _in_time(work: Callable[..., Any], limit_s: float, args: Any, named: Any) ->
 
 
 def distributed() -> Any:
-    """Dask's package. Raises NeurolensError, which names the extra, where it is not installed."""
+    """Return Dask's package. Raises NeurolensError, which names the extra, where it is not installed."""
     try:
         import distributed
     except ModuleNotFoundError:

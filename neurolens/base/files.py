@@ -212,7 +212,7 @@ def cache_folder(name: str = "") -> Path:
 
 
 def _is_own_folder(folder: Path) -> bool:
-    """Make a folder if it is missing; True if it is this user's and nobody else can write to it."""
+    """Make a folder if it is missing; return whether it is this user's and nobody else can write to it."""
     with suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.lstat()

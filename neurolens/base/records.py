@@ -87,7 +87,7 @@ class Results:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that a result depends on."""
+    """Return the versions of the packages that a result depends on."""
     from importlib.metadata import PackageNotFoundError, version  # its import takes a third of the time of --help
 
     found = {"python": platform.python_version()}

@@ -31,7 +31,7 @@ Rows = list[dict[str, Any]]  # of a table, by the names of its columns
 
 @dataclass(frozen=True)
 class Report:
-    """Base of answers."""
+    """The base class of the answers of commands."""
 
     def text(self) -> str:
         """Return what the command prints."""
@@ -62,8 +62,8 @@ def tables_of(answer: Any, name: str) -> dict[str, Rows]:
     """Return the tables of an answer, a dataclass or a mapping, by name; each case is a row.
 
     The table `name` is one row, that of single figures. Each list of records makes a table; tables inside a record
-    repeat its first figure. So do arrays over the same axes (`over`), whose table repeats what is over fewer of them.
-    Names within names are joined by a point; places in a list are numbers.
+    repeat its first figure. Arrays over the same axes (`over`) make a table, too, in which those over fewer of these
+    axes are repeated. Names within names are joined by a point; places in a list are numbers.
     """
     found: dict[str, Rows] = {name: [{}]}
     _add(answer, name, "", found)

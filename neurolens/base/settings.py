@@ -343,7 +343,7 @@ def changed(settings: Any, *, unset: bool = False) -> dict[str, Any]:
 
 
 def with_changes(settings: T, changes: object) -> T:
-    """Settings with the values of `changes`, a mapping or an object with such fields, that are not None."""
+    """Return settings with the values of `changes`, a mapping or an object, that are not None."""
     values = changes
     if not isinstance(values, Mapping):
         values = {f.name: getattr(changes, f.name, None) for f in fields(settings)}  # type: ignore[arg-type]
@@ -574,7 +574,7 @@ def _describe(kind: Any) -> str:
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Settings as plain tables and values, the form that `from_dict` takes; None becomes the text "none"."""
+    """Return settings as plain tables and values, the form that `from_dict` takes; None becomes the text "none"."""
 
     def plain(value: Any) -> Any:
         if is_dataclass(value):

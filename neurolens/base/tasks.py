@@ -288,7 +288,6 @@ def keep_memory() -> None:
     Otherwise it returns the memory of every larger array, and a trace spends half of its time on getting pages again.
     Dask's nannies set MALLOC_TRIM_THRESHOLD_, which also stops the C library from raising these sizes. One call serves
     the whole process.
-    nannies ask for memory to be given back (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth.
     """
     with suppress(AttributeError, OSError):  # another C library
         library = ctypes.CDLL(None)

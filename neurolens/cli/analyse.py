@@ -157,7 +157,7 @@ examples:
         return scene, [*notes, *rim_doubts(lens), *file_doubts(tabled, states=bool(self.state.given.zoom)), *doubts]
 
     def _one(self, what: str, scene: Scene, doubts: list[str]) -> tuple[Report, Path | None]:
-        """One analysis, and its picture where a folder is given; new warnings are added to `doubts`."""
+        """Compute one analysis, and draw it where a folder is given; new warnings are added to `doubts`."""
         from neurolens.optics.analysis.bundles import check_light
         from neurolens.optics.analysis.layout import state_text
 
@@ -207,7 +207,7 @@ class Analysed(Report):
     state: str
 
     def text(self) -> str:
-        """Every analysis as a table."""
+        """Return every analysis as a table."""
         edge, drawn = self.edge, f"{len(self.pictures)} pictures drawn in"
         widest = f"fields to {edge.field_deg:.2f}°, {edge.height_mm:.2f} mm: {edge.name}"
         folders = {str(Path(file).parent) for file in self.pictures.values()}
@@ -321,7 +321,7 @@ def _vignetting_text(found: Illumination) -> str:
 
 
 def _mtf_text(found: Mtf, over_height: bool = False) -> str:
-    """The contrast at frequencies of `_MTF_PER_MM` for every field, or at all of them over the image height."""
+    """Return the contrast at `_MTF_PER_MM` for every field, or at all frequencies over the image height."""
     at = [k for k, f in enumerate(found.frequency_per_mm) if over_height or f in _MTF_PER_MM]
     limit = ", ".join(_fixed(found.diffraction_limit[k]) for k in at)
     waves = ", ".join(f"{w:.0f}" for w in found.wavelength_nm)
@@ -357,7 +357,7 @@ def _psf_text(found: Psf) -> str:
 
 
 def _spread_text(found: Spread) -> str:
-    """Every place of the picture with the design's figure and what 10%, 50% and 90% of the copies have."""
+    """Return a row for every place of the picture: the design's figure, and the 10%, 50% and 90% of the copies."""
     shares, last = (0.1, 0.5, 0.9), f"{found.frequency_per_mm[-1]:g}/mm"
     header = ("place", "RMS µm", "10%", "half", "90%", f"MTF {last} T", "S", "both, 10%", "half", "90%")
     rms, mtf = (np.quantile(v, shares, axis=0).T for v in (found.copy_rms_um, found.copy_contrast))
@@ -383,7 +383,7 @@ def _each(form: Callable[..., Any], *values: Iterable[Any]) -> list[Any]:
 
 
 def _over_field(head: str, found: Any, columns: Sequence[tuple[str, list[str]]], every: bool = False) -> str:
-    """A table of headings and cells with a row for some fields, or for every one: its angle, its height, the cells."""
+    """Return a table with a row for some fields, or for `every` one: its angle, its height, then the cells."""
     count = len(found.field_deg)
     angles = ["axis" if field == 0 else f"{field:.2f}°" for field in found.field_deg]
     heights = [("height mm", _each(partial(_fixed, places=2), found.height_mm))] if hasattr(found, "height_mm") else []

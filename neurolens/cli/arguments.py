@@ -318,7 +318,7 @@ class Figures(Reporting):
 
 @contextmanager
 def keeps(text: str) -> Iterator[None]:
-    """Say this, and not the command's `kept`, of what an interrupt inside the block leaves."""
+    """Say what an interrupt inside the block leaves, in place of the command's `kept`."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -349,7 +349,7 @@ def rms_error(text: str) -> tuple[str, float]:
 
 
 def words_of(choices: Sequence[str], least: str = "") -> Callable[[str], tuple[str, ...]]:
-    """The type of an argument that lists some of `choices`, each once, with commas; `least` must be among them."""
+    """Return the type of an argument that lists some of `choices`, each once, with commas, `least` among them."""
 
     def convert(text: str) -> tuple[str, ...]:
         words = tuple(word.strip() for word in text.split(","))

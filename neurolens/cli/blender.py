@@ -308,7 +308,7 @@ def _character(lens: Lens) -> dict[str, Any]:
 
 
 def stated_lens(model: Path, lenses: Path) -> Lens | None:
-    """The prescription behind a model, scaled and zoomed as the model is, or over its range; None without a file."""
+    """Return the lens behind a model, scaled and zoomed as the model is, or over its range; None without a file."""
     from neurolens.optics.setting.states import set_lens
 
     facts = read_card(model)["lens"]
@@ -322,7 +322,7 @@ def stated_lens(model: Path, lenses: Path) -> Lens | None:
 
 
 def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
-    """What a lens does to its picture wide open, for `extension.library.Field`; None where it cannot be traced."""
+    """Return the field of a lens wide open, for `extension.library.Field`; None where it cannot be traced."""
     if find_spec("torch") is None:
         return None
     from neurolens.cameras.exact import ExactCamera

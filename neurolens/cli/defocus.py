@@ -76,16 +76,16 @@ examples:
     threads: int = cli.threads()
 
     def assumed(self) -> Any:
-        """The focus, too."""
+        """Assume the focus as well."""
         given = self.state.given
         return super().assumed() | ({} if given.focus_m or given.zoom else {"state": ("--focus", self._focus)})
 
     def _film(self) -> tuple[tuple[float, float], str]:
-        """The largest film of the plate's shape on that which the lens covers."""
+        """Return the largest film of the plate's shape within the film that the lens covers."""
         return cli.film_like(self.plate, *super()._film())
 
     def _focus(self) -> tuple[cli.LensState, str]:
-        """The state with the focus on what the middle of the plate shows, or on the nearest that the lens can."""
+        """Return the state, focused on what the middle of the plate shows, or as near to that as the lens can."""
         near_m, said = near_of(self.lens, **self._size()), "what the middle of the plate shows"
         focus_m = float(f"{middle_m(self.plate, self._frame, self._depth()):.3g}")
         if focus_m < near_m:
@@ -93,12 +93,12 @@ examples:
         return self.state.at(focus_m=focus_m), f"{focus_m:g} ({said})"
 
     def _frame(self) -> Frame:
-        """The frame of the lens's picture, focused as it is without --focus."""
+        """Return the ideal camera of the lens's picture, as it is focused without --focus."""
         film = self.film or self._film()[0]
         return frame_of(cli.camera(self.lens, self.state.shot(film, runtime="onnxruntime"), Progress(quiet=True)))
 
     def _depth(self) -> DepthSettings:
-        """What the plate's depth means."""
+        """Return how the plate's depth is to be understood."""
         starts = {"auto": None, "film": True, "pinhole": False}
         return DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
 

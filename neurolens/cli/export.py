@@ -94,7 +94,7 @@ examples:
     state: cli.LensState = group(_CAMERA, names={*BY_LENSES, *LensCamera.takes}, unset=True)
 
     def assumed(self) -> Any:
-        """A film for a whole camera alone, and the suffix of the language."""
+        """Assume a film for a whole camera alone, and the suffix of the language."""
         suffix = {"c": ".h", "c-double": ".h", "cuda": ".cuh", "vex": ".h"}.get(self.to, f".{self.to}")
         film = {"film": super().assumed()["film"]} if self.whole_camera else {}
         return film | {"out": ("--output", lambda: self._output(suffix))}

@@ -68,7 +68,7 @@ _QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile o
 
 
 def _gain(text: str) -> tuple[str, list[float]]:
-    """The type of --gain: a name, and factors of red, green and blue."""
+    """Read --gain: a name, and factors of red, green and blue."""
     name, _, rest = text.partition("=")
     factors = cli.floats(rest, "/")
     if len(factors) not in (1, 3) or not all(0 <= v < math.inf for v in factors):
@@ -213,7 +213,7 @@ examples:
             cli.check_written(Path(self.path[1]), "--path", "OUT.png")
 
     def assumed(self) -> Any:
-        """Assume a light as well. Without a light, a path, CSV or JSON in the command, assume a small picture, too."""
+        """Assume a light; and a small picture, where the command names no light, path, CSV or JSON."""
         found = super().assumed() | ({} if self.lights or self.image else {"light": ("--light", self._a_light)})
         if any((self.light, self.lights, self.image, self.path, self.csv, self.json, self.frames.frames)):
             del found["out"]
@@ -261,7 +261,7 @@ examples:
         return self.answer(results, lambda: _text(first, results))
 
     def _states(self) -> Iterator[Flare]:
-        """The command with the settings of each frame."""
+        """Yield the command with the settings of each frame."""
         for frame, digits, values in self.frames.states(vars(self.state.given), self.called):
             of_lens = {"focus_m": self.focus_m} | {k: v for k, v in values.items() if k in vars(self.state.given)}
             place = {name: value for name, value in values.items() if name not in of_lens}
@@ -438,7 +438,7 @@ def _write(
 
 
 def _exposure(picture: FloatArray) -> float | None:
-    """Stops that take the 99% quantile of the lit pixels of a picture [H, W, 3] to 0.8; None where none is lit."""
+    """Return the stops that take the 99% quantile of a picture's lit pixels to 0.8; None where none is lit."""
     bright = picture.max(-1)
     lit = bright[bright > 0]
     return round(math.log2(_SHOWN_AT / float(np.quantile(lit, _QUANTILE))), 2) if len(lit) else None

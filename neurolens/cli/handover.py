@@ -79,7 +79,7 @@ examples:
         return self.answer(data, lambda: _text(data))
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
-        """The maps of `stmap`, the light as a grey picture with alpha, by which all programs multiply, and NVIDIA's."""
+        """Return the maps of `stmap`, the light as grey with alpha, by which any program multiplies, and NVIDIA's."""
 
         def light(*given: Any) -> dict[str, Any]:
             grey = illumination_map(*given)["Y"]

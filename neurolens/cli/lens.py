@@ -211,7 +211,7 @@ class DerivedRims(Report):
 
     @property
     def kept(self) -> str:
-        """What is kept at the edge of the field, in words."""
+        """Return in words what is kept at the edge of the field."""
         return f"{100 * self.vignetting:g}% of the pupil's height"
 
     def text(self) -> str:
@@ -365,7 +365,7 @@ def _surfaces(surfaces: list[SurfaceRow]) -> str:
 
 
 def kept_row(file: Path, index: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
-    """The row of a lens of the library as its index keeps it; None of another lens, or where the file has changed."""
+    """Return a lens's row of the library's index; None for another lens, or where the file has changed."""
     entry = index.get(file.name)
     if entry is None or file.resolve().parent != (library() / "lenses").resolve() or entry["sha256"] != sha256_of(file):
         return None
@@ -373,7 +373,7 @@ def kept_row(file: Path, index: dict[str, dict[str, Any]]) -> dict[str, Any] | N
 
 
 def _place(sort: str, row: dict[str, Any]) -> tuple[Any, ...]:
-    """Where a row stands: those without the value last."""
+    """Return the key by which rows are sorted; those without the value come last."""
     figure = CHARACTER[sort][0] if sort in CHARACTER else _SORTS[sort]
     value = ((row.get("character") or {}) if sort in CHARACTER else row).get(figure)
     if value in (None, ""):
@@ -383,7 +383,7 @@ def _place(sort: str, row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _list_text(rows: list[dict[str, Any]], sort: str | None) -> str:
-    """The table; sorted by a character it shows these in place of other data."""
+    """Return the table; sorted by a character, it shows characters in place of other data."""
     middle = (
         [heading for _, heading in CHARACTER.values()]
         if sort in CHARACTER

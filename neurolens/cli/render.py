@@ -110,7 +110,7 @@ examples:
     threads: int = cli.threads("workers, each pinned to a core if there are as many as cores")
 
     def assumed(self) -> Any:
-        """Nothing for tiles, whose picture has the name that it was rendered to."""
+        """Assume nothing for tiles: their picture has the name that it was rendered to."""
         if self.merge and self.out is None:
             self.refuse("--output", "(missing)", "-o OUT.exr beside --merge")
         return super().assumed()

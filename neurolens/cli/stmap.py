@@ -96,7 +96,7 @@ class PictureCommand(cli.Reporting):
     state: cli.LensState = cli.camera_state()
 
     def assumed(self) -> Any:
-        """The width, too."""
+        """Assume the width as well."""
         width = "--width", lambda: (self.usual_px, str(self.usual_px))
         return super().assumed() | ({} if self.height or self.size else {"width": width})
 
@@ -319,7 +319,7 @@ def _is_of(path: Path, facts: dict[str, Any]) -> bool:
 def _ideal(field: Field, plates: Plates) -> dict[str, Any]:
     """Describe the camera that an undistorted picture is of; lists are for the x and the y meridian.
 
-    In what it shows, a pixel of both pictures is `pixel_aspect` times as wide as high, and viewers stretch it so.
+    In both pictures a pixel shows `pixel_aspect` times as much across as up, and viewers stretch it so.
     """
     (x, y), (width, height) = field.frame.reach_mm, plates.pixel_mm
     return {

@@ -77,7 +77,7 @@ examples:
     jobs: int = setting_of(Build, "jobs", Build.jobs)
 
     def assumed(self) -> Any:
-        """Six lenses, in the forms that take no minute."""
+        """Assume six lenses, in the forms that take less than a minute."""
         few = tuple(shipped() / "lenses" / f"{name}.toml" for name in _SIX)
         quick = tuple(kind for kind in _DOWNLOADS if kind != "osl")
         found = {"downloads": ("--downloads", lambda: (quick, ",".join(quick)))} if not self.lenses else {}

@@ -27,7 +27,7 @@ Moved = Value | None
 
 
 def derivative(output: str, by: str) -> str:
-    """The name of the output that holds the derivatives of an output by one row of an input (`program.row_names`)."""
+    """Return the name of the output with the derivatives of an output by one row of an input (`program.row_names`)."""
     return f"{output}_by_{by}"
 
 

@@ -48,7 +48,7 @@ _PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], _Plan]] = WeakKeyDiction
 
 
 def _plan(graph: Graph) -> _Plan:
-    """Return the numbers of the nodes that the outputs need, in order, each with the values that are then done with.
+    """Return the numbers of the nodes that the outputs need, in order, each with the values that no later node needs.
 
     A plan is kept as long as its graph.
     """
@@ -80,7 +80,7 @@ class _Space:
         self.floor, self.concat = library.floor, library.cat if self.torch else np.concatenate
 
     def numbers(self, array: NDArray[Any]) -> Rows:
-        """Coefficients in the precision and on the device of the rays."""
+        """Return coefficients in the precision and on the device of the rays."""
         if self.torch:
             return self.torch.as_tensor(array, dtype=self.like.dtype, device=self.like.device)
         return array.astype(self.like.dtype)

@@ -185,11 +185,11 @@ class Graph:
         return self.add("input", (), rows, name=name, per_call=per_call)
 
     def table(self, name: str, columns: int) -> Value:
-        """Numbers [cells, columns] that the caller gives, for `lookup` alone."""
+        """Add numbers [cells, columns] that the caller gives, for `lookup` alone."""
         return self.add("table", (), columns, name=name, per_call=True)
 
     def own_table(self, values: ArrayLike) -> Value:
-        """Numbers [cells, columns] of the graph itself, for `lookup` alone."""
+        """Add numbers [cells, columns] of the graph itself, for `lookup` alone."""
         array = np.asarray(values, np.float64)
         return self.add("table", (), array.shape[1], arrays=(array,), per_call=True)
 
@@ -241,7 +241,7 @@ class Graph:
         return self.add("take", (x,), len(rows), static=tuple(int(r) for r in rows))
 
     def split(self, x: Value, sizes: Iterable[int]) -> list[Value]:
-        """Parts of `x` of consecutive rows, of these sizes."""
+        """Return parts of `x` of consecutive rows, of these sizes."""
         ends = np.cumsum([0, *sizes])
         return [x[int(a) : int(b)] for a, b in zip(ends, ends[1:], strict=False)]
 
@@ -262,7 +262,7 @@ class Graph:
         moving: tuple[Value, ArrayLike] | None = None,
         added: Value | None = None,
     ) -> Value:
-        """weight [R, K] x + bias [R].
+        """Return weight [R, K] x + bias [R].
 
         Args:
             moving: (s, W1) with s one row of the call: the weight is then weight + s W1.
@@ -280,7 +280,7 @@ class Graph:
         return self.add("affine", inputs, len(w), arrays=arrays, static=static)
 
     def quadratic(self, x: Value, forms: Sequence[Form], bias: ArrayLike | None = None) -> Value:
-        """Row r is the sum of x_i x_j over the pairs (i, j) of form r, plus bias [R]."""
+        """Return rows, of which row r is the sum of x_i x_j over the pairs (i, j) of form r, plus bias [R]."""
         b = np.zeros(len(forms)) if bias is None else np.asarray(bias, np.float64)
         return self.add("quadratic", (x,), len(forms), arrays=(b,), static=tuple(tuple(f) for f in forms))
 
@@ -295,7 +295,7 @@ class Graph:
         return self.quadratic(self.concat(a, b), [tuple((k, a.rows + k) for k in range(a.rows))])
 
     def polynomial(self, exponents: Exponents, weight: ArrayLike, x: Value) -> Value:
-        """weight [R, M] times the monomials of x [V rows], for exponents [M, V], rows of which are unique."""
+        """Return weight [R, M] times the monomials of x [V rows], for exponents [M, V], whose rows are unique."""
         w = np.asarray(weight, np.float64)
         return self.add("polynomial", (x,), len(w), arrays=(np.asarray(exponents, np.int64), w))
 
@@ -312,7 +312,7 @@ class Graph:
         return self.each("select", truth, then, other)
 
     def first_failure(self, tests: Sequence[tuple[Value, Value]], codes: Sequence[int]) -> Value:
-        """The code of the first test for which value <= limit is false, as it is for NaN; 0 where all are true."""
+        """Return the code of the first test for which value <= limit is false, as for NaN; 0 where all are true."""
         flat = [v for pair in tests for v in pair]
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 

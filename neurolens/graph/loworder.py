@@ -163,7 +163,7 @@ def _slopes(graph: Graph, samples: Mapping[str, Array]) -> Array:
 
 
 def _matrices(results: Mapping[str, NDArray[np.float32]], passed: NDArray[np.bool_]) -> Array:
-    """Derivatives [6, 2, M] of the rays that pass."""
+    """Return the derivatives [6, 2, M] of the rays that pass."""
     rows = [np.broadcast_to(results[name], (6, len(passed)))[:, passed] for name in _NAMES]
     return np.stack(rows, axis=1).astype(np.float64)
 
@@ -194,7 +194,7 @@ def _variables(g: Graph, rays: Array) -> tuple[Array, Value]:
 
 
 def _exponents(degree: int, count: int) -> NDArray[np.int64]:
-    """Exponents [M, count] of the monomials of so many variables up to a degree."""
+    """Return exponents [M, count] of the monomials of so many variables up to a degree."""
     chosen = [m for n in range(degree + 1) for m in combinations_with_replacement(range(count), n)]
     return np.array([np.bincount(np.array(m, np.int64), minlength=count) for m in chosen])
 
@@ -202,7 +202,7 @@ def _exponents(degree: int, count: int) -> NDArray[np.int64]:
 def pursue(
     columns: Sequence[Array], wanted: Sequence[Array], good: Sequence[float], most: int = _MOST_TERMS
 ) -> tuple[list[int], list[Array]]:
-    """Orthogonal matching pursuit for several states at once, with the same columns for all.
+    """Choose columns, the same for several states, by orthogonal matching pursuit.
 
     It chooses rows of `columns` [M, N] of each state until their weighted sum is within `good` (RMS) of `wanted` [N] in
     every state. The pursuits of `models.terms` need torch, which a render with a model does not have.

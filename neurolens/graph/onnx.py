@@ -200,13 +200,13 @@ class _Writer:
         return self._moved.setdefault(key, (name, rows, stack.shape[1:]))[0]
 
     def affine(self, weight: Array, value: str, bias: Array) -> str:
-        """weight [T, R, K] @ value [K, N] + bias [T, R]."""
+        """Write weight [T, R, K] @ value [K, N] + bias [T, R]."""
         if not np.any(bias):
             return self.op("MatMul", self.numbers(weight), value)
         return self.op("Gemm", self.numbers(weight), value, self.numbers(bias[:, :, None]))
 
     def split(self, value: str, sizes: Sequence[int]) -> list[str]:
-        """Cut along the first axis."""
+        """Cut a value along its first axis."""
         if len(sizes) == 1:
             return [value]
         number = len(self.nodes)
@@ -327,7 +327,7 @@ def _mixed_pairs(graph: Graph, number: int) -> list[tuple[int, int]]:
 
 
 def _quadratic(w: _Writer, number: int, node: Node, arrays: list[Array]) -> _Linear:
-    """x y = ((x + y)^2 - x^2 - y^2) / 2: squares only, so that one pass makes them all."""
+    """Write products by squares, x y = ((x + y)^2 - x^2 - y^2) / 2, so that one pass makes them all."""
     source = node.inputs[0]
     rows = w.graphs[0].nodes[source].rows
     if source not in w._squares:
@@ -354,7 +354,7 @@ def _places(longer: _Longer, rows: int, sums: Sequence[tuple[int, int]]) -> dict
 
 
 def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """Monomials of degree 2, 3 to 4, 5 to 8 ... are each a product of two lower ones, gathered from their blocks."""
+    """Write monomials of degree 2, of 3 to 4, of 5 to 8 ..., each a product of two from the blocks before."""
     exponents, weight = node.arrays[0], arrays[1]
     used = (weight != 0).any((0, 1))
     table = {tuple(e): weight[:, :, k] for e, k in zip(exponents[used].tolist(), np.flatnonzero(used), strict=True)}
@@ -382,7 +382,7 @@ def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str
 
 
 def _series(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """Horner's scheme; a leading 1 costs nothing."""
+    """Write Horner's scheme; a leading 1 costs nothing."""
     t, coefficients = w.name(node.inputs[0]), arrays[0]
     value = t if (coefficients[:, -1] == 1).all() else w.op("Mul", t, w.numbers(coefficients[:, -1]))
     for k in range(coefficients.shape[1] - 2, -1, -1):

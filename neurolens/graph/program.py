@@ -216,7 +216,7 @@ class Program:
         return simple if simple is not None else self._append(Step(kind, tuple(e.argument for e in arguments)))
 
     def fma(self, a: Number, b: Number, c: Number) -> Expr:
-        """a b + c."""
+        """Return a b + c."""
         return self.op("fma", a, b, c)
 
     def sum(self, a: Expr, b: Expr) -> Expr:
@@ -229,14 +229,14 @@ class Program:
         return a + b
 
     def tanh(self, value: Expr) -> Expr:
-        """tanh by additions, multiplications and one division, which every compiler vectorises."""
+        """Return tanh by additions, multiplications and one division, which every compiler vectorises."""
         x = self.op("clamp", value, TANH_LIMIT)
         t = x * x
         found = x * self.horner(t, TANH_NUMERATOR) / self.horner(t, TANH_DENOMINATOR)
         return self._function(found, value)
 
     def select(self, a: Number, b: Number, then: Number, otherwise: Number) -> Expr:
-        """`then` where a <= b, else `otherwise`, which NaN chooses too."""
+        """Return `then` where a <= b, else `otherwise`, which NaN chooses too."""
         return self.op("select", a, b, then, otherwise)
 
     def horner(self, t: Expr, coefficients: Sequence[Number]) -> Expr:
@@ -366,7 +366,7 @@ class Program:
         return self._rewritten(single)
 
     def waits(self) -> bool:
-        """Whether a core that works on one ray, or one vector, after the other waits for results most of the time.
+        """Return whether a core that works on ray after ray, or vector after vector, mostly waits for results.
 
         Counted for a core that does two operations a cycle, gives a result after 4 cycles and a quotient or root after
         12; that it looks 144 operations ahead was chosen by measuring exact lenses and models.

@@ -210,8 +210,8 @@ def _first_failure(at: _Lowering, node: Node, given: list[list[Expr]], arrays: l
 def _first_of(p: Program, tests: list[tuple[Expr, Expr, float]]) -> Expr:
     """Return the code of the first test that fails.
 
-    With many tests none should wait for the last. They are cut where all codes before are above those behind, so that
-    the larger of two results is the first failure's.
+    Many tests are cut into groups, so that none waits for the last: where all codes before a cut are above those behind
+    it, the larger of two results is the first failure's.
     """
     status = p.literal(0.0)
     if not tests:

@@ -98,7 +98,7 @@ class Blur:
 
 
 def _shares(places: Any, at: Any) -> list[tuple[int, tuple[tuple[int, int], Any]]]:
-    """Return of each place (increasing) that has a share of points: its number, first and last + 1 point, shares."""
+    """Return, for each place with a share of points: its number, its first point, the one after its last, shares."""
     found = []
     for k, unit in enumerate(np.eye(len(places))):
         share = np.interp(at, places, unit)

@@ -357,7 +357,7 @@ class RayJob:
         }
 
     def _rounding(self, focus_m: float) -> tuple[float, float]:
-        """The z of the plane where rays of `compact` start, and the step of their places there, in metres in our frame.
+        """Return z of the plane where rays of `compact` start, and the step of their places there (m, in our frame).
 
         Rounding moves a ray sideways by up to a step over the root of 2, whatever its distance.
         """

@@ -53,7 +53,6 @@ class LensRays(NamedTuple):
 
     Attributes:
         origin: [N, 3]. direction: [N, 3] of unit length; along the axis where the ray did not pass.
-        origin: [N, 3]. direction: [N, 3] of unit length; along the axis where the ray did not pass.
         weight: [N] factor on the ray's radiance: a film point's value is the mean of weight times radiance over its
             rays. 0 where the ray did not pass.
     """
@@ -96,7 +95,7 @@ class LensCamera:
         self._lens = self._made(shot)
 
     def film_points(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
-        """Film points [N, 2] (mm) of places [N, 2], from the upper left, in a picture of `size` (width, height) pixels.
+        """Return film points [N, 2] (mm) of places [N, 2], from the upper left, in a picture of `size` pixels.
 
         The middle of the first pixel is at (0.5, 0.5); the picture on the film stands on its head.
         """
@@ -228,7 +227,7 @@ class _Lens:
         self.program, self._backwards = lower(graph), dict[bool, Run]()
 
     def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
-        """Origins and directions [3, N], weights and status [N] of rays; film and square are [N, 2], light is [N]."""
+        """Return origins and directions [3, N], weights and status [N], for film and square [N, 2] and light [N]."""
         if self.compiled:  # numpy transposes arrays of two columns ten times as fast as torch
             points, places = (np.ascontiguousarray(t.numpy().T) for t in (film, square))
             rays = self.camera.sample(points, places, np.ascontiguousarray(light.numpy()))
@@ -241,7 +240,7 @@ class _Lens:
     def gradients(
         self, film: Tensor, square: Tensor, light: Tensor, outer: Sequence[Tensor], by_light: bool = True
     ) -> tuple[Tensor | None, ...]:
-        """A number's gradients [N, 2], [N, 2], [N] by the inputs of `outputs`, from its gradients by the results.
+        """Return a number's gradients [N, 2], [N, 2], [N] by the inputs of `outputs`, from those by the results.
 
         Those by the wavelength are None unless `by_light`: glasses and coatings have as many steps as the ray itself.
         """
@@ -250,22 +249,22 @@ class _Lens:
 
     @cached_property
     def forward(self) -> Run:
-        """The rays of rows [5, N] of what is given."""
+        """Return the function that takes inputs, as rows [5, N], to rays."""
         return self._run(self.program, _GIVEN)
 
     def backward(self, by_light: bool) -> Run:
-        """The gradients of rows [12, N]: what is given, and gradients by what is found."""
+        """Return the function that takes rows [12, N], inputs and gradients by results, to gradients by inputs."""
         if by_light not in self._backwards:
             program = self.adjoint(by_light)
             self._backwards[by_light] = self._run(program, (*_GIVEN, *(f"{OUTER}{name}" for name in _FOUND)))
         return self._backwards[by_light]
 
     def adjoint(self, by_light: bool) -> Program:
-        """The program of the gradients by what is given, with or without the wavelength."""
+        """Return the program of the gradients by the inputs, with or without the wavelength."""
         return adjoint(self.program, _FOUND, _GIVEN if by_light else _GIVEN[:-1])
 
     def _run(self, program: Program, rows: Sequence[str]) -> Run:
-        """A program as a function of rows [R, N] of these names: a kernel on a GPU, C on the CPU, else in torch."""
+        """Return a program as a function of rows [R, N] of these names: a kernel on a GPU, C on the CPU, or torch."""
         if self.dtype == torch.float32 and "mask" not in self._tables and self.device.type == "cpu":
             with suppress(InputError):
                 return self._as_c(program, rows)
@@ -358,7 +357,7 @@ def _chosen(first: Tensor, x: Any, y: Any, dtype: torch.dtype) -> Tensor:
 
 
 def has_kernels(device: torch.device) -> bool:
-    """Whether `on_gpu` can run on a device: an NVIDIA GPU, and a torch that compiles kernels (2.11 was tried)."""
+    """Return whether `on_gpu` can run on a device: an NVIDIA GPU, and a torch that compiles kernels (2.11 does)."""
     return device.type == "cuda" and torch.version.cuda is not None and hasattr(torch.cuda, "_compile_kernel")
 
 

@@ -1,4 +1,4 @@
-"""Measures models by zone, on rays that no fit has used, traced once through the exact lens; also fits and measures.
+"""Measures models by zone, on rays that no fit has used, traced once through the exact lens; fits models, too.
 
 A smaller stop changes no ray, but only which of them pass, which the crossing with the stop decides.
 """
@@ -226,7 +226,7 @@ class Measured:
 
     @property
     def error(self) -> float:
-        """The film-equivalent RMS, or that of the angle where no ray is within 60 degrees."""
+        """Return the film-equivalent RMS, or that of the angle where no ray is within 60 degrees."""
         found = self.record.get("rms_um")
         return float(found if found is not None else self.record.get("direction_rms_deg") or 1e9)
 

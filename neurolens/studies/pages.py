@@ -213,7 +213,7 @@ class Column:
         return number(record, self.key)
 
     def cell(self, record: Record, thousands: str = "") -> str:
-        """The figure as text: a dash if it is missing, "~" before the minimum of a noisy timing; "never" stays."""
+        """Return the figure as text: a dash if it is missing, "~" before the minimum of a noisy timing."""
         if record.get(self.key) == "never":
             return "never"
         value, parent = number(record, self.key), self.key.removesuffix(".min")

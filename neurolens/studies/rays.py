@@ -224,7 +224,7 @@ def _film_equivalent_mm(
 
 
 def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor]:
-    """The radial and tangential derivative [N] of `_plane_coordinates` by film position, 1/mm, of the exact lens.
+    """Return radial and tangential derivatives [N] of `_plane_coordinates` by film position, 1/mm, of the exact lens.
 
     They are central differences in float64 of the ray through the middle of the passing rays (a chief-like ray whose
     pupil point stays as the film point moves), at each ray's own film radius, film plane and wavelength. The lens is
@@ -278,7 +278,7 @@ SEED = 104729  # which no fit's rays are likely to have
 
 
 def false_shares(exact_passes: Tensor, model_passes: Tensor) -> dict[str, float | None]:
-    """False_pass and false_block from [N] booleans of rays uniform over the lit film and the domain's pupil disc.
+    """Return false_pass and false_block from [N] booleans of rays uniform over lit film and pupil disc.
 
     False passes are rays that the model passes and the exact lens blocks, as a share of those that the model passes.
     False blocks are rays that the model blocks and the exact lens passes, as a share of those that the exact lens

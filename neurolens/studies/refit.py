@@ -26,7 +26,7 @@ _RAYS, _STATES = 6000, 4  # fresh rays of a state on which errors are measured, 
 def refit_transmittance(file: Path, lens: Lens | StateSpace, out: Path | None = None) -> dict[str, Any]:
     """Fit the transmittance of a model again and write its file; position, direction and gates stay to the bit.
 
-    The card gets the lens with its coatings, and the errors of the transmittance on fresh rays; it keeps its others.
+    The card gets the lens with its coatings, and the errors of the transmittance on fresh rays; its other errors stay.
 
     Args:
         lens: the model's lens as it is now, or its states.
@@ -55,7 +55,7 @@ def refit_transmittance(file: Path, lens: Lens | StateSpace, out: Path | None = 
 
 
 def transmittance_errors(models: Sequence[LensModel]) -> dict[str, float]:
-    """Return the errors of the transmittance on rays that no fit has seen: RMS and largest, of models the worst."""
+    """Return the errors of the transmittance on rays that no fit has seen: RMS and largest, of the worst model."""
     rows = []
     for model in as_stored(models):
         seed = int(model.settings.get("rays_seed") or 0) + FRESH

@@ -335,7 +335,7 @@ def _compare_scene(
 
 
 def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The depths [N] of what a camera's chief rays of film points [2, N] meet, in m along the axis from the film.
+    """Return depths [N] of what chief rays of film points [2, N] meet, in m along the axis from the film.
 
     They are inf where rays meet nothing, and NaN where no light passes.
     """

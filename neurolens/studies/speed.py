@@ -111,7 +111,7 @@ class Race:
         return {**timing, "batch": self.batch[name], "repeats": len(ns)}
 
     def speedup(self, name: str, over: str) -> dict[str, float] | None:
-        """The factor by which `name` is faster than `over`: "min" by minima, "median" of the ratios within rounds."""
+        """Return how many times as fast as `over` a candidate is: "min" by minima, "median" of ratios within rounds."""
         if name not in self.ns or over not in self.ns:
             return None
         ratios = [b / a for a, b in zip(self.ns[name], self.ns[over], strict=True)]
@@ -240,7 +240,7 @@ def exact_records(timed: Race) -> list[ExactRecord]:
 
 
 def camera_candidate(camera: Camera, domain: Domain, name: str | None = None) -> Candidate:
-    """A camera of the renderer (thin lens, pinhole): from film points and pupil samples to weighted scene rays."""
+    """Return a camera of the renderer as a candidate: from film points and pupil samples to weighted rays."""
 
     def prepare(rays: FilmRays) -> Call:
         film = _float32(torch.stack([rays.film_x, rays.film_y]))

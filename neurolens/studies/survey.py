@@ -147,7 +147,7 @@ def is_of(record: Mapping[str, Any], task: Task) -> bool:
 
 
 def _put(folder: Path, name: str, data: bytes) -> Path:
-    """Write a file of these bytes under its own last name, by which formats are recognised and messages speak."""
+    """Write a file of these bytes under its own name, whose suffix tells its format and which messages show."""
     folder.mkdir(exist_ok=True)
     file = folder / (PurePosixPath(name).name or "lens")
     file.write_bytes(data)
@@ -452,7 +452,7 @@ def _remarks(record: Mapping[str, Any]) -> list[str]:
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> str:
-    """Texts, then the figures by their keys, then lists, their items parted by " | ", a row for each record."""
+    """Return a row of CSV for each record: texts, then figures by their keys, then lists, with " | " between items."""
     inner = [{**(r.get("photographs") or {}), **(r.get("fit") or {})} for r in records]
     keys = sorted({key for found in inner for key, v in found.items() if not isinstance(v, list | dict)})
     plain = [c.key for c in COLUMNS if "." not in c.key]

@@ -50,7 +50,7 @@ class Primitive(Protocol):
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Dot products [N] of vectors [3, N], or of one vector [3] with vectors [3, N]."""
+    """Return dot products [N] of vectors [3, N], or of one vector [3] with vectors [3, N]."""
     out: FloatArray = a[0] * b[0]
     out += a[1] * b[1]
     out += a[2] * b[2]

@@ -228,7 +228,7 @@ def _spectra(
     camera: CameraSettings,
     most: float | None = None,
 ) -> dict[str, Spectrum]:
-    """Measured spectra over all of the camera's wavelengths, scaled to a maximum of 1 (with `most`: unscaled)."""
+    """Return measured spectra over the camera's wavelengths, scaled to a maximum of 1 (with `most`: unscaled)."""
     low, high = camera.wavelength_nm
     found = {}
     for name, table in tables.items():

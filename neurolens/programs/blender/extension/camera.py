@@ -113,7 +113,7 @@ def focus_m(found: Any) -> float:
 
 
 def depths_in_view(context: Any, found: Any, setting: Setting, efl_mm: float) -> list[float]:
-    """Depths along the view (m) at which rays of a pinhole of this focal length end; inf if they meet nothing."""
+    """Return depths along the view (m) where rays of a pinhole of this focal length end; inf if they meet nothing."""
     graph = context.evaluated_depsgraph_get()
     frame = found.evaluated_get(graph).matrix_world.normalized()
     right, up, back = (frame.col[k].xyz for k in range(3))

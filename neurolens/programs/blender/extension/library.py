@@ -32,7 +32,7 @@ _HEADROOM = 1.001  # factor on a near limit, for rounding
 
 
 class LensError(Exception):
-    """One sentence for the user about why nothing was done; the scene is as it was before."""
+    """One sentence that tells the user why nothing was done; the scene is as it was before."""
 
 
 @dataclass(frozen=True)
@@ -417,7 +417,7 @@ def _px(value: float) -> str:
 
 
 def confusion_mm(efl_mm: float, f_number: float, focus_m: float, depth_m: float) -> float:
-    """The diameter (mm) of a thin lens's circle of confusion; focus and depth count from the film, inf allowed."""
+    """Return the diameter (mm) of a thin lens's circle of confusion, from distances to the film (inf allowed)."""
 
     def image(distance_m: float) -> float:
         total = 1e3 * distance_m
