@@ -28,6 +28,7 @@ WRITTEN = {
     "lens_file",
     "layout",
     "breathing",
+    "csv",
     "fit",
     "plot",
     "csv",

@@ -1,7 +1,9 @@
 """OSLO lens files (.len) of simple lenses: spheres, conics and aspheres of four terms, with round openings.
 
 They have "LEN NEW name focal-length surfaces", settings, then the surfaces, object first, each ended by NXT, the image
-by END.
+by END. Tilts TLA and TLB are left-handed, TLC is right-handed, each about the axes that the one before has turned, and
+decentres come first, by Sinclair Optics (OSLO User's Guide 5.4, "Tilted and/or decentered surfaces", 1997) and Lambda
+Research ("Comparing Tilt Values in OSLO vs TracePro"). So they are as CODE V's.
 """
 
 from __future__ import annotations
@@ -13,20 +15,24 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
+from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import UNKNOWN
-from neurolens.optics.readers.draft import INFINITE, Draft, Row, lens_of, primary_first
+from neurolens.optics.readers.breaks import Turn
+from neurolens.optics.readers.draft import INFINITE, Draft, Row, lens_of, placed, primary_first
 from neurolens.optics.readers.glasses import by_indices, named_glass
 from neurolens.optics.readers.source import UNITS_MM, Line, ReadOptions, by_word, read_lines
 
+TURNS = ("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC")
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 # Designer, weights, settings of the program, drawings.
 HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
 # What changes rays and is not read, if a number other than 0 or a word follows; with what is expected in its place.
 REFUSED = by_word(
     ("NA", "EBR, FNO or NAO to size the stop"),
-    ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: they are not read from OSLO's files"),
+    ("GC RCO", "no return of the axes: without it, what follows a tilted surface is tilted with it"),
+    ("BEN", "no bend of the axes: a bend belongs to a mirror"),
     ("RFL RFH REFL", "no mirror: the lens model has none"),
     ("GRT GSP GOR DFR DOE HOE HOR", "no grating or hologram: the lens model has none"),
     ("GRD GDT NZ1 NR1 NR2 NR4", "no gradient index: the lens model has none"),
@@ -145,7 +151,10 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
             if line.first(word, rest) != 0:
                 raise line.error(word, rest[0], "0: the film in the paraxial image")
             block.solved = True
-        case _ if word in ("RD", "CV", "TH", "CC", *TERMS):
+        case "DT":
+            if line.first(word, rest) != 1:
+                raise line.error(word, rest[0], "1: decentres before tilts")
+        case _ if word in ("RD", "CV", "TH", "CC", *TERMS, *TURNS):
             block.values[word] = line.first(word, rest)
         case _:
             file.skipped[word] += 1
@@ -175,7 +184,10 @@ def _complete(file: File) -> None:
         if block.solved and block is not last:
             raise block.start.error("PY", f"(on surface {k})", "the last surface")
     distance = first.values.get("TH", 0.0)
-    file.rows = tuple(map(_row, middle))
+    for block in file.blocks[1:]:
+        x, y, z, a, b, c = (block.values.get(name, 0.0) for name in TURNS)
+        block.turn = Turn(Placement((x, y, z), (-a, -b, c))) if any((x, y, z, a, b, c)) else None
+    file.rows = placed([_row(block) for block in middle], file.blocks[1:])
     file.object_medium, file.wavelengths_nm = first.medium, primary_first(waves_nm, waves_nm[0] if waves_nm else 0.0)
     file.object_distance = math.inf if distance >= INFINITE else distance
     file.film_given = not (last.solved and "TH" not in last.values)

@@ -142,6 +142,25 @@ GO
 """
 
 
+OSLO = """\
+LEN NEW "a copy" 50 4
+EBR 5
+UNI 1
+AIR
+TH 1e20
+NXT
+AIR; TH 1; AP 5; AST
+NXT
+GLA BK7; RD 50; TH 4; AP 8; DT 1; DCX 0.05; TLA -0.4; TLB 0.3
+NXT
+AIR; RD -50; TH 46; AP 8
+NXT
+AIR
+WV 0.5876
+END 4
+"""
+
+
 def test_code_v_turns_left_handed_and_zemax_right_handed(tmp_path: Path) -> None:
     ours = read(CODE_V.format(back=""), tmp_path, "a.seq")
     theirs = read(
@@ -154,6 +173,7 @@ def test_code_v_turns_left_handed_and_zemax_right_handed(tmp_path: Path) -> None
         tmp_path,
     )
     assert [s.placement for s in ours.surfaces] == [s.placement for s in theirs.surfaces]
+    assert [s.placement for s in read(OSLO, tmp_path, "a.len").surfaces] == [s.placement for s in ours.surfaces]
     assert ours.decentred == [0], "the film goes with the element: from it, the stop is decentred"
     restored = CODE_V.replace("S -50 46", "S -50 -4").format(back="S 0 50; XDE 0.05; ADE -0.4; BDE 0.3; REV")
     lens = read(restored, tmp_path, "b.seq")
