@@ -28,7 +28,6 @@ WRITTEN = {
     "lens_file",
     "layout",
     "breathing",
-    "csv",
     "fit",
     "plot",
     "csv",
