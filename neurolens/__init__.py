@@ -38,4 +38,4 @@ if not TYPE_CHECKING:  # to which any name would be one
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})  # without what it imports

@@ -37,8 +37,9 @@ class Defocus(cli.Reporting):
     and more, inf: sky), without motion blur; depth without antialiasing is best. Its pinhole stands where
     `neurolens stmap` says; pictures of `neurolens render --camera pinhole:LENS` need nothing else. A data window
     larger than the display window is overscan, which a lens with barrel distortion needs. What a lens sees behind the
-    edges of things comes of layers with a depth of their own (behind.R, behind.G, behind.B, behind.Z in the file, or
-    --behind) or deep files; else what is beside an edge is put there, and the share of that light is said."""
+    edges of things is read from layers with a depth of their own (behind.R, behind.G, behind.B, behind.Z in the file,
+    or --behind) or from deep files. Without them, what is beside an edge is put there, and the command says which share
+    of the light that is."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 
@@ -147,7 +148,7 @@ class Bokeh(PictureCommand):
 
     Every kernel has its field's cat's eye, coma and colour fringes, in pixels of the picture, and a sum of 1 in each
     channel; all cells have the same odd width, the centroid of green in the middle. The light of each field relative to
-    the axis is in the metadata and with --json. For a program that takes one kernel, --grid 1x1 gives the axis's."""
+    the axis is in the metadata and with --json. --grid 1x1 gives the kernel of the axis alone."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 

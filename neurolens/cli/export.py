@@ -42,13 +42,15 @@ class Export(cli.Reporting):
     """Write a model or a lens as source code, as C unless --to says otherwise: a self-contained C99 header (one
     function for a ray, one for arrays that compilers vectorise), a function in a shading language, or an ONNX file.
 
-    Domain guard, stop, rims, transmittance and status codes are those of the model; the card is a comment at the top,
-    and constants and the film's position for a focus stand beside it. Of a model of a zoom's whole range (or of
-    internal focus) the state is an argument. A lens file gives the exact lens, with c-double within 1e-12 mm of the
-    tracer. OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades, zoom and more are its inputs.
-    With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted ray
-    out, its pupil's outline as a table in the file, or as data beside it for most shading languages.
-    Needs the extra "train" (torch); without it source code is written from the model's file, whole, nothing fixed."""
+    The code has the model's domain guard, stop, rims, transmittance and status codes. A comment at the top holds the
+    card; beside it stand constants, and the place of the film for a focus. For a model of a whole zoom (or of internal
+    focus) the state is an argument. A lens file gives the exact lens; --to c-double keeps it within 1e-12 mm of the
+    tracer. OSL is a camera of Blender's Cycles (4.5 and later), whose inputs are stop, focus, blades, zoom and more.
+
+    With --whole-camera the code is the camera for one focus and stop: it takes a film point and two random numbers, and
+    gives a weighted ray. The pupil's outline is a table in the file, or data beside it for most shading languages.
+
+    Without the extra "train" (torch), models alone are written, whole, with nothing fixed."""
 
     epilog = """\
 values fixed by a scene are folded into fewer operations (--fix, repeatable):

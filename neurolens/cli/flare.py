@@ -81,18 +81,18 @@ class Flare(cli.Figures):
     """Print the brightest ghosts of a lens that is focused at infinity, and write a picture of its flare (with -o, or
     where only a lens is given).
 
-    Ghosts are traced exactly: light that two surfaces reflect on its way to the film, with the reflectance of
-    Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. They are
-    printed with energy, position and size, on the film itself, which pictures show turned by 180 degrees.
+    A ghost is light that two surfaces reflect on its way to the film. It is traced exactly, with the reflectance of
+    Fresnel's equations or of the coatings, all rims, the shape of the stop, and the spectrum. The table has its energy,
+    position and size on the film itself, which pictures show turned by 180 degrees.
 
-    With -o they are an OpenEXR picture that can be added to a render of the same lens, film and focus: R, G and B are
-    the sum of the layers (ghosts.R, .G, .B, and so on); the --layers ghosts with the greatest values on the film have
-    layers of their own. A white card of radiance 1 is 1 on the axis, as in `neurolens render`.
+    The OpenEXR picture can be added to a render of the same lens, film and focus. R, G and B are the sum of the layers
+    (ghosts.R, .G, .B, and so on); --layers N gives the N ghosts with the greatest values on the film a layer each. A
+    white card of radiance 1 is 1 on the axis, as in `neurolens render`.
 
-    With --photons light goes on by chance instead, with any number of reflections. With --glare, or if anything
-    scatters, photons make the layer "glare": light that is reflected more than twice or scatters. The layer "starburst"
-    has the light that diffraction sends aside, but not the image of the light itself. Each surface divides light by the
-    mean of both polarisations. Needs the extra "train" (torch) and a C compiler."""
+    With --photons, photons take the place of ghosts, and are reflected by chance any number of times. With --glare, or
+    if anything scatters, photons make the layer "glare": light that is reflected more than twice or scatters. The layer
+    "starburst" has the light that diffraction sends aside, but not the image of the light itself. Each surface divides
+    light by the mean of both polarisations. Needs the extra "train" (torch) and a C compiler."""
 
     epilog = """\
 examples:

@@ -49,15 +49,13 @@ class Render(cli.Reporting):
     """Path-trace a scene with the size, film, focus and samples that it states, through a lens with its widest stop
     and all its dispersion, and write OpenEXR in linear sRGB with a PNG preview beside it.
 
-    The settings, the camera and the card of a model are kept in the EXR's
-    metadata, attribute "neurolens", as JSON.
+    The EXR's metadata keep the settings, the camera and the card of a model, as JSON in the attribute "neurolens".
 
-    The same seed gives the same picture for any number of threads; all cameras share its
-    random numbers. Lenses and models run as C where the machine has a compiler, which the first
-    picture takes some seconds for. No camera needs torch, but for --field.
+    The same seed gives the same picture for any number of threads, and all cameras share its random numbers. Lenses and
+    models run as C where the machine has a compiler; compiling takes some seconds, once. Only --field needs torch.
 
-    The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
-    command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
+    The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far. The same command then
+    goes on from OUT.exr.part and ends with the same picture, bit for bit."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 

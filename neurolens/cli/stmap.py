@@ -382,8 +382,8 @@ class Projection(FieldCommand, cli.Figures):
     nerfstudio (its camera block; cx, cy from the corner of the first pixel, OpenCV's from its centre), with NVIDIA's
     names for f-theta; and, where one centre leaves more than half a pixel, NAME.noncentral.yaml: the ray of each pixel,
     as the model noncentral_generic of camera_calibration (Schoeps et al. 2020). `neurolens rays` writes rays over the
-    whole pupil, with their light. A projection that turns back within the field is said; a planar one beyond 85
-    degrees is refused. Needs the extra "train" (scipy)."""
+    whole pupil, with their light. The command says where a projection turns back within the field, and
+    refuses a planar one beyond 85 degrees. Needs the extra "train" (scipy)."""
 
     epilog = f"""{cli.CAMERAS_HELP}
 
