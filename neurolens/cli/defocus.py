@@ -11,6 +11,7 @@ from typing import Any, Literal
 from neurolens import __version__
 from neurolens.base.errors import note
 from neurolens.base.progress import Progress
+from neurolens.base.report import Report
 from neurolens.base.settings import group, positive, setting, whole
 from neurolens.cameras.build import near_of
 from neurolens.cameras.field import Frame, frame_of
@@ -116,9 +117,10 @@ examples:
         check_field(camera)
         plate = read_plate(self.plate, self.film, frame_of(camera), self._depth(), self.behind)
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
-        data: dict[str, Any] = {"plate": self.plate.name, "layers": len(plate.layers), "file": str(files.out)}
-        data |= {name: getattr(found, name) for name in ("highlights", "filled", "lost", "beyond")}
-        metadata = {"version": __version__, "camera": camera.settings, "defocus": data}
+        answer = Blurred(
+            self.plate.name, len(plate.layers), str(files.out), found.highlights, found.filled, found.lost, found.beyond
+        )
+        metadata = {"version": __version__, "camera": camera.settings, "defocus": vars(answer)}
         layers = {}
         if sensor is not None:
             layers, metadata["sensor"] = expose(found.rgb, sensor, self.seed), about(sensor, self.seed)
@@ -129,13 +131,31 @@ examples:
             layers=layers, attributes=attributes,
         )  # fmt: skip
         write_png(files.preview, found.rgb, self.exposure)
-        return self.answer(data, lambda: _defocus_text(data))
+        return self.answer(answer)
 
 
-def _defocus_text(data: dict[str, Any]) -> str:
-    said = f"{data['layers']} layer{'s' * (data['layers'] > 1)}, {data['highlights']} highlights spread"
-    shares = f"{data['filled']:.2%} of the light filled in, {data['lost']:.2%} lost, {data['beyond']:.2%} from beyond"
-    return f"{data['file']}: {said}, {shares} the plate"
+@dataclass(frozen=True)
+class Blurred(Report):
+    """A picture that a lens took of a plate: its highlights that were spread, and shares of its light.
+
+    Attributes:
+        filled, beyond: that the plate did not have, behind the edges of things and outside of it.
+        lost: of highlights, that no layer shows.
+    """
+
+    plate: str
+    layers: int
+    file: str
+    highlights: int
+    filled: float
+    lost: float
+    beyond: float
+
+    def text(self) -> str:
+        """Return a line."""
+        said = f"{self.layers} layer{'s' * (self.layers > 1)}, {self.highlights} highlights spread"
+        shares = f"{self.filled:.2%} of the light filled in, {self.lost:.2%} lost, {self.beyond:.2%} from beyond"
+        return f"{self.file}: {said}, {shares} the plate"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,29 +224,48 @@ examples:
             distance = "inf" if math.isinf(cells[0].distance_m) else f"{cells[0].distance_m:.10g}m"
             path = self.out.with_name(f"{self.out.name}.{distance}.exr")
             picture = as_picture(cells, self.grid[0], side)
-            rows += (kernels := [_facts(cell) for cell in cells])
-            more = {"kernel_px": side, "fields": list(self.grid), "kernels": kernels}
+            rows += (kernels := [KernelFacts.of(cell) for cell in cells])
+            more = {"kernel_px": side, "fields": list(self.grid), "kernels": [vars(kernel) for kernel in kernels]}
             write_channels(path, {c: picture[..., k] for k, c in enumerate("RGB")}, None, facts | more)
             write_png(path.with_suffix(".png"), as_preview(picture, side))
             files.append(str(path))
-        data = {"kernel_px": side, "fields": list(self.grid), "kernels": rows, "files": files}
-        return self.answer(data, lambda: _bokeh_text(data))
+        return self.answer(Kernels(side, self.grid, rows, files))
 
 
-def _facts(cell: Cell) -> dict[str, Any]:
-    """Return what the metadata say of a kernel, and its light by channel over that of an ideal lens on the axis."""
-    distance = None if math.isinf(cell.distance_m) else cell.distance_m
-    facts: dict[str, Any] = {"field": list(cell.field), "distance_m": distance, "place_px": list(cell.place_px)}
-    lit = cell.kernel is not None
-    return facts | {"light": cell.kernel.energy.tolist() if lit else [0.0] * 3, "width_px": cell.width_px if lit else 0}  # type: ignore[union-attr]
+@dataclass(frozen=True)
+class KernelFacts:
+    """What the metadata say of a kernel, and its light by channel over that of an ideal lens on the axis."""
+
+    field: tuple[float, float]
+    distance_m: float | None
+    place_px: tuple[float, float]
+    light: list[float]
+    width_px: int
+
+    @classmethod
+    def of(cls, cell: Cell) -> KernelFacts:
+        """Return the one of a cell, which is dark where no light reaches it."""
+        distance = None if math.isinf(cell.distance_m) else cell.distance_m
+        light, width = ([0.0] * 3, 0) if cell.kernel is None else (cell.kernel.energy.tolist(), cell.width_px)
+        return cls(cell.field, distance, cell.place_px, light, width)
 
 
-def _bokeh_text(data: dict[str, Any]) -> str:
-    columns, rows = data["fields"]
-    lines = [f"{columns} x {rows} kernels a picture, {data['kernel_px']} pixels a side each"]
-    for k, file in enumerate(data["files"]):
-        cells = data["kernels"][k * columns * rows : (k + 1) * columns * rows]
-        widths, light = ([row[name] for row in cells] for name in ("width_px", "light"))
-        low, high = (cli.number(by(v[1] for v in light), 3) for by in (min, max))
-        lines.append(f"{file}: blur {min(widths)} to {max(widths)} pixels wide, light {low} to {high}")
-    return "\n".join(lines)
+@dataclass(frozen=True)
+class Kernels(Report):
+    """Kernels of all distances, in columns and rows (`fields`), one file a distance."""
+
+    kernel_px: int
+    fields: tuple[int, int]
+    kernels: list[KernelFacts]
+    files: list[str]
+
+    def text(self) -> str:
+        """Return how wide and how bright the kernels of each file are."""
+        columns, rows = self.fields
+        lines = [f"{columns} x {rows} kernels a picture, {self.kernel_px} pixels a side each"]
+        for k, file in enumerate(self.files):
+            cells = self.kernels[k * columns * rows : (k + 1) * columns * rows]
+            widths = [c.width_px for c in cells]
+            low, high = (cli.number(by(c.light[1] for c in cells), 3) for by in (min, max))
+            lines.append(f"{file}: blur {min(widths)} to {max(widths)} pixels wide, light {low} to {high}")
+        return "\n".join(lines)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,11 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
 from neurolens.base.progress import Progress
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import setting, setting_of
 from neurolens.cameras.contract import Camera
 from neurolens.cli import arguments as cli
-from neurolens.cli.stmap import Maker, Projection, StMap, TracedFrame, one_centre
+from neurolens.cli.stmap import Maker, Maps, Projection, StMap, TracedFrame, one_centre
 from neurolens.optics.lens.shot import POSES
 from neurolens.pictures.render.pictures import read_channels, standard_attributes
 from neurolens.pictures.render.stmap import illumination_map
@@ -65,18 +66,17 @@ examples:
         progress = self.progress()
         frames, plates = self.traced(progress)
         self.out.mkdir(parents=True, exist_ok=True)
-        data = self.data_of(frames, plates)
+        found = self.found(frames, plates, [])
         shot = standards.Handed(
             standard_attributes(frames[0].camera.settings), __version__, (self.fps.numerator, self.fps.denominator),
             tuple(standards.Pinhole.of(f.number, f.fields[""], f.camera.settings, f.focus_m) for f in frames), plates,
             tuple(name for name in frames[0].fields if name), _coatings(frames[0].camera.settings),
         )  # fmt: skip
         writer = _Writer(self, frames, shot)
-        files = self.maps(frames, plates, progress, self.out / "shot") + writer.files(data, progress)
+        files = self.maps(frames, plates, progress, self.out / "shot") + writer.files(found, progress)
         for note in writer.notes:
             warn(f"not written: {note}")
-        data |= {"files": files, "not_written": writer.notes, "left": writer.left, "projections": writer.fits}
-        return self.answer(data, lambda: _text(data))
+        return self.answer(Handed(replace(found, files=files), writer.notes, writer.left, writer.fits))
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
         """Return the maps of `stmap`, the light as grey with alpha, by which any program multiplies, and NVIDIA's."""
@@ -108,13 +108,13 @@ class _Writer:
     frames: list[TracedFrame]
     shot: standards.Handed
     left: dict[str, float] = field(default_factory=dict)
-    fits: dict[str, dict[str, Any]] = field(default_factory=dict)
+    fits: dict[str, Fitted] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
-    def files(self, data: dict[str, Any], progress: Progress) -> list[str]:
+    def files(self, found: Maps, progress: Progress) -> list[str]:
         """Write all files and return their names."""
         names, command, shot = [], self.command, self.shot
-        tables = command.noncentral or any(standards.noncentral_pays(row["parallax"]) for row in data["frames"])
+        tables = command.noncentral or any(standards.noncentral_pays(row.parallax) for row in found.frames)
         with progress.stage("fit projections, OpenTrackIO") as report:
             for k in range(len(self.frames)):
                 names += self._of_frame(k)
@@ -126,10 +126,10 @@ class _Writer:
         entries = self._entries(progress)
         exits, _ = read_channels(command.out / f"shot.exit{shot.frames[0].name}.exr", "RG")
         self._worse("exit_px", standards.exit_residual_px(self.frames[0].fields[""], shot.plates, exits))
-        self._worse("maps_px", max(row["there_and_back_px"] for row in data["frames"]))
+        self._worse("maps_px", max(row.there_and_back_px for row in found.frames))
         values = {"shot": shot, "about": f"{shot.about}, neurolens {__version__}", "entries": entries}
         values |= {"left": self.left, "fits": self.fits, "notes": self.notes, "projection": command.projection}
-        values |= {"parallax": data["frames"][0]["parallax"], "types": standards.LENSFUN_TYPES}
+        values |= {"parallax": found.frames[0].parallax, "types": standards.LENSFUN_TYPES}
         for name in ("shot.usda", "shot.nk", "shot.blender.py", "shot.lensfun.xml", "README.md"):
             if entries or name != "shot.lensfun.xml":
                 template = f"handover.{name.removeprefix('shot.')}.jinja"
@@ -155,8 +155,8 @@ class _Writer:
                 self.notes.extend([note] if note not in self.notes else [])
                 continue
             names += standards.write_projection(command.out / f"shot.{kind}{pinhole.name}", fitted, told)
-            row = {"worst_px": left.worst_px, "rms_px": left.rms_px, "turns_back_at_deg": told.turns_back_at_deg}
-            if left.worst_px >= self.fits.get(kind, row)["worst_px"]:
+            row = Fitted(left.worst_px, left.rms_px, told.turns_back_at_deg)
+            if left.worst_px >= self.fits.get(kind, row).worst_px:
                 self.fits[kind] = row
         return names
 
@@ -224,13 +224,32 @@ def _rate(text: str) -> Fraction:
     raise argparse.ArgumentTypeError(f"got {text!r}, expected frames a second from 1 to 1000, as 24 or 24000/1001")
 
 
-def _text(data: dict[str, Any]) -> str:
-    names = {"ST maps, there and back": "maps_px", "NVIDIA's lookup pictures": "exit_px"}
-    names |= {"ray of each pixel, at any distance": "noncentral_px"}
-    names |= {"OpenTrackIO": "opentrackio_px", "lensfun": "lensfun_px", "lensfun, colours": "colour_px"}
-    rows = [(name, f"{data['left'][key]:.2g}") for name, key in names.items() if key in data["left"]]
-    rows += [(kind, f"{fit['worst_px']:.2g}") for kind, fit in data["projections"].items()]
-    heading = f"{data['camera']}: {len(data['files'])} files are written; README.md in their folder explains them"
-    first = data["frames"][0]
-    told = f"{cli.table(('left at most, of what is in focus', 'pixels'), rows)}"
-    return f"{heading}\n{told}\n{one_centre(first['parallax'], first['before_film_mm'])}"
+@dataclass(frozen=True)
+class Fitted:
+    """What a fitted projection leaves, in the frame where that is most."""
+
+    worst_px: float
+    rms_px: float
+    turns_back_at_deg: float | None
+
+
+@dataclass(frozen=True)
+class Handed(Report):
+    """The maps and files of a shot, what was not written, and the most that each standard and projection leaves."""
+
+    maps: Maps = field(metadata=PART)
+    not_written: list[str]
+    left: dict[str, float]
+    projections: dict[str, Fitted]
+
+    def text(self) -> str:
+        """Return a table of what each standard leaves."""
+        names = {"ST maps, there and back": "maps_px", "NVIDIA's lookup pictures": "exit_px"}
+        names |= {"ray of each pixel, at any distance": "noncentral_px"}
+        names |= {"OpenTrackIO": "opentrackio_px", "lensfun": "lensfun_px", "lensfun, colours": "colour_px"}
+        rows = [(name, f"{self.left[key]:.2g}") for name, key in names.items() if key in self.left]
+        rows += [(kind, f"{fit.worst_px:.2g}") for kind, fit in self.projections.items()]
+        maps, first = self.maps, self.maps.frames[0]
+        heading = f"{maps.camera}: {len(maps.files)} files are written; README.md in their folder explains them"
+        told = f"{cli.table(('left at most, of what is in focus', 'pixels'), rows)}"
+        return f"{heading}\n{told}\n{one_centre(first.parallax, first.ideal.before_film_mm)}"

@@ -218,8 +218,7 @@ examples:
         progress = self.progress()
         frames, plates = self.traced(progress)
         files = self.maps(frames, plates, progress, self.out)
-        data = self.data_of(frames, plates) | {"files": files}
-        return self.answer(data, lambda: _stmap_text(data))
+        return self.answer(self.found(frames, plates, files))
 
     def states(self) -> list[tuple[str, cli.LensState]]:
         """Return the numbers of frames as file names have them, with the state of the lens in each."""
@@ -282,31 +281,29 @@ examples:
         about |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
         about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
         about["settings"] = fingerprint_of(plain([frame.camera.settings, self.distance, self.state.stop]))
-        return about | {"map": kind, "wavelengths_nm": field.spectrum[0].tolist(), **_ideal(field, plates)}
+        about |= {"map": kind, "wavelengths_nm": field.spectrum[0].tolist()}
+        return about | vars(Undistorted.of(field, plates))
 
-    def data_of(self, frames: list[TracedFrame], plates: Plates) -> dict[str, Any]:
+    def found(self, frames: list[TracedFrame], plates: Plates, files: list[str]) -> Maps:
         """Return the figures of the maps."""
         rows = []
         for frame in frames:
-            field = frame.fields[""]
+            field, ideal = frame.fields[""], Undistorted.of(frame.fields[""], plates)
             moved, missed = worst_px(field, plates)
-            row: dict[str, Any] = {"frame": frame.index, "focus_m": frame.focus_m}
-            row |= _ideal(field, plates)
-            row |= {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
             # One pinhole, at the y meridian's pupil, shows widths in this plane as the pupil of the x meridian does.
             plane = 1e3 * (frame.focus_m if self.distance is None else self.distance)
             x, y = field.frame.pupil_mm
             nearer = 1.0 if math.isinf(plane) else (plane - x) / (plane - y)
-            row |= {"plane_m": plane / 1e3, "pixel_aspect_of_one_pinhole": row["pixel_aspect"] * nearer}
-            rows.append(row | {"parallax": self.parallax(frame.camera, field)})
-        return {
-            "camera": str(self.camera),
-            "picture_px": list(plates.picture),
-            "undistorted_px": list(plates.undistorted),
-            "overscan": list(plates.overscan),
-            "film_undistorted_mm": [n * p for n, p in zip(plates.undistorted, plates.pixel_mm, strict=True)],
-            "frames": rows,
-        }
+            rows.append(MapsOfFrame(
+                frame=frame.index, focus_m=frame.focus_m, ideal=ideal, field_deg=field.field_deg, shift_px=moved,
+                there_and_back_px=missed, plane_m=plane / 1e3, pixel_aspect_of_one_pinhole=ideal.pixel_aspect * nearer,
+                parallax=self.parallax(frame.camera, field),
+            ))  # fmt: skip
+        film = [n * p for n, p in zip(plates.undistorted, plates.pixel_mm, strict=True)]
+        return Maps(
+            camera=str(self.camera), picture_px=plates.picture, undistorted_px=plates.undistorted,
+            overscan=plates.overscan, film_undistorted_mm=film, frames=rows, files=files,
+        )  # fmt: skip
 
 
 def _is_of(path: Path, facts: dict[str, Any]) -> bool:
@@ -316,46 +313,84 @@ def _is_of(path: Path, facts: dict[str, Any]) -> bool:
     return False
 
 
-def _ideal(field: Field, plates: Plates) -> dict[str, Any]:
-    """Describe the camera that an undistorted picture is of; lists are for the x and the y meridian.
+@dataclass(frozen=True)
+class Undistorted:
+    """The camera that an undistorted picture is of; lists are for the x and the y meridian.
 
     In both pictures a pixel shows `pixel_aspect` times as much across as up, and viewers stretch it so.
     """
-    (x, y), (width, height) = field.frame.reach_mm, plates.pixel_mm
-    return {
-        "projection": field.target,
-        "focal_mm": [x, y],
-        "before_film_mm": list(field.frame.pupil_mm),
-        "pixel_aspect": float(f"{y / x * width / height:.6g}"),
-    }
+
+    projection: str
+    focal_mm: list[float]
+    before_film_mm: list[float]
+    pixel_aspect: float
+
+    @classmethod
+    def of(cls, field: Field, plates: Plates) -> Undistorted:
+        """Return the one of a field."""
+        (x, y), (width, height) = field.frame.reach_mm, plates.pixel_mm
+        aspect = float(f"{y / x * width / height:.6g}")
+        return cls(field.target, [x, y], list(field.frame.pupil_mm), aspect)
 
 
-def _stmap_text(data: dict[str, Any]) -> str:
-    first = data["frames"][0]
-    (width, height), (wide, high), (fx, fy) = data["picture_px"], data["undistorted_px"], data["overscan"]
-    focal, before = (
-        " x ".join(dict.fromkeys(cli.number(v, 6) for v in first[k])) for k in ("focal_mm", "before_film_mm")
-    )
-    film = " x ".join(cli.number(v, 6) for v in data["film_undistorted_mm"])
-    worst = {k: max(row[k] for row in data["frames"]) for k in ("shift_px", "there_and_back_px")}
-    lines = [
-        f"{data['camera']}: picture {width} x {height}, undistorted {wide} x {high} pixels "
-        f"(overscan {fx:.4f} x {fy:.4f}), {film} mm",
-        f"undistorted, {first['projection']}: focal length {focal} mm, its point {before} mm before the film"
-        + (" (first frame)" if len(data["frames"]) > 1 else ""),
-        f"distortion moves points by up to {worst['shift_px']:.4g} pixels; there and back within "
-        f"{worst['there_and_back_px']:.2g}",
-    ]
-    if " x " in focal:
-        x, y = (cli.number(v, 6) for v in first["before_film_mm"])
-        line = f"pixel aspect ratio {first['pixel_aspect']:.5g}; entrance pupil of the x meridian {x} mm, of the y "
-        line += f"meridian {y} mm before the film"
-        if math.isfinite(first["plane_m"]):
-            plane, aspect = cli.number(first["plane_m"], 3), f"{first['pixel_aspect_of_one_pinhole']:.5g}"
-            line += f"; a pinhole at the latter shows what is {plane} m from the film with {aspect}"
-        lines.append(line)
-    lines.append(one_centre(first["parallax"], first["before_film_mm"]))
-    return "\n".join([*lines, *data["files"]])
+@dataclass(frozen=True, kw_only=True)
+class MapsOfFrame:
+    """Figures of the maps of a frame.
+
+    Attributes:
+        shift_px: how far distortion moves points at most. there_and_back_px: the most that both maps leave.
+        pixel_aspect_of_one_pinhole: of what a pinhole at the y meridian's pupil shows in the plane at `plane_m`.
+    """
+
+    frame: int | None
+    focus_m: float
+    ideal: Undistorted = dataclass_field(metadata=PART)
+    field_deg: float
+    shift_px: float
+    there_and_back_px: float
+    plane_m: float
+    pixel_aspect_of_one_pinhole: float
+    parallax: list[dict[str, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Maps(Report):
+    """The sizes of the pictures of ST maps, the figures of each frame, and the files."""
+
+    camera: str
+    picture_px: tuple[int, int]
+    undistorted_px: tuple[int, int]
+    overscan: tuple[float, float]
+    film_undistorted_mm: list[float]
+    frames: list[MapsOfFrame]
+    files: list[str]
+
+    def text(self) -> str:
+        """Return the sizes, the ideal camera, the largest shift, and the files."""
+        first, ideal = self.frames[0], self.frames[0].ideal
+        (width, height), (wide, high), (fx, fy) = self.picture_px, self.undistorted_px, self.overscan
+        focal, before = (
+            " x ".join(dict.fromkeys(cli.number(v, 6) for v in both)) for both in (ideal.focal_mm, ideal.before_film_mm)
+        )
+        film = " x ".join(cli.number(v, 6) for v in self.film_undistorted_mm)
+        moved, missed = (max(getattr(f, k) for f in self.frames) for k in ("shift_px", "there_and_back_px"))
+        lines = [
+            f"{self.camera}: picture {width} x {height}, undistorted {wide} x {high} pixels "
+            f"(overscan {fx:.4f} x {fy:.4f}), {film} mm",
+            f"undistorted, {ideal.projection}: focal length {focal} mm, its point {before} mm before the film"
+            + (" (first frame)" if len(self.frames) > 1 else ""),
+            f"distortion moves points by up to {moved:.4g} pixels; there and back within {missed:.2g}",
+        ]
+        if " x " in focal:
+            x, y = (cli.number(v, 6) for v in ideal.before_film_mm)
+            line = f"pixel aspect ratio {ideal.pixel_aspect:.5g}; entrance pupil of the x meridian {x} mm, of the y "
+            line += f"meridian {y} mm before the film"
+            if math.isfinite(first.plane_m):
+                plane, aspect = cli.number(first.plane_m, 3), f"{first.pixel_aspect_of_one_pinhole:.5g}"
+                line += f"; a pinhole at the latter shows what is {plane} m from the film with {aspect}"
+            lines.append(line)
+        lines.append(one_centre(first.parallax, ideal.before_film_mm))
+        return "\n".join([*lines, *self.files])
 
 
 def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) -> str:
