@@ -108,7 +108,7 @@ class _Writer:
     frames: list[TracedFrame]
     shot: standards.Handed
     left: dict[str, float] = field(default_factory=dict)
-    fits: dict[str, Fitted] = field(default_factory=dict)
+    fits: dict[str, standards.FittedProjection] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def files(self, found: Maps, progress: Progress) -> list[str]:
@@ -147,7 +147,7 @@ class _Writer:
         names = [str(path)]
         for kind in _KINDS:
             try:
-                fitted, left, told = standards.fitted_projection(
+                fitted, _, told = standards.fitted_projection(
                     kind, traced, command.picture, command.film, self.shot.about
                 )
             except InputError as error:
@@ -155,9 +155,8 @@ class _Writer:
                 self.notes.extend([note] if note not in self.notes else [])
                 continue
             names += standards.write_projection(command.out / f"shot.{kind}{pinhole.name}", fitted, told)
-            row = Fitted(left.worst_px, left.rms_px, told.turns_back_at_deg)
-            if left.worst_px >= self.fits.get(kind, row).worst_px:
-                self.fits[kind] = row
+            if told.worst_px >= self.fits.get(kind, told).worst_px:
+                self.fits[kind] = told
         return names
 
     def _ray_table(self, k: int) -> str:
@@ -225,22 +224,13 @@ def _rate(text: str) -> Fraction:
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """What a fitted projection leaves, in the frame where that is most."""
-
-    worst_px: float
-    rms_px: float
-    turns_back_at_deg: float | None
-
-
-@dataclass(frozen=True)
 class Handed(Report):
     """The maps and files of a shot, what was not written, and the most that each standard and projection leaves."""
 
     maps: Maps = field(metadata=PART)
     not_written: list[str]
     left: dict[str, float]
-    projections: dict[str, Fitted]
+    projections: dict[str, standards.FittedProjection]
 
     def text(self) -> str:
         """Return a table of what each standard leaves."""
