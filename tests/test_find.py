@@ -143,7 +143,8 @@ def test_files_and_paths_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     shutil.copy(LENSES / "cooke_triplet_50.toml", "petzval")
     assert resolve("petzval").file == Path("petzval")
-    for path in ("lenses/petzval", "./biotar", "../petzval", "petzval.zmx", "biotar\\x", "laikin.ols-99"):
+    code = "@SUM(1)", "=petzval", "petzval; biotar", "$(biotar)"
+    for path in ("lenses/petzval", "./biotar", "../petzval", "petzval.zmx", "biotar\\x", "laikin.ols-99", *code):
         with pytest.raises(InputError, match="missing"):
             resolve(path)
 
@@ -165,6 +166,7 @@ def test_the_command_lists_lenses_and_the_nearest(capsys: pytest.CaptureFixture[
     answer = nl.find("sumilux")
     assert answer.code == 1 and answer["found"] == 0 and len(answer["lenses"]) == 3
     assert "no lens has all these words; the nearest:" in answer.text
+    assert nl.find("?").text == "no lens has these words, nor similar ones"
     assert "photographs" in nl.find("canon ef 20mm").text and "no photographs" in nl.find("noct").text
     assert len(nl.find("swirl")["lenses"]) == len(list(LENSES.glob("*.toml")))
     assert len(nl.find("swirl").text.splitlines()) == 12

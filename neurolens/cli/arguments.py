@@ -29,6 +29,7 @@ from neurolens.base.settings import (
     spelling,
     with_changes,
 )
+from neurolens.base.tomlfile import suggestion
 from neurolens.base.units import as_float
 from neurolens.graph.compiler import compiled_so_far
 from neurolens.optics.lens.shot import BY_LENSES, Shot, StopShape, film_size
@@ -94,11 +95,11 @@ class Parser(argparse.ArgumentParser):
         # Abbreviations are refused, because one may become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # numbers are no options: -12,3 is a value, as -12 is
-        self.intermixed, self.whole, self.alone = False, False, True
+        self.intermixed, self.whole, self.alone, self._passes = False, False, True, False
         self.renamed: Mapping[str, Sequence[str]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse as argparse does, with old names of commands; an intermixed parser reports unknown arguments itself."""
+        """Parse as argparse does, with old names of commands; an unknown option is refused, with the nearest."""
         args = sys.argv[1:] if args is None else list(args)
         args = [*self.renamed.get(args[0], args[:1]), *args[1:]] if args else args
         args = self._sizes(args)
@@ -108,14 +109,18 @@ class Parser(argparse.ArgumentParser):
             self.exit(2, f"{first}\nExample: {re.sub('^neurolens|(?<=&& )neurolens', program(), example)}\n")
         if self.intermixed:
             alone, self.alone, self.intermixed = self.alone, True, False  # argparse comes back here for its two passes
+            self._passes = True
             try:
                 found, rest = self.parse_known_intermixed_args(args, namespace)
             finally:
-                self.alone, self.intermixed = alone, True
-            if rest:
-                self.error(f"unrecognized arguments: {' '.join(rest)}")
-            return found, rest
-        return super().parse_known_args(args, namespace)
+                self.alone, self.intermixed, self._passes = alone, True, False
+        else:
+            found, rest = super().parse_known_args(args, namespace)
+        if rest and not self._passes:
+            word, known = rest[0].partition("=")[0], [key for key in self._option_string_actions if key[:2] == "--"]
+            near = suggestion(word, known) if word.startswith("--") else ""
+            self.error(f"unrecognized arguments: {' '.join(rest)}{near}")
+        return found, rest
 
     def _sizes(self, args: list[str]) -> list[str]:
         """Return the words of a command line, with "--width 3840x2160" turned into width and height."""

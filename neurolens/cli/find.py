@@ -58,8 +58,8 @@ def _text(found: Found, rows: Sequence[Mapping[str, Any]]) -> str:
     header = ("lens", "name", "light", "year", "checked by")
     text = cli.table(header, [_cells(row) for row in rows[:_SHOWN]], left=len(header))
     if not found.hits:
-        scaled = "\nother commands scale any lens: --focal-length MM" * bool(rows)
-        text = f"no lens has all these words; the nearest:\n{text}{scaled}"
+        text = f"no lens has all these words; the nearest:\n{text}\nother commands scale any lens: --focal-length MM"
+        text = text if rows else "no lens has words like these"
     elif len(rows) > _SHOWN:
         text += f"\n{len(rows) - _SHOWN} more: further words leave fewer, --json shows all"
     if found.chosen and len(rows) > 1:

@@ -31,18 +31,20 @@ from neurolens.pictures.flare.canvas import CELLS, FADE, Floats
 from neurolens.pictures.render.colour import SpectralRange, balance
 from neurolens.pictures.render.job import camera_axes
 from neurolens.pictures.render.scene import Scene
+from neurolens.pictures.render.scenetables import BRIGHTEST
 from neurolens.pictures.render.world import World
 
 _PLASTIC = 1.32471795724474602596  # ratio of the R2 sequence (Roberts 2018): x^3 = x + 1
 
 SUN = math.pi  # irradiance by which the sun lights a white card across its way as radiance 1
 MOST_LIGHTS = 10_000  # in a list, and for --most
+_MOST = 10 * BRIGHTEST  # irradiance, above that of a hemisphere of a scene's brightest; float32 holds its pictures
 # Columns of a list of lights: the default (NaN: none), the least and the largest value.
 _COLUMNS: dict[str, tuple[float, float, float]] = {
     "frame": (0.0, -1e7, 1e7),
     "azimuth_deg": (math.nan, -360.0, 360.0),
     "elevation_deg": (math.nan, -90.0, 90.0),
-    **dict.fromkeys("rgb", (SUN, 0.0, 1e30)),
+    **dict.fromkeys("rgb", (SUN, 0.0, _MOST)),
     "diameter_deg": (0.0, 0.0, 90.0),
     "distance_m": (math.inf, 1e-6, math.inf),
     "visible": (1.0, 0.0, 1.0),
@@ -77,7 +79,7 @@ class Light:
         distance_m: from the front vertex; inf allowed. shape: that of an extended light; the angles are of its middle.
 
     Raises:
-        InputError: the light lies behind the lens, the distance is not positive, or an irradiance is negative.
+        InputError: the light lies behind the lens, the distance is not positive, or an irradiance is negative or beyond float32.
     """
 
     azimuth_deg: float
@@ -92,8 +94,8 @@ class Light:
             raise InputError("light", "azimuth, elevation", angles, "angles within 90 degrees of the axis")
         if not self.distance_m > 0:
             raise InputError("light", "distance_m", self.distance_m, "a positive distance in metres, or inf")
-        if not all(0 <= v < math.inf for v in self.rgb):
-            raise InputError("light", "rgb", self.rgb, "three finite numbers of at least 0")
+        if not all(0 <= v <= _MOST for v in self.rgb):
+            raise InputError("light", "rgb", self.rgb, f"three numbers from 0 to {_MOST:g}")
 
     @property
     def towards(self) -> Array:

@@ -96,6 +96,7 @@ def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[
 LAYERS = ("ghosts", "glare", "starburst")
 GLARE = 1 << 18  # photons of the glare where anything scatters
 _MOST_PHOTONS = 1 << 30
+_MOST_GAIN = 1e9
 _QUICK_BINS, _QUICK_CELL_PX, _QUICK_PHOTONS = 5, 24.0, 1 << 16
 
 
@@ -223,8 +224,8 @@ class FlareSettings:
                 "0 beside layers or gains of single ghosts, which photons do not tell apart",
             )
         for name, factor in self.gains.items():
-            if not all(0 <= v < math.inf for v in factor):
-                raise InputError("flare", f"gain {name}", factor, "finite numbers of at least 0")
+            if not all(0 <= v <= _MOST_GAIN for v in factor):
+                raise InputError("flare", f"gain {name}", factor, f"numbers from 0 to {_MOST_GAIN:g}")
         if self.scatter.on and not self.glare:
             object.__setattr__(self, "glare", GLARE)
 
