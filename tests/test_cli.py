@@ -18,6 +18,7 @@ from command_line import described, failure, run_json
 from lens_models import edited
 from shipped import whole
 
+from neurolens.base.units import in_unit
 from neurolens.cli import build_parser, main
 from neurolens.cli.arguments import first_example, scene_file
 from neurolens.cli.train import Train
@@ -126,7 +127,8 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         (["lens", ZOOM, "--zoom", "wide"], ["zoom", "wide", "72mm"]),
         (["lens", GAUSS, "--layout", "a.exr"], ["--layout", ".png"]),
         (["lens", GAUSS, "--layout", "/no/such/folder/a.png"], ["--layout", "folder"]),
-        (["lens", GAUSS, "--foc", "1"], ["--foc"]),
+        (["lens", GAUSS, "--foc", "1"], ["--foc 1; did you mean '--focus'?"]),
+        (["render", "room", "--fnumber=2"], ["--fnumber=2; did you mean '--f-number'?", "neurolens render --help"]),
         (["lens", GAUSS, "-o", "a.toml"], ["-o"]),
         (["lens", GAUSS, "--derive-rims", "--layout", "a.png"], ["--layout"]),
         (["lens", GAUSS, "lenses", "--efl", "20"], ["--focal-length", "one lens file"]),
@@ -550,7 +552,10 @@ def test_values_take_the_units_that_people_type(capsys: pytest.CaptureFixture[st
     for film, mm in (("super35", (24.89, 18.66)), ("Super-35", (24.89, 18.66)), ("36mm x 2.4cm", (36.0, 24.0))):
         assert parse(["flare", str(GAUSS), "--film", film]).film == mm
     assert parse(f"lens {GAUSS} --focus 200cm".split()).focus_m == 2.0
-    assert "metres" in failure(capsys, "lens", GAUSS, "--focus", "2kg")
+    found = parse(["lens", str(GAUSS), "--focus", "6'", "--f-number", "1:2.8"])
+    assert (found.focus_m, found.f_number) == (1.8288, 2.8)
+    assert [in_unit("m", float)(f"3 {mu}m") for mu in "\u00b5\u03bc"] == [3e-6, 3e-6]
+    assert "6ft or inf, in metres" in failure(capsys, "lens", GAUSS, "--focus", "2kg")
     assert "36x24" in failure(capsys, "flare", GAUSS, "--light", "1,1", "--film", "superb")
     assert "the film sets the height" in failure(capsys, "flare", GAUSS, "--light", "1,1", "--width", "384x216")
 

@@ -166,7 +166,7 @@ def test_the_command_lists_lenses_and_the_nearest(capsys: pytest.CaptureFixture[
     answer = nl.find("sumilux")
     assert answer.code == 1 and answer["found"] == 0 and len(answer["lenses"]) == 3
     assert "no lens has all these words; the nearest:" in answer.text
-    assert nl.find("?").text == "no lens has these words, nor similar ones"
+    assert nl.find("?").text == "no lens has words like these"
     assert "photographs" in nl.find("canon ef 20mm").text and "no photographs" in nl.find("noct").text
     assert len(nl.find("swirl")["lenses"]) == len(list(LENSES.glob("*.toml")))
     assert len(nl.find("swirl").text.splitlines()) == 12

@@ -11,7 +11,16 @@ from typing import TypeVar
 T = TypeVar("T")
 # The worth of units, by dimension: a value may be typed with any unit of its option's dimension.
 WORTH: tuple[dict[str, float], ...] = (
-    {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3, "ft": 0.3048, "in": 0.0254, '"': 0.0254},
+    {
+        "m": 1,
+        "cm": 1e-2,
+        "mm": 1e-3,
+        "um": 1e-6,
+        "\N{MICRO SIGN}m": 1e-6,
+        "\N{GREEK SMALL LETTER MU}m": 1e-6,
+        "nm": 1e-9,
+    }
+    | {"km": 1e3, "ft": 0.3048, "'": 0.3048, "in": 0.0254, '"': 0.0254},
     {"deg": 1, "\N{DEGREE SIGN}": 1, "rad": 180 / math.pi},
     {"s": 1, "ms": 1e-3, "min": 60, "h": 3600},
     {"px": 1, "pixels": 1},
@@ -31,13 +40,14 @@ def as_float(text: str) -> float:
 def in_unit(unit: str, convert: Callable[[str], T]) -> Callable[[str], T]:
     """Make the type of an argument whose numbers may have a unit: in_unit("m", float)("6ft") is 1.8288.
 
-    With `unit` "f" it takes f/2. Units may be typed in capitals: 2M is 2 m, for no option has a use for megametres.
+    With `unit` "f" it takes f/2 and 1:2. Units may be typed in capitals: 2M is 2 m, for no option has a use for
+    megametres.
     """
     worth = next((worth for worth in WORTH if unit in worth), {})
 
     def plain(word: str) -> str:
         if unit == "f":
-            return re.sub(r"^f/? ?(?=[\d.])", "", word, flags=re.IGNORECASE)
+            return re.sub(r"^(?:f/? ?|1:)(?=[\d.])", "", word, flags=re.IGNORECASE)
         found = _QUANTITY.fullmatch(word.strip())
         if found is None or (factor := worth.get(found[2].lower())) is None:
             return word

@@ -85,7 +85,7 @@ class Shot:
     film_mm: tuple[float, float]
     focus_m: float = setting(
         math.inf, "distance from the film to the object in focus, or inf (default: {}inf)",
-        within=(1e-6, math.inf), unit="a distance in metres", common=True,
+        within=(1e-6, math.inf), unit="a distance such as 2, 200cm, 6ft or inf, in metres", common=True,
     )  # fmt: skip
     f_number: float | None = setting(
         None, "focal length over entrance-pupil diameter, focused at infinity (default: {}the widest)",

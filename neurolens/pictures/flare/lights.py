@@ -79,7 +79,8 @@ class Light:
         distance_m: from the front vertex; inf allowed. shape: that of an extended light; the angles are of its middle.
 
     Raises:
-        InputError: the light lies behind the lens, the distance is not positive, or an irradiance is negative or beyond float32.
+        InputError: the light lies behind the lens, the distance is not positive, or an irradiance is negative or
+            beyond float32.
     """
 
     azimuth_deg: float
