@@ -49,11 +49,8 @@ cameras:
   thin, pinhole                the same of 50 mm and f/4, or of --focal-length and --f-number
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
                                points with these projections, of 14 mm; --field sets the picture's circle"""
-_SUFFIXES = {
-    "png": (".png", ".pdf", ".svg"),
-    "html": (".html", ".htm"),
-    "npz": (".npz", ".safetensors", ".exr"),
-}  # of files that a placeholder stands for
+# Of files that a placeholder stands for.
+_SUFFIXES = {"png": (".png", ".pdf", ".svg"), "html": (".html", ".htm"), "npz": (".npz", ".safetensors", ".exr")}
 _FEW = 10  # options; the help of more shows those that are marked as common
 
 
@@ -95,7 +92,8 @@ class Parser(argparse.ArgumentParser):
         # Abbreviations are refused, because one may become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # numbers are no options: -12,3 is a value, as -12 is
-        self.intermixed, self.whole, self.alone, self._passes = False, False, True, False
+        self.intermixed: bool | None = False
+        self.whole, self.alone = False, True
         self.renamed: Mapping[str, Sequence[str]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -108,17 +106,16 @@ class Parser(argparse.ArgumentParser):
             example = re.sub(r" *\\\n *", " ", first_example(self.epilog or ""))
             self.exit(2, f"{first}\nExample: {re.sub('^neurolens|(?<=&& )neurolens', program(), example)}\n")
         if self.intermixed:
-            alone, self.alone, self.intermixed = self.alone, True, False  # argparse comes back here for its two passes
-            self._passes = True
+            alone, self.alone, self.intermixed = self.alone, True, None  # argparse comes back here for its two passes
             try:
                 found, rest = self.parse_known_intermixed_args(args, namespace)
             finally:
-                self.alone, self.intermixed, self._passes = alone, True, False
+                self.alone, self.intermixed = alone, True
         else:
             found, rest = super().parse_known_args(args, namespace)
-        if rest and not self._passes:
-            word, known = rest[0].partition("=")[0], [key for key in self._option_string_actions if key[:2] == "--"]
-            near = suggestion(word, known) if word.startswith("--") else ""
+        if rest and self.intermixed is not None:
+            known = [key for key in self._option_string_actions if key.startswith("--")]
+            near = suggestion(rest[0].partition("=")[0], known) * rest[0].startswith("--")
             self.error(f"unrecognized arguments: {' '.join(rest)}{near}")
         return found, rest
 
@@ -576,10 +573,8 @@ def number(value: Any, digits: int = 4) -> str:
         return value or "-"
     if isinstance(value, int):
         return str(value)
-    if math.isnan(value):
-        return "-"
-    if math.isinf(value):
-        return "infinity"
+    if not math.isfinite(value):
+        return "-" if math.isnan(value) else "infinity"
     text = f"{value + 0.0:.{digits}g}"  # turns -0 into 0
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
