@@ -131,8 +131,8 @@ def test_points_and_what_is_no_place_at_all() -> None:
 
 
 CASES = {
-    # Bare: what many layers reflect changes over a ghost, whose fewest cells then leave up to 9% of its light wrong.
     "open": lambda: set_lens(lens_of("laikin_double_gauss_50"), coating="bare"),
+    "layers": lambda: set_lens(lens_of("laikin_double_gauss_50"), coating="multi-layer"),
     "blades": lambda: replace(
         set_lens(lens_of("laikin_double_gauss_50"), f_number=5.6), aperture=Aperture(blades=6, curvature=0.3)
     ),
@@ -141,10 +141,14 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    ("case", "distance_m"), [("blades", math.inf), ("open", 0.6), *whole(("open", math.inf), ("phone", math.inf))]
+    ("case", "distance_m"),
+    [("blades", math.inf), ("layers", math.inf), ("open", 0.6), *whole(("open", math.inf), ("phone", math.inf))],
 )
 def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> None:
-    """Every ghost that counts: grid and low-discrepancy rays agree in the light that falls on the film."""
+    """Every ghost that counts: grid and low-discrepancy rays agree in the light that falls on the film.
+
+    What many layers reflect changes threefold over a ghost, of which its fewest cells leave up to 4% wrong.
+    """
     lens, light = CASES[case](), Light(11.0, -6.0, distance_m=distance_m)
     tracer = GhostTracer(lens)
     size = 6.0 if case == "phone" else 36.0
@@ -164,7 +168,9 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
         edges = edges_of(found.rows[0], grid.columns, (96, 64), 96 / size)
         picture = np.zeros((64, 96, 3), np.float32)
         draw_edges(picture, range(64), edges, np.array([len(edges)]), np.full((1, 3), area * grid.cell))
-        assert picture[..., 0].sum(dtype=np.float64) == pytest.approx(wanted, rel=0.01 + off)
+        assert picture[..., 0].sum(dtype=np.float64) == pytest.approx(
+            wanted, rel=(0.04 if case == "layers" else 0.01) + off
+        )
     total = sum(w for p, w in zip(tracer.pairs, expected, strict=True) if p not in grids)
     assert total < 1e-3 * expected.sum()
 
