@@ -53,7 +53,7 @@ def measured(scene: Scene, camera: Any, mode: Any, args: argparse.Namespace) -> 
         seconds.append(lab.cpu_s() - began)
         pictures.append(found.rgb.astype(np.float64))
     rgb = np.stack(pictures)
-    return {"mean": rgb.mean(axis=(0, 1, 2)), "seconds": min(seconds), "mode": found.stats["wavelengths"],
+    return {"mean": rgb.mean(axis=(0, 1, 2)), "seconds": min(seconds), "mode": found.stats.wavelengths,
             "luminance": (rgb @ SRGB.to_xyz[1]).var(axis=0, ddof=1), "channels": rgb.var(axis=0, ddof=1)}  # fmt: skip
 
 

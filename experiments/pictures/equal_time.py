@@ -185,7 +185,7 @@ def measure_scene(file: Path, counts: Counts, threads: int, report: lab.Report) 
         )  # fmt: skip
         done += samples
         report(done / total)
-        return made.rgb.astype(np.float64), float(made.stats["seconds"])
+        return made.rgb.astype(np.float64), float(made.stats.seconds)
 
     halves = [drawn(cameras[EXACT], counts.reference, _REFERENCE_SEED + k, 2)[0] for k in range(2)]
     for camera in cameras.values():  # the first render of a camera loads code and fills caches

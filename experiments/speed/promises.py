@@ -159,7 +159,7 @@ def check_floors(rounds: int) -> list[lab.Goal]:
     shot = scene.settings.camera
     camera = ThinLens(50.0, shot.f_number or 2.8, shot.focus_m, shot.film_mm)
     drawn = [render(scene, camera, seed=k, threads=2, max_depth=3, samples=16) for k in range(5)]
-    speed = max(float(picture.stats["mpaths_per_s"]) for picture in drawn)
+    speed = max(float(picture.stats.mpaths_per_s) for picture in drawn)
     return [*floors, lab.Goal("render of the room, two cores, depth 3, Mpath/s", RENDER_MPATH_S, speed, at_least=True)]
 
 

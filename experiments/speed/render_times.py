@@ -131,8 +131,8 @@ def time_renders(subjects: Sequence[Subject], scenes: dict[str, Scene], size: di
                 few = pixels if k >= 0 else pixels | {"samples": 1}
                 stats = render(shown, camera, **few, seed=1, threads=1, film=film).stats
                 if k >= 0:
-                    s.seconds[cost].append(stats["seconds"])
-                    s.camera_s[cost].append(stats["camera_thread_seconds"])
+                    s.seconds[cost].append(stats.seconds)
+                    s.camera_s[cost].append(stats.camera_thread_seconds)
             report((k + 1 + (i + 1) / len(runs)) / (max(rounds.values()) + 1))
 
 

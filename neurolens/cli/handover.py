@@ -234,9 +234,11 @@ class Handed(Report):
 
     def text(self) -> str:
         """Return a table of what each standard leaves."""
-        names = {"ST maps, there and back": "maps_px", "NVIDIA's lookup pictures": "exit_px"}
-        names |= {"ray of each pixel, at any distance": "noncentral_px"}
-        names |= {"OpenTrackIO": "opentrackio_px", "lensfun": "lensfun_px", "lensfun, colours": "colour_px"}
+        names = {
+            "ST maps, there and back": "maps_px", "NVIDIA's lookup pictures": "exit_px",
+            "ray of each pixel, at any distance": "noncentral_px", "OpenTrackIO": "opentrackio_px",
+            "lensfun": "lensfun_px", "lensfun, colours": "colour_px",
+        }  # fmt: skip
         rows = [(name, f"{self.left[key]:.2g}") for name, key in names.items() if key in self.left]
         rows += [(kind, f"{fit.worst_px:.2g}") for kind, fit in self.projections.items()]
         maps, first = self.maps, self.maps.frames[0]

@@ -20,9 +20,6 @@ from neurolens.optics.lens.shot import Dispersion, Shot
 if TYPE_CHECKING:
     from neurolens.optics.lens.prescription import Lens
     from neurolens.studies.plan import plan as plans
-    from neurolens.studies.plan.candidates import Choice
-
-_LEAST_S = 1e-3  # a picture's time is known no finer
 
 
 def _budget(text: str) -> float:
@@ -171,11 +168,10 @@ class Planned(Report):
         best = self.plan.best
         if best is None or not self.plan.work.whole or self.plan_s <= SHARE * best.seconds:
             return []
-        every = "every camera was timed, as asked"
-        why = every if self.every else "setting up a lens takes seconds, however small the picture"
-        ratio = self.plan_s / max(best.seconds, _LEAST_S)
+        every, small = "every camera was timed, as asked", "setting up a lens takes seconds, however small the picture"
+        ratio = self.plan_s / max(best.seconds, 1e-3)  # a picture's time is known no finer
         spent, times = (cli.number(float(f"{value:.2g}"), 3) for value in (self.plan_s, ratio))
-        return [f"This plan took {spent} CPU seconds, {times} times its picture: {why}."]
+        return [f"This plan took {spent} CPU seconds, {times} times its picture: {every if self.every else small}."]
 
     def _needs(self) -> str:
         """Tell what the scene asks of the lens."""
@@ -207,7 +203,7 @@ class Planned(Report):
         plan = self.plan
         best, front = plan.best and plan.best.name, plan.front
         rows = [
-            (f"{'● ' if c.name == best else '○ ' if c.name in front else ''}{_short(c)}", cli.number(c.error_px, 3),
+            (f"{'● ' if c.name == best else '○ ' if c.name in front else ''}{c.short}", cli.number(c.error_px, 3),
              cli.number(100 * c.light_error, 2), "~" * c.noisy + cli.number(c.seconds, 3),
              cli.number(c.camera_seconds, 2), cli.number(c.noise, 3), c.how)
             for c in plan.choices
@@ -230,7 +226,7 @@ def _sentences(plan: plans.Plan) -> list[str]:
         closest = f"; the closest is {nearest.name} with {cli.number(nearest.error_px, 3)} px" if nearest else ""
         return [f"No camera for --for {plan.target} keeps {plan.budget_px:g} px{closest}."]
     how = f", {best.how}" * bool(best.how)
-    lines = [f"Use {_short(best)}{how}: {cli.number(best.error_px, 3)} px of {plan.budget_px:g}."]
+    lines = [f"Use {best.short}{how}: {cli.number(best.error_px, 3)} px of {plan.budget_px:g}."]
     if plan.work.whole:
         lines.append(
             f"The picture takes about {seconds(best.seconds)} s of one thread to the noise that the scene's samples "
@@ -244,7 +240,3 @@ def _sentences(plan: plans.Plan) -> list[str]:
         more = f"Dispersion takes {seconds(times)} times the samples"
         lines.append(f"{more}; --dispersion lateral leaves longitudinal colour out.")
     return lines
-
-
-def _short(choice: Choice) -> str:
-    return choice.name.rpartition(".")[2]

@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from neurolens.base.errors import NeurolensError, printable, warn
 from neurolens.base.files import atomic_write_text, library
 from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
-from neurolens.base.records import plain, program
+from neurolens.base.records import program
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import changed, group, positive, setting
 from neurolens.base.tasks import Stopping, Unfinished
 from neurolens.cameras.contract import FloatArray
@@ -28,7 +29,7 @@ from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.pictures.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
 from neurolens.pictures.frames.farm import how_to_resume, render_frames
 from neurolens.pictures.render.pictures import write_png
-from neurolens.pictures.render.renderer import RenderResult, Watch, merge_tiles, tile_path
+from neurolens.pictures.render.renderer import RenderResult, Statistics, Watch, merge_tiles, tile_path
 from neurolens.pictures.render.settings import FilmSettings, SensorSettings
 
 _FARMS, _LONG = "farms", "long renders"  # titles in the help
@@ -175,22 +176,20 @@ examples:
         files = prepared.files
         with Stopping() as stopping, progress.stage(f"render {prepared.name}") as report:
             result = prepared.render(self.threads, report, self._watch(files, stopping))
-            if not result.stats["complete"]:
+            if not result.stats.complete:
                 raise Unfinished
         kept = files.kept() if stopping() else self.kept
-        if not result.stats["paths"]:
+        if not result.stats.paths:
             return _interrupted(stopping, kept)
         with cli.keeps(kept):
             write_pictures(prepared, result, flare)
-        if dropped := result.stats["dropped_samples"]:
-            warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
-        if not result.stats["complete"]:
+        if dropped := result.stats.dropped_samples:
+            warn(f"{dropped} of {result.stats.paths} samples were not finite and count as black")
+        if not result.stats.complete:
             return _interrupted(stopping, f"{_so_far(result, files)}; {files.kept()}")
         if not self.keep_checkpoint:
             files.checkpoint.unlink(missing_ok=True)
-        stats = plain(result.stats)
-        data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": prepared.camera.settings}
-        return self.answer(data, lambda: _summary(stats, files))
+        return self.answer(Rendered(str(files.out), str(files.preview), result.stats, prepared.camera.settings))
 
     def _watch(self, files: Files, stop: Stopping) -> Watch:
         """Return what watches a render: it updates the preview, writes checkpoints, and stops when asked to."""
@@ -240,18 +239,28 @@ def _so_far(result: RenderResult, files: Files) -> str:
     samples = result.layers.samples
     least, most = int(samples.min()), int(samples.max())
     spread = f" ({least} to {most})" if least < most else ""
-    done, asked = result.stats["samples_done"], result.stats["samples"]
+    done, asked = result.stats.samples_done, result.stats.samples
     return f"{files.out} holds {done:.3g} of {asked} samples per pixel{spread}"
 
 
-def _summary(stats: dict[str, Any], files: Files) -> str:
-    """Return the summary of a finished render."""
-    return (
-        f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
-        f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "
-        f"{100 * stats['passed_fraction']:.0f}% of the rays pass, "
-        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{files.out}\n{files.preview}"
-    )
+@dataclass(frozen=True)
+class Rendered(Report):
+    """A finished picture, with what it took and the settings of its camera."""
+
+    file: str
+    preview: str
+    took: Statistics = field(metadata=PART)
+    camera: Mapping[str, Any]
+
+    def text(self) -> str:
+        """Return its size, time and files."""
+        took = self.took
+        return (
+            f"{took.scene} through {took.camera}: {took.settings['width']} x {took.settings['height']}, {took.samples} "
+            f"samples in {duration(took.seconds)} ({took.mpaths_per_s:.2f} Mpath/s, "
+            f"{100 * took.passed_fraction:.0f}% of the rays pass, "
+            f"{100 * took.camera_fraction:.0f}% of the time in the camera)\n{self.file}\n{self.preview}"
+        )
 
 
 _LENS = "laikin_double_gauss_50"

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError, NeurolensError, pip_install
 from neurolens.base.progress import Report
+from neurolens.base.records import plain
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera, FloatArray
@@ -289,10 +290,11 @@ def render_all(
                 done += 1
                 report(done / total)
             stats = result.stats
-            share, record = stats["camera_fraction"], {"name": name, "scene": scene.name, "render_s": stats["seconds"]}
-            record |= {"camera_s": share * stats["seconds"], "camera_share": share}
-            records.cameras.append(record | {key: stats[key] for key in ("samples", "width", "height", "threads")})
-            metadata = {"render": result.stats, "camera": camera.settings, "mean_of_renders": choice.seeds}
+            share, record = stats.camera_fraction, {"name": name, "scene": scene.name, "render_s": stats.seconds}
+            record |= {"camera_s": share * stats.seconds, "camera_share": share, "samples": stats.samples}
+            size = {key: stats.settings[key] for key in ("width", "height")}
+            records.cameras.append(record | size | {"threads": stats.threads})
+            metadata = {"render": plain(stats), "camera": camera.settings, "mean_of_renders": choice.seeds}
             file, mean = folder / f"{_stem(scene, name)}.exr", np.mean(renders[name], axis=0, dtype=np.float32)
             attributes = standard_attributes(camera.settings, choice.width, choice.height)
             write_exr(file, mean, half=True, metadata=metadata, attributes=attributes)

@@ -228,10 +228,10 @@ class Prepared:
             result = taken(self.camera, watch)
             behind = watch and replace(watch, preview=None, checkpoint=None)
             for k in range(1, frame.behind + 1):
-                if result.stats["complete"]:
+                if result.stats.complete:
                     layer = taken(Behind(self.camera, self.scene, k), behind)
-                    if not layer.stats["complete"]:  # the picture itself is in its checkpoint; its layers begin anew
-                        result.stats["complete"] = False
+                    if not layer.stats.complete:  # the picture itself is in its checkpoint; its layers begin anew
+                        result = replace(result, stats=replace(result.stats, complete=False))
                         if result.save is not None:
                             result.save()
                         break
@@ -390,7 +390,7 @@ def write_pictures(
     metadata: dict[str, Any] = {"version": __version__, "scene": str(frame.scene), "camera": camera}
     metadata |= {"render": plain(result.stats), "colour": space.stated}
     layers: Layers = {}
-    if frame.channels == "all" or not result.stats["complete"]:
+    if frame.channels == "all" or not result.stats.complete:
         layers, metadata["layers"] = asdict(result.layers), dict(MEANING)
     for k, layer in enumerate(result.behind, 1):
         behind = converted(layer.rgb, conversion(SRGB, space)).astype(np.float32)

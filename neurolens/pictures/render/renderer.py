@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import check_writable
+from neurolens.base.report import PART
 from neurolens.base.tasks import Failed, Forked, Here, run_each
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.pictures.render.colour import COLOUR_SPACES, SRGB, check_name, conversion, converted
@@ -158,16 +159,42 @@ class Keeper:
         return done + max(pause_s, _REST * (done - began))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Statistics:
+    """What a render took, or that of some rows. Seconds and samples include those before a checkpoint.
+
+    Attributes:
+        samples_done: mean of a pixel. dropped_samples: were not finite, and count as black.
+        settings: those that decide the picture, its width and height among them.
+        wavelengths: how a path takes them. passed_fraction: of the camera rays.
+        thread_seconds: summed over the workers. camera_thread_seconds, camera_fraction: of these, in the camera.
+    """
+
+    scene: str
+    threads: int
+    camera: str
+    samples: int
+    samples_done: float
+    complete: bool
+    settings: dict[str, Any] = field(metadata=PART)
+    wavelengths: str
+    wavelengths_nm: tuple[float, float]
+    seconds: float
+    paths: int
+    mpaths_per_s: float
+    passed_fraction: float
+    dropped_samples: int
+    thread_seconds: float
+    camera_thread_seconds: float
+    camera_fraction: float
+
+
 @dataclass(frozen=True)
 class RenderResult:
     """A picture and how it was made.
 
     Attributes:
         rgb: [H, W, 3] float32 linear sRGB; a uniform environment of radiance 1 gives 1 on the axis.
-        stats: JSON-able; settings, complete, samples_done (mean a pixel), seconds, paths, mpaths_per_s,
-            passed_fraction, thread_seconds (summed over the workers), camera_thread_seconds (of these, in the camera),
-            camera_fraction (their ratio), dropped_samples (not finite; they count as black). Seconds and dropped
-            samples include those before a checkpoint.
         layers: additional channels.
         identity: what pictures of the same settings have in common, to tell whether rows belong together; only of a
             part of a picture.
@@ -177,7 +204,7 @@ class RenderResult:
     """
 
     rgb: FloatArray
-    stats: dict[str, Any]
+    stats: Statistics
     layers: Layers
     identity: dict[str, Any] | None = None
     save: Callable[[], None] | None = None
@@ -246,14 +273,13 @@ def render(
     finally:
         seconds = keeper.seconds
     keeper.finish()
-    rgb, layers = develop(job)
-    stats = {"scene": scene.name, "threads": threads, **_stats(job, seconds)}
+    (rgb, layers), took = develop(job), _statistics_of(job, threads, seconds)
     # `keeper` itself would keep the film's sums in memory.
     save = keeper.save if watch is not None and watch.checkpoint is not None else None
-    return RenderResult(rgb, stats, layers, None if rows is None else identity(job), save)
+    return RenderResult(rgb, took, layers, None if rows is None else identity(job), save)
 
 
-def _stats(job: Job, seconds: float) -> dict[str, Any]:
+def _statistics_of(job: Job, threads: int, seconds: float) -> Statistics:
     tiling = job.tiling
     began = tiling.tile * np.arange(tiling.tiles)
     ends = np.minimum(began + tiling.tile, job.own.stop)
@@ -261,23 +287,14 @@ def _stats(job: Job, seconds: float) -> dict[str, Any]:
     paths = int(np.sum(pixels * tiling.samples_done(job.film.done)))
     sums = job.film.sums[job.own]
     camera_s, thread_s = (float(s) for s in job.film.seconds)
-    return {
-        "camera": job.camera.name,
-        "samples": tiling.samples,
-        "samples_done": paths / len(sums),
-        "complete": job.film.fraction == 1,
-        **job.picture_settings(),
-        "wavelengths": job.mode,
-        "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
-        "seconds": seconds,
-        "paths": paths,
-        "mpaths_per_s": paths / seconds * 1e-6,
-        "passed_fraction": float(sums[:, PASSED].sum()) / max(paths, 1),
-        "dropped_samples": int(sums[:, DROPPED].sum()),
-        "thread_seconds": thread_s,
-        "camera_thread_seconds": camera_s,
-        "camera_fraction": camera_s / max(thread_s, 1e-12),
-    }
+    return Statistics(
+        scene=job.scene.name, threads=threads, camera=job.camera.name, samples=tiling.samples,
+        samples_done=paths / len(sums), complete=job.film.fraction == 1, settings=job.picture_settings(),
+        wavelengths=job.mode, wavelengths_nm=(job.spectral.low_nm, job.spectral.high_nm), seconds=seconds, paths=paths,
+        mpaths_per_s=paths / seconds * 1e-6, passed_fraction=float(sums[:, PASSED].sum()) / max(paths, 1),
+        dropped_samples=int(sums[:, DROPPED].sum()), thread_seconds=thread_s, camera_thread_seconds=camera_s,
+        camera_fraction=camera_s / max(thread_s, 1e-12),
+    )  # fmt: skip
 
 
 def _count(field: str, value: int, most: float = math.inf) -> int:

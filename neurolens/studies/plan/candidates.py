@@ -80,6 +80,11 @@ class Choice:
     camera_seconds: float = math.inf
 
     @property
+    def short(self) -> str:
+        """Its name without that of the lens."""
+        return self.name.rpartition(".")[2]
+
+    @property
     def noisy(self) -> bool:
         """Whether its timing spreads too far to tell it from one that is a little shorter: see `records.noisy`."""
         return noisy({"min": 1.0, "median": self.spread})

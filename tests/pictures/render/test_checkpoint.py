@@ -58,7 +58,7 @@ def test_what_a_failed_render_had_goes_on_to_the_same_picture(first: int, then: 
     reports: list[float] = []
     watch = Watch(checkpoint=part)
     resumed = render(lit_scene(), camera, threads=then, watch=watch, progress=lambda f, s: reports.append(f), **options)
-    assert resumed.stats["complete"] and all(2 / 3 < f <= 1 for f in reports)
+    assert resumed.stats.complete and all(2 / 3 < f <= 1 for f in reports)
     assert same(resumed, render(lit_scene(), camera, threads=1, **options))
 
 
@@ -67,9 +67,9 @@ def test_a_render_that_is_asked_to_stop_gives_the_picture_so_far(tmp_path: Path)
     part = tmp_path / "a.exr.part"
     stopped = render(lit_scene(), THIN, samples=100_000, watch=Watch(checkpoint=part, stop=lambda: True), **SIZE)
     samples = stopped.layers.samples
-    assert not stopped.stats["complete"] and stopped.stats["samples_done"] == pytest.approx(samples.mean())
+    assert not stopped.stats.complete and stopped.stats.samples_done == pytest.approx(samples.mean())
     assert samples.max() - samples.min() <= 16 and not samples.max() % 16
-    assert not part.exists() or stopped.stats["paths"] > 0
+    assert not part.exists() or stopped.stats.paths > 0
     enough = int(samples.max()) + 16
     resumed = render(lit_scene(), THIN, samples=enough, watch=Watch(checkpoint=part), **SIZE)
     assert same(resumed, render(lit_scene(), THIN, samples=enough, threads=1, **SIZE))
@@ -164,9 +164,9 @@ def test_samples_that_are_not_finite_are_dropped_counted_and_remembered(mode: An
     # They count as black: the same picture as where their rays do not pass.
     black = render(bright, Spoilt(50.0, 2.0, 3.0, FILM, spoilt=False), samples=32, threads=1, film=film, **SIZE)
     assert np.all(np.isfinite(found.rgb)) and np.all(np.isfinite(found.layers.variance))
-    assert black.stats["dropped_samples"] == 0 and np.array_equal(found.rgb, black.rgb)
-    spoilt = (found.stats["passed_fraction"] - black.stats["passed_fraction"]) * 32 * 36 * 24
-    assert found.stats["dropped_samples"] == round(spoilt) > 100
+    assert black.stats.dropped_samples == 0 and np.array_equal(found.rgb, black.rgb)
+    spoilt = (found.stats.passed_fraction - black.stats.passed_fraction) * 32 * 36 * 24
+    assert found.stats.dropped_samples == round(spoilt) > 100
     assert np.array_equal(found.layers.variance, black.layers.variance)
 
 
@@ -243,5 +243,5 @@ def test_a_checkpoint_that_does_not_fit_the_disk_leaves_the_older_one_and_the_re
     before = part.read_bytes()
     with files_of_at_most(20_000):
         found = kept_render(part, samples=32, watch=Watch(checkpoint=part, keep=True, note=told.append))
-    assert found.stats["complete"] and told == [f"checkpoint not written: {part}: File too large"]
+    assert found.stats.complete and told == [f"checkpoint not written: {part}: File too large"]
     assert part.read_bytes() == before and os.listdir(tmp_path) == [part.name]

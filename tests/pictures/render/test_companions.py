@@ -156,7 +156,7 @@ def in_modes(camera: Any, samples: int, light: str = "D65", modes: Any = ("one",
     made = replace(made, settings=replace(made.settings, camera=replace(made.settings.camera, film_mm=camera.film_mm)))
     size = LARGE | {"height": round(LARGE["width"] * camera.film_mm[1] / camera.film_mm[0])}
     found = [render(made, camera, samples=samples, film=FilmSettings(wavelengths=mode), **size) for mode in modes]
-    assert [f.stats["wavelengths"] for f in found] == ["one", "companions"][-len(modes) :]
+    assert [f.stats.wavelengths for f in found] == ["one", "companions"][-len(modes) :]
     return [f.rgb.astype(np.float64) for f in found]
 
 
@@ -238,12 +238,12 @@ def test_any_number_of_workers_and_an_interruption_give_the_same_picture(
     monkeypatch.setattr("neurolens.pictures.render.job._LITTLE_PX", 0.0)
     made, camera, part = edges(), compiled(model_camera()), tmp_path / "a.part"
     all_of_it = render(made, camera, **options)
-    assert all_of_it.stats["wavelengths"] == "companions"
+    assert all_of_it.stats.wavelengths == "companions"
     assert same(render(made, camera, **options | {"threads": 3}), all_of_it)
     calls = iter([False])
     watch = Watch(checkpoint=part, stop=lambda: next(calls, True))
     first = render(made, camera, **options | {"threads": 2}, watch=watch)
-    assert not first.stats["complete"]
+    assert not first.stats.complete
     assert same(render(made, camera, watch=Watch(checkpoint=part), **options), all_of_it)
     rows = [render(made, camera, rows=rows, **options).rgb for rows in ((0, 27), (27, 28), (28, 80))]
     assert np.array_equal(np.concatenate(rows), all_of_it.rgb)

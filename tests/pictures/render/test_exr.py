@@ -248,7 +248,7 @@ def test_previews_come_while_the_render_goes_on(monkeypatch: pytest.MonkeyPatch)
     watch = Watch(preview=shown.append, preview_s=0, stop=lambda: len(shown) > 1)
     made = scene(GREY, environment=WHITE)
     found = render(made, Pinhole(4000.0, FILM), **SIZE, samples=100_000, watch=watch)
-    assert not found.stats["complete"] and found.layers.samples.max() < 100_000
+    assert not found.stats.complete and found.layers.samples.max() < 100_000
     for preview in (*shown, found.rgb):
         lit = preview > 0
         assert lit.any() and preview[lit] == pytest.approx(np.ones(np.count_nonzero(lit)), rel=1e-4)
@@ -263,4 +263,4 @@ def test_a_preview_that_cannot_be_written_is_told_once_and_the_render_goes_on(tm
     watch = Watch(preview=fails, preview_s=0, note=told.append)
     made = scene(environment=WHITE)
     found = render(made, Pinhole(50.0, FILM), width=90, height=60, samples=64, threads=1, watch=watch)
-    assert found.stats["complete"] and told == ["preview not written: p.png: Permission denied"]
+    assert found.stats.complete and told == ["preview not written: p.png: Permission denied"]

@@ -62,7 +62,7 @@ def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.Monk
     assert np.array_equal(one.rgb, two.rgb)
     assert not np.array_equal(one.rgb, render(made, camera, threads=1, seed=1, **options).rgb)
     assert seen == sorted(seen) and all(0 < x <= 1 for x in seen)
-    assert one.stats["paths"] == 36 * 24 * 40 and one.stats["passed_fraction"] == 1
+    assert one.stats.paths == 36 * 24 * 40 and one.stats.passed_fraction == 1
     assert one.rgb.shape == (24, 36, 3) and one.rgb.dtype == np.float32
 
 
@@ -88,7 +88,7 @@ class HalfBlocked(Pinhole):
 def test_rays_that_do_not_pass_are_black_whatever_they_hold() -> None:
     result = render(lit_scene(), HalfBlocked(50.0, FILM), **SIZE, samples=4)
     assert not result.rgb[:, :18].any() and result.rgb[:, 18:].mean() > 0.5
-    assert result.stats["passed_fraction"] == pytest.approx(0.5, abs=1e-6)
+    assert result.stats.passed_fraction == pytest.approx(0.5, abs=1e-6)
 
 
 class Prism(Pinhole):

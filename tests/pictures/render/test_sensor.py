@@ -241,7 +241,7 @@ def test_a_pixel_that_is_not_whole_takes_no_companions(scene: Path) -> None:
     camera = make_camera(MODEL, Shot((36.0, 24.0), 1.0))
     film = FilmSettings(fill_factor=0.5)
     sizes = {"width": 960, "height": 640, "samples": 1, "threads": 1, "rows": (0, 1)}
-    assert render(scene_from_tables(tables), camera, film=film, **sizes).stats["wavelengths"] == "one"  # type: ignore[arg-type]
+    assert render(scene_from_tables(tables), camera, film=film, **sizes).stats.wavelengths == "one"  # type: ignore[arg-type]
     with pytest.raises(InputError, match="film.wavelengths"):
         render(scene_from_tables(tables), camera, film=FilmSettings(wavelengths="hero", fill_factor=0.5), **sizes)  # type: ignore[arg-type]
 

@@ -184,7 +184,7 @@ def test_a_camera_that_disperses_gets_one_wavelength_a_path() -> None:
 
     def mode(camera: Any, wavelengths: str = "auto") -> str:
         film = FilmSettings(wavelengths=wavelengths)  # type: ignore[arg-type]
-        return str(render(made, camera, film=film, **options).stats["wavelengths"])
+        return str(render(made, camera, film=film, **options).stats.wavelengths)
 
     assert mode(Pinhole(40.0, FILM)) == "hero" and mode(Pinhole(40.0, FILM), "one") == "one"
     assert mode(prism(0.05)) == "one"
