@@ -18,7 +18,7 @@ import tmm
 from command_line import described, failure, run_json
 
 import neurolens as nl
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError, Note
 from neurolens.cameras.build import make_camera
 from neurolens.cli import _FIRST, build_parser, command, main
 from neurolens.cli.arguments import Reporting
@@ -336,3 +336,9 @@ def test_packages_that_are_missing_in_a_call_are_named(monkeypatch: pytest.Monke
     monkeypatch.setattr("neurolens.cli.export.Export.run", run)
     with pytest.raises(NeurolensError, match="pip install"):
         nl.export(MODEL, to="c", output="a.h")
+
+
+def test_notes_of_a_call_point_to_the_line_of_the_caller() -> None:
+    with pytest.warns(Note) as said:
+        nl.projection("double gauss 100 1.1", width=48)
+    assert {w.filename for w in said} == {__file__} and any("assumed: --film" in str(w.message) for w in said)

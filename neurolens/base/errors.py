@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -85,12 +86,21 @@ class Note(NeurolensWarning):
 
 def note(text: str) -> None:
     """Say on stderr what was taken or assumed, a `Note`."""
-    warnings.warn(text, Note, stacklevel=2)
+    warnings.warn(text, Note, stacklevel=_outside())
 
 
 def warn(text: str) -> None:
     """Warn with a NeurolensWarning, which the command line prints to stderr."""
-    warnings.warn(text, NeurolensWarning, stacklevel=2)
+    warnings.warn(text, NeurolensWarning, stacklevel=_outside())
+
+
+def _outside() -> int:
+    """Return the `stacklevel` of the line that called this package, which Python shows with a warning."""
+    own, frame, found = str(Path(__file__).parents[1]), sys._getframe(1), [True]
+    while frame.f_back is not None:
+        frame = frame.f_back
+        found.append(frame.f_code.co_filename.startswith(own))
+    return len(found) - found[::-1].index(True) + 1
 
 
 @contextmanager
