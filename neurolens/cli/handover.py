@@ -243,5 +243,5 @@ class Handed(Report):
         rows += [(kind, f"{fit.worst_px:.2g}") for kind, fit in self.projections.items()]
         maps, first = self.maps, self.maps.frames[0]
         heading = f"{maps.camera}: {len(maps.files)} files are written; README.md in their folder explains them"
-        told = f"{cli.table(('left at most, of what is in focus', 'pixels'), rows)}"
+        told = f"{cli.table(('largest error of what is in focus', 'pixels'), rows)}"
         return f"{heading}\n{told}\n{one_centre(first.parallax, first.ideal.before_film_mm)}"

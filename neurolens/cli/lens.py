@@ -289,7 +289,7 @@ class Described(Report):
         along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
         reached = facts.half_field_reached_deg, facts.half_field_reached_x_deg
         half, half_x = ("-" if v is None else f"{v:.2f} degrees" for v in reached)
-        share_of = "of rays uniform over the film and over the disc of all passing rays, 5% wider"
+        share_of = "of rays spread evenly over the film, and over a disc 5% wider than all that pass"
         rows = [
             ("image radius", f"{cli.number(facts.image_radius_mm)} mm", f"from {facts.image_radius_from}"),
             ("half field", half, f"reached at the edge of the film{along}{states}"),

@@ -377,7 +377,7 @@ class Maps(Report):
         lines = [
             f"{self.camera}: picture {width} x {height}, undistorted {wide} x {high} pixels "
             f"(overscan {fx:.4f} x {fy:.4f}), {film} mm",
-            f"undistorted, {ideal.projection}: focal length {focal} mm, its point {before} mm before the film"
+            f"undistorted, {ideal.projection}: focal length {focal} mm, the pinhole {before} mm before the film"
             + (" (first frame)" if len(self.frames) > 1 else ""),
             f"distortion moves points by up to {moved:.4g} pixels; there and back within {missed:.2g}",
         ]
@@ -396,11 +396,13 @@ class Maps(Report):
 def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) -> str:
     """Return what one centre leaves of things at other distances, as a sentence."""
     told = [
-        f"{cli.number(p['rms_px'], 2)} pixels RMS, {cli.number(p['worst_px'], 2)} at most, {_where(p['distance_m'])}"
+        f"{cli.number(p['rms_px'], 2)} pixels RMS, {cli.number(p['worst_px'], 2)} at most, for things "
+        f"{_where(p['distance_m'])}"
         for p in parallax
     ]
     before = " x ".join(dict.fromkeys(cli.number(v, 4) for v in before_film_mm))
-    return f"the entrance pupil moves with the field: one centre, {before} mm before the film, leaves {'; '.join(told)}"
+    moves = "the entrance pupil moves with the field, so that one centre"
+    return f"{moves}, {before} mm before the film, is off by {'; '.join(told)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -503,13 +505,13 @@ class Projected(Report):
         lines = [
             f"{found.camera}, {found.model}: {radii}, centre {centre} pixels",
             numbers,
-            f"leaves {found.rms_px:.3g} pixels RMS, {worst} of what is in focus",
+            f"what is in focus is off by {found.rms_px:.3g} pixels RMS, {worst}",
             cli.table(header, rows),
             one_centre(found.parallax or [], found.before_film_mm),
         ]
         if found.noncentral is not None:
             rms, most = (cli.number(max(row[key] for row in found.noncentral), 2) for key in ("rms_px", "worst_px"))
-            lines.append(f"the ray of each pixel leaves {rms} pixels RMS, {most} at most, at all these distances")
+            lines.append(f"the ray of each pixel is off by {rms} pixels RMS, {most} at most, at all these distances")
         if found.model == "kannala-brandt" and found.field_deg >= 90:
             lines.append("OpenCV's own functions end at 90 degrees, for they divide by z")
         return "\n".join([*lines, *self.files])

@@ -143,7 +143,9 @@ def test_parallax_is_the_walk_of_the_entrance_pupil(capsys: pytest.CaptureFixtur
         assert close["worst_px"] / far["worst_px"] == pytest.approx((near[metres][1] - one) / one, rel=0.2)
         assert far["worst_px"] > 20
     assert main(["projection", str(FISHEYE), *words]) == 0
-    assert re.search(r"leaves \S+ pixels RMS, \S+ at most, at infinity; \S+ pixels RMS", capsys.readouterr().out)
+    assert re.search(
+        r"is off by \S+ pixels RMS, \S+ at most, for things at infinity; \S+ pixels RMS", capsys.readouterr().out
+    )
     ideal = run_json(capsys, "projection", "fisheye-equidistant", *words)
     assert all(row["worst_px"] < 0.01 for row in ideal["parallax"])
 
