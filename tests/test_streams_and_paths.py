@@ -107,13 +107,19 @@ BROKEN = {
     "projection": ["projection", "broken.toml", "--projection", "opencv", *_FILM, "-o"],
     "export": ["export", "broken.toml", "--to", "c", "-o"],
     "blender": ["blender", "build", "--models", ".", "-o"],
+    "add": ["blender", "add", "broken.toml", "--extension"],
     "mitsuba": ["mitsuba", "broken.xml", "--camera", "broken.toml", "-o"],
+    "copies": ["copies", "broken.toml", "-o"],
+    "psf": ["psf", "broken.toml", *_FILM, "-o"],
+    "rays": ["rays", "broken.toml", *_FILM, "-o"],
+    "models": ["models", "broken.toml", "--csv"],
+    "demo": ["demo", "-o"],
 }
 ENDINGS = {
     **dict.fromkeys(("render", "flare", "defocus", "mitsuba"), ".exr"),
     **dict.fromkeys(("lens", "ghost"), ".png"),
     **dict.fromkeys(("verify", "rims", "convert"), ".toml"),
-    **{"view": ".html", "blender": ".zip"},
+    **{"view": ".html", "blender": ".zip", "psf": ".npz", "rays": ".npz"},
 }
 
 

@@ -103,7 +103,8 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
         if cameras:
             expected += f", with {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
         ours = [file.stem for folder, suffix in places for file in sorted((library() / folder).glob(f"*{suffix}"))]
-        near = suggestion(word, [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())])
+        known = [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())]
+        near = suggestion(word, [name for name in known if name != word])
         if not near and found.near:
             near = f"; did you mean {' or '.join(repr(entry.lens) for entry in found.near)}?"
         raise InputError(word, asked, "(a model)" if path.exists() else "(missing)", expected + near)

@@ -114,9 +114,9 @@ class Parser(argparse.ArgumentParser):
         else:
             found, rest = super().parse_known_args(args, namespace)
         if rest and self.intermixed is not None:
-            known = [key for key in self._option_string_actions if key.startswith("--")]
-            near = suggestion(rest[0].partition("=")[0], known) * rest[0].startswith("--")
-            self.error(f"unrecognized arguments: {' '.join(rest)}{near}")
+            known = [key[2:] for key in self._option_string_actions if key.startswith("--")]
+            near = suggestion(rest[0][2:].partition("=")[0], known).replace("'", "'--", 1)
+            self.error(f"unrecognized arguments: {' '.join(rest)}{near * rest[0].startswith('--')}")
         return found, rest
 
     def _sizes(self, args: list[str]) -> list[str]:

@@ -25,7 +25,7 @@ from types import ModuleType
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, fcntl, place_inside, read_bytes, safe_name
+from neurolens.base.files import atomic_path, check_writable, fcntl, place_inside, read_bytes, safe_name
 from neurolens.base.find import entries, said_of
 from neurolens.base.lensname import year_of
 from neurolens.base.tomlfile import parse_json
@@ -170,8 +170,10 @@ def _holder(folder: Path) -> str:
 
 
 def check_takes(to: Path) -> None:
-    """Refuse a zip or a user folder that takes no lens, before the lens is made; raises InputError as `add_lens`."""
+    """Refuse a zip or a user folder that takes no lens, before the lens is made; raises what `add_lens` does."""
     _contents(to)
+    there = next(p for p in (to, *to.absolute().parents) if p.exists())
+    check_writable(there if there.is_file() else there / FACTS)
 
 
 def add_lens(to: Path, lens: PackedLens) -> None:
