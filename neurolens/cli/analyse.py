@@ -82,12 +82,12 @@ examples:
         kind=between(0, 179, "degrees"), nargs="+", metavar="DEG", old=("fields",), common=True,
     )  # fmt: skip
     wavelengths: tuple[tuple[float, ...], ...] | None = setting(
-        None, f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
+        None, f"wavelengths of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
         "(default: d, F and C, or the file's own where its range lacks the d line)",
         kind=wavelengths_nm, nargs="+", metavar="NM", common=True,
     )  # fmt: skip
     frequencies: tuple[float, ...] | None = setting(
-        None, "of mtf-height (default: 10 20 40)", kind=between(0, 1000, "cycles per mm"), nargs="+",
+        None, "frequencies of mtf-height (default: 10 20 40)", kind=between(0, 1000, "cycles per mm"), nargs="+",
         metavar="PER_MM", common=True,
     )  # fmt: skip
     axis: Literal["x", "y"] = setting("y", "plane of the field, for anamorphic lenses (default: y)")
@@ -95,10 +95,10 @@ examples:
         None, "show how so many copies of the lens differ: MTF, spots and best focus in the middle and at 80% of the "
         "corners, drawn as by neurolens copies", kind=whole(2, 10_000), metavar="N",
     )  # fmt: skip
-    seed: int = setting(0, "of the copies", kind=whole(0))
-    tolerances: Path | None = setting(None, "of the copies, as of `neurolens copies`", metavar="FILE.toml")
+    seed: int = setting(0, "seed of the copies", kind=whole(0))
+    tolerances: Path | None = setting(None, "tolerances of the copies, as of `neurolens copies`", metavar="FILE.toml")
     out: Path | None = cli.output_path("FOLDER", "draw a picture of each in this folder", None)
-    format: Literal["png", "pdf", "svg"] = setting("png", "of the pictures (default: png)")
+    format: Literal["png", "pdf", "svg"] = setting("png", "format of the pictures (default: png)")
     full: bool = setting(False, "with --json: also every ray and every pixel")
 
     @property

@@ -77,8 +77,8 @@ class Build(cli.Reporting):
     called = "neurolens blender build"
     epilog = Blender.epilog
 
-    out: Path = cli.output_path("OUT.zip", "default: neurolens.zip", Path("neurolens.zip"))
-    models: Path | None = setting(None, "default: the models that ship", metavar="DIR")
+    out: Path = cli.output_path("OUT.zip", "zip to write (default: neurolens.zip)", Path("neurolens.zip"))
+    models: Path | None = setting(None, "folder of models (default: those that ship)", metavar="DIR")
     lens: tuple[str, ...] = setting(
         (), "only this lens, repeatable: LENS of LENS.ols-64.onnx or of LENS.toml (default: all)", metavar="LENS"
     )

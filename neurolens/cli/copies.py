@@ -35,7 +35,7 @@ examples:
     file: Path = cli.lens(models=True, positional=True)
     out: Path = cli.output_path("FOLDER", "folder of the files, which is made")
     number: int = setting(10, "copies", kind=whole(1, 10_000), metavar="N", common=True)
-    seed: int = setting(0, "of the random draws", kind=whole(0))
+    seed: int = setting(0, "seed of the random draws", kind=whole(0))
     tolerances: Path | None = setting(
         None, "tolerances by the names of these options (decentre_mm = 0.02), instead of their defaults",
         metavar="FILE.toml", common=True,

@@ -61,12 +61,14 @@ examples:
     )  # fmt: skip
     depth: str = setting("", "name of the channel with the depth (default: Z, or Depth.Z)", metavar="CHANNEL")
     depth_scale: float | None = setting(None, "metres of a unit of depth (default: 1)", within=(-1e6, 1e6), metavar="M")
-    depth_along: Literal["axis", "ray"] = setting("axis", "whether depth is along the axis or each ray (default: axis)")
+    depth_along: Literal["axis", "ray"] = setting(
+        "axis", "direction of depth: along the axis, or along each ray (default: axis)"
+    )
     depth_from: Literal["auto", "film", "pinhole"] = setting(
         "auto", "where depth begins (default: auto, the film in pictures of neurolens, else the pinhole)"
     )
     samples: int = setting(
-        SAMPLES, "of each pixel whose blur is uneven, rounded up to a power of two; others take fewer "
+        SAMPLES, "samples of a pixel whose blur is uneven, rounded up to a power of two; others take fewer "
         f"(default: {SAMPLES})", within=(8, 512),
     )  # fmt: skip
     no_highlights: bool = setting(False, "do not spread very bright pixels as discs; their blur is then noisy")
@@ -181,8 +183,8 @@ examples:
 
     out: Path = cli.output_path("OUT", "start of the files' names")
     distance: tuple[float, ...] = setting(
-        (), "of things from the film in metres, or inf (repeatable; default: inf, where that is in focus 20 focal "
-        "lengths)",
+        (), "distance of things from the film in metres, or inf; repeatable (default: inf, or 20 focal lengths "
+        "where inf is in focus)",
         kind=positive("a distance in metres", infinite=True), metavar="M", common=True,
     )  # fmt: skip
     grid: tuple[int, int] = setting(

@@ -79,10 +79,10 @@ examples:
         (), "fix an input, as focus=2 or wavelengths=450,550,650; repeatable", metavar="KEY=VALUE", common=True
     )
     only: tuple[str, str, str, str, str] = setting(
-        _PARTS, f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
+        _PARTS, f"parts to write, of {','.join(_PARTS)} (default: all; the domain guard is always there)",
         kind=cli.words_of(_PARTS, "ray"), metavar="PARTS",
     )  # fmt: skip
-    name: str | None = setting(None, "of the function (default: the lens's id)")
+    name: str | None = setting(None, "name of the function (default: the lens's id)")
     derivatives: bool = setting(False, "add outputs for ray differentials (with --to onnx or --whole-camera)")
     inverse: bool = setting(
         False,

@@ -121,8 +121,8 @@ examples:
         "away; # in its name stands for the frame's digits", metavar="PLATE.exr", title=OF_LIGHTS,
     )  # fmt: skip
     threshold: float = setting(
-        2.0, "of --image: value of a colour, where a white card of radiance 1 is 1; pixels count in full from 2 T on, "
-        "so that none switches on at once (default: 2)",
+        2.0, "value of a colour from which a pixel of --image counts as light; a white card of radiance 1 has 1. "
+        "Pixels count in full from 2 T on, so that none switches on at once (default: 2)",
         kind=positive("a value of the picture"), metavar="T", title=OF_LIGHTS,
     )  # fmt: skip
     out: Path | None = cli.output_path("OUT.exr", "picture to write, of a light that is given; the preview is OUT.png")
@@ -132,14 +132,15 @@ examples:
     )  # fmt: skip
     film: tuple[float, float] = cli.film(title=OF_PICTURE)
     width: int = setting(
-        960, "of the picture (default: 960)", within=(1, 16384), metavar="PIXELS", title=OF_PICTURE, common=True
+        960, "width of the picture (default: 960)", within=(1, 16384), metavar="PIXELS", title=OF_PICTURE, common=True
     )
     exposure: float | None = cli.exposure(
         None, "99% of the lit pixels become no brighter than 0.8; frames share one value", title=OF_PICTURE
     )
     colour_space: ColourSpaceName | None = setting(
-        None, "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES), which holds more of saturated "
-        "lights: what is beyond becomes paler, never negative; default: that of --image, else of a scene, else sRGB",
+        None, "linear colours of the EXR: sRGB (D65) or ACEScg (AP1, the white of ACES). ACEScg holds more "
+        "saturated lights; a colour beyond becomes paler, never negative (default: that of --image, else of a"
+        " scene, else sRGB)",
         title=OF_PICTURE,
     )  # fmt: skip
     quick: bool = setting(
@@ -156,7 +157,7 @@ examples:
         "flare of these frames to OUT.0001.exr and so on, of lights by their keys in lists, the lens, and the camera "
         "of a scene of --lights by --key; a frame that exists is kept."
     )
-    restart: bool = setting(False, "of --frames: make those that exist again")
+    restart: bool = setting(False, "make frames again that exist (with --frames)")
     state: cli.LensState = cli.lens_state()
 
     frame: int | None = None

@@ -86,7 +86,7 @@ class Frames:
 
     frames: range | None = setting(None, "{}", kind=_frames, metavar="FIRST:LAST[:STEP]")
     key: tuple[str, ...] = setting(
-        (), "values at frames, repeatable: {}; before the first key and after the last one they stay. Or a file of "
+        (), "values at frames, repeatable, of {}. Before the first key and after the last one they stay. Or a file of "
         "keys, .csv with a header or .json (a list of objects): a column frame, and one for each NAME; an empty cell "
         "is no key", metavar="NAME=FRAME:VALUE,...",
     )  # fmt: skip
@@ -104,7 +104,9 @@ class Frames:
 
 def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
     """Return a field of `Frames`; `does` is the help of --frames, `names` are the quantities that keys may set."""
-    measures = ", ".join(f"{name} (linear in {_QUANTITIES[name].linear_in})" for name in names)
+    found = {name: _QUANTITIES[name] for name in names}
+    other = ", ".join(f"{name} in {q.linear_in}" for name, q in found.items() if q.linear_in != q.unit)
+    measures = f"{', '.join(names)}. Between keys they move evenly in their unit, but {other}"
     measures += "; position and look-at are X/Y/Z in m" if "position" in names else ""
     return group("frames", texts={"frames": does, "key": measures})
 

@@ -61,8 +61,8 @@ examples:
     )
     breathing: Path | None = cli.plot_path("draw field of view, focal length, magnification against the focus distance")
     sort: _Sort | None = setting(
-        None, "of several files: the order; the last five are figures of bokeh and flare, the strongest first, which "
-        "take seconds a lens that is not of lenses/", common=True,
+        None, "order of several files; the last five are figures of bokeh and flare, the strongest first, which "
+        "take seconds for a lens that is not of lenses/", common=True,
     )  # fmt: skip
     derive_rims: bool = setting(
         False, "compute the diameters from the f-number and the field, and print them beside those of the file",

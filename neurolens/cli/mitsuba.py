@@ -34,14 +34,15 @@ examples:
     scene: str = setting(..., "scene file (.xml), or cornell-box", positional=True, metavar="SCENE")
     camera: str = cli.lens(models=True, cameras=True)
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
-    variant: str | None = setting(None, "of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)")
-    samples: int | None = setting(None, "a pixel (default: the scene's)", within=(1, 1 << 20), common=True)
+    variant: str | None = setting(None, "variant of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)")
+    samples: int | None = setting(None, "samples of a pixel (default: the scene's)", within=(1, 1 << 20), common=True)
     film: tuple[float, float] | None = cli.film(
         None, "size in mm (default: the largest of the picture's shape that the lens covers)"
     )
-    seed: int = setting(0, "default: 0", kind=whole(0, 1 << 15))
+    seed: int = setting(0, "seed of the random numbers (default: 0)", kind=whole(0, 1 << 15))
     units_per_m: float = setting(
-        1.0, "of the scene (default: 1; 1000 for one in millimetres)", option="units-per-m", metavar="N",
+        1.0, "units of the scene that make a metre (default: 1; 1000 for a scene in millimetres)",
+        option="units-per-m", metavar="N",
         kind=positive("scene units in a metre"),
     )  # fmt: skip
     exposure: float = cli.exposure()

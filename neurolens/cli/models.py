@@ -264,7 +264,7 @@ keeps its own; ./lenses; the project's."""
         "four times as many test the vignetting (default: 30000)", within=(1000, 1_000_000),
     )  # fmt: skip
     seed: int | None = setting(
-        None, "of the rays (default: one that differs from the fit's)", kind=whole(0), metavar="N"
+        None, "seed of the rays (default: one that differs from the fit's)", kind=whole(0), metavar="N"
     )
 
     def run(self) -> int:

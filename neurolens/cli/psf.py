@@ -83,7 +83,7 @@ examples:
         metavar="CxR", common=True,
     )  # fmt: skip
     distance: tuple[tuple[float, ...], ...] | None = setting(
-        None, "of things from the film in metres, or inf (default: what is in focus)",
+        None, "distances of things from the film in metres, or inf (default: what is in focus)",
         kind=listed(positive("a distance in metres", infinite=True)), nargs="+", metavar="M", common=True,
     )  # fmt: skip
     f_number: tuple[tuple[float, ...], ...] | None = setting(
@@ -91,7 +91,7 @@ examples:
         kind=listed(between(*F_NUMBER, "f-numbers")), nargs="+", metavar="N", common=True,
     )  # fmt: skip
     channels: Literal["rgb", "mono"] = setting(
-        "rgb", "those of a Bayer sensor, by the film's response, or one of all light (default: rgb)"
+        "rgb", "rgb: the channels of a Bayer sensor, by the film's response; mono: one of all light (default: rgb)"
     )
     wavelengths: tuple[tuple[float, ...], ...] | None = setting(
         None, f"a channel for each of these, {said(WAVELENGTH_NM)} nm, in place of R, G and B",

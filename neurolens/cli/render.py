@@ -285,9 +285,11 @@ class Demo(cli.Command):
     kept = "pictures so far are kept; the same command goes on"
     alone = True
 
-    out: Path = cli.output_path("FOLDER", "default: neurolens-demo", Path("neurolens-demo"))
-    width: int = setting(480, "(default: 480)", within=(1, 4096), metavar="PIXELS")
-    samples: int = setting(32, "a pixel (default: 32)", within=(1, 2**16))
+    out: Path = cli.output_path(
+        "FOLDER", "folder of the page and its pictures (default: neurolens-demo)", Path("neurolens-demo")
+    )
+    width: int = setting(480, "width of the pictures (default: 480)", within=(1, 4096), metavar="PIXELS")
+    samples: int = setting(32, "samples of a pixel (default: 32)", within=(1, 2**16))
 
     def run(self) -> int:
         """Render and write the page."""

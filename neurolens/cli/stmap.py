@@ -195,7 +195,8 @@ examples:
     out: Path = cli.output_path("SHOT", "start of the files' names")
     projection: Literal["rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"] = setting(
         "rectilinear",
-        "of the undistorted picture (default: rectilinear, a plane, which holds 85 degrees from the axis)",
+        "projection of the undistorted picture (default: rectilinear, a plane, which holds 85 degrees from "
+        "the axis)",
         common=True,
     )  # fmt: skip
     distance: float | None = setting(
@@ -206,7 +207,8 @@ examples:
         False, "write maps for each channel, too (SHOT.undistort.red.exr, ...), of the --wavelengths", common=True
     )
     wavelengths: tuple[float, float, float] = setting(
-        _CHANNELS_NM, "those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
+        _CHANNELS_NM, "wavelengths of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. "
+        "709)",
         kind=channels_nm, metavar="NM", old=("channels-nm",),
     )  # fmt: skip
     frames: Frames = frames_group(

@@ -68,21 +68,22 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     )  # fmt: skip
     zoom_range: bool = setting(
         False,
-        'of --lens: one model of all focal lengths between the file\'s zoom states (input "state", in mm)',
+        'fit one model of all focal lengths between the zoom states of --lens (input "state", in mm)',
         common=True,
     )
     internal_focus: bool = setting(
-        False, 'of --lens: one model of internal focus, infinity to the near limit (input "state", in 1/m)'
+        False, 'fit one model of the internal focus of --lens, from infinity to the near limit (input "state", in 1/m)'
     )
     within: tuple[str, float] | None = cli.within(
-        "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
-        "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)",
+        "find the fastest model of --lens whose film-equivalent RMS error on fresh rays is at most this, as "
+        "2um or 0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit"
+        " code 1 if none is)",
         common=True,
     )
     phase: bool = setting(False, "models have the optical path, too, for point spread by diffraction (neurolens psf)")
     pixels_across: int = setting(
-        4000, "of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
-        "4000: 9 um each for a radius of 21.6 mm)", within=(1, 10**6),
+        4000, "pixels of --within that make the width of the 3:2 frame inscribed in the film circle (default: 4000,"
+        " of 9 um each for a radius of 21.6 mm)", within=(1, 10**6),
     )  # fmt: skip
     rounds: int | None = setting(
         None,
@@ -205,17 +206,17 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
     kept = "finished files are kept; the same command goes on"
 
     folder: Path = setting(..., "folder of lens files", positional=True, metavar="FOLDER")
-    out: Path = cli.output_path("DIR", "default: runs/survey", Path("runs/survey"))
+    out: Path = cli.output_path("DIR", "folder of the results (default: runs/survey)", Path("runs/survey"))
     no_fit: bool = setting(False, "read and check only", common=True)
     verify: bool = setting(
         False, "hold each lens against photographs (neurolens verify; extra photographs)", common=True
     )
     terms: int = setting(64, "coefficients (default 64)", within=(1, 400))
     rays: int = setting(30_000, "to fit and to measure (default 30000)", within=(1000, 10**6))
-    seed: int = setting(1, "of the rays (default 1)", kind=whole(0))
+    seed: int = setting(1, "seed of the rays (default: 1)", kind=whole(0))
     half_field: float = setting(
-        15.0, "assumed where a file gives neither rims nor a field (default 15)", within=(1e-3, 179.0),
-        unit="degrees", metavar="DEG",
+        15.0, "half field that is assumed where a file gives neither rims nor a field (default: 15)",
+        within=(1e-3, 179.0), unit="degrees", metavar="DEG",
     )  # fmt: skip
     jobs: int = setting(
         cores(), "files at a time, about 1 GB of memory each (default: all cores)", within=(1, 256), common=True

@@ -67,12 +67,12 @@ examples:
     lenses: tuple[Path, ...] = cli.lens((), models=True, positional=True, metavar="LENS|MODEL", nargs="*")
     out: Path = cli.output_path("FILE.html", "page (default: view.html)", Path("view.html"))
     downloads: Sequence[str] = setting(
-        (), "of glsl, onnx, c, osl what the page brings as files of each form (default: all; without a lens all but "
-        "osl, which takes seconds a form, a minute of a zoom, once); the last are left out where the page grows beyond "
-        "3 MB, or 40 kB a lens, exact lenses' first", kind=cli.words_of(_DOWNLOADS, "glsl"), metavar="KINDS",
+        (), "files that the page offers, of glsl, onnx, c, osl (default: all; without a lens all but osl, which takes "
+        "seconds a form, and a minute for a zoom, once). Where the page grows beyond 3 MB, or 40 kB a lens, the last "
+        "are left out, those of exact lenses first", kind=cli.words_of(_DOWNLOADS, "glsl"), metavar="KINDS",
     )  # fmt: skip
     ghosts: bool = setting(
-        False, "a lamp that can be dragged draws its ghosts, the 24 brightest of each LENS; needs a C compiler"
+        False, "add a lamp that can be dragged and draws its ghosts, the 24 brightest of each LENS; needs a C compiler"
     )
     jobs: int = setting_of(Build, "jobs", Build.jobs)
 

@@ -110,7 +110,7 @@ class RaySettings:
     """What `rays` takes besides a camera, its shot and the size of the picture; options of `neurolens rays`."""
 
     samples: int = setting(
-        16, "a pixel; powers of two are spread most evenly (default: 16)", within=(1, 1 << 16), common=True
+        16, "samples of a pixel; powers of two are spread most evenly (default: 16)", within=(1, 1 << 16), common=True
     )
     to: Literal["opengl", "opencv", "mitsuba", "newton", "gsplat", "3dgrut"] = setting(
         "opengl", "who takes the rays: opengl and newton (x right, y up, the camera looks along -z), opencv and 3dgrut "
@@ -126,16 +126,17 @@ class RaySettings:
         None, "wavelengths that samples share, as 550 or 611,549,464 (default: 400 to 700 nm, more of what film sees)",
         kind=wavelengths_nm, metavar="NM",
     )  # fmt: skip
-    seed: int = setting(0, "of the random numbers (default: 0)", kind=whole(0))
+    seed: int = setting(0, "seed of the random numbers (default: 0)", kind=whole(0))
     compact: bool = setting(
         False, f"16 bytes a ray; refused where that moves rays by more than {MOST_COMPACT_PX:g} pixels"
     )
     origin: Literal["film", "pupil"] = setting(
-        "film", "of the camera's frame: the film's centre, or the entrance pupil's, where calibrated cameras have it "
-        "(default: film)",
+        "film", "origin of the camera's frame: the centre of the film, or of the entrance pupil, where calibrated "
+        "cameras have it (default: film)",
     )  # fmt: skip
     units_per_m: float = setting(
-        1.0, "of the scene (default: 1; 1000 for one in millimetres)", option="units-per-m", metavar="N",
+        1.0, "units of the scene that make a metre (default: 1; 1000 for a scene in millimetres)",
+        option="units-per-m", metavar="N",
         within=(1e-9, 1e9), unit="scene units in a metre",
     )  # fmt: skip
     position_m: Vector | None = setting(

@@ -104,9 +104,9 @@ class Shot:
         within=(0.001, 360.0), unit="degrees", apart="size",
     )  # fmt: skip
     focus_mode: FocusMode = setting(
-        "auto", "best: the film where the spot on the axis is smallest at this aperture; paraxial: in the paraxial "
-        "image; internal: first the groups moved as the focus states of the lens file do (default: auto, internal "
-        "where these reach the distance, else best)", old=("focusing",),
+        "auto", "best puts the film where the spot on the axis is smallest at this aperture, paraxial into the "
+        "paraxial image; internal first moves the groups as the focus states of the lens file say (default: "
+        "auto, which is internal where these states reach the distance, else best)", old=("focusing",),
     )  # fmt: skip
     aperture: Any = None  # an `Aperture`, whose module loads numpy, which the help of the command line does without
     wavelength_nm: tuple[float, float] = LIGHT_NM
@@ -134,24 +134,25 @@ class Shot:
         "lens file's)", within=(0, 100), unit="mm",
     )  # fmt: skip
     coating: str | None = setting(
-        None, "of every surface between glass and air whose coating the lens file does not state: single-layer (1940s "
-        "to 60s), three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; bare or stated: of no "
-        "surface, or of none but these; of one: three-layer,s07=bare (default: the lens's own)",
+        None, "coat every surface between glass and air whose coating the lens file does not state: single-layer "
+        "(1940s to 60s), three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband. bare "
+        "takes every coating away, stated keeps those of the file alone; three-layer,s07=bare sets one "
+        "surface apart (default: by the year of the design)",
         metavar="NAME",
     )  # fmt: skip
     clamp_f_number: bool = False
     vignetting: Vignetting = setting(
-        "both", "parts that are kept: both; natural, the cos^4 law; optical, the effective aperture; none (default: "
-        "both)",
+        "both", "which dark corners are kept: both kinds; natural, the cos^4 law; optical, what the rims cut off; "
+        "none (default: both)",
     )  # fmt: skip
     dispersion: Dispersion = setting(
-        "full", "parts that are kept: full; lateral, the picture's shift with the wavelength, for less noise; off "
-        "(default: full)",
+        "full", "which dispersion is kept: full; lateral, the picture's shift with the wavelength, for less noise; "
+        "off (default: full)",
     )  # fmt: skip
     runtime: Runtime | None = setting(
         None,
-        "what runs a lens or model, to compare: the same rays (default: c where the machine has a C compiler that "
-        "takes it)",
+        "what runs a lens or model; both give the same rays (default: c where the machine has a C compiler "
+        "that takes it)",
     )
 
     def __post_init__(self) -> None:
@@ -248,11 +249,14 @@ class StopShape:
         None, "blades, their corners on the circle of the stop (default: the lens file's, else round)", within=(3, 100)
     )
     blade_rotation_deg: float | None = setting(
-        None, "of the first corner (or of the mask), from x towards y, seen from the film (default: 0)",
+        None, "angle of the first corner (or of the mask), from x towards y, seen from the film (default: 0)",
         within=(-360.0, 360.0), unit="degrees",
     )  # fmt: skip
     blade_curvature: float | None = setting(
-        None, "of the blades' edges: 0 straight, 1 round (default: 0)", within=(0.0, 1.0), metavar="C"
+        None,
+        "how far the blades' edges bulge, from 0 (straight) to 1 (round) (default: 0)",
+        within=(0.0, 1.0),
+        metavar="C",
     )
     aperture_mask: Path | None = setting(
         None, "opening of any shape: light passes where the picture is brighter than half; it spans the stop",

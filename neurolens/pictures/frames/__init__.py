@@ -74,7 +74,7 @@ class Picture:
         None, "width and height of the film in mm (default: the scene's)", option="film", kind=film_size, metavar="WxH",
         common=True,
     )  # fmt: skip
-    seed: int = setting(0, "of the random numbers (default: 0)", kind=whole(0))
+    seed: int = setting(0, "seed of the random numbers (default: 0)", kind=whole(0))
     max_depth: int | None = setting_of(CameraSettings, "max_depth")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = setting(
@@ -82,8 +82,9 @@ class Picture:
         within=(-40, 40), unit="stops", metavar="STOPS",
     )  # fmt: skip
     channels: Literal["all", "beauty"] = setting(
-        "all", "of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along "
-        "the axis from the film) and blocked (share of camera rays that do not pass) (default: all)", old=("layers",),
+        "all", "channels of the EXR: beauty is colour alone; all adds samples, variance (of the pixel's luminance), "
+        "Z (depth in m along the axis from the film) and blocked (share of camera rays that do not pass) "
+        "(default: all)", old=("layers",),
     )  # fmt: skip
     behind: int = setting(
         0, "add so many layers of what stands behind the first things that a pinhole sees, as channels behind1.R and "

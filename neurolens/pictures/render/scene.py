@@ -60,14 +60,17 @@ class CameraSettings(Shot, StopShape, Checked):
     aperture: Any = field(default=None, init=False)
     clamp_f_number: bool = field(default=True, init=False)
     width: int = setting(
-        320, "width (default: the scene's, or from --height and the film's shape)", within=(1, 16384), metavar="PIXELS",
-        common=True,
+        320, "width of the picture (default: the scene's, or from --height and the film's shape)", within=(1, 16384),
+        metavar="PIXELS", common=True,
     )  # fmt: skip
     height: int = setting(
-        180, "height (default: the scene's, or from --width and the film's shape)", within=(1, 16384), metavar="PIXELS"
+        180,
+        "height of the picture (default: the scene's, or from --width and the film's shape)",
+        within=(1, 16384),
+        metavar="PIXELS",
     )
-    samples: int = setting(64, "per pixel (default: the scene's)", within=(1, 2**20), common=True)
-    max_depth: int = setting(6, "bounces (default: the scene's)", within=(1, 1000))
+    samples: int = setting(64, "samples of a pixel (default: the scene's)", within=(1, 2**20), common=True)
+    max_depth: int = setting(6, "surfaces at which a path may scatter (default: the scene's)", within=(1, 1000))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -29,16 +29,18 @@ class FilmSettings:
         fill_factor: share of a pixel that takes light, a square in its middle, since the filter of a pixel is a box.
     """
 
-    colour_space: ColourSpaceName = setting("sRGB", "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)")
+    colour_space: ColourSpaceName = setting(
+        "sRGB", "linear colours of the EXR: sRGB (D65) or ACEScg (AP1, the white of ACES)"
+    )
     white_balance: str | None = setting(
         None, "light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene", metavar="LIGHT"
     )
     wavelengths: WavelengthMode = setting(
-        "auto", "of a path: one; hero, four that share it; auto, hero where the camera can",
+        "auto", "wavelengths of a path: one; hero, four that share it; auto, hero where the camera can",
         option="wavelength-mode", old=("wavelengths",),
     )  # fmt: skip
     wavelength_sampling: WavelengthSampling = setting(
-        "importance", "by importance (film response times light) or uniform"
+        "importance", "how wavelengths are drawn: by importance (the film's response times the light), or uniformly"
     )
     fill_factor: float = setting(
         1.0, "share of a pixel's area that takes light, a square in its middle", within=(0.01, 1), metavar="SHARE"
@@ -63,12 +65,24 @@ class SensorSettings:
         InputError: a value out of bounds.
     """
 
-    mosaic: Mosaic = setting("RGGB", "of colours from the top left (default: RGGB); none: a pixel counts all three")
-    electrons: float = setting(2e4, "of a pixel of value 1, mean (default: 20000)", within=(1e-6, 1e9), metavar="N")
+    mosaic: Mosaic = setting(
+        "RGGB",
+        "colours of two rows of pixels, from the top left; with none each pixel counts all three (default: RGGB)",
+    )
+    electrons: float = setting(
+        2e4,
+        "mean number of electrons where the value of a pixel is 1 (default: 20000)",
+        within=(1e-6, 1e9),
+        metavar="N",
+    )
     full_well: float = setting(3e4, "electrons that a pixel holds (default: 30000)", within=(1, 1e9), metavar="N")
-    read_noise: float = setting(3.0, "in electrons, RMS, of reading (default: 3)", within=(0, 1e6), metavar="N")
-    noise: Literal["all", "none"] = setting("all", "of photons and of reading, by --seed; or none (default: all)")
-    bits: int = setting(14, "of the numbers that are read; the largest is a full well (default: 14)", within=(1, 16))
+    read_noise: float = setting(3.0, "noise of reading, in electrons RMS (default: 3)", within=(0, 1e6), metavar="N")
+    noise: Literal["all", "none"] = setting(
+        "all", "all: the noise of photons and of reading, by --seed; none: no noise (default: all)"
+    )
+    bits: int = setting(
+        14, "bits of the numbers that the sensor gives; the largest number is a full well (default: 14)", within=(1, 16)
+    )
     black_level: int | None = setting(
         None, "number that is read without light (default: 512 of 14 bits and more, else a 32nd of the range)",
         within=(0, 65_534), metavar="N",
@@ -121,18 +135,18 @@ class Scatter:
     """
 
     barrel: float = setting(
-        0.0, "of light that the barrel reflects, its rings and the stop, a fifth glossily", within=(0, 1),
+        0.0, "share of light that the barrel, its rings and the stop reflect, a fifth of it glossily", within=(0, 1),
         metavar="SHARE", title=OF_PHOTONS,
     )  # fmt: skip
     gloss: float = 0.2
     sensor: float = setting(
-        0.0, "of light that the film reflects, half of it as a mirror", within=(0, 0.9), metavar="SHARE",
-        title=OF_PHOTONS,
+        0.0, "share of light that the film reflects, half of it as a mirror does", within=(0, 0.9),
+        metavar="SHARE", title=OF_PHOTONS,
     )  # fmt: skip
     mirror: float = 0.5
     dust: float = setting(
-        0.0, "of the front that is dusty: light scatters there, mean cosine 0.98", within=(0, 1), metavar="SHARE",
-        title=OF_PHOTONS,
+        0.0, "share of the front that is dusty; dust scatters light with a mean cosine of 0.98", within=(0, 1),
+        metavar="SHARE", title=OF_PHOTONS,
     )  # fmt: skip
     dust_forward: float = 0.98
     haze_per_mm: float = setting(
@@ -172,7 +186,7 @@ class FlareSettings:
         old=("wavelengths",), title=OF_PICTURE,
     )  # fmt: skip
     cell_px: float = setting(
-        8.0, "size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
+        8.0, "size on the film of the cells of which a ghost is drawn (default: 8; 48 for a quick look)",
         within=(1, 256), unit="pixels", title=OF_PICTURE,
     )  # fmt: skip
     brightest: int = setting(
@@ -181,8 +195,8 @@ class FlareSettings:
     )  # fmt: skip
     most: int = setting(
         32,
-        "of --image and of a scene: the lights of the most energy; what is left out is said. With --frames they fade "
-        "before they are left out",
+        "number of lights that --image and a scene give, those of the most energy; the command says what it leaves "
+        "out. With --frames they fade before they are left out",
         within=(1, 10_000), title=OF_LIGHTS,
     )  # fmt: skip
     without: tuple[str, ...] = setting(
@@ -191,11 +205,12 @@ class FlareSettings:
     gains: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     starburst: bool = setting(False, "the layer starburst; some seconds a light", title=OF_LAYERS)
     photons: int = setting(
-        0, "instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
+        0, "trace N photons a light and wavelength in place of all pairs of surfaces; chance decides who reflects",
         within=(0, _MOST_PHOTONS), title=OF_PHOTONS,
     )  # fmt: skip
     most_reflections: int = setting(
-        10, "of photons and glare at most (default: 10)", within=(1, 1000), option="reflections", title=OF_PHOTONS,
+        10, "reflections of a photon, at most, for --photons and --glare (default: 10)", within=(1, 1000),
+        option="reflections", title=OF_PHOTONS,
     )  # fmt: skip
     kernel_px: float = setting(
         3.0, "radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
@@ -207,7 +222,7 @@ class FlareSettings:
     )  # fmt: skip
     scatter: Scatter = setting(Scatter(), "what scatters photons")
     seed: int = setting(
-        0, "of the chances of photons, the same in all frames; ghosts have none", within=(0, 1 << 20), title=OF_PHOTONS
+        0, "seed of photons, the same in all frames; ghosts need none", within=(0, 1 << 20), title=OF_PHOTONS
     )
 
     def __post_init__(self) -> None:
