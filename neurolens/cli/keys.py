@@ -105,8 +105,9 @@ class Frames:
 def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
     """Return a field of `Frames`; `does` is the help of --frames, `names` are the quantities that keys may set."""
     other = (f"{name} in {q.linear_in}" for name, q in _QUANTITIES.items() if name in names and q.linear_in != q.unit)
-    measures = f"{', '.join(names)}. Between keys they move evenly in their unit, but {', '.join(other)}"
-    measures += "; position and look-at are X/Y/Z in m" if "position" in names else ""
+    measures = f"{', '.join(names)}. Between keys they move evenly in their unit, but {', '.join(other)}" + (
+        "; position and look-at are X/Y/Z in m" * ("position" in names)
+    )
     return group("frames", texts={"frames": does, "key": measures})
 
 
