@@ -233,7 +233,7 @@ def methods() -> Answer:
         [("python -m experiments surrogates laikin_double_gauss_50", "surrogates/laikin_double_gauss_50.md")],
         "One lens, the 50 mm f/1.8 double Gauss, at full aperture and field. The published methods are our "
         "implementations of [their papers](../papers.md), fitted on the same rays and written by the same writers. "
-        "The tables of rays were meant for a GPU and are judged on a CPU here. Times are of an earlier version of these "
+        "The tables of rays were meant for a GPU and are judged on a CPU here. Times are of an earlier version of the "
         "writers: [polynomials of 60 terms](../../../models/README.md) take about half as long now. " + MACHINE,
         [
             ("experiments/results/surrogates/ogawa_zoom_70_200.md", "the same through a 70-200 zoom"),
