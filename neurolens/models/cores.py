@@ -318,8 +318,9 @@ def in_cubics(weight: Array) -> Array:
     """Return the coefficients of w^k T_j(T_4(w)) [4 J, M], k = 0 to 3 and j fastest, for those of powers of w."""
     t4, size = Polynomial(cheb2poly([0, 0, 0, 0, 1])), len(weight)
     outer = [Polynomial(cheb2poly(row))(t4).coef for row in np.eye(size // 4)]
-    basis = [np.pad(row, (k, size))[:size] for k in range(4) for row in outer]
-    return np.asarray(np.linalg.solve(np.transpose(basis), weight), np.float64)
+    basis = [np.pad(row, (k, size))[:size] for row in outer for k in range(4)]  # degree by degree: zeros stay zeros
+    found = np.linalg.solve(np.transpose(basis), weight).reshape(-1, 4, weight.shape[1])
+    return np.asarray(found.swapaxes(0, 1).reshape(weight.shape), np.float64)
 
 
 @stored_as("invariants")
