@@ -615,3 +615,14 @@ def test_a_scene_that_ships_is_found_by_name_or_path_and_a_file_here_comes_first
     assert scene_file("room") == scene_file("experiments/scenes/room.toml") == shipped
     (tmp_path / "room").touch()
     assert scene_file("room") == Path("room") and scene_file("no-such") == Path("no-such")
+
+
+def test_a_converted_lens_is_scaled_as_commands_scale_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And is a product no more."""
+    out = tmp_path / "long.toml"
+    run_json(capsys, "convert", ROOT / "lenses/sony_sonnar_55.toml", "--focal-length", "85", "-o", out)
+    own, scaled = described(out), run_json(capsys, "lens", ROOT / "lenses/sony_sonnar_55.toml", "--focal-length", "85")
+    for key in ("efl_mm", "film_z_mm", "f_number", "t_stop", "image_radius_mm"):
+        assert own[key] == pytest.approx(scaled[key], rel=1e-9)
+    written = out.read_text(encoding="utf-8")
+    assert "at 85 mm" in written and "believed_to_be" not in written and "[measured]" not in written

@@ -14,8 +14,9 @@ from neurolens.base.errors import InputError, pip_install, warned
 from neurolens.base.files import atomic_path
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.report import PART, Report
-from neurolens.base.settings import group, setting
+from neurolens.base.settings import group, setting, setting_of
 from neurolens.cli import arguments as cli
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.source import ReadOptions
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(cli.Reporting):
-    """Read a lens file of another program and write it as a lens file of neurolens (.toml).
+    """Read a lens file of any format, as of another program, and write it as a lens file of neurolens (.toml).
 
     Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), texts of the Optical Bench (.txt), FlareSim
     (.lens), the TOML of the Blender add-on Physical Camera, plain tables of four
@@ -38,12 +39,14 @@ class Convert(cli.Reporting):
 examples:
   neurolens convert experiments/fuzz_seeds/lens.zmx -o my_lens.toml
   neurolens convert wide.22mm.dat -o wide.toml --name "Wide angle 22 mm" --source "Smith p. 360"
-  neurolens convert triplet.seq -o triplet.toml --half-field 20 --json"""
+  neurolens convert triplet.seq -o triplet.toml --half-field 20 --json
+  neurolens convert lenses/leica_summilux_50mm_f1_4.toml --focal-length 85 -o summilux_85.toml"""
     kept = "only a finished lens file is written"
 
-    file: Path = setting(..., "lens file of another program", positional=True, metavar="FILE")
+    file: Path = setting(..., "lens file of any format", positional=True, metavar="FILE")
     out: Path = cli.output_path("OUT.toml", "lens file to write")
     force: bool = setting(False, "replace an existing file", common=True)
+    focal_length_mm: float | None = setting_of(Shot, "focal_length_mm")
     unsaid: ReadOptions = group("what the file does not say")
 
     def _output(self, suffix: str | None = None) -> tuple[Path, str]:
@@ -55,11 +58,15 @@ examples:
         if self.out.exists() and not self.force:
             raise InputError(self.out, "--output", "(an existing file)", "a new file, or --force to replace it")
         from neurolens.optics.readers.any_format import read_any
+        from neurolens.optics.readers.assemble import first_order
 
         with warned(self.file) as read:
             lens = read_any(self.file, self.unsaid)
         if read:  # the file keeps what else its source had, and what was assumed
             lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
+        if self.focal_length_mm is not None:  # then it is no product
+            lens = lens.scaled(self.focal_length_mm / first_order(lens).efl_mm)
+            lens = replace(lens, name=f"{lens.name}, at {self.focal_length_mm:g} mm", believed_to_be="", measured=())
         write_checked(lens, self.out)
         return self.answer(_converted(lens, [*read, *_doubts(lens)], self.file, self.out))
 
