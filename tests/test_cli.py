@@ -314,6 +314,17 @@ def test_render_shapes_the_stop_by_the_command_line_over_the_scene(
     assert shaped["camera"]["aperture"] == {"blades": 5, "rotation_deg": 0.0, "curvature": 0.5}
 
 
+def test_a_camera_says_that_a_stop_is_wider_than_the_lens_has(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The rims then vignette; a scene's f-number becomes the widest."""
+    words = ["render", str(scene), "--camera", str(TRIPLET), "--samples", "1", "-o", str(tmp_path / "a.exr")]
+    scene.write_text(scene.read_text().replace("f_number = 4.0", "f_number = 1.0"))
+    for more, said in (("1", True), ("5", False), (None, False)):
+        assert main([*words, *(["--f-number", more] if more else [])]) == 0
+        assert ("the stop gives f/1, wider than the f/5 of the source" in capsys.readouterr().err) == said
+
+
 def test_a_width_alone_is_enough(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of 36 x 24 mm, 16 pixels across and 11 down are 3% off, and none are nearer."""
     common = ("render", scene, "--camera", "thin", "--film", "36x24", "--samples", 1, "--quiet")
@@ -549,14 +560,21 @@ def test_values_take_the_units_that_people_type(capsys: pytest.CaptureFixture[st
     found = parse("render a.toml --camera thin -o a.exr --focus 6ft --focal-length 2in --f-number f/2".split())
     assert (found.focus_m, found.focal_length_mm, found.f_number) == (1.8288, 50.8, 2.0)
     assert parse("render a.toml --camera thin -o a.exr --width 3840x2160".split()).height == 2160
-    for film, mm in (("super35", (24.89, 18.66)), ("Super-35", (24.89, 18.66)), ("36mm x 2.4cm", (36.0, 24.0))):
+    for film, mm in (
+        ("super35", (24.89, 18.66)),
+        ("Super-35", (24.89, 18.66)),
+        ("36mm x 2.4cm", (36.0, 24.0)),
+        ("36*24", (36.0, 24.0)),
+    ):
         assert parse(["flare", str(GAUSS), "--film", film]).film == mm
     assert parse(f"lens {GAUSS} --focus 200cm".split()).focus_m == 2.0
     found = parse(["lens", str(GAUSS), "--focus", "6'", "--f-number", "1:2.8"])
     assert (found.focus_m, found.f_number) == (1.8288, 2.8)
     assert [in_unit("m", float)(f"3 {mu}m") for mu in "\u00b5\u03bc"] == [3e-6, 3e-6]
     assert "6ft or inf, in metres" in failure(capsys, "lens", GAUSS, "--focus", "2kg")
-    assert "36x24" in failure(capsys, "flare", GAUSS, "--light", "1,1", "--film", "superb")
+    for film in ("superb", "35", "0x24"):
+        said = failure(capsys, "flare", GAUSS, "--light", "1,1", "--film", film)
+        assert f"got '{film}', expected the film's width x height in mm, as in 36x24" in said
     assert "the film sets the height" in failure(capsys, "flare", GAUSS, "--light", "1,1", "--width", "384x216")
 
 

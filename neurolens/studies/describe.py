@@ -39,7 +39,7 @@ from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.check import Check, check_lens, doubts, verdict
 from neurolens.optics.setting.focusing import at_infinity, groups_reach_m
 from neurolens.optics.setting.pupils import camera_rays, image_radius_mm
-from neurolens.optics.setting.states import set_lens
+from neurolens.optics.setting.states import set_lens, wider_than_stated
 from neurolens.optics.trace.rays import trace
 from neurolens.pictures.flare.ghosts import GhostTracer, ghost_table
 from neurolens.pictures.flare.lights import Light
@@ -293,9 +293,7 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
         reached_deg: half field that reaches the edge of the film.
         far: whether the lens is at infinity focus, for which its source states the field.
     """
-    sentences = rim_doubts(lens)
-    if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
-        sentences.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
+    sentences = rim_doubts(lens) + wider_than_stated(lens, f_number)
     if far and lens.half_field_deg is not None and reached_deg is not None and reached_deg < lens.half_field_deg - 2:
         sentences.append(
             f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}"

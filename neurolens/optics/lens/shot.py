@@ -210,13 +210,13 @@ class Shot:
 def film_size(text: str) -> tuple[float, float]:
     """Read an option: a film's width x height in mm, as in 36x24, also with units, or its name in `FILMS`."""
     named = FILMS.get(re.sub(r"[-_ ]", "", text.lower()), text.lower())
-    width, _, height = named.partition("x")
+    width, _, height = re.sub(r"[*\N{MULTIPLICATION SIGN}]", "x", named).partition("x")
     expected = f"the film's width x height in mm, as in 36x24, or one of {', '.join(FILMS)}, each"
     side = in_unit("mm", between(*FILM_MM, expected))
     try:
         return side(width.strip()), side(height.strip())
     except ArgumentTypeError as error:
-        raise ArgumentTypeError(f"{text!r}: {error}") from None
+        raise ArgumentTypeError(f"got {text!r}, expected {str(error).partition(', expected ')[2]}") from None
 
 
 def film_within(radius_mm: float) -> tuple[tuple[float, float], str]:

@@ -92,6 +92,13 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
     return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
 
 
+def wider_than_stated(lens: Lens, f_number: float) -> list[str]:
+    """Return a sentence if an f-number opens the stop of a lens by over 5% beyond what its source states."""
+    if f_number >= 0.95 * lens.f_number:
+        return []
+    return [f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source"]
+
+
 def focus_mode_of(lens: Lens, shot: Shot) -> FocusMode:
     """Return how a lens in its zoom position and size focuses for a shot: what "auto" stands for, else as asked.
 
