@@ -185,10 +185,9 @@ def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
 
     tabled = read_any(path)
     camera = ExactCamera(tabled, shot, progress=progress)
-    given = None if shot.clamp_f_number else shot.f_number
     camera.settings["notes"] = [
         *_doubts(tabled),
-        *wider_than_stated(tabled, given or math.inf),
+        *wider_than_stated(tabled, (not shot.clamp_f_number and shot.f_number) or math.inf),
         *_film_notes(set_lens(camera.lens, focus_m=math.inf), shot.film_mm),
     ]
     return camera
