@@ -218,7 +218,6 @@ def methods() -> Answer:
         axis.grid()
 
     table = [[title, *(found[method][at[name]] for name in at)] for method, (title, _) in METHODS.items()]
-    table += [["lens transport maps, Chen 2026", *["not stated"] * 3], ["Ray2Ray 2026", "about 1", *["not stated"] * 2]]
     ours, theirs = figure_of("ols-64", "RMS um"), figure_of("schrade-40", "RMS um")
     return Answer(
         "methods",
@@ -235,10 +234,11 @@ def methods() -> Answer:
         [("python -m experiments surrogates laikin_double_gauss_50", "surrogates/laikin_double_gauss_50.md")],
         "One lens, the 50 mm f/1.8 double Gauss, at full aperture and field. The published methods are our "
         "implementations of [their papers](../papers.md), fitted on the same rays and written by the same writers. "
-        "The tables of rays were meant for a GPU and are judged on a CPU here. The last two rows are what the authors "
-        "of the newest models state of other lenses: the maps draw flare in 74.4 s, where tracing takes 1,180 s, at "
-        "one zoom and stop; Ray2Ray leaves about 1 um and 0.01 degrees, and we know its abstract alone. Times are of an earlier version of the "
-        "writers: [polynomials of 60 terms](../../../models/README.md) take about half as long now. " + MACHINE,
+        "The tables of rays were meant for a GPU and are judged on a CPU here. Of two models of 2026 we know what their "
+        "authors state, of other lenses: precomputed lens transport maps draw flare in 74.4 s, where tracing takes "
+        "1,180 s, at one zoom and stop; Ray2Ray leaves about 1 um and 0.01 degrees, by its abstract. "
+        "Times are of an earlier version of the writers: [polynomials of 60 terms](../../../models/README.md) take "
+        "about half as long now. " + MACHINE,
         [
             ("experiments/results/surrogates/ogawa_zoom_70_200.md", "the same through a 70-200 zoom"),
             ("experiments/results/surrogates/phone_lens_6.md", "the same through a phone lens"),
