@@ -235,8 +235,8 @@ def methods() -> Answer:
         "One lens, the 50 mm f/1.8 double Gauss, at full aperture and field. The published methods are our "
         "implementations of [their papers](../papers.md), fitted on the same rays and written by the same writers. "
         "The tables of rays were meant for a GPU and are judged on a CPU here. Of two models of 2026 we know what "
-        "their authors state, of other lenses: precomputed lens transport maps draw flare in 74.4 s, where tracing takes "
-        "1,180 s, at one zoom and stop; Ray2Ray leaves about 1 um and 0.01 degrees, by its abstract. "
+        "their authors state, of other lenses: precomputed lens transport maps draw flare in 74.4 s, where tracing "
+        "takes 1,180 s, at one zoom and stop; Ray2Ray leaves about 1 um and 0.01 degrees, by its abstract. "
         "Times are of an earlier version of the writers: [polynomials of 60 terms](../../../models/README.md) take "
         "about half as long now. " + MACHINE,
         [
