@@ -2,7 +2,7 @@
 
 Each scene is planned through a double Gauss; the exact lens, a model and a thick lens with an ST map are then rendered
 whole with two seeds. The seconds of a render times its variance over the exact lens's are set beside the plan's. Then
-pictures of some sizes are planned twice, as `neurolens plan` does by default. All seconds are of the processor, for
+small pictures are planned twice, as `neurolens plan` does by default. All seconds are of the processor, for
 the clock counts other work, too. Writes plan_times.md and plan_times.json.
 """
 
@@ -28,7 +28,7 @@ from neurolens.studies.plan.candidates import EXACT
 SCENES, LENS, MODEL, PLAIN = ("garden", "room", "lights"), "laikin_double_gauss_50", "ols-36", "thick + ST map"
 _COUNTED = 95.0  # percentile of squared differences above which the rarest lights are left to chance
 
-SIZES = (96, 16), (640, 16), (640, 256), (1920, 256)  # width and samples
+SIZES = (96, 16), (640, 16)  # width and samples of small pictures; `plans` has large ones
 
 OPTIONS = (
     lab.count("samples", 16, "of a pixel (default: 16)"),

@@ -334,9 +334,9 @@ _HEAD = """\
 open, near, coloured), 1920 pixels across the film. A budget is kept where 95% of the picture keep it, at places, pupil
 samples and wavelengths that the plan did not see. Made by `python -m experiments plans`."""
 _PICTURES_HEAD = """\
-The plan of a picture for our renderer, at 0.25 px, in the cases that were measured last. Seconds of the picture and of
-the plan are of one thread's processor, those of the picture to the noise of the exact lens with the scene's samples.
-The clock ran while other work did."""
+The plan of a picture for our renderer, at 0.25 px, in {whole} of {cases} cases: where it is missing, the rows below
+are an earlier version's. Seconds of the picture and of the plan are of one thread's processor, those of the picture to
+the noise of the exact lens with the scene's samples. The clock ran while other work did."""
 _ALONE_HEAD = """\
 The camera alone, which is harder on the choice, in C and in onnxruntime. *px*: error of the camera chosen; *render*:
 the same from renders of pieces of the picture, as far as it is above the noise; a dash where too few pieces can tell.
@@ -405,6 +405,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
     cases = [({"lens": r["lens"], "scene": r["scene"]}, e) for r in rows for e in r["effects"]]
     wrong = [case | effect for case, effect in cases if not effect_holds(effect)]
     tried, sizes = [len(r["cameras"]) for r in rows] or [0], len({*choices.TERMS, *MORE_TERMS})
+    pictures = _PICTURES_HEAD.format(whole=len(_whole(rows)), cases=len(rows))
     alone = _ALONE_HEAD.format(tried=f"{min(tried)} to {max(tried)}", sizes=sizes)
     named = lab.columns(
         ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),
@@ -412,7 +413,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
     )  # fmt: skip
     return lab.page(
         _HEAD.format(cases=len(rows), all=len(CASES)), lab.goal_table("goal", goals(rows)),
-        _PICTURES_HEAD, lab.table(_PICTURES, _whole(rows)), alone, lab.table(_COLUMNS, decisions_of(rows), "–"),
+        pictures, lab.table(_PICTURES, _whole(rows)), alone, lab.table(_COLUMNS, decisions_of(rows), "–"),
         "Effects that the probe has wrong:" if wrong else "", lab.table(named, wrong) if wrong else "",
     )  # fmt: skip
 
