@@ -12,8 +12,7 @@ wavelength, drawn by the film's response, and its channel c is weighted by
 
     w_c(lambda) = response_c(lambda) B_c(lambda) / pdf(lambda).
 
-It is the diagonal of what our film makes of light of the basis spectra B (Mallett and Yuksel 2019;
-    `SpectralRange`),
+It is the diagonal of what our film makes of light of the basis spectra B (Mallett and Yuksel 2019; `SpectralRange`),
 without its few negative values (Mitsuba's scalar variants drop samples below 0) and scaled to a mean of 1. White stays
 white, and any colour stays itself where the rays do not depend on the wavelength. The terms off the diagonal have mean
 0; an RGB renderer cannot represent them, and colour fringes of saturated objects differ by them from a spectral render.
