@@ -1,6 +1,5 @@
 """The exact lens and its models as cameras: exposure, focus, agreement; the same picture through every known pupil."""
 
-import io
 import math
 from dataclasses import replace
 from functools import cache
@@ -15,7 +14,6 @@ from shipped import whole
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.progress import Progress
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
@@ -106,16 +104,6 @@ def test_without_a_compiler_a_camera_runs_in_onnxruntime(monkeypatch: pytest.Mon
     assert lens_models.exact_camera.__wrapped__(2.0, 8.0).runtime == "onnxruntime"
     with pytest.raises(InputError, match="CC: got '/no/compiler'"):
         ExactCamera(lens_models.lens(), Shot(FILM, 2.0, 8.0, runtime="c"), bounds=lens_models.domain().bounds)
-
-
-def test_what_was_compiled_is_said_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    said = []
-    for _ in range(2):
-        stream = io.StringIO()
-        ExactCamera(lens_models.lens(), Shot(FILM, 2.0, 3.0, runtime="c"), progress=Progress(stream=stream))
-        said.append([line for line in stream.getvalue().splitlines() if line.startswith("compiled")])
-    assert len(said[0]) == 1 and str(tmp_path) in said[0][0] and said[1] == []
 
 
 def test_focus_that_no_film_plane_reaches() -> None:
