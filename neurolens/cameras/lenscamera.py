@@ -185,7 +185,7 @@ class LensFilm:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where rays of film points cross the upright film plane and the pupil [2, N], and their area [N].
 
-        The area is that of `PupilOutline.sample`, times what turns a weight on the plane into that on the film.
+        The area is that of `PupilOutline.sample`, times the factor from a weight on the plane to that on the film.
         """
         g, given = Graph(), {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
         plane, pupil = self.on_plane(g, g.input("film_mm", 2))

@@ -1,8 +1,8 @@
 """How the film stands: turned about two axes, and moved in its plane.
 
-A lens knows lines alone. The line from a point of such a film through a point of the pupil meets the plane of an
-upright film, in which the axis meets both films, elsewhere: `to_plane` finds the place and what the turn does to the
-light, `to_film` the way back.
+A lens takes rays, whatever film they come from. The line from a point of a turned film through a point of the pupil
+meets the plane of an upright film, in which the axis meets both films, elsewhere: `to_plane` finds the place and what
+the turn does to the light, `to_film` the way back.
 """
 
 from __future__ import annotations

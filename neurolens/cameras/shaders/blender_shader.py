@@ -172,8 +172,8 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
 
     Args:
         plane_mm: the plane of its pupil points.
-        far, inside_m: for groups that have moved, the lens at infinity focus, whose picture keeps its size, and the
-            distance in focus.
+        far, inside_m: where groups have moved to focus, the lens at infinity focus, which sets the picture's size, and
+            the distance in focus.
     """
     from neurolens.optics.setting.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds

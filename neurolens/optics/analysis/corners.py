@@ -200,7 +200,7 @@ class Spread(Report):
 
     @property
     def softest(self) -> tuple[int, int]:
-        """The copy and the place, as rows of the arrays, with the least contrast at the last frequency."""
+        """Return which copy and which place, as rows of the arrays, have the least contrast at the last frequency."""
         row, place = np.unravel_index(np.argmin(self.copy_contrast), self.copy_contrast.shape)
         return int(row), int(place)
 

@@ -62,8 +62,8 @@ def _quarter_wave(_low: float, _high: float, at_nm: float) -> Films:
 def _v_coat(low: float, high: float, at_nm: float) -> Films:
     """Two films without any reflection at `at_nm` and normal incidence (Macleod, section 3.2: equations of tan^2).
 
-    Magnesium fluoride over tantala (2.10), over alumina (1.63) for glass above 1.90; of the two solutions the thinner,
-    which is the broader.
+    Magnesium fluoride over tantala (2.10), over alumina (1.63) for glass above 1.90; of two solutions the thinner one
+    is taken, whose band is broader.
 
     Raises:
         InputError: no two films of these indices bring the reflection of these media to zero.

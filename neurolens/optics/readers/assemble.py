@@ -5,9 +5,10 @@ ones are a figure of their own (`optics.lens.figures.Qcon`). With u the height o
 
     sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x),
 
-whose slopes along the normal are orthonormal. (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic,
-Thorlabs's ASL5040-UV is sharp.) The cosine is no polynomial: a polynomial as close as `CLOSE_MM` up to the rim stands
-for it. Conics so steep that the lens model's powers do not come so close are refused.
+whose slopes along the normal are orthonormal. (Forbes starts from a sphere, whose cosine is sqrt(1 - c^2 r^2). That a
+conic is meant shows in Thorlabs's ASL5040-UV, which is sharp only so.) The cosine is no polynomial: a polynomial as
+close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens model's powers do not come so close are
+refused.
 """
 
 from __future__ import annotations

@@ -136,8 +136,7 @@ def outline_spectrum(
     power of sinc(x / 2), x in pixels, whose samples a pixel apart always have the same sum.
 
     Args:
-        part: K and N for the K-th of N spectra whose mean is wanted; each starts pairs at its own share of the
-            elements.
+        part: K and N, where N spectra are averaged and this is the K-th; each begins to pair elements at another place.
     """
     wave = shortest_nm * 1e-6
     pixel = max(pixel_mm, 8 * reach_mm / _SPECTRUM)
