@@ -117,8 +117,9 @@ def run(args: argparse.Namespace) -> None:
     rows = [row for name in lab.counted(names, "scenes", args.quiet) for row in case(name, args)]
     head = f"`python -m experiments plan-times`: {LENS}, {args.samples} samples, {args.width} pixels wide; "
     pairs = [twice(name, *size) for size in SIZES for name in names]
+    load = f"; {os.getloadavg()[0]:.0f} programs ran at the end of it."
     page = lab.page(
-        "# Seconds of plans", head + lab.machine_line(), lab.table(_COLUMNS, rows),
+        "# Seconds of plans", head + lab.machine_line().removesuffix(".") + load, lab.table(_COLUMNS, rows),
         "Two plans of each picture, at 0.25 px; the first compiles and fits what the second finds ready:",
         lab.table(_TWICE, pairs),
     )  # fmt: skip
