@@ -743,7 +743,8 @@ def blur() -> Answer:
             ("python -m experiments defocus --checks", "defocus_checks.md"),
         ],
         "A 50 mm f/1.4 wide open, pictures 480 pixels wide. Plates have 512 samples a pixel, path-traced pictures "
-        "1,024. `defocus` took 64 samples a pixel; its default is 128 now. " + MACHINE,
+        "1,024. `defocus` took its default of 128 samples. Other programs shared the machine, so times are upper "
+        "bounds. " + MACHINE,
         [("docs/pages/how-to/defocus.md", "blur a plate yourself")],
     )
 
