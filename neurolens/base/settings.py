@@ -462,7 +462,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
         place = _join(prefix, name)
         if name in data:
             values[name] = _convert(_in_unit_of(name, data[name]), hints[name], file, place)
-        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+        elif f.default in (dataclasses.MISSING, ...) and f.default_factory is dataclasses.MISSING:
             raise InputError(file, place, "(missing)", _describe(hints[name]))
     try:
         return cls(**values)

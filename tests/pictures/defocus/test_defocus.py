@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 from shipped import whole
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, DifferentialCamera
 from neurolens.cameras.field import field_of, frame_of
@@ -34,6 +34,8 @@ from neurolens.pictures.defocus.picture import (
 )
 from neurolens.pictures.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.pictures.render.pictures import read_channels, read_exr, write_channels
+from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.scene import load_scene
 from tests.command_line import failure, run_json
 
 ROOT = Path(__file__).parents[3]
@@ -598,3 +600,17 @@ def test_depth_below_a_metre_is_taken_where_its_unit_is_stated(tmp_path: Path) -
     plate = plate_file(tmp_path / "macro.exr", np.linspace(300, 700, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]))
     layer = read_plate(plate, FILM, frame_of(thin()), DepthSettings(scale_m=1e-3)).layers[0]
     assert layer.texel[0, 0, 3] == pytest.approx(1 / 0.3, rel=1e-3)
+
+
+@pytest.mark.parametrize("colour", [(1.0, 1.0, 1.0), (0.9, 0.3, 0.1)])
+def test_a_plain_wall_has_the_colour_that_a_path_tracer_gives_it(colour: tuple[float, ...], tmp_path: Path) -> None:
+    """Through coated glass, whose films and absorption tint the picture; 1% off with three colours each by itself."""
+    scene = "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 5\n[environment]\ncolour = {}\n"
+    (path := tmp_path / "wall.toml").write_text(scene.format(list(colour)))
+    shot = Shot((1.8, 1.2), 5.0, f_number=1.4, wavelength_nm=(400.0, 700.0))
+    camera = make_camera(str(ROOT / "lenses" / "leica_summilux_m_50mm_f1_4.toml"), shot)
+    traced = render(load_scene(path), camera, width=12, height=8, samples=2048, threads=1).rgb.mean(axis=(0, 1))
+    wall = plate_of(camera, (np.full((8, 12, 3), colour), np.full((8, 12), 0.3)), size=(12, 8))
+    with pytest.warns(NeurolensWarning, match="overscan"):
+        found = defocus(wall, camera).rgb.mean(axis=(0, 1))
+    assert found == pytest.approx(traced, rel=3e-3)

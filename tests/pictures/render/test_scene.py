@@ -138,6 +138,12 @@ def test_one_number_is_a_grey(kind: str, grey: Any, colour: Any) -> None:
             scene(**(materials | {name: table}))
 
 
+def test_a_scene_without_a_focus_says_that_it_is_missing(tmp_path: Path) -> None:
+    (path := tmp_path / "a.toml").write_text("[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\n")
+    with pytest.raises(InputError, match=r"camera\.focus_m: got \(missing\), expected a number"):
+        load_scene(path)
+
+
 def test_empty_and_missing_files(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     for content in ("", "camera = 3", "[camera", "[camera]\nfocus_m = 2\n"):
