@@ -271,7 +271,7 @@ def _settings(shot: Shot, **more: Any) -> CameraShot:
     """The settings that the exact lens and the model share, and more."""
     return CameraShot(
         shot.film_mm, shot.focus_m, film_offset_mm=shot.offset_mm, wavelength_nm=shot.wavelength_nm,
-        focus_mode="paraxial", **more,
+        focus_mode="paraxial", film_tilt_deg=shot.panel.film_tilt_deg, **more,
     )  # fmt: skip
 
 

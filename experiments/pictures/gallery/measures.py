@@ -25,6 +25,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera
 from neurolens.optics.lens.glass import LINE_D_NM
+from neurolens.pictures.render.job import camera_axes
 
 _RADII = 13
 
@@ -293,6 +294,19 @@ def edge_blur(view: View) -> dict[str, float]:
     return {"middle_um": middle, "edge_um": edge, "edge_over_middle": _ratio(edge, middle)}
 
 
+def board_blur(view: View) -> dict[str, float]:
+    """Measure the RMS radius of the spots of points of the scene's plane y = 0, at three heights of the picture."""
+    camera = view.shot.scene.settings.camera
+    up, height_m = camera_axes(camera)[1], float(camera.position_m[1])
+    found = {}
+    for name, y_mm in (("near", -9.0), ("middle", 0.0), ("far", 9.0)):
+        # How high above the plane the middle ray is at two depths, and at which depth it meets the plane.
+        near, far = (height_m + up @ [*scene_point(view.camera, (0.0, y_mm), d, 550.0), -d] for d in (0.5, 1.0))
+        depth_m = 0.5 + 0.5 * float(near / (near - far))
+        found[f"{name}_um"] = math.hypot(*spot(view.camera, (0.0, y_mm), depth_m).widths_um)
+    return found
+
+
 def line_bow(view: View) -> dict[str, float]:
     """The bow of a straight line of the scene, its middle at (0, y_mm) and its end at x_mm: above 0 away from the
     film's centre (pincushion), below towards it (barrel); in um, and in percent of y_mm.
@@ -340,7 +354,7 @@ def _ratio(a: float, b: float) -> float:
 MEASURES: dict[str, Callable[[View], dict[str, float]]] = {
     measure.__name__: measure
     for measure in (
-        *(light_profile, comet, line_blur, edge_blur, line_bow, colour_blur, lateral_colour, falloff, against_post),
+        *(light_profile, comet, line_blur, edge_blur, board_blur, line_bow, colour_blur, lateral_colour, falloff, against_post),
         *(depth_of_field, series, pinhole, panorama, bokeh.stop_shape, bokeh.cats_eye, bokeh.anamorphic),
     )
 }

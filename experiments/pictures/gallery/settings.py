@@ -28,6 +28,7 @@ class Panel:
             comes nearer than 5% to its surface's radius of curvature.
         f_number: None takes the scene's, else the lens's own.
         focus_m: from the film; None takes the scene's. film_offset_mm: away from the lens, after focusing.
+        film_tilt_deg: of the film of the exact lens and of models, as of `neurolens.optics.lens.shot`.
         film_mm: None takes the scene's. window_mm: the part that is drawn: centre x and y as printed (x right, y up),
             width and height; None draws all of it.
         width, samples: of the picture.
@@ -49,6 +50,7 @@ class Panel:
     f_number: float | None = None
     focus_m: float | None = None
     film_offset_mm: float = 0.0
+    film_tilt_deg: float = 0.0
     film_mm: tuple[float, float] | None = None
     window_mm: tuple[float, float, float, float] | None = None
     width: int = 240
