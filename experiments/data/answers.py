@@ -684,7 +684,7 @@ def pictures() -> Answer:
         [
             (
                 "experiments/results/gallery/README.md",
-                "twenty effects of real lenses, each measured: `python -m experiments gallery`",
+                "twenty-two effects of real lenses, each measured: `python -m experiments gallery`",
             ),
             ("experiments/results/plans.md", "plans of scenes, and whether they hold: `python -m experiments plans`"),
             ("experiments/results/dask.md", "a farm of workers: `python -m experiments dask`"),

@@ -354,7 +354,8 @@ def _ratio(a: float, b: float) -> float:
 MEASURES: dict[str, Callable[[View], dict[str, float]]] = {
     measure.__name__: measure
     for measure in (
-        *(light_profile, comet, line_blur, edge_blur, board_blur, line_bow, colour_blur, lateral_colour, falloff, against_post),
+        *(light_profile, comet, line_blur, edge_blur, board_blur, line_bow, colour_blur, lateral_colour),
+        *(falloff, against_post),
         *(depth_of_field, series, pinhole, panorama, bokeh.stop_shape, bokeh.cats_eye, bokeh.anamorphic),
     )
 }
