@@ -60,8 +60,8 @@ LEAN_MODULES = {
 # Statements that each room has, as the last issue left it: what a reader has to hold. A room that grows by more than
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
-    "__init__": 25, "__main__": 4, "base": 2020, "graph": 2629, "optics": 9995, "models": 4500, "cameras": 4245,
-    "pictures": 7540, "programs": 2760, "studies": 3330, "cli": 4095, "front": 210,
+    "__init__": 25, "__main__": 4, "base": 2020, "graph": 2629, "optics": 10000, "models": 4500, "cameras": 4245,
+    "pictures": 7590, "programs": 2760, "studies": 3330, "cli": 4105, "front": 210,
 }  # fmt: skip
 SLACK = 1.03
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,13 +18,14 @@ from neurolens.cameras.field import Frame, frame_of
 from neurolens.cameras.sampling import focus_m
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import PictureCommand, channels_nm, whole_pair
-from neurolens.pictures.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, kernels_over
+from neurolens.pictures.defocus.diffraction import Diffraction
+from neurolens.pictures.defocus.kernels import Cell, Grooves, as_picture, as_preview, aspheres, diffracted, kernels_over
 from neurolens.pictures.defocus.picture import SAMPLES, check_field, defocus
 from neurolens.pictures.defocus.plate import DepthSettings, middle_m, read_plate
 from neurolens.pictures.frames import Files
 from neurolens.pictures.render.pictures import standard_attributes, write_channels, write_exr, write_png
 from neurolens.pictures.render.sensor import about, expose
-from neurolens.pictures.render.settings import SensorSettings
+from neurolens.pictures.render.settings import SensorSettings, diffraction
 
 _MOST = 64  # fields along a side, at most
 
@@ -72,6 +73,7 @@ examples:
         f"(default: {SAMPLES})", within=(8, 512),
     )  # fmt: skip
     no_highlights: bool = setting(False, "do not spread very bright pixels as discs; their blur is then noisy")
+    diffraction: bool = diffraction()
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = cli.exposure()
     sensor: SensorSettings = group("sensor (any of these adds what it reads as channels raw)", unset=True)
@@ -118,11 +120,14 @@ examples:
         camera = cli.camera(self.lens, shot := self.state.shot(self.film), progress)
         check_field(camera)
         plate = read_plate(self.plate, self.film, frame_of(camera), self._depth(), self.behind)
+        waves = Diffraction.of(camera, plate.size) if self.diffraction else None
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
+        found = found if waves is None else replace(found, rgb=waves(found.rgb))
         answer = Blurred(
             self.plate.name, len(plate.layers), str(files.out), found.highlights, found.filled, found.lost, found.beyond
         )
-        metadata = {"version": __version__, "camera": camera.settings, "defocus": vars(answer)}
+        metadata: dict[str, Any] = {"version": __version__, "camera": camera.settings, "defocus": vars(answer)}
+        metadata["diffraction"] = self.diffraction
         layers = {}
         if sensor is not None:
             layers, metadata["sensor"] = expose(found.rgb, sensor, self.seed), about(sensor, self.seed)
@@ -199,6 +204,7 @@ examples:
         0.0, "height of the grooves that grinding leaves on aspheres, which draw onion rings: 1 to 20 nm are plain "
         "(default: 0)", within=(0, 1000), metavar="NM",
     )  # fmt: skip
+    diffraction: bool = diffraction()
     ring_spacing: float = setting(0.5, "from groove to groove (default: 0.5 mm)", within=(0.01, 100), metavar="MM")
 
     def run(self) -> int:
@@ -213,14 +219,19 @@ examples:
         grooves = Grooves(self.ring_height, self.ring_spacing) if self.ring_height else None
         if grooves:
             aspheres(camera)
+            if self.diffraction:
+                self.refuse("--diffraction", "(beside --ring-height)", "one of both")
         with progress.stage("find the kernels") as report:
             found = kernels_over(
                 camera, self.picture, tuple(dict.fromkeys(distances)), self.grid, self.wavelengths, grooves, report
             )
+        if self.diffraction:
+            waves = Diffraction.of(camera, self.picture, self.wavelengths)
+            found = [diffracted(camera, self.picture, cells, waves) for cells in found]
         side = max(cell.width_px for cells in found for cell in cells)
         facts: dict[str, Any] = {"version": __version__, "camera": camera.settings, "picture_px": list(self.picture)}
         facts |= {"film_mm": list(self.film), "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m}
-        facts |= {"grooves": vars(grooves)} if grooves else {}
+        facts |= {"diffraction": self.diffraction} | ({"grooves": vars(grooves)} if grooves else {})
         files, rows = [], []
         for cells in found:
             distance = "inf" if math.isinf(cells[0].distance_m) else f"{cells[0].distance_m:.10g}m"

@@ -30,19 +30,16 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import whole_pair
 from neurolens.optics.lens.shot import BY_LENSES
+from neurolens.pictures.defocus.diffraction import MOST_PX, Channels, channels_of, places_of
 from neurolens.pictures.render.pictures import write_channels
 from neurolens.programs.psf import (
-    MOST_PX,
     Arrays,
-    Channels,
     PsfTask,
     about,
-    channels_of,
     channels_of_exr,
     forget,
     how_to_resume,
     library_of,
-    places_of,
 )
 
 _ACROSS = 6000  # pixels of a picture whose pixels are not given

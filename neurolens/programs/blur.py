@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from neurolens.base.errors import InputError
+from neurolens.pictures.defocus.diffraction import shares
 from neurolens.pictures.render.images import read_picture
 from neurolens.pictures.render.sensor import about as about_sensor
 from neurolens.pictures.render.sensor import expose
@@ -59,12 +60,12 @@ class Blur:
         height, width = size
         up = at_mm[1] + ((height - 1) / 2 - np.arange(height)) * pixel_mm
         right = at_mm[0] + (np.arange(width) - (width - 1) / 2) * pixel_mm
-        rows = _shares(-arrays["place_mm"][:, 0, 1], -up)
-        columns = _shares(arrays["place_mm"][0, :, 0], right)
+        rows = shares(-arrays["place_mm"][:, 0, 1], -up)
+        columns = list(shares(arrays["place_mm"][0, :, 0], right))
         self._parts = [
-            (*down[0], *across[0], torch.from_numpy(down[1][:, None] * across[1]), torch.from_numpy(kernels[i, j]))
-            for i, down in rows
-            for j, across in columns
+            (*down, *across, torch.from_numpy(part[:, None] * other), torch.from_numpy(kernels[i, j]))
+            for i, down, part in rows
+            for j, across, other in columns
         ]
 
     def __call__(self, sharp: Tensor) -> Tensor:
@@ -95,18 +96,6 @@ class Blur:
                 spectrum = torch.fft.rfft2(weight * room[:, own[0], own[1]], s=shape) * torch.fft.rfft2(h, s=shape)
                 found[:, at[0], at[1]] += torch.fft.irfft2(spectrum, s=shape)
         return found[:, r : r + height, r : r + width]
-
-
-def _shares(places: Any, at: Any) -> list[tuple[int, tuple[tuple[int, int], Any]]]:
-    """Return, for each place with a share of points: its number, its first point, the one after its last, shares."""
-    found = []
-    for k, unit in enumerate(np.eye(len(places))):
-        share = np.interp(at, places, unit)
-        some = np.nonzero(share)[0]
-        if len(some):
-            first, last = int(some[0]), int(some[-1]) + 1
-            found.append((k, ((first, last), share[first:last])))
-    return found
 
 
 @dataclass

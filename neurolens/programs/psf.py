@@ -17,7 +17,6 @@ upright: row 0 is its top.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
@@ -33,18 +32,14 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import read_arrays, write_arrays
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import Failed, run_each
 from neurolens.models.model import LensModel
 from neurolens.optics.lens.prescription import Lens
-from neurolens.pictures.defocus.plate import channel_wavelengths
+from neurolens.pictures.defocus.diffraction import Channels, spreads
 from neurolens.pictures.render.film import digest
 
 Arrays = dict[str, NDArray[Any]]
-Channels = dict[str, tuple[float, ...]]
-MOST_PX = 255  # pixels along a side of the point spread
 _NAMES = ("psf", "centre_mm", "inside", "light", "by_rays", "differs", "place_mm", "f_number", "distance_m")
-_COLOURS = 3  # wavelengths in a channel of a sensor
 
 
 @dataclass(frozen=True)
@@ -78,68 +73,17 @@ class PsfTask:
             raise InputError(lens.path, "distance_m", self.distance_m, f"above {front_m:.4g}, the front of the lens")
 
 
-def channels_of(kind: str, lens: Lens) -> Channels:
-    """Return the wavelengths of channels: R, G and B ("rgb"), or Y, all of these ("mono").
-
-    They share the light of each channel equally, as the film responds to it. A lens that is made for other light has
-    the wavelengths of its file in Y.
-    """
-    if not lens.visible:
-        return {"Y": lens.wavelengths_nm}
-    found = channel_wavelengths(((np.arange(_COLOURS) + 0.5) / _COLOURS).astype(np.float32), *LIGHT_NM)
-    colours = {name: tuple(np.round(nm, 1).tolist()) for name, nm in zip("RGB", found.astype(float), strict=True)}
-    return colours if kind == "rgb" else {"Y": tuple(nm for waves in colours.values() for nm in waves)}
-
-
-def places_of(film_mm: tuple[float, float], grid: tuple[int, int]) -> tuple[tuple[float, float], ...]:
-    """Return the middles of equal parts of the picture, row by row from the top: right and up, in mm."""
-    right, up = (size * ((np.arange(n) + 0.5) / n - 0.5) for size, n in zip(film_mm, grid, strict=True))
-    return tuple((x, y) for y in up[::-1].tolist() for x in right.tolist())
-
-
 def point_spread(task: PsfTask) -> Arrays:
     """Return the arrays of a task as the file holds them, a row for each place off the axis.
-
-    Places that are mirror images of each other are computed once, where lens and stop are symmetric.
 
     Raises:
         InputError: no light of the axis reaches the film.
     """
-    from neurolens.optics.analysis.diffraction import pupils_at, reach_of, spread
-    from neurolens.optics.analysis.fields import Scene
-
-    film = -np.array(task.places_mm)  # the picture is upright, the image on the film is not
-    symmetric = task.lens.aperture is None and not task.lens.decentred
-    mirrored = np.abs(film) if symmetric else film
-    unique, number = np.unique(mirrored.round(9), axis=0, return_inverse=True)
-    waves = sorted({nm for some in task.channels for nm in some})
-    middle = task.channels[len(task.channels) // 2]
-    waves.insert(0, waves.pop(waves.index(sorted(middle)[len(middle) // 2])))  # the reference comes first
-    weights = np.array([[nm in some for nm in waves] for some in task.channels], np.float64)
-    scene = Scene(task.lens, task.distance_m)
-    if task.model is not None:
-        from neurolens.models.wavefront import model_pupils
-
-        pupils = model_pupils(task.model, scene, unique, waves)
-    elif task.lens.round:
-        pupils = pupils_at(scene, unique, waves)
-    else:
-        from neurolens.pictures.flare.exit_pupil import pupils_seen
-
-        pupils = pupils_seen(task.lens, task.distance_m, unique, waves)
-    reach = max(reach_of(some) for some in pupils)
-    side = task.side or min(2 * math.ceil(reach / task.pixel_mm) + 1, MOST_PX)
-    found = [spread(some, weights, task.pixel_mm, side) for some in pupils]
-    turned, centres = [], []
-    for place, k in zip(film, number.reshape(-1), strict=True):
-        x, y = (-1 if a < -1e-9 and symmetric else 1 for a in place)
-        turned.append(found[k].light[:, ::y, ::-x])  # columns of the picture run against x
-        centres.append(-found[k].centre_mm * (x, y))
-    every = [found[k] for k in number.reshape(-1)]
+    every = spreads(task.lens, task.distance_m, task.places_mm, task.channels, task.pixel_mm, task.side, task.model)
     if not (axis := every[-1].pupil.sum()) > 0:
         raise InputError(task.lens.path, "distance_m", task.distance_m, "one whose light reaches the film")
     whole = {
-        "psf": np.array(turned, np.float32), "centre_mm": np.array(centres),
+        "psf": np.array([s.light for s in every], np.float32), "centre_mm": np.array([s.centre_mm for s in every]),
         "inside": np.array([s.inside for s in every]),
         "light": np.array([s.pupil.sum() / axis for s in every]),
         "by_rays": np.array([s.by_rays for s in every]), "differs": np.array([s.differs for s in every]),

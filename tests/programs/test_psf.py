@@ -20,6 +20,7 @@ from neurolens.optics.lens.prescription import Lens, Placement
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
+from neurolens.pictures.defocus.diffraction import places_of
 from neurolens.pictures.defocus.kernels import kernels_over
 from neurolens.pictures.flare.exit_pupil import pupils_seen
 from neurolens.pictures.render.pictures import read_channels
@@ -80,7 +81,7 @@ def test_an_image_out_of_focus_is_the_kernel_of_the_blur() -> None:
     shot = Shot((30.0, 20.0), focus_m=2.0, f_number=2.0)
     [cells] = kernels_over(make_camera(LENS, shot), (3750, 2500), [math.inf], (3, 2), (540.0, 540.0, 540.0))
     lens = set_lens(read_lens(library() / "lenses" / f"{LENS}.toml"), replace(Shot.part(), focus_m=2.0, f_number=2.0))
-    task = p.PsfTask(lens, math.inf, (*p.places_of((30.0, 20.0), (3, 2)), (0.0, 0.0)), ((540.0,),), 0.008, 91)
+    task = p.PsfTask(lens, math.inf, (*places_of((30.0, 20.0), (3, 2)), (0.0, 0.0)), ((540.0,),), 0.008, 91)
     for cell, image in zip(cells, p.point_spread(task)["psf"][:, 0], strict=True):
         assert cell.kernel is not None
         kernel = cell.kernel.centred(91, cell.place_px)[..., 1]

@@ -103,6 +103,12 @@ class ExitPupil:
         w, e = self._at(places, slice(2))
         return phasor(w * (1e6 / self.wavelength_nm), np.sqrt(np.maximum(e, 0)))
 
+    def perfect(self) -> ExitPupil:
+        """Return the pupil without aberrations: all its light goes to the film point from which x and y are counted."""
+        figures = self.figures.copy()
+        figures[..., 0] = 0
+        return replace(self, figures=figures, centre_mm=np.zeros(2), hits_mm=np.zeros((2, 1)))
+
     def light(self, places: Array | tuple[Array, Array]) -> Array:
         """Return the light per area of cosines (mm^2) at points, which are as in `passes`."""
         return np.asarray(np.maximum(self._at(places, slice(1, 2))[0], 0))

@@ -17,7 +17,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
+from neurolens.pictures.defocus.diffraction import MOST_PX, Diffraction, lens_of, spreads
 from neurolens.pictures.defocus.plate import (
     FloatArray,
     Plate,
@@ -362,6 +363,46 @@ class Cell:
             return 1
         first = np.subtract(self.kernel.corner_px, np.floor(self.place_px))
         return 2 * int(np.abs([first, first + self.kernel.light.shape[1::-1] - 1]).max()) + 1
+
+    def spread_by(self, waves: Diffraction) -> Cell:
+        """Return the cell with the kernel after diffraction."""
+        if self.kernel is None:
+            return self
+        own = waves.at(self.place_px)
+        light, r = self.kernel.light, own.shape[-1] // 2
+        shape = light.shape[0] + 2 * r, light.shape[1] + 2 * r
+        spectrum = np.fft.rfft2(light, shape, (0, 1)) * np.fft.rfft2(own.transpose(1, 2, 0), shape, (0, 1))
+        column, row = self.kernel.corner_px
+        return self._with(np.fft.irfft2(spectrum, shape, (0, 1)), (column - r, row - r))
+
+    def _with(self, light: Array, corner_px: tuple[int, int]) -> Cell:
+        """Return the cell with another picture [h, w, 3] of its point."""
+        assert self.kernel is not None
+        lit: FloatArray = np.maximum(light, 0).astype(np.float32)
+        return replace(self, kernel=replace(self.kernel, light=lit, corner_px=corner_px))
+
+
+def diffracted(camera: Camera, size: tuple[int, int], cells: Sequence[Cell], waves: Diffraction) -> list[Cell]:
+    """Return the kernels of one distance with diffraction.
+
+    They are sums of waves over the pupils of their places. Where these would need too many points, or pixels, the
+    kernels by rays are spread by their zone's diffraction.
+    """
+    widest, r = max(cell.width_px for cell in cells), waves.kernels.shape[-1] // 2
+    summed = None
+    if widest + 2 * _MARGIN <= MOST_PX:
+        width, height = camera.film_mm
+        places = [(cell.field[0] * width / 2, cell.field[1] * height / 2) for cell in cells]
+        side, pixel_mm = min(widest + 2 * r, MOST_PX), camera.film_mm[0] / size[0]
+        summed = spreads(lens_of(camera), cells[0].distance_m, places, waves.channels, pixel_mm, side)
+    found = []
+    for k, cell in enumerate(cells):
+        if summed is None or cell.kernel is None or summed[k].by_rays or not summed[k].inside.all():
+            found.append(cell.spread_by(waves))
+            continue
+        x, y = (math.floor(at) - side // 2 for at in cell.place_px)
+        found.append(cell._with(summed[k].light.transpose(1, 2, 0) * cell.kernel.energy, (x, y)))
+    return found
 
 
 def own_plate(camera: Camera, size: tuple[int, int]) -> Plate:

@@ -31,6 +31,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.optics.lens.shot import POSES, Shot, film_size
 from neurolens.optics.readers.glasses import more_glasses
+from neurolens.pictures.defocus.diffraction import Diffraction
 from neurolens.pictures.render.behind import Behind
 from neurolens.pictures.render.colour import (
     ACESCG,
@@ -48,7 +49,7 @@ from neurolens.pictures.render.pictures import standard_attributes
 from neurolens.pictures.render.renderer import RenderResult, Watch, render, rows_of, tile_path, windows
 from neurolens.pictures.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
 from neurolens.pictures.render.sensor import about, expose
-from neurolens.pictures.render.settings import LAYERS, FilmSettings, SensorSettings, size_by_shape
+from neurolens.pictures.render.settings import LAYERS, FilmSettings, SensorSettings, diffraction, size_by_shape
 from neurolens.pictures.render.world import shared_worlds
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ class Picture:
         0, "add so many layers of what stands behind the first things that a pinhole sees, as channels behind1.R and "
         "so on, for the blur of neurolens defocus; each takes as long as the picture (default: 0)", within=(0, 8),
     )  # fmt: skip
+    diffraction: bool = diffraction()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,6 +200,7 @@ class Prepared:
         sensor: what turns the picture into numbers; None without one. size: width and height of the whole picture in
             pixels.
         rows: the first row of the frame's tile and the one after its last; None without a tile.
+        diffraction: of the camera; None without.
     """
 
     frame: Frame
@@ -208,6 +211,7 @@ class Prepared:
     camera: Camera
     size: tuple[int, int]
     rows: tuple[int, int] | None
+    diffraction: Diffraction | None = None
 
     @property
     def name(self) -> str:
@@ -271,7 +275,14 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
     error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
     if error > (pixel := 1e3 * camera.film_mm[0] / width):
         warn(f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um")
-    return Prepared(frame, files, scene, film, sensor, camera, (width, height), rows)
+    waves = None
+    if frame.diffraction:
+        if rows is not None:
+            raise InputError(
+                "neurolens render", "--diffraction", "(a tile)", "a whole picture: light goes across tiles"
+            )
+        waves = Diffraction.of(camera, (width, height))
+    return Prepared(frame, files, scene, film, sensor, camera, (width, height), rows, waves)
 
 
 def render_frame(
@@ -389,7 +400,9 @@ def write_pictures(
     frame, files, (width, height) = prepared.frame, prepared.files, prepared.size
     space, camera = COLOUR_SPACES[prepared.film.colour_space], plain(prepared.camera.settings)
     metadata: dict[str, Any] = {"version": __version__, "scene": str(frame.scene), "camera": camera}
-    metadata |= {"render": plain(result.stats), "colour": space.stated}
+    metadata |= {"render": plain(result.stats), "colour": space.stated, "diffraction": frame.diffraction}
+    if prepared.diffraction is not None:
+        result = replace(result, rgb=prepared.diffraction(result.rgb))
     layers: Layers = {}
     if frame.channels == "all" or not result.stats.complete:
         layers, metadata["layers"] = asdict(result.layers), dict(MEANING)

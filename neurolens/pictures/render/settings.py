@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import check_bounds, setting
@@ -13,6 +13,14 @@ WavelengthMode = Literal["auto", "one", "hero"]
 WavelengthSampling = Literal["importance", "uniform"]
 _BLACK = 512  # of 14 bits: the number that is read without light
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
+
+
+def diffraction() -> Any:
+    """Return --diffraction, a switch of pictures that are made of rays."""
+    return setting(
+        False, "spread light by the waves of the stop, its blades and the rims, in 5 x 3 zones of the picture, after "
+        "the rays; for small pixels and stops. Takes a lens or its model, and the extra \"train\" (torch)",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,129 @@
+"""`--diffraction` of `render`, `defocus` and `bokeh`: Airy's disc, even light, the star of `flare`, what is refused."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import failure, run_json
+from scipy.special import j0, j1
+
+from neurolens.cameras.build import make_camera
+from neurolens.cameras.contract import Camera
+from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.analysis.spots import working_f_number
+from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.defocus.diffraction import Diffraction
+from neurolens.pictures.flare.diffraction import far_field
+from neurolens.pictures.flare.exit_pupil import exit_pupil, outline
+from neurolens.pictures.flare.lights import Light
+from neurolens.pictures.render.pictures import read_channels
+
+LENS, NM = "laikin_double_gauss_50", 546.0
+
+
+def camera(film_mm: float, f_number: float, aperture: Aperture | None = None) -> Camera:
+    film = (film_mm, film_mm)
+    shot = replace(Shot(film_mm=film), f_number=f_number, aperture=aperture, focus_m=math.inf, runtime="onnxruntime")
+    return make_camera(LENS, shot)
+
+
+def test_a_point_becomes_airys_disc() -> None:
+    """Light within a radius is 1 - J0^2 - J1^2 (Rayleigh); the light beyond the kernel is put back."""
+    size, made = (60, 60), camera(0.12, 22.0)
+    picture = np.zeros((*size, 3), np.float32)
+    picture[30, 30] = 1
+    found = Diffraction.of(made, size, (NM,) * 3)(picture)[..., 1]
+    n = working_f_number(Scene(made.lens), NM)  # type: ignore[attr-defined]
+    radii = np.array([0.008, 0.012, 0.02, 0.03])
+    v = math.pi * radii / (NM * 1e-6 * n)
+    within = np.array([_within(found, r / 0.002) for r in radii])
+    assert within == pytest.approx(1 - j0(v) ** 2 - j1(v) ** 2, abs=0.015)
+
+
+def _within(light: np.ndarray, radius_px: float) -> float:
+    """Light within a radius of the middle of pixel 30, with the share of the pixels on its edge."""
+    part = (np.arange(600) + 0.5) / 10 - 30.5
+    inside = np.hypot(part[:, None], part) < radius_px
+    return float((light * inside.reshape(60, 10, 60, 10).mean((1, 3))).sum())
+
+
+def test_even_light_stays_even_and_light_is_kept() -> None:
+    made = Diffraction.of(camera(3.0, 16.0, Aperture(blades=5)), (90, 90), (NM,) * 3)
+    even = np.full((90, 90, 3), 0.7, np.float32)
+    assert made(even) == pytest.approx(even, rel=3e-4)  # kernels of neighbouring zones differ a little
+    dark = np.zeros((90, 90, 3), np.float32)
+    r = made.kernels.shape[-1] // 2
+    dark[r + 8 : -r - 8, r + 8 : -r - 8] = np.random.default_rng(1).random((74 - 2 * r, 74 - 2 * r, 3))
+    assert made(dark).sum((0, 1)) == pytest.approx(dark.sum((0, 1)), rel=1e-5)
+
+
+def test_the_star_is_that_of_flare() -> None:
+    """The same lens, seven blades: light by pixel, out to where streaks are 1e-4 of the middle."""
+    pixel, side = 0.012, 61
+    made = camera(pixel * 7 * side, 16.0, Aperture(blades=7))
+    found = Diffraction.of(made, (7 * side, 7 * side), (NM,) * 3).kernels[1, 2, 1]
+    pupil = exit_pupil(made.lens, Light(0.0, 0.0), NM)  # type: ignore[attr-defined]
+    assert pupil is not None
+    pupil = pupil.perfect()
+    part, middle = 13, len(found) // 2
+    line = (np.arange(-25 * part, 25 * part + 1) / part) * pixel
+    fine = far_field(pupil, outline(pupil), line, line)
+    whole = (np.arange(51) * part)[:, None] + np.arange(-(part // 2), part // 2 + 1)
+    inner = whole[1:-1].reshape(-1)
+    star = fine[np.ix_(inner, inner)].reshape(49, part, 49, part).mean((1, 3))
+    ours = found[middle - 24 : middle + 25, middle - 24 : middle + 25]
+    star, ours = star / star.sum(), ours / ours.sum()
+    bright = star > 1e-4 * star.max()
+    assert bright.sum() > 150
+    assert np.abs(np.log(ours[bright] / star[bright])).mean() < 0.1
+    assert 0.5 * np.abs(ours - star).sum() < 0.02
+
+
+def test_commands_spread_light_and_say_so(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A small picture of small pixels at f/22: edges become soft, and the light stays."""
+    words = ["render", scene, "--camera", LENS, "--film", "0.3x0.2", "--width", 30, "--f-number", 22, "--samples", 4]
+    words += ["--runtime", "onnxruntime", "--quiet"]
+    pictures = []
+    for name, more in (("rays", ()), ("waves", ("--diffraction",))):
+        run_json(capsys, *words, *more, "-o", tmp_path / f"{name}.exr")
+        planes, about = read_channels(tmp_path / f"{name}.exr")
+        assert about["diffraction"] is bool(more)
+        pictures.append(planes["G"])
+    rays, waves = pictures
+    assert np.abs(np.diff(waves)).mean() < 0.5 * np.abs(np.diff(rays)).mean()
+    assert waves.mean() == pytest.approx(rays.mean(), rel=0.1)
+    assert "a whole picture" in failure(capsys, *words, "--diffraction", "--tile", "1/2", "-o", tmp_path / "a.exr")
+    thin = ["thin" if word == LENS else word for word in words]
+    assert "or a model of one" in failure(capsys, *thin, "--diffraction", "-o", tmp_path / "a.exr")
+
+
+def test_kernels_of_bokeh_are_sums_of_waves_or_spread_rays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In focus at f/16 the first dark ring has its radius; far out of focus the disc keeps its size."""
+    words = [
+        "bokeh",
+        LENS,
+        "--film",
+        "6x4",
+        "--width",
+        3000,
+        "--focus",
+        2,
+        "--f-number",
+        16,
+        "--grid",
+        "1x1",
+        "--quiet",
+    ]
+    words += ["--wavelengths", "546,546,546", "--diffraction", "--quiet"]
+    found = run_json(capsys, *words, "--distance", 2, "--distance", 0.5, "-o", tmp_path / "a")
+    sharp, wide = (read_channels(Path(file))[0]["G"] for file in found["files"])
+    middle = found["kernel_px"] // 2
+    line = sharp[middle, middle:]
+    working = working_f_number(Scene(make_camera(LENS, Shot(film_mm=(6, 4), f_number=16, focus_m=2.0)).lens, 2.0), NM)
+    assert int(line[:9].argmin()) == pytest.approx(1.22 * NM * 1e-6 * working / 0.002, abs=1)
+    assert sharp.sum() == pytest.approx(1, abs=0.01) and wide.sum() == pytest.approx(1, abs=1e-3)
+    area = [np.count_nonzero(kernel > 0.3 * kernel.max()) for kernel in (sharp, wide)]
+    assert area[1] > 100 * area[0]
