@@ -52,6 +52,7 @@ QUESTIONS = {
         "outside": ("outside", "random inputs through exported models"),
     },
     "pictures": {
+        "deblur": ("deblur", "a network that corrects blur, trained on real lenses or on random Zernike terms"),
         "plans": ("plans", "plans of scenes: whether budgets are kept, and what the cheapest camera costs"),
         "plan-times": ("plan_times", "seconds that plans print beside those of renders to equal noise"),
         "equal-time": ("equal_time", "errors of pictures after equal time and equal samples, every camera"),
