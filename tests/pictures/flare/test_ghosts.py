@@ -197,7 +197,7 @@ BAD = [
     (lambda: Light(180.0, 0.0), "within 90 degrees"),
     (lambda: Light(math.nan, 0.0), "within 90 degrees"),
     (lambda: Light(0.0, 0.0, distance_m=0.0), "positive distance"),
-    (lambda: Light(0.0, 0.0, (1.0, -1.0, 0.0)), "at least 0"),
+    (lambda: Light(0.0, 0.0, (1.0, -1.0, 0.0)), "from 0 to"),
     (lambda: light_rays(plate(), Light(0.0, 0.0, distance_m=0.005), 0, 9), "outside the lens"),
     (lambda: GhostTracer(plate(), [Pair(1, 2)]), "surfaces that reflect"),
     (lambda: GhostTracer(replace(plate(), film_z_mm=None)), "focused"),
