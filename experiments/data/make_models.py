@@ -188,8 +188,7 @@ lens so.
 - **T RMS** is the error of the transmittance of the coated lens, whose coatings the card names. `--transmittance`
   fits it again where coatings or glass are others now.
 - **Times** are ns a ray on one core, in onnxruntime and as C compiled here, with stop, rims and transmittance. "–"
-  was not timed. The other times are of earlier models with as many coefficients, which were fitted before glasses of
-  two figures had a partial dispersion. `--times` takes them again.
+  was not timed. `--times` takes them again.
 - **Speed-up** is that of the model as C over the exact coated lens as C, doing the same work in the same run.
   `make bench` holds the models of the first lenses to the speed-ups that the index promises."""
 
