@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve  # type: ignore[import-untyped]
+from scipy.linalg import cho_solve  # type: ignore[import-untyped]
 
 from neurolens.optics.analysis.fields import on_plane
 from neurolens.optics.lens.apertures import Aperture
@@ -243,6 +243,7 @@ def _fitted(places: Array, half: Array, wave_mm: Array, disc_places: Array, powe
     return figures
 
 
+_APART = 1e-7  # the least share of the largest pivot that a sound fit has
 _ORDERS = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
 
 
@@ -271,12 +272,15 @@ def _least(a: Array) -> Callable[[Array], Array]:
     """Return a function that solves a x = b for any b by least squares.
 
     The normal equations take a fraction of the time of a QR decomposition; a second step on what the first leaves
-    restores the digits that they lose.
+    restores the digits that they lose. Where the rays that pass fill too little of the box to tell all polynomials
+    apart, they would lose all digits, and the smallest solution is found by singular values.
     """
-    squares = cho_factor(a.T @ a, overwrite_a=True, check_finite=False)
+    factor, failed = torch.linalg.cholesky_ex(torch.from_numpy(a.T @ a))
+    if failed or factor.diagonal().min() < _APART * factor.diagonal().max():
+        return lambda b: np.linalg.lstsq(a, b, rcond=None)[0]
 
     def solved(b: Array) -> Array:
-        first = cho_solve(squares, a.T @ b, check_finite=False)
-        return np.asarray(first + cho_solve(squares, a.T @ (b - a @ first), check_finite=False))
+        first = cho_solve((factor.numpy(), True), a.T @ b, check_finite=False)
+        return np.asarray(first + cho_solve((factor.numpy(), True), a.T @ (b - a @ first), check_finite=False))
 
     return solved

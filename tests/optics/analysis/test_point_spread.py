@@ -23,7 +23,7 @@ from neurolens.optics.analysis.diffraction import (
     pupils_at,
     spread,
 )
-from neurolens.optics.analysis.exit_pupil import ExitPupil
+from neurolens.optics.analysis.exit_pupil import ExitPupil, _least
 from neurolens.optics.analysis.field_curves import illumination
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.psf import psf
@@ -118,6 +118,18 @@ def test_the_image_is_the_sum_of_waves_over_exact_rays(f_number: float, field: f
     assert found.diffraction[0] == pytest.approx(direct, abs=0.02 * direct.max())
     assert found.strehl[0] == pytest.approx(direct.max(), abs=5e-3)
     assert pupil.blur_mm < half
+
+
+@pytest.mark.parametrize("lost", [0.0, 1e-9])
+def test_fits_of_too_few_rays_are_the_smallest(lost: float) -> None:
+    """Where rays do not tell the terms of a fit apart, exactly or nearly, the fit holds at the rays and stays small."""
+    rng = np.random.default_rng(3)
+    a = rng.normal(size=(200, 60))
+    a[:, 59] = a[:, :59].mean(1) + lost * rng.normal(size=200)
+    wanted = rng.normal(size=60)
+    found = _least(a)(a @ wanted)
+    assert np.abs(a @ (found - wanted)).max() < 1e-8
+    assert np.abs(found).max() < 1.5 * np.abs(wanted).max()
 
 
 def test_all_light_is_in_the_image() -> None:
