@@ -30,9 +30,8 @@ from neurolens.cameras.shaders.pupil_fit import light_lost
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
 
-# Of a camera ray of a shader in Cycles under a white sky, experiments/results/osl_speed.md: a base, each of its
-# operations, and what a division or a root takes besides. Fitted to the least times of the six lenses there: within
-# 3.5%.
+# A camera ray costs Cycles a base, so much for each operation of its shader, and more for a division or a root. These
+# times (ns) are fitted to the least times of the six lenses in experiments/results/osl_speed.md.
 _SHADER_NS, _STEP_NS, _DEAR_NS, _DEAR = 90.66, 0.2295, 2.772, ("div", "sqrt")
 
 

@@ -219,7 +219,7 @@ def page(groups: dict[str, list[list[Row]]]) -> str:
         "# Lens tables broken on purpose",
         f"`python -m experiments photographs-faults FOLDER`: what `table_faults` finds; {lab.machine_line()}",
         "## Faults", lab.table("kind|tables|found|asked for|told|the right one among them|it is first", lines),
-        "Up to four changes that fit alike are told; the right one of a dropped asphere is at its surface; several "
+        "Up to four changes that fit alike are named. A dropped asphere counts as found at its surface. Some faults "
         "are no single change. Only tables that raise no alarm are broken.",
         "## Alarms of tables as they are", lab.table("tables|tables|alarms", alarms),
         "## Figures of tables as they are (certain matches)", lab.table("figure|50%|90%|95%|98%", told),

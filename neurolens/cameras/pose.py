@@ -22,7 +22,7 @@ _HAIR = 1e-18  # mm; added so that the axis stays finite
 
 @dataclass(frozen=True)
 class FilmPose:
-    """How a film stands. All 0 is upright and centred; such a pose is false where a truth is asked for.
+    """How a film stands. With all figures 0 it stands upright and centred, and `bool(pose)` is False.
 
     Attributes:
         tilt, swing: turns (rad) as `Shot.film_tilt_deg` and `Shot.film_swing_deg` state them.

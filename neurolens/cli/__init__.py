@@ -83,8 +83,8 @@ examples:
   neurolens export laikin_double_gauss_50.ols-36 --to c -o gauss.h
 
 A command alone, as "neurolens render", prints what it does and an example; neurolens COMMAND --help has its options.
-Exit codes: 0 done; 1 a model breaks a promise, or none has the error asked for; 2 bad input; 70 a fault of neurolens
-itself, or no memory; 130 interrupted."""
+Exit codes: 0 done; 1 a model breaks a promise, or no model reaches the error asked for; 2 bad input; 70 a fault of
+neurolens itself, or no memory; 130 interrupted."""
 
 # What `neurolens` alone prints: what to type first, for each of the three ways in.
 _FIRST = """\

@@ -49,7 +49,7 @@ cameras:
   thin, pinhole                the same of 50 mm and f/4, or of --focal-length and --f-number
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
                                points with these projections, of 14 mm; --field sets the picture's circle"""
-# Of files that a placeholder stands for.
+# The file names that an argument takes, by its placeholder in the help: --plot PNG takes .png, .pdf and .svg.
 _SUFFIXES = {"png": (".png", ".pdf", ".svg"), "html": (".html", ".htm"), "npz": (".npz", ".safetensors", ".exr")}
 _FEW = 10  # options; the help of more shows those that are marked as common
 
@@ -287,8 +287,8 @@ class Reporting(Command):
         """Print a report, or a mapping with its `text`, as JSON if --json asks for it, else as text; returns the exit
         code. `full`: with what a report has in bulk."""
         text = text or found.text  # type: ignore[union-attr]  # of a report
-        for said in filter(None, (self.told, compiled_so_far())):
-            note(said)
+        for line in filter(None, (self.told, compiled_so_far())):
+            note(line)
         if self.tell is not None:
             self.tell(plain(found, strict=False, full=full), text())
         elif self.json:

@@ -9,13 +9,14 @@ order about the decentre that was found last.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
@@ -29,8 +30,7 @@ from neurolens.optics.setting.copies import Off, elements_of, perturbed
 _COLUMNS = ("x_mm", "y_mm", "frequency_per_mm", "tangential", "sagittal")
 _STEP_MM = 2e-3  # of decentres, for derivatives
 _SCALES = (0.03, 0.03, 0.1, 0.1, 0.03)  # mm, mm, degrees, degrees, mm: how far starts lie from the lens as designed
-_STARTS, _STEPS, _SEED = 12, 40, 54
-_DAMPING, _ENOUGH = (1e-3, 10.0, 1e6), 1e-4
+_STARTS, _SEED = 12, 54
 _LEAST, _SOLE = 0.02, 1.5  # the least contrast that tells; by how many times an element must fit better than others
 
 
@@ -198,29 +198,10 @@ def _fitted(rounds: Sequence[Corners], measured: Measured, first: int) -> tuple[
             moved = sum((way * v for way, v in zip(ways, values[:2] - centre, strict=True)), here.off_mm)
             return _left(_contrast(corners, here._replace(off_mm=moved), values, measured), measured)
 
-        tried = [_descended(left, start, scales) for start in starts]
-        best, slopes = min(tried, key=lambda one: _rms(left(one[0])))
-        starts = [best]
+        tried = [least_squares(lambda v: left(v * scales), start / scales, method="lm") for start in starts]
+        nearest = min(tried, key=lambda one: float(one.cost))
+        starts = [best := nearest.x * scales]
     found = _left(_contrast(corners, _spots(corners, first, best[:2]), best, measured), measured)
     free = max(len(found) - len(best) - len(measured.per_mm), 1)
-    covariance = np.linalg.pinv(slopes.T @ slopes) * (found @ found) / free
+    covariance = np.linalg.pinv(nearest.jac.T @ nearest.jac) * (found @ found) / free
     return best, _rms(found), np.sqrt(np.diag(covariance)) * scales
-
-
-def _descended(left: Callable[[Array], Array], start: Array, scales: Array) -> tuple[Array, Array]:
-    """Return where Levenberg's and Marquardt's method ends, and the slopes there, in units of `scales`."""
-    values, now, (damping, factor, most) = start, left(start), _DAMPING
-    steps = np.diag(scales) * 1e-3
-    slopes = np.stack([(left(values + s) - left(values - s)) / 2e-3 for s in steps], 1)
-    for _ in range(_STEPS):
-        normal = slopes.T @ slopes
-        step = np.linalg.solve(normal + damping * (np.diag(np.diag(normal)) + 1e-12 * np.eye(5)), -slopes.T @ now)
-        ahead = left(values + step * scales)
-        if ahead @ ahead < now @ now:
-            values, now, damping = values + step * scales, ahead, damping / factor
-            slopes = np.stack([(left(values + s) - left(values - s)) / 2e-3 for s in steps], 1)
-            if np.abs(step).max() < _ENOUGH:
-                break
-        elif (damping := damping * factor) > most:
-            break
-    return values, slopes
