@@ -20,7 +20,8 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.models.card import CARD_KEY, MODEL_KEY, read_card
 from neurolens.models.export import export_onnx
 from neurolens.models.fit import ModelSettings, Prepared, as_model, fit_model, prepare
-from neurolens.models.model import Domain, LensModel
+from neurolens.models.fitted import Domain
+from neurolens.models.model import LensModel
 from neurolens.models.network import fit_network
 from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.source import at_wavelength

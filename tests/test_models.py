@@ -18,8 +18,8 @@ from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.cli import main
 from neurolens.cli import models as models_command
 from neurolens.models.file import read_model
-from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.pairs import passing_rays, sample_domain
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens

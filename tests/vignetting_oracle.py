@@ -6,8 +6,8 @@ from typing import Any
 import torch
 
 from neurolens.base import status as st
-from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays, sample_domain, trace_pairs
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.pairs import sample_domain, trace_pairs
 from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.rays import SEED, ZONES, false_shares
 

@@ -25,8 +25,9 @@ from experiments import lab
 from neurolens.models.copied import Perturbed, copy_of
 from neurolens.models.cores import DIRECTION, STOP
 from neurolens.models.file import as_stored, read_model
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, draw
+from neurolens.models.pairs import draw
 from neurolens.models.perturbations import exact_answers, steps_of, with_perturbations
 from neurolens.models.source import copies_program, fused_program
 from neurolens.optics.lens.paraxial import first_order

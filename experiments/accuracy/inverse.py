@@ -27,6 +27,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.models.cores import Array
 from neurolens.models.fit import ModelSettings, fit_model, prepare
+from neurolens.models.fitted import Domain
 from neurolens.models.inverse import (
     STEPS,
     TOLERANCE,
@@ -37,7 +38,7 @@ from neurolens.models.inverse import (
     scene_system,
     stop_system,
 )
-from neurolens.models.model import Domain, LensModel
+from neurolens.models.model import LensModel
 from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.lens.paraxial import first_order

@@ -19,7 +19,7 @@ from neurolens.base.records import plain
 from neurolens.cameras.model import load_model
 from neurolens.models.export import export_onnx
 from neurolens.models.fit import NETWORKS, ModelSettings, Prepared, prepare
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import PairSettings, make_pairs
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import image_radius_mm

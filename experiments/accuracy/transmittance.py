@@ -16,7 +16,7 @@ import torch
 
 from experiments import lab
 from neurolens.base import status as st
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import domain_of, sample_domain
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.prescription import Lens

@@ -31,8 +31,9 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import ModelSettings, fit_model, prepare
-from neurolens.models.model import Domain, LensModel
-from neurolens.models.pairs import FilmRays, make_pairs, sample_domain, trace_pairs
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.model import LensModel
+from neurolens.models.pairs import make_pairs, sample_domain, trace_pairs
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import lens_files

@@ -34,7 +34,7 @@ from neurolens.base.records import versions
 from neurolens.base.settings import LIGHT_NM, RANGE, read_config
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import NETWORKS, ModelSettings, prepare
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import PairSettings, make_pairs
 from neurolens.models.targets import TRANSMITTANCE_TERMS
 from neurolens.models.transmittance import MOST_W

@@ -33,8 +33,7 @@ import torch
 from numpy.typing import NDArray
 
 from experiments.speed.tracer_race import Hand, by_figures, compiled
-from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays
+from neurolens.models.fitted import Domain, FilmRays
 from neurolens.optics.lens import glass
 from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.speed import Unavailable

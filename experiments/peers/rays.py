@@ -51,7 +51,7 @@ from neurolens.graph.ir import pruned
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
 from neurolens.models.file import read_model
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.source import fused_program
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.analysis.plots import drawing, plain_log_ticks

@@ -27,7 +27,7 @@ from experiments.lab import Row
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.optics.analysis.plots import drawing, plain_log_ticks
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.pictures.render.renderer import render

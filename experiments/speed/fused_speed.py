@@ -28,8 +28,9 @@ from neurolens.graph.scalars import lower
 from neurolens.models.assemble import ALL, RAY_ONLY
 from neurolens.models.export import export_onnx
 from neurolens.models.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, PairSettings, domain_of, make_pairs
+from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.source import Fix, fixed_models, fused_program
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.tracegraph import exact_graph

@@ -43,8 +43,9 @@ from neurolens.graph.program import (
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import write_glsl
 from neurolens.models.file import read_model
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel, Prediction
-from neurolens.models.pairs import FilmRays, PairSet, sample_domain, trace_pairs
+from neurolens.models.pairs import PairSet, sample_domain, trace_pairs
 from neurolens.models.source import fused_program
 from neurolens.optics.trace.surfaces import Rays
 from neurolens.optics.trace.tracegraph import exact_graph

@@ -44,9 +44,9 @@ from experiments.speed import gpu
 from experiments.speed.gpu import EXACT, LENSES
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import atomic_write_text
-from neurolens.cameras.cameragraph import whole_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.lenscamera import LensCamera as Camera
+from neurolens.cameras.lensfilm import whole_camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.c import Signature
 from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Program

@@ -25,7 +25,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import ModelSettings, prepare
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.source import fused_program
 from neurolens.pictures.render.renderer import render

@@ -29,8 +29,8 @@ from experiments import lab
 from experiments.speed.fused_speed import Case
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.scalars import lower
-from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays, domain_of, sample_domain
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.pairs import domain_of, sample_domain
 from neurolens.optics.lens.figures import SPHERE
 from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, cauchy, index_of
 from neurolens.optics.lens.prescription import Lens, Medium, Surface

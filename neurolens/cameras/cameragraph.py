@@ -1,29 +1,24 @@
-"""Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
+"""The parts of a lens camera as graphs: from film point, two random numbers and wavelength to ray, weight and status.
 
-`whole_camera` writes the graph of a camera, once for all that run it: the graph of its lens stands between those of the
-pupil and the weights.
+`lensfilm.whole_camera` joins them: the graph of the lens stands between those of the pupil and the weights.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.contract import CameraRays, RayDifferentials
-from neurolens.cameras.pose import to_plane
 from neurolens.graph.derive import derivative
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import FILM_X_Y
 from neurolens.optics.lens.apertures import Aperture
-
-if TYPE_CHECKING:
-    from neurolens.cameras.lenscamera import LensFilm
 
 Array = NDArray[np.float64]
 
@@ -223,33 +218,6 @@ def lens_inside(g: Graph, lens: LensGraph, rays: Value, mask_too: bool) -> tuple
 def unrounded(status: Value) -> Value:
     """Return the status of a lens's graph before it becomes an integer, so that tests can be added to it."""
     return status.graph.inputs_of(status.number)[0] if status.node.kind == "whole" else status
-
-
-def whole_camera(
-    film: LensFilm, lens: LensGraph, also: Sequence[str] = (), mask_too: bool = False
-) -> tuple[Graph, dict[str, float]]:
-    """Write the graph of a camera, with the graph of its lens inside, and return it with its numbers of the call.
-
-    Inputs are those of `pupil_graph` and `weight_graph`. Outputs are those of `weight_graph`, the derivatives of the
-    ray that the lens's graph has, and those named in `also`, of the pupil's graph or the lens's, or `plane_mm`, where
-    rays meet the plane of an upright film. With `mask_too` the graph tests a mask in the stop; else `stop_xy_mm` is an
-    output, and the caller tests it.
-    """
-    g = Graph()
-    own = g.input("film_mm", 2)
-    film_mm, pupil = film.on_plane(g, own)
-    wavelength = g.input("wavelength_nm")  # last, as the functions in C and in shaders have their arguments
-    found, aperture = lens_inside(g, lens, g.concat(film_mm, pupil["pupil_mm"], wavelength), mask_too)
-    derivatives = tuple(name for name in found if "_by_" in name)
-    if film.pose.turned and derivatives:
-        turn = to_plane(film.pose, film.outline.film_radius_mm, derivatives)
-        turned = g.inline(turn, {"film_mm": own, **pupil, **{name: found[name] for name in derivatives}})
-        found = found | {name: turned[name] for name in derivatives}
-    given = {"film_mm": film_mm, **pupil, **found, "lens_status": unrounded(found["status"])}
-    g.outputs |= g.inline(weight_graph(derivatives, aperture, lens.stopped, lens.unit), given)
-    inner = pupil | found | {"plane_mm": film_mm}
-    g.outputs |= {name: value for name, value in inner.items() if name in also}
-    return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
 
 
 def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:

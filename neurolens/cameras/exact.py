@@ -21,7 +21,8 @@ from neurolens.base.progress import Progress
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.lenscamera import LensCamera, LensScene
+from neurolens.cameras.lenscamera import LensCamera
+from neurolens.cameras.lensfilm import LensScene
 from neurolens.cameras.onnxlens import BATCH, LensRays, LensRun
 from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTable, outline_of, wavelength_between

@@ -221,7 +221,7 @@ class ThickLens:
 def ideal_graph(aperture: Aperture | None = None) -> Graph:
     """Write the rays of an ideal lens as a graph, whose numbers are inputs of the call (`ThickLens._numbers`).
 
-    Its other inputs and its outputs are those of `cameragraph.whole_camera`.
+    Its other inputs and its outputs are those of `lensfilm.whole_camera`.
     """
     g = Graph()
     film, square, light = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")

@@ -1,6 +1,6 @@
 """The camera class of lenses, exact or modelled: everything between the random numbers and the weighted ray.
 
-A camera is one graph, with that of its lens between the pupil and the weights (`cameragraph.whole_camera`). It
+A camera is one graph, with that of its lens between the pupil and the weights (`lensfilm.whole_camera`). It
 runs as C where the machine has a compiler, else in onnxruntime; both give the same rays, to rounding.
 """
 
@@ -11,9 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -23,7 +21,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays, status_graph, weight_graph, whole_camera
+from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays
 from neurolens.cameras.companions import Pair, Shift, companion_graph, fit_shift, lanes_graph
 from neurolens.cameras.contract import (
     MANY_RAYS_A_CALL,
@@ -33,196 +31,24 @@ from neurolens.cameras.contract import (
     FloatArray,
     SpectralRays,
 )
-from neurolens.cameras.onnxlens import LensRays, LensRun, open_session, run_batches
-from neurolens.cameras.pose import UPRIGHT, FilmPose, to_film, to_plane
-from neurolens.cameras.pupil_outline import PupilOutline, leaning
-from neurolens.cameras.sampling import FrontDiscs, arrived, stratified
+from neurolens.cameras.lensfilm import LensFilm, LensScene, whole_camera
+from neurolens.cameras.onnxlens import open_session, run_batches
+from neurolens.cameras.pose import FilmPose
+from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.cameras.sampling import FrontDiscs, arrived
 from neurolens.graph.c import Signature, padded_columns, write_blocks
 from neurolens.graph.compiler import has_compiler, load_compiled
-from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import Program, row_names
 from neurolens.graph.scalars import lower
 from neurolens.models.assemble import ONNX, SCALARS, Form
-from neurolens.models.inverse import InverseRays
-from neurolens.optics.lens.apertures import Aperture
-from neurolens.optics.lens.prescription import LINE_D_NM, Surface
+from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.lens.shot import POSES, Runtime, Shot
-from neurolens.optics.setting.pupils import GROUPS
 from neurolens.optics.trace.shapes import sag_and_derivatives
 
 Array = NDArray[np.float64]
-
-_ROUND = 0.02  # the squeeze of a model may differ from 1 by this error without a cylinder
-# Points on each side of the square over which the exposure on the axis is integrated.
-_QUADRATURE = 256
-
-
-@dataclass(frozen=True)
-class LensScene:
-    """A lens at one focus and stop; takes film points, pupil points [2, N] (mm) and wavelengths [N] (nm) to scene rays.
-
-    Attributes:
-        lens: a lens with a round stop.
-        film_z_mm: the film plane.
-        stop_radius_mm: radius of the stop.
-        aperture: the shape of the opening, where it is not round.
-    """
-
-    lens: LensRun
-    film_z_mm: float
-    stop_radius_mm: float
-    aperture: Aperture | None = None
-
-    def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> LensRays:
-        rays = np.concatenate([film, pupil, wavelength_nm[None]]).astype(np.float32)
-        out = self.lens.run(rays, self.film_z_mm, self.stop_radius_mm)
-        return out._replace(status=self.status_of(out))
-
-    def status_of(self, rays: LensRays | InverseRays) -> NDArray[np.int32]:
-        """Return the status [N] of rays of the lens, with that of the stop's shape; see `status_graph`."""
-        given = {"scene_ray": rays.scene_ray, "lens_status": rays.status[None].astype(np.float32)}
-        if self.aperture is not None:
-            given |= {"stop_xy_mm": rays.stop_xy_mm, "stop_radius_mm": np.array([[self.stop_radius_mm]], np.float32)}
-            given |= {} if self.aperture.mask is None else {"mask": self.aperture.table}
-        return evaluate(status_graph(self.aperture, self.stopped), given)["status"][0].astype(np.int32)
-
-    @property
-    def stopped(self) -> int:
-        """Return the status of rays that the stop's shape blocks."""
-        return st.blocked(self.lens.stop_index, st.RIM)
-
-    def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Test whether rays pass at one wavelength, bool [N]; for a round stop only the status is computed."""
-        waves = np.full(film.shape[1], wavelength_nm, np.float32)
-        if self.aperture is not None:
-            return self(film, pupil, waves).status == st.PASSED
-        rays = np.concatenate([film, pupil, waves[None]]).astype(np.float32)
-        return self.lens.status(rays, self.film_z_mm, self.stop_radius_mm) == st.PASSED
-
-    def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points, bool [N]."""
-        passed = np.zeros(film.shape[1], bool)
-        for azimuth in chain(*GROUPS):
-            left = np.flatnonzero(~passed)
-            if len(left):
-                cos, sin = math.cos(azimuth), math.sin(azimuth)
-                turn = np.array([[cos, -sin], [sin, cos]], np.float32)
-                passed[left] = self.passes(turn @ film[:, left], turn @ pupil[:, left], wavelength_nm)
-        return passed
-
-    def axial_transmittance(self, wavelength_nm: tuple[float, float]) -> float | None:
-        """Return the axial ray's transmittance at the wavelength nearest the d line; None if the stop blocks it."""
-        axis = np.zeros((2, 1), np.float32)
-        out = self(axis, axis, np.clip([LINE_D_NM], *wavelength_nm).astype(np.float32))
-        through = float(out.transmittance[0])
-        return through if out.status[0] == st.PASSED and 0 < through <= 1 else None
-
-    def squeeze(self, height_mm: float, wavelength_nm: tuple[float, float]) -> float | None:
-        """Return the squeeze of a lens known by its rays alone.
-
-        A ray that leaves it parallel to the axis at height h has the slope h / f on the film's side, which tells f in
-        each meridian. Rays count whether they pass or not.
-        """
-        h = height_mm
-        film = np.array([[h, -h, 0, 0], [0, 0, h, -h]], np.float32)
-        out = self(film, film, np.clip([LINE_D_NM] * 4, *wavelength_nm).astype(np.float32))
-        with np.errstate(all="ignore"):
-            slope = out.scene_ray[3:5].astype(np.float64) / out.scene_ray[5]
-            squeeze = float((slope[0, 0] - slope[0, 1]) / (slope[1, 2] - slope[1, 3]))
-        if abs(squeeze - 1) < _ROUND:
-            return 1.0
-        return squeeze if math.isfinite(squeeze) and squeeze > 0 else None
-
-
-class LensFilm:
-    """The film and pupil of a lens at one focus and stop.
-
-    Args:
-        outline: the pupil of every film radius; None where no ray passes.
-        wavelength_nm: range of the wavelengths in use.
-        scene: the lens, set for this film.
-        film_mm: width and height of the film. pose: how it stands.
-
-    Raises:
-        InputError: no ray passes from the film's centre.
-    """
-
-    def __init__(
-        self, outline: PupilOutline | None, wavelength_nm: tuple[float, float], scene: LensScene, film_mm: Pair,
-        pose: FilmPose = UPRIGHT,
-    ) -> None:  # fmt: skip
-        if outline is None:
-            raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
-        self.film_z_mm, self.scene, self.pose = scene.film_z_mm, scene, pose
-        self.distance_mm = scene.film_z_mm - outline.pupil_z_mm
-        if lean := pose.lean(film_mm, self.distance_mm):
-            outline = leaning(outline, replace(scene, aperture=None).passes, lean)
-        self.outline, self.exposure = outline, 1.0
-        self.exposure = self._exposure_on_axis(wavelength_nm)
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """Return the inputs of `cameragraph.weight_graph` for a whole call."""
-        scale = 1 / (self.distance_mm**2 * self.exposure)
-        return {"per_distance": 1 / self.distance_mm, "scale": scale, "film_z_mm": self.film_z_mm}
-
-    def on_plane(self, g: Graph, film_mm: Value) -> tuple[Value, dict[str, Value]]:
-        """Write the pupil of film points into a graph; return where its rays meet the plane of an upright film, too."""
-        if not self.pose:
-            return film_mm, g.inline(self.outline.graph, {"film_mm": film_mm})
-        turn = to_plane(self.pose, self.outline.film_radius_mm)
-        unknown = {"film_mm": film_mm, "pupil_mm": film_mm * 0.0, "area_mm2": film_mm[0]}
-        central = g.inline(turn, unknown)
-        pupil = g.inline(self.outline.graph, {"film_mm": central["central_mm"], "lean": central["lean"]})
-        turned = g.inline(turn, {"film_mm": film_mm, **pupil})
-        return turned["plane_mm"], pupil | {"area_mm2": turned["area_mm2"]}
-
-    def start(
-        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return where rays of film points cross the upright film plane and the pupil [2, N], and their area [N].
-
-        The area is that of `PupilOutline.sample`, times the factor from a weight on the plane to that on the film.
-        """
-        g, given = Graph(), {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
-        plane, pupil = self.on_plane(g, g.input("film_mm", 2))
-        g.outputs = {"plane_mm": plane, **pupil}
-        numbers = self.outline.numbers | {"per_distance": 1 / self.distance_mm}
-        given |= {name: np.array([[value]], np.float32) for name, value in numbers.items()}
-        found = evaluate(g, given | {"outline": self.outline.table})
-        area = found["area_mm2"][0]
-        return found["plane_mm"], found["pupil_mm"], np.where(area > 0, area, np.float32(0))
-
-    def from_plane(self, plane_mm: Array, pupil_mm: Array) -> Array:
-        """Return the film points [2, N] of rays by where they cross the upright film plane and the pupil plane."""
-        given = {"plane_mm": plane_mm, "pupil_mm": pupil_mm, "per_distance": np.array([[1 / self.distance_mm]])}
-        return np.asarray(evaluate(to_film(self.pose), given)["film_mm"])
-
-    def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """Return cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        plane, pupil, _ = self.start(film_mm, square, wavelength_nm)
-        slope = (pupil - plane) * np.float32(1 / self.distance_mm)
-        cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
-        return cos4
-
-    def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
-        """Return the integral of T cos over solid angle where the axis meets the film, as a mean over wavelengths."""
-        square, wavelength = stratified(_QUADRATURE, wavelength_nm)
-        axis = np.zeros_like(square) + np.array(self.pose.moved_mm, np.float32)[:, None]
-        film, pupil, area = self.start(axis, square, wavelength)
-        out = self.scene(film, pupil, wavelength)
-        given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
-        given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
-        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
-        weight = evaluate(weight_graph(), given)["weight"]
-        exposure = float(weight.mean(dtype=np.float64))
-        if not exposure > 0:
-            raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
-        return exposure
-
 
 # What a camera computes: rays, rays with differentials, rays with companions, or whether companions pass
 # (`companion_graph`).

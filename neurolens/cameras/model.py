@@ -20,7 +20,8 @@ from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import kept_outline, searching_code
-from neurolens.cameras.lenscamera import LensCamera, LensScene
+from neurolens.cameras.lenscamera import LensCamera
+from neurolens.cameras.lensfilm import LensScene
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,10 @@ from neurolens.base import status as st
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.graph.ir import Graph, Value
 from neurolens.models.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Units
+from neurolens.models.fitted import Encoding, Fitted
+from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.trace.arithmetic import NUMPY, TINY, Graphs
 from neurolens.optics.trace.shapes import curve_of, depth, polynomials
-
-if TYPE_CHECKING:
-    from neurolens.models.model import Encoding, LensModel
-    from neurolens.optics.lens.prescription import Surface
 
 Array = NDArray[np.float64]
 
@@ -82,7 +79,7 @@ class Parts:
 ALL, RAY_ONLY = Parts(), Parts(False, False, False, False)
 
 
-def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
+def model_graph(model: Fitted, form: Form, parts: Parts = ALL) -> Graph:
     """Write the graph of a model."""
     g = Graph()
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
@@ -95,13 +92,13 @@ def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
     return g
 
 
-def units_of(model: LensModel, series: DirectionSeries, form: Form) -> Units:
+def units_of(model: Fitted, series: DirectionSeries, form: Form) -> Units:
     """Return the units of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
     return Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
 
 
 def add_outputs(
-    model: LensModel,
+    model: Fitted,
     values: CoreValues,
     inside: Value,
     radius: Value | None,
@@ -160,7 +157,7 @@ def wavelength_row(e: Encoding, wavelength_nm: Value) -> Value:
     return (1000 / math.sqrt(e.w_half)) / wavelength_nm
 
 
-def within_domain(model: LensModel, rays: Value, film_z: Value, radius: Value | None, form: Form) -> Value:
+def within_domain(model: Fitted, rays: Value, film_z: Value, radius: Value | None, form: Form) -> Value:
     """Return whether film point, pupil point, wavelength, film position and stop lie in the domain; NaN does not.
 
     Film position and stop are tested once a call: where they fail, film points must lie within a squared radius of -1.
@@ -177,7 +174,7 @@ def within_domain(model: LensModel, rays: Value, film_z: Value, radius: Value | 
     return inside
 
 
-def _tests(model: LensModel, values: CoreValues, radius: Value, form: Form) -> list[tuple[tuple[Value, Value], int]]:
+def _tests(model: Fitted, values: CoreValues, radius: Value, form: Form) -> list[tuple[tuple[Value, Value], int]]:
     """Return the tests of stop and rims as camera rays meet them: last surface first, at each as in `base.status`."""
     g = radius.graph
     crossing = _scaled(form, g.square(values.vectors[STOP]), radius * radius)
@@ -211,7 +208,7 @@ class DirectionSeries:
     minus_cos: Array | None = None
 
     @staticmethod
-    def of(model: LensModel, form: Form) -> DirectionSeries:
+    def of(model: Fitted, form: Form) -> DirectionSeries:
         """Choose the series that decode a model's direction vector up to its largest angle; slopes need none."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
@@ -251,7 +248,7 @@ class DirectionSeries:
         return g.concat(vector * g.series(t, self.sinc), g.series(t, self.minus_cos))
 
 
-def scene_ray(model: LensModel, values: CoreValues, series: DirectionSeries, form: Form) -> Value:
+def scene_ray(model: Fitted, values: CoreValues, series: DirectionSeries, form: Form) -> Value:
     """Return the position on the front surface (mm) and the unit direction, 6 rows."""
     g, position = values.transmittance.graph, values.vectors[POSITION]
     z = g.affine(np.zeros((1, 2)), position) if model.front is None else sag(position, model.front, form)

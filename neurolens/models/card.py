@@ -361,7 +361,7 @@ def _zoom_mm(path: Any, axis: Axis, zoom: str | float) -> float:
 
 
 def mix_domain(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, Any]:
-    """Mix the domain (as `models.model.Domain.to_dict` writes it) of a state from nodes with weights [K].
+    """Mix the domain (as `models.fitted.Domain.to_dict` writes it) of a state from nodes with weights [K].
 
     Wavelengths and the nearest object are those of the first node; the distances in focus are mixed as 1 / distance.
     """

@@ -26,6 +26,7 @@ from neurolens.models.axes import STATE
 from neurolens.models.card import CARD_KEY, CARD_KIND, CARD_SCHEMA, MODEL_KEY, POLARISED, card_to_json
 from neurolens.models.copied import copy_inputs
 from neurolens.models.file import as_stored, coefficients_text, onnx_of
+from neurolens.models.fitted import Domain, FilmRays
 from neurolens.models.inverse import (
     STEPS,
     TOLERANCE,
@@ -36,8 +37,8 @@ from neurolens.models.inverse import (
     scene_graph,
     stop_graph,
 )  # fmt: skip
-from neurolens.models.model import Domain, LensModel, Prediction
-from neurolens.models.pairs import FilmRays, sample_domain
+from neurolens.models.model import LensModel, Prediction
+from neurolens.models.pairs import sample_domain
 from neurolens.models.phase import card_entry
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens

@@ -40,7 +40,8 @@ from neurolens.models.card import (
 )  # fmt: skip
 from neurolens.models.copied import copy_inputs, copy_nodes
 from neurolens.models.cores import CORES, Core
-from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
+from neurolens.models.fitted import Domain, Encoding, Gate, Scales
+from neurolens.models.model import LensModel, mixed, with_one_angle
 from neurolens.optics.lens.figures import figure_of
 from neurolens.optics.lens.prescription import Coating, Lens, Surface
 

@@ -27,7 +27,8 @@ from neurolens.base.settings import LIGHT_NM
 from neurolens.models.axes import Array, Axis, product, weights
 from neurolens.models.boundaries import invariant_core
 from neurolens.models.cores import STOP, Core, Refracted, Residual
-from neurolens.models.model import Domain, Encoding, LensModel, Scales, mixed
+from neurolens.models.fitted import Domain, Encoding, Scales
+from neurolens.models.model import LensModel, mixed
 from neurolens.models.network import fit_network, training_s, with_boundary_terms
 from neurolens.models.pairs import (
     PairSettings,

@@ -49,7 +49,8 @@ from neurolens.models.cores import (
     Refracted,
     Units,
 )
-from neurolens.models.model import Domain, Encoding, LensModel
+from neurolens.models.fitted import Domain, Encoding
+from neurolens.models.model import LensModel
 from neurolens.optics.trace.surfaces import front_rays
 
 STEPS = 3

@@ -16,7 +16,7 @@ from torch.quasirandom import SobolEngine
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.settings import FILM_MM, WAVELENGTH_NM, said, within
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain, FilmRays
 from neurolens.optics.lens.paraxial import PupilBounds, first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.focusing import film_range_mm
@@ -35,35 +35,6 @@ _EDGE = 0.03  # width of the film's edge, as a share of its radius
 # Another pupil plane is taken where so many times more of the disc passes; each plane tried is this factor further from
 # the film than the one before, out to so many focal lengths.
 _BETTER, _STEP, _REACH = 1.25, 1.02, 20
-
-
-@dataclass(frozen=True)
-class FilmRays:
-    """Camera rays as film point, pupil point and wavelength, each [N] float64; mm and nm, lens frame."""
-
-    film_x: Tensor
-    film_y: Tensor
-    film_z: Tensor
-    pupil_x: Tensor
-    pupil_y: Tensor
-    wavelength_nm: Tensor
-
-    def __len__(self) -> int:
-        return self.film_x.shape[0]
-
-    @property
-    def rows(self) -> Tensor:
-        """Return rows [5, N] as graphs take them: all but the film plane."""
-        return torch.stack([self.film_x, self.film_y, self.pupil_x, self.pupil_y, self.wavelength_nm])
-
-    def select(self, index: Tensor | slice) -> FilmRays:
-        return FilmRays(*(c[index] for c in self.columns()))
-
-    def to(self, dtype: torch.dtype) -> FilmRays:
-        return FilmRays(*(c.to(dtype) for c in self.columns()))
-
-    def columns(self) -> tuple[Tensor, ...]:
-        return (self.film_x, self.film_y, self.film_z, self.pupil_x, self.pupil_y, self.wavelength_nm)
 
 
 def domain_of(

@@ -22,8 +22,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.models.copied import FORMS, Perturbed, copy_of
 from neurolens.models.cores import DIRECTION, POSITION, STOP, Array, InvariantPolynomial, LightField
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, PairSet, blocked_splits, draw, lost, trace_pairs
+from neurolens.models.pairs import PairSet, blocked_splits, draw, lost, trace_pairs
 from neurolens.models.targets import boundary_weights, film_equivalent, film_equivalent_weights, gate_values
 from neurolens.models.terms import (
     Exponents,

@@ -28,8 +28,8 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.models.cores import Array, Phased, angle_vector
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays
 from neurolens.models.terms import (
     Exponents,
     Sweep,

@@ -32,7 +32,7 @@ from neurolens.models.boundaries import (
     stop_crossing,
 )
 from neurolens.models.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, LightField, MirrorPolynomial
-from neurolens.models.model import Encoding
+from neurolens.models.fitted import Encoding
 from neurolens.models.pairs import PairSet, RayPairs
 from neurolens.models.targets import (
     POLYNOMIALS,

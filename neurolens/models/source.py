@@ -36,7 +36,8 @@ from neurolens.models.assemble import ALL, SCALARS, Parts, model_graph
 from neurolens.models.axes import mixture, mixture_of, state_names
 from neurolens.models.card import axes_of
 from neurolens.models.copied import copy_inputs, copy_nodes
-from neurolens.models.model import Domain, LensModel, with_one_angle
+from neurolens.models.fitted import Domain
+from neurolens.models.model import LensModel, with_one_angle
 from neurolens.optics.lens.glass import inverse_square_um
 
 DOUBLE = "c-double"

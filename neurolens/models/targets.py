@@ -26,10 +26,10 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.settings import check_bounds, setting
 from neurolens.models.assemble import tilt_series
 from neurolens.models.cores import DIRECTION, POSITION, STOP, Array, LightField, Refracted, angle_vector
-from neurolens.models.model import Domain, Encoding, Gate, LensModel, Scales
+from neurolens.models.fitted import Domain, Encoding, FilmRays, Gate, Scales
+from neurolens.models.model import LensModel
 from neurolens.models.pairs import (
     RIM_REACH,
-    FilmRays,
     PairSet,
     RayPairs,
     draw,

@@ -26,8 +26,9 @@ from neurolens.models.cores import (
     Refracted,
     Residual,
 )
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, passing_rays
+from neurolens.models.pairs import passing_rays
 from neurolens.models.terms import (
     Exponents,
     Sweep,

@@ -24,9 +24,9 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.cameragraph import whole_camera
 from neurolens.cameras.lenscamera import CompiledProgram, padded
 from neurolens.cameras.lenscamera import LensCamera as _Camera
+from neurolens.cameras.lensfilm import whole_camera
 from neurolens.graph.adjoint import OUTER, adjoint
 from neurolens.graph.c import Signature
 from neurolens.graph.compiler import has_compiler

@@ -19,7 +19,7 @@ from neurolens.base.files import library
 from neurolens.cameras.model import OnnxLens
 from neurolens.models.axes import Axis
 from neurolens.models.fit import State, StateSpace
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import passing_rays
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens

@@ -25,7 +25,7 @@ from neurolens.base.lensname import maker_of, year_of
 from neurolens.base.report import PART, Report
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.exact import axial_transmittance, state_of
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import sample_domain
 from neurolens.optics.analysis import layout
 from neurolens.optics.analysis.bundles import Filled

@@ -16,7 +16,7 @@ from neurolens.base.files import atomic_write_text
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.settings import EYE_NM, RANGE, apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.models.fit import ModelSettings, StateSpace, axes_of
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import PairSettings, domain_of
 from neurolens.optics.lens.glass import glass_of
 from neurolens.optics.lens.paraxial import first_order

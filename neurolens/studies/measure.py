@@ -23,16 +23,10 @@ from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.models.export import export_onnx
 from neurolens.models.fit import NETWORKS, ModelSettings, Prepared, fit_model
-from neurolens.models.model import Domain, Prediction
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.model import Prediction
 from neurolens.models.network import clear_training
-from neurolens.models.pairs import (
-    FilmRays,
-    PairSet,
-    join_pairs,
-    passing_rays,
-    sample_domain,
-    trace_pairs,
-)
+from neurolens.models.pairs import PairSet, join_pairs, passing_rays, sample_domain, trace_pairs
 from neurolens.models.phase import path_errors
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.surfaces import Rays

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays, PairSet, focused_plane_z_mm, sample_domain
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.pairs import PairSet, focused_plane_z_mm, sample_domain
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays, image_radius_mm

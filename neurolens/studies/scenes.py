@@ -23,7 +23,7 @@ from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.compiler import has_compiler
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.optics.analysis.plots import drawing, plain_log_ticks
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens

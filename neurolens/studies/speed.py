@@ -34,8 +34,8 @@ from neurolens.graph.compiler import FLAGS, compile_c, has_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.models.file import read_model
-from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays, sample_domain
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.pairs import sample_domain
 from neurolens.models.source import fused_program
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.lens.paraxial import first_order

@@ -46,7 +46,7 @@ from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import Failed, run_each
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import ModelSettings, prepare
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import PairSettings, make_pairs
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.analysis.layout import thumbnail

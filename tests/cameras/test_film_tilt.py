@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.cameragraph import D_FILM, whole_camera
+from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.lensfilm import whole_camera
 from neurolens.cameras.pose import FilmPose
 from neurolens.cli import main
 from neurolens.cli.keys import frames_of

@@ -23,8 +23,9 @@ from neurolens.models.assemble import ALL
 from neurolens.models.cores import Core
 from neurolens.models.export import export_onnx
 from neurolens.models.file import coefficients_text, read_model
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel, Prediction
-from neurolens.models.pairs import FilmRays, sample_domain
+from neurolens.models.pairs import sample_domain
 from neurolens.models.source import Fix, at_wavelength, fixed_models, fused_program
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.shot import Shot

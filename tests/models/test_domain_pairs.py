@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import (
     PairSettings,
     RayPairs,

@@ -33,7 +33,7 @@ from neurolens.models.assemble import ALL, RAY_ONLY, Parts
 from neurolens.models.card import MODEL_KEY, card_to_json, read_metadata
 from neurolens.models.export import card_of, export_onnx, lens_facts
 from neurolens.models.file import onnx_of, read_model
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import domain_of
 from neurolens.models.source import Fix, at_wavelength, export_source, fixed_models, fused_program, identifier
 from neurolens.optics.lens.paraxial import first_order

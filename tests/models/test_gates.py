@@ -19,17 +19,9 @@ from neurolens.models.boundaries import GateFit, invariant_core
 from neurolens.models.cores import STOP, InvariantPolynomial, LightField
 from neurolens.models.export import export_onnx
 from neurolens.models.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.models.model import Domain, Gate, LensModel
-from neurolens.models.pairs import (
-    FilmRays,
-    PairSet,
-    PairSettings,
-    domain_of,
-    make_pairs,
-    sample_domain,
-    sample_lit,
-    trace_pairs,
-)
+from neurolens.models.fitted import Domain, FilmRays, Gate
+from neurolens.models.model import LensModel
+from neurolens.models.pairs import PairSet, PairSettings, domain_of, make_pairs, sample_domain, sample_lit, trace_pairs
 from neurolens.models.polynomial import fit_polynomial
 from neurolens.models.targets import boundary_rays, gate_reach, gate_values, targets_of
 from neurolens.optics.lens.prescription import Lens, Surface

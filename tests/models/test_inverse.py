@@ -25,9 +25,10 @@ from neurolens.graph.loworder import with_film_derivatives
 from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.models.export import export_inverse, export_onnx
 from neurolens.models.fit import ModelSettings, fit_model
+from neurolens.models.fitted import FilmRays
 from neurolens.models.inverse import InverseModel, convergence, front_index, inverse_of, passing_rays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, PairSet, sample_domain, trace_pairs
+from neurolens.models.pairs import PairSet, sample_domain, trace_pairs
 from neurolens.optics.trace.shapes import sag_and_derivatives
 from neurolens.optics.trace.surfaces import front_rays
 from neurolens.optics.trace.tracegraph import exact_graph

@@ -14,8 +14,8 @@ from neurolens.graph.ir import Graph
 from neurolens.models.assemble import DirectionSeries
 from neurolens.models.cores import angle_vector
 from neurolens.models.fit import Prepared, prepare
-from neurolens.models.model import Encoding
-from neurolens.models.pairs import FilmRays, PairSettings, domain_of, make_pairs
+from neurolens.models.fitted import Encoding, FilmRays
+from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.polynomial import fit_planes, shifted
 from neurolens.models.targets import targets_of
 from neurolens.models.terms import invariant_exponents, monomials, solve, vector_columns

@@ -19,8 +19,9 @@ from neurolens.models.copied import Copied, Perturbed, copy_inputs, copy_of
 from neurolens.models.cores import DIRECTION, STOP
 from neurolens.models.export import export_onnx
 from neurolens.models.file import as_stored, read_model
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, draw
+from neurolens.models.pairs import draw
 from neurolens.models.perturbations import copy_errors, derivatives, exact_answers, steps_of, with_perturbations
 from neurolens.models.source import at_wavelength, copies_program, fused_program
 from neurolens.models.targets import film_equivalent

@@ -19,8 +19,9 @@ from neurolens.models.cores import Phased
 from neurolens.models.export import card_of, export_onnx
 from neurolens.models.file import as_stored, coefficients_text, onnx_of, read_model
 from neurolens.models.fit import ModelSettings
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
+from neurolens.models.pairs import passing_rays, sample_domain
 from neurolens.models.phase import direction_at, path_errors, path_um, traced, unit_um, with_phase
 from neurolens.models.source import at_wavelength, fused_program
 from neurolens.models.wavefront import model_pupils

@@ -19,9 +19,9 @@ from neurolens.models import polynomial
 from neurolens.models.boundaries import stop_crossing
 from neurolens.models.cores import DIRECTION, POSITION, STOP, InvariantPolynomial
 from neurolens.models.fit import fit_model
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel, Prediction
 from neurolens.models.pairs import (
-    FilmRays,
     PairSet,
     PairSettings,
     domain_of,

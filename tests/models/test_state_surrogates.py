@@ -23,8 +23,9 @@ from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.models.axes import Axis, product, weights
 from neurolens.models.export import export_states
 from neurolens.models.fit import StateModel, StateSettings, StateSpace, fit_states, focus_axis, zoom_axis
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel, mix
-from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
+from neurolens.models.pairs import passing_rays, sample_domain
 from neurolens.models.targets import TRANSMITTANCE_TERMS
 from neurolens.models.transmittance import refitted
 from neurolens.optics.lens.designs import coated

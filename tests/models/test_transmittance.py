@@ -18,8 +18,9 @@ from neurolens.graph.interpret import evaluate
 from neurolens.models.card import read_card
 from neurolens.models.cores import InvariantPolynomial, LightField, Residual
 from neurolens.models.file import read_model
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, passing_rays, sample_domain
+from neurolens.models.pairs import passing_rays, sample_domain
 from neurolens.models.transmittance import refitted
 from neurolens.optics.lens.glass import absorption_of, index_at, index_of
 from neurolens.optics.lens.shot import Shot

@@ -19,8 +19,9 @@ from neurolens.graph.c import Signature, literal
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.program import SCENE_RAY, Program
 from neurolens.graph.shading import write_glsl
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, sample_domain
+from neurolens.models.pairs import sample_domain
 from neurolens.models.source import fused_program
 from neurolens.studies.speed import CompiledSource
 

@@ -12,15 +12,8 @@ from shipped import whole
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.models.model import Domain
-from neurolens.models.pairs import (
-    FilmRays,
-    PairSet,
-    domain_of,
-    passing_rays,
-    sample_domain,
-    trace_pairs,
-)
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.pairs import PairSet, domain_of, passing_rays, sample_domain, trace_pairs
 from neurolens.optics.lens.paraxial import PupilBounds, first_order
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.readers.lensfile import read_lens

@@ -9,8 +9,8 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import Pinhole, ThinLens
-from neurolens.models.model import Domain
-from neurolens.models.pairs import FilmRays, domain_of
+from neurolens.models.fitted import Domain, FilmRays
+from neurolens.models.pairs import domain_of
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens

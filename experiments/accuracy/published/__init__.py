@@ -23,7 +23,8 @@ from experiments.accuracy.published.taylor import fit_taylor
 from neurolens.base.errors import InputError
 from neurolens.models.cores import Core
 from neurolens.models.fit import as_model, fit_model
-from neurolens.models.model import Encoding, Gate, LensModel
+from neurolens.models.fitted import Encoding, Gate
+from neurolens.models.model import LensModel
 from neurolens.models.targets import ModelSettings, Prepared
 from neurolens.models.terms import pinned_threads
 

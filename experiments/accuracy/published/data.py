@@ -14,7 +14,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.models.cores import DIRECTION, POSITION, Array, Core, CoreValues, Field, Units, stored_as
-from neurolens.models.model import Encoding, Gate
+from neurolens.models.fitted import Encoding, Gate
 from neurolens.models.pairs import PairSet, RayPairs
 from neurolens.models.targets import ModelSettings, Prepared, gate_reach, scales_of
 from neurolens.models.terms import Exponents, monomials, ordered, powers, united

@@ -30,7 +30,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.models.cores import ROUND, Core, CoreValues, Field, Units, stored_as
-from neurolens.models.model import Gate
+from neurolens.models.fitted import Gate
 from neurolens.models.pairs import PairSet, sample_domain, trace_pairs
 from neurolens.models.targets import scales_of
 

@@ -27,7 +27,8 @@ from experiments.accuracy.published.rtf import meridian_of, turn, turned_back
 from neurolens.graph.interpret import monomials
 from neurolens.graph.ir import Graph
 from neurolens.models.cores import Core, CoreValues, Field, Units, stored_as
-from neurolens.models.pairs import FilmRays, trace_pairs
+from neurolens.models.fitted import FilmRays
+from neurolens.models.pairs import trace_pairs
 from neurolens.models.targets import scales_of
 
 Array = NDArray[np.float64]

@@ -29,8 +29,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.models.cores import Core, CoreValues, Field, LightField, Units, stored_as
-from neurolens.models.model import Gate
-from neurolens.models.pairs import FilmRays, trace_pairs
+from neurolens.models.fitted import FilmRays, Gate
+from neurolens.models.pairs import trace_pairs
 from neurolens.models.targets import scales_of
 from neurolens.models.terms import Exponents, monomials
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from experiments.accuracy.published.data import RawPolynomial, raw_polynomial
 from neurolens.base.errors import InputError
-from neurolens.models.model import Encoding
+from neurolens.models.fitted import Encoding
 from neurolens.models.targets import scales_of
 from neurolens.models.terms import ordered
 from neurolens.optics.lens.glass import index_of

@@ -28,7 +28,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.reduced import Vignetted
 from neurolens.models.fit import ModelSettings, prepare
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens, Surface

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import LensGraph, whole_camera
-from neurolens.cameras.lenscamera import LensFilm
+from neurolens.cameras.cameragraph import LensGraph
+from neurolens.cameras.lensfilm import LensFilm, whole_camera
 from neurolens.cameras.model import ModelScene, best_focus_of_stops_mm
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.graph.c import Extras

@@ -1,52 +1,183 @@
-"""Completes what a file says differently from a lens, or leaves open: Forbes's aspheres, stop, f-number, film, rims.
-
-Forbes's mild aspheres (Qbfs) become even powers of the height (G. W. Forbes, Opt. Express 15, 5218, 2007); the strong
-ones are a figure of their own (`optics.lens.figures.Qcon`). With u the height over a normalisation radius and x = u^2,
-
-    sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x),
-
-whose slopes along the normal are orthonormal. (Forbes starts from a sphere, whose cosine is sqrt(1 - c^2 r^2). That a
-conic is meant shows in Thorlabs's ASL5040-UV, which is sharp only so.) The cosine is no polynomial: a polynomial as
-close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens model's powers do not come so close are
-refused.
-"""
+"""From a draft to the lens: stop, f-number, back focus, rims and states, completed where a file leaves them open."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
-from decimal import Context, Decimal, localcontext
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from numpy.polynomial import Polynomial
-from numpy.polynomial.polynomial import polyval
-
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, printable
 from neurolens.optics.lens import paraxial
 from neurolens.optics.lens.paraxial import FirstOrder, system_of
-from neurolens.optics.lens.prescription import Lens, Medium
-from neurolens.optics.readers.source import MAX_INDEX, MAX_POWER, MAX_SURFACES, assume, warn
-from neurolens.optics.setting.rims import check_figures, end_mm, narrowed_rims, with_derived_rims
+from neurolens.optics.lens.prescription import Configuration, Lens, Medium, same_medium
+from neurolens.optics.readers.draft import Draft, State
+from neurolens.optics.readers.source import MAX_INDEX, MAX_POWER, MAX_SURFACES, UNITS_MM, ReadOptions, assume, warn
+from neurolens.optics.setting.rims import check_figures, check_states, end_mm, narrowed_rims, with_derived_rims
 
-if TYPE_CHECKING:
-    from neurolens.optics.readers.draft import Draft
-
-# A diameter that the file does not give, until `finish` has found it.
-UNKNOWN = math.nan
+_ONE_PLACE = "one configuration, where surfaces are tilted or decentred"
+_ROUNDED_MM = 1e-4  # to which programs round lengths
+_AGREES = 0.03  # relative, since f-numbers are printed with two digits
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
 _SHORTEST = 0.01  # focal length over the thickest glass, at least: of 391 lenses none is below 0.19
 _SLIGHTLY = 0.1  # share of a rim's diameter
 # f-number by the stop's diameter over the stated one: where radii were meant by diameters, and where all is right
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)
 
-# error of sag, in the unit of the heights: what is aimed at, and what is accepted for steep conics
-CLOSE_MM, WORST_MM = 1e-11, 1e-9
-_DIGITS = 80
-_SAMPLES = 101
-# of sag: how much rounding the coefficients to float64 may change; float32 carries what passes this
-_ROUNDING_MM = 2e-8
-Terms = tuple[tuple[int, float], ...]
+
+def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
+    """Return the lens of a draft, in mm, checked by `finish`; InputError if `options` give another unit."""
+    options = options or ReadOptions()
+    if +draft.skipped:
+        listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
+        warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
+    try:
+        draft = with_stop(_without_negative_zeros(draft), options.stop)
+        draft = _without_dummies(draft)
+        if draft.states and any(row.surface.placement for row in draft.rows):
+            raise InputError(draft.file, "configurations", f"({len(draft.states)} of them)", _ONE_PLACE)
+        return _lens_of(draft, options)
+    except InputError as error:
+        value = draft.in_file(error.value) if isinstance(error.value, str) else error.value
+        raise InputError(error.file, draft.in_file(error.field), value, draft.in_file(error.expected)) from None
+
+
+def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
+    unit = options.units or draft.unit or "mm"
+    if options.units and draft.unit and options.units != draft.unit:
+        raise InputError(
+            draft.file, "--units", options.units, f"{draft.unit!r}, as the file itself says (or no --units)"
+        )
+    if unit not in UNITS_MM:
+        raise InputError(draft.file, "--units", unit, f"one of {', '.join(UNITS_MM)}")
+    factor = UNITS_MM[unit]
+    if options.f_number is not None and (draft.f_number or draft.pupil) is not None:
+        warn(draft.file, f"--f-number {options.f_number:g} is not used: the file sizes the stop itself")
+    f_number = draft.f_number or options.f_number or math.nan
+    lens = Lens(
+        name=options.name or draft.name or printable(Path(draft.file).stem),
+        source=options.source or f"{draft.kind} file {printable(Path(draft.file).name)}",
+        surfaces=tuple(row.surface for row in draft.rows),
+        f_number=f_number,
+        image_radius_mm=draft.image_radius,
+        half_field_deg=options.half_field_deg or draft.half_field_deg,
+        notes="\n".join(draft.notes),
+        rims=draft.rims,
+        path=draft.file,
+        stated_efl_mm=draft.stated_efl,
+        object_medium=Medium(**draft.object_medium),
+        wavelengths_nm=draft.wavelengths_nm,
+    )
+    if draft.drawn:
+        lens = with_likely_rims(lens, draft)
+    if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
+        # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
+        rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
+        lens = replace(lens, surfaces=tuple(rows))
+    pupil = draft.pupil if draft.object_na is None else pupil_of(lens, draft.object_na, draft.object_distance)
+    lens = finish(lens, pupil_mm=pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
+    if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
+        message = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
+        warn(draft.file, f"{message}: the diameter is kept")
+    lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
+    lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
+    with suppress(InputError):
+        check_states(lens)
+        return lens
+    lens = narrowed(lens, draft)
+    check_states(lens)
+    return lens
+
+
+def _states(draft: Draft) -> tuple[State, ...]:
+    """Return the states of the file; a table without states that is focused near becomes a focus state."""
+    if not draft.states and math.isfinite(draft.object_distance):
+        return (State("as filed", object_distance=draft.object_distance, film_given=draft.film_given),)
+    return draft.states
+
+
+def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
+    """Return a state for the lens file; its stop follows from the state's pupil or f-number."""
+    last = len(lens.surfaces) - 1
+    thickness = dict(state.thickness)
+    if not state.film_given:
+        thickness.pop(last, None)
+    found = Configuration(state.name, None, tuple(sorted(thickness.items())))
+    there = lens.with_gaps(dict(found.thickness_mm))
+    data = first_order(there)
+    opening, f_number = state.stop_diameter, state.f_number
+    pupil = state.pupil
+    if pupil is None and f_number is not None:
+        pupil = abs(data.efl_mm) / f_number
+    if pupil is None and opening is None:
+        pupil = draft.pupil
+        if pupil is None and draft.f_number is not None:
+            pupil = abs(data.efl_mm) / draft.f_number
+    if pupil is not None and opening is None:
+        wanted = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
+        opening = smaller_stop(draft.file, wanted, stop_aperture(draft), f'state "{state.name}": ')
+        f_number = f_number if opening == wanted else None
+    if f_number is None and opening is not None:
+        f_number = data.f_number * 2 * there.stop_radius_mm / opening
+    distance = state.object_distance if math.isfinite(state.object_distance) else None
+    if not state.film_given:
+        focal_z = data.rear_focal_z_mm if distance is None else data.image_z_mm(-distance)
+        thickness[last] = focal_z - float(there.vertices_mm[last])
+    return replace(
+        found,
+        efl_mm=None if distance is not None else data.efl_mm,
+        thickness_mm=tuple(sorted(thickness.items())),
+        f_number=f_number,
+        stop_diameter_mm=opening,
+        object_distance_mm=distance,
+    )
+
+
+def _without_negative_zeros(draft: Draft) -> Draft:
+    """Return the draft with gaps closed that are negative by no more than rounding."""
+    least, rows = -_ROUNDED_MM / UNITS_MM.get(draft.unit or "mm", 1.0), list(draft.rows)
+    for k, row in enumerate(draft.rows):
+        if least <= row.surface.thickness_mm < 0:
+            rows[k] = replace(row, surface=replace(row.surface, thickness_mm=0.0))
+            found = f"surface {k}: a thickness of {row.surface.thickness_mm:.3g} is taken as 0"
+            warn(draft.file, draft.in_file(found))
+    return replace(draft, rows=tuple(rows))
+
+
+def _without_dummies(draft: Draft) -> Draft:
+    """Return the draft without planes between equal media that cut no beam; gaps on both sides become one."""
+    if len(draft.rows) > MAX_SURFACES:
+        raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
+    rows, surfaces, medium = draft.rows, [row.surface for row in draft.rows], Medium(**draft.object_medium)
+    flat = [math.isinf(s.radius_mm) and not s.stop and not s.figure.bends for s in surfaces]
+    idle = [flat[k] and not row.aperture and same_medium(surfaces, k, medium) for k, row in enumerate(rows)]
+    dropped = [k for k in range(len(rows)) if idle[k]]
+    kept = [k for k in range(len(rows)) if k not in dropped]
+    if not dropped or not kept:
+        return draft
+    # The kept row to which each row's thickness belongs; those in front of all (-1) belong to the object's distance.
+    owner = [bisect_right(kept, k) - 1 for k in range(len(rows))]
+
+    def merged(thickness: dict[int, float]) -> tuple[list[float], float]:
+        sums = [0.0] * (len(kept) + 1)
+        for k, row in enumerate(rows):
+            sums[owner[k]] += thickness.get(k, row.surface.thickness_mm)
+        return sums[:-1], sums[-1]
+
+    table, front = merged({})
+    new = tuple(
+        replace(rows[k], surface=replace(rows[k].surface, thickness_mm=t)) for k, t in zip(kept, table, strict=True)
+    )
+    states = []
+    for state in draft.states:
+        sums, before = merged(state.thickness)
+        gaps = {place: sums[place] for place in sorted({owner[k] for k in state.thickness if owner[k] >= 0})}
+        states.append(replace(state, thickness=gaps, object_distance=state.object_distance + before))
+    listed = draft.in_file(f"surface {', '.join(map(str, dropped))}")
+    warn(draft.file, f"{listed} left out: a plane in one medium that cuts no beam")
+    return replace(draft, rows=new, states=tuple(states), object_distance=draft.object_distance + front)
 
 
 def finish(
@@ -279,74 +410,3 @@ def narrowed(lens: Lens, draft: Draft) -> Lens:
         say = assume if any(s.semi_diameter_mm > end_mm(s) * (1 + 1e-6) for s in lens.surfaces) else warn
         say(lens.path, f"rims narrowed to where spheres end or neighbours touch: {', '.join(changed)}")
     return found
-
-
-def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, conic: float = 0.0) -> Terms:
-    """Return the powers of the height of a Qbfs departure from a conic, with their coefficients.
-
-    Args:
-        a: a_0, a_1, ... radius: normalisation radius. rim: height up to which the surface is used.
-
-    Raises:
-        ValueError: the conic is too steep, or float64 cannot hold the coefficients.
-    """
-    with localcontext(Context(prec=_DIGITS)):
-        s2, k = (Decimal(curvature) * Decimal(radius)) ** 2, Decimal(conic)
-        reach = (Decimal(rim) / Decimal(radius)) ** 2
-        if (1 + k) * s2 * reach >= 1:
-            raise ValueError("a rim inside the conic")
-
-        def inverse_cosine(x: Decimal) -> Decimal:
-            return ((1 - k * s2 * x) / (1 - (1 + k) * s2 * x)).sqrt()
-
-        form = _polynomial(0, 1, -1) * _qbfs_sum(a)
-        samples = [reach * k / (_SAMPLES - 1) for k in range(_SAMPLES)]
-        exact = [polyval(x, form.coef) * inverse_cosine(x) for x in samples]
-        for degree in range(MAX_POWER // 2 - max(len(a), 1)):
-            found = form * _interpolated(inverse_cosine, reach, degree)
-            off = max(abs(polyval(x, found.coef) - y) for x, y in zip(samples, exact, strict=True))
-            if off <= Decimal(CLOSE_MM):
-                break
-        if off > Decimal(WORST_MM):
-            raise ValueError(f"a conic that powers up to {MAX_POWER} follow to {WORST_MM:g}")
-        return _powers(found.coef.tolist(), radius, rim)
-
-
-def _qbfs_sum(a: Sequence[float]) -> Polynomial:
-    """Return sum a_m Qbfs_m(x), by the recurrence of Forbes, Opt. Express 18, 19700 (2010), appendix A."""
-    d = Decimal
-    p = [_polynomial(2), _polynomial(6, -8)]
-    q = [_polynomial(1), _polynomial(13, -16) / d(19).sqrt()]
-    f, g, h = [d(2), d(19).sqrt() / 2], [d(-1) / 2], list[Decimal]()
-    for m in range(2, len(a)):
-        h.append(-d(m * (m - 1)) / (2 * f[m - 2]))
-        g.append(-(1 + g[m - 2] * h[m - 2]) / f[m - 1])
-        f.append((m * (m + 1) + 3 - g[m - 1] ** 2 - h[m - 2] ** 2).sqrt())
-        p.append(_polynomial(2, -4) * p[m - 1] - p[m - 2])
-        q.append((p[m] - q[m - 1] * g[m - 1] - q[m - 2] * h[m - 2]) / f[m])
-    return sum((term * d(value) for value, term in zip(a, q, strict=False)), _polynomial(0))
-
-
-def _interpolated(function: Callable[[Decimal], Decimal], reach: Decimal, degree: int) -> Polynomial:
-    """Return the polynomial through a function of x in Chebyshev's points of [0, reach]."""
-    nodes = [reach / 2 * (1 - Decimal(math.cos(math.pi * (k + 0.5) / (degree + 1)))) for k in range(degree + 1)]
-    table = [function(x) for x in nodes]
-    for order in range(1, degree + 1):  # Newton's divided differences
-        for k in range(degree, order - 1, -1):
-            table[k] = (table[k] - table[k - 1]) / (nodes[k] - nodes[k - order])
-    found = _polynomial(table[-1])
-    for x, value in zip(nodes[-2::-1], table[-2::-1], strict=True):
-        found = _polynomial(-x, 1) * found + value
-    return found
-
-
-def _powers(in_x: Sequence[Decimal], radius: float, rim: float) -> Terms:
-    """Return the powers of the height of a polynomial in x; ValueError where its terms cancel beyond float64."""
-    terms = tuple((2 * k, float(c / Decimal(radius) ** (2 * k))) for k, c in enumerate(in_x) if c)
-    if sum(abs(a) * rim**p for p, a in terms) * 2.0**-53 > _ROUNDING_MM:
-        raise ValueError("fewer terms: powers of the height cancel in float64")
-    return terms
-
-
-def _polynomial(*coefficients: Decimal | int) -> Polynomial:
-    return Polynomial([Decimal(c) for c in coefficients])

@@ -1,40 +1,26 @@
-"""The data that a reader finds in a file, and its conversion to a lens, common to all formats."""
+"""The data that a reader finds in a file, common to all formats; `assemble` makes the lens of it."""
 
 from __future__ import annotations
 
 import math
 import re
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
-from neurolens.base.errors import InputError, printable
 from neurolens.base.settings import WAVELENGTH_NM, within
 from neurolens.optics.lens.figures import MOST_Q_TERMS, WIDEST_Q, figure_of, qcon_powers
-from neurolens.optics.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
-from neurolens.optics.readers.assemble import (
-    UNKNOWN,
-    finish,
-    first_order,
-    narrowed,
-    pupil_of,
-    qbfs_terms,
-    smaller_stop,
-    stop_aperture,
-    with_likely_rims,
-    with_rims,
-    with_stop,
-)
+from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.readers.breaks import Step, Turn, placements
-from neurolens.optics.readers.source import MAX_SURFACES, UNITS_MM, Line, ReadOptions, warn
-from neurolens.optics.setting.rims import check_states
+from neurolens.optics.readers.forbes import qbfs_terms
+from neurolens.optics.readers.source import Line
 
+# A diameter that the file does not give, until `assemble.finish` has found it.
+UNKNOWN = math.nan
 INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
 MAX_STATES = 200
+_ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
 LEAST_RADIUS = 1e-3  # the least that coefficients of aspheres are normalised by, in the unit of the file
 
 
@@ -107,7 +93,7 @@ class Row:
     """One surface in the file's unit.
 
     Attributes:
-        surface: its diameter may be `assemble.UNKNOWN`.
+        surface: its diameter may be `UNKNOWN`.
         aperture: whether the file sets a clear aperture on it, so that even a plane in air cuts the beam.
         name: the number by which the file calls it; empty where that is its place in the table, from 0.
     """
@@ -261,162 +247,3 @@ def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[f
     """Return the wavelengths of a file in the order of `Lens`; those beyond what neurolens traces are left out."""
     sound = [round(nm, 6) for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]  # as read in micrometres
     return tuple(sorted(sound, key=lambda nm: nm != round(primary_nm, 6)))
-
-
-def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
-    """Return the lens of a draft, in mm, checked by `assemble.finish`; InputError if `options` give another unit."""
-    options = options or ReadOptions()
-    if +draft.skipped:
-        listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
-        warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
-    try:
-        draft = with_stop(_without_negative_zeros(draft), options.stop)
-        draft = _without_dummies(draft)
-        if draft.states and any(row.surface.placement for row in draft.rows):
-            raise InputError(draft.file, "configurations", f"({len(draft.states)} of them)", _ONE_PLACE)
-        return _lens_of(draft, options)
-    except InputError as error:
-        value = draft.in_file(error.value) if isinstance(error.value, str) else error.value
-        raise InputError(error.file, draft.in_file(error.field), value, draft.in_file(error.expected)) from None
-
-
-def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
-    unit = options.units or draft.unit or "mm"
-    if options.units and draft.unit and options.units != draft.unit:
-        raise InputError(
-            draft.file, "--units", options.units, f"{draft.unit!r}, as the file itself says (or no --units)"
-        )
-    if unit not in UNITS_MM:
-        raise InputError(draft.file, "--units", unit, f"one of {', '.join(UNITS_MM)}")
-    factor = UNITS_MM[unit]
-    if options.f_number is not None and (draft.f_number or draft.pupil) is not None:
-        warn(draft.file, f"--f-number {options.f_number:g} is not used: the file sizes the stop itself")
-    f_number = draft.f_number or options.f_number or math.nan
-    lens = Lens(
-        name=options.name or draft.name or printable(Path(draft.file).stem),
-        source=options.source or f"{draft.kind} file {printable(Path(draft.file).name)}",
-        surfaces=tuple(row.surface for row in draft.rows),
-        f_number=f_number,
-        image_radius_mm=draft.image_radius,
-        half_field_deg=options.half_field_deg or draft.half_field_deg,
-        notes="\n".join(draft.notes),
-        rims=draft.rims,
-        path=draft.file,
-        stated_efl_mm=draft.stated_efl,
-        object_medium=Medium(**draft.object_medium),
-        wavelengths_nm=draft.wavelengths_nm,
-    )
-    if draft.drawn:
-        lens = with_likely_rims(lens, draft)
-    if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
-        # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
-        rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
-        lens = replace(lens, surfaces=tuple(rows))
-    pupil = draft.pupil if draft.object_na is None else pupil_of(lens, draft.object_na, draft.object_distance)
-    lens = finish(lens, pupil_mm=pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
-    if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
-        message = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
-        warn(draft.file, f"{message}: the diameter is kept")
-    lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
-    lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
-    with suppress(InputError):
-        check_states(lens)
-        return lens
-    lens = narrowed(lens, draft)
-    check_states(lens)
-    return lens
-
-
-_ONE_PLACE = "one configuration, where surfaces are tilted or decentred"
-_ROUNDED_MM = 1e-4  # to which programs round lengths
-_AGREES = 0.03  # relative, since f-numbers are printed with two digits
-_ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
-
-
-def _states(draft: Draft) -> tuple[State, ...]:
-    """Return the states of the file; a table without states that is focused near becomes a focus state."""
-    if not draft.states and math.isfinite(draft.object_distance):
-        return (State("as filed", object_distance=draft.object_distance, film_given=draft.film_given),)
-    return draft.states
-
-
-def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
-    """Return a state for the lens file; its stop follows from the state's pupil or f-number."""
-    last = len(lens.surfaces) - 1
-    thickness = dict(state.thickness)
-    if not state.film_given:
-        thickness.pop(last, None)
-    found = Configuration(state.name, None, tuple(sorted(thickness.items())))
-    there = lens.with_gaps(dict(found.thickness_mm))
-    data = first_order(there)
-    opening, f_number = state.stop_diameter, state.f_number
-    pupil = state.pupil
-    if pupil is None and f_number is not None:
-        pupil = abs(data.efl_mm) / f_number
-    if pupil is None and opening is None:
-        pupil = draft.pupil
-        if pupil is None and draft.f_number is not None:
-            pupil = abs(data.efl_mm) / draft.f_number
-    if pupil is not None and opening is None:
-        wanted = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
-        opening = smaller_stop(draft.file, wanted, stop_aperture(draft), f'state "{state.name}": ')
-        f_number = f_number if opening == wanted else None
-    if f_number is None and opening is not None:
-        f_number = data.f_number * 2 * there.stop_radius_mm / opening
-    distance = state.object_distance if math.isfinite(state.object_distance) else None
-    if not state.film_given:
-        focal_z = data.rear_focal_z_mm if distance is None else data.image_z_mm(-distance)
-        thickness[last] = focal_z - float(there.vertices_mm[last])
-    return replace(
-        found,
-        efl_mm=None if distance is not None else data.efl_mm,
-        thickness_mm=tuple(sorted(thickness.items())),
-        f_number=f_number,
-        stop_diameter_mm=opening,
-        object_distance_mm=distance,
-    )
-
-
-def _without_negative_zeros(draft: Draft) -> Draft:
-    """Return the draft with gaps closed that are negative by no more than rounding."""
-    least, rows = -_ROUNDED_MM / UNITS_MM.get(draft.unit or "mm", 1.0), list(draft.rows)
-    for k, row in enumerate(draft.rows):
-        if least <= row.surface.thickness_mm < 0:
-            rows[k] = replace(row, surface=replace(row.surface, thickness_mm=0.0))
-            found = f"surface {k}: a thickness of {row.surface.thickness_mm:.3g} is taken as 0"
-            warn(draft.file, draft.in_file(found))
-    return replace(draft, rows=tuple(rows))
-
-
-def _without_dummies(draft: Draft) -> Draft:
-    """Return the draft without planes between equal media that cut no beam; gaps on both sides become one."""
-    if len(draft.rows) > MAX_SURFACES:
-        raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
-    rows, surfaces, medium = draft.rows, [row.surface for row in draft.rows], Medium(**draft.object_medium)
-    flat = [math.isinf(s.radius_mm) and not s.stop and not s.figure.bends for s in surfaces]
-    idle = [flat[k] and not row.aperture and same_medium(surfaces, k, medium) for k, row in enumerate(rows)]
-    dropped = [k for k in range(len(rows)) if idle[k]]
-    kept = [k for k in range(len(rows)) if k not in dropped]
-    if not dropped or not kept:
-        return draft
-    # The kept row to which each row's thickness belongs; those in front of all (-1) belong to the object's distance.
-    owner = [bisect_right(kept, k) - 1 for k in range(len(rows))]
-
-    def merged(thickness: dict[int, float]) -> tuple[list[float], float]:
-        sums = [0.0] * (len(kept) + 1)
-        for k, row in enumerate(rows):
-            sums[owner[k]] += thickness.get(k, row.surface.thickness_mm)
-        return sums[:-1], sums[-1]
-
-    table, front = merged({})
-    new = tuple(
-        replace(rows[k], surface=replace(rows[k].surface, thickness_mm=t)) for k, t in zip(kept, table, strict=True)
-    )
-    states = []
-    for state in draft.states:
-        sums, before = merged(state.thickness)
-        gaps = {place: sums[place] for place in sorted({owner[k] for k in state.thickness if owner[k] >= 0})}
-        states.append(replace(state, thickness=gaps, object_distance=state.object_distance + before))
-    listed = draft.in_file(f"surface {', '.join(map(str, dropped))}")
-    warn(draft.file, f"{listed} left out: a plane in one medium that cuts no beam")
-    return replace(draft, rows=new, states=tuple(states), object_distance=draft.object_distance + front)

@@ -32,8 +32,8 @@ from neurolens.base.tomlfile import parse_json
 from neurolens.optics.lens import paraxial
 from neurolens.optics.lens.figures import Figure, figure_of
 from neurolens.optics.lens.prescription import Configuration, Lens, Surface
-from neurolens.optics.readers.assemble import UNKNOWN, finish, first_order
-from neurolens.optics.readers.draft import MAX_STATES, Draft, Row, State, lens_of
+from neurolens.optics.readers.assemble import finish, first_order, lens_of
+from neurolens.optics.readers.draft import MAX_STATES, UNKNOWN, Draft, Row, State
 from neurolens.optics.readers.glasses import named_glass, same_glass
 from neurolens.optics.readers.source import MAX_SURFACES, ReadOptions, Table, read_text, warn
 from neurolens.optics.setting.rims import check_states

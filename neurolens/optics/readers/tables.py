@@ -35,7 +35,8 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.figures import Figure, figure_of
 from neurolens.optics.lens.prescription import Lens, Surface
-from neurolens.optics.readers.draft import INFINITE, MAX_STATES, Draft, Row, State, lens_of
+from neurolens.optics.readers.assemble import lens_of
+from neurolens.optics.readers.draft import INFINITE, MAX_STATES, Draft, Row, State
 from neurolens.optics.readers.glasses import same_glass
 from neurolens.optics.readers.source import MAX_SURFACES, Line, ReadOptions, assume, read_lines, warn
 

@@ -21,8 +21,9 @@ from neurolens.optics.lens import glass as catalogue
 from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers import draft
+from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
-from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, lens_of, placed, primary_first
+from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, placed, primary_first
 from neurolens.optics.readers.glasses import named_glass
 from neurolens.optics.readers.source import MAX_POWER, Line, ReadOptions, assume, by_word, read_lines, warn
 

@@ -26,7 +26,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import field_of
 from neurolens.graph.compiler import has_compiler
-from neurolens.models.model import Domain
+from neurolens.models.fitted import Domain
 from neurolens.models.pairs import domain_of
 from neurolens.optics.analysis.field_curves import illumination
 from neurolens.optics.analysis.fields import Scene as Fields

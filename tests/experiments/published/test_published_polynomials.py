@@ -18,7 +18,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate, monomials
 from neurolens.graph.ir import Graph
-from neurolens.models.model import Encoding
+from neurolens.models.fitted import Encoding
 from neurolens.models.pairs import sample_domain, trace_pairs
 from neurolens.models.polynomial import ideal_map
 from neurolens.models.targets import fit_encoding, scales_of

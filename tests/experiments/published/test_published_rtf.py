@@ -19,8 +19,9 @@ from experiments.accuracy.published.rtf import least_ellipse, meridian_variables
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.models.cores import LightField
+from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import FilmRays, sample_domain, trace_pairs
+from neurolens.models.pairs import sample_domain, trace_pairs
 from neurolens.studies.rays import ray_errors
 
 

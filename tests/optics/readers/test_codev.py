@@ -14,8 +14,8 @@ from neurolens.optics.lens import glass as catalogue
 from neurolens.optics.lens.figures import Figure, Qcon
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.readers.assemble import qbfs_terms
 from neurolens.optics.readers.codev import read_seq
+from neurolens.optics.readers.forbes import qbfs_terms
 from neurolens.optics.readers.source import ReadOptions
 
 TEXT = """\

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from neurolens.optics.lens.figures import MOST_Q_TERMS, Qcon
-from neurolens.optics.readers.assemble import CLOSE_MM, _qbfs_sum, qbfs_terms
+from neurolens.optics.readers.forbes import CLOSE_MM, _qbfs_sum, qbfs_terms
 
 mpmath = pytest.importorskip("mpmath")
 mp = mpmath.mp.clone()
