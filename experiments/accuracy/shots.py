@@ -95,13 +95,13 @@ def _smallest(probed: Probe, shipped: Model, folder: Path) -> Model:
     best = -1
     while low <= high:
         size = (low + high) // 2
-        um, light = _errors(probed, _onnx(probed, fit(TERMS[size])[0]))
+        um, light = _errors(probed, _onnx(probed, fit(TERMS[size])))
         # Light that a plan takes for right is no reason for more terms.
         if um <= shipped.um and light <= max(shipped.light, LIGHT):
             best, high = size, size - 1
         else:
             low = size + 1
-    return _measured(probed, fit(TERMS[best])[0], TERMS[best])
+    return _measured(probed, fit(TERMS[best]), TERMS[best])
 
 
 def _onnx(probed: Probe, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
@@ -120,7 +120,7 @@ def _errors(probed: Probe, camera: OnnxCamera) -> tuple[float, float]:
 def _measured(probed: Probe, file: Path, terms: int) -> Model:
     camera = _onnx(probed, file)
     um, light = _errors(probed, camera)
-    ns = ns_a_ray(_onnx(probed, file, "c"), probed.places)["min"]
+    ns = ns_a_ray(_onnx(probed, file, "c"), probed.places)
     operations = sum(camera_program(camera.film, camera.lens_graph(), own_table=False).count().values())
     return Model(terms, um, light, operations, ns)
 

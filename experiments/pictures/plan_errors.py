@@ -32,7 +32,7 @@ from neurolens.pictures.render.scene import Scene
 from neurolens.pictures.render.settings import FilmSettings
 from neurolens.studies.plan import footprints as prints
 from neurolens.studies.plan.footprints import Footprints, Places
-from neurolens.studies.plan.probe import COUNTED, parts_of, spectrum_seen
+from neurolens.studies.plan.probe import COUNTED, light_of
 from neurolens.studies.scenes import seen_depths_m
 
 Array = NDArray[np.float64]
@@ -60,8 +60,7 @@ def fresh_places(scene: Scene, exact: Camera, rgb: Array, across: int = 22, seed
     index = np.stack(np.meshgrid(*(np.arange(n) for n in cells))).reshape(2, -1)
     points = ((index + np.random.default_rng(seed).random(index.shape)) / np.array(cells)[:, None] - 0.5) * film
     depth = seen_depths_m(scene, exact, points)
-    nm, seen = spectrum_seen(scene, rgb)
-    nanometres, share = parts_of(nm, seen, 0, len(nm) - 1, _WAVES if exact.dispersive else 1)
+    _, nanometres, share = light_of(scene, rgb, _WAVES if exact.dispersive else 1)
     return prints.places_of(exact, points, np.where(np.isnan(depth), np.inf, depth), nanometres, share)
 
 

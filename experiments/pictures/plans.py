@@ -130,22 +130,22 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     asked, own = probed.asked, probed.shot
     shot = Shot(own.film_mm, own.focus_m, asked.f_number, zoom=case.state, wavelength_nm=own.wavelength_nm)
     exact = make_camera(lens.path, shot)  # as in a render: a plan's own has another outline of pupils
-    places = plan_errors.fresh_places(scene, exact, probed.overview.rgb.mean((0, 1)))
+    places = plan_errors.fresh_places(scene, exact, probed.small.mean((0, 1)))
     fresh = Fresh(exact, places, plan_errors.fresh_prints(exact, places))
     report(0.1)
     rows: dict[str, dict[str, Any]] = {}
     chosen: dict[str, choices.Choice] = {}
     decisions: list[dict[str, Any]] = []
-    sizes: list[Path] = []
+    sizes, fitted = list[Path](), list[Path]()
     for number, target in enumerate(TARGETS):
-        if number == 0:
-            picks = choices.candidates(probed, BUDGETS, target, models=case.shipped(), folder=folder)
-            fitted = [folder / f"{c.name}.onnx" for c in picks if c.how == choices.FITTED]
-        else:  # fits are the same for all targets
-            picks = choices.candidates(probed, BUDGETS, target, models=[*case.shipped(), *fitted])
+        # fits are the same for all targets
+        known, place = ([*case.shipped(), *fitted], None) if number else (case.shipped(), folder)
+        picks = {b: choices.candidates(probed, b, target, models=known, folder=place) for b in BUDGETS}
+        # of a camera that was tried for several budgets, what is timed
+        every = {c.name: c for c in sorted(sum(picks.values(), ()), key=lambda c: -c.ns)}
+        fitted = [folder / f"{c.name}.onnx" for c in every.values() if c.how == choices.FITTED]
         report(0.2 + 0.3 * number)
-        more = _more(probed, target, folder, picks, sizes, case.shipped())
-        every = {c.name: c for c in (*picks, *more)}
+        every |= {c.name: c for c in _more(probed, target, folder, every, sizes, case.shipped())}
         report(0.3 + 0.3 * number)
         for choice in every.values():
             row = rows.setdefault(choice.name, {"plan_px": choice.error_px, "plan_light": choice.light_error})
@@ -157,7 +157,7 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
                     light = light + prints.light_beside(camera, places) / np.maximum(fresh.seen.light, 1e-30)
                 row |= {"px": _counted(apart), "light": _counted(light)}
         for budget in BUDGETS:
-            best = min((c for c in picks if c.meets(budget)), key=_cost, default=None)
+            best = min((c for c in picks[budget] if c.meets(budget)), key=_cost, default=None)
             decisions.append(_decision(target, budget, best, list(every.values()), rows))
             if best is not None and best.name != "exact":
                 chosen.setdefault(best.name, best)
@@ -188,7 +188,7 @@ def _more(
     probed: Probe,
     target: choices.Target,
     folder: Path,
-    picks: Sequence[choices.Choice],
+    tried: Mapping[str, choices.Choice],
     made: list[Path],
     shipped: Sequence[Path],
 ) -> Iterator[choices.Choice]:
@@ -198,25 +198,21 @@ def _more(
     No polynomials are larger than what has half of the least budget: they cost more. `made` keeps files for the next
     target.
     """
-    trial = choices.Trial(probed, target, (_TRIED_PX,))
-    costs = {c.name: c for c in picks}
 
     def costed(file: Path) -> choices.Choice | None:
-        choice = costs.get(file.stem)
+        choice = tried.get(file.stem)
         if choice is not None and (math.isfinite(choice.ns) or not choice.meets(_TRIED_PX)):
             return choice
-        judged = choices.model_judged(trial, file)
-        if judged is None:
-            return None
-        return trial.timed(judged) if judged.choice.meets(_TRIED_PX) else judged.choice
+        judged = choices.model_judged(probed, file, target)
+        return choices.timed(judged, probed) if judged and judged.meets(_TRIED_PX) else judged
 
     yield from (c for c in map(costed, shipped) if c is not None)
     fit: Any = None
     for terms in sorted({*choices.shot_terms(probed), *MORE_TERMS}):
         file = folder / f"{Path(probed.lens.path).stem}.shot-ols-{terms}.onnx"
-        if file.stem not in costs and file not in made:
+        if file.stem not in tried and file not in made:
             fit = fit or choices.shot_fits(probed, folder)
-            made.append(fit(terms)[0])
+            made.append(fit(terms))
         choice = costed(file)
         if choice is not None:
             yield choice
@@ -225,7 +221,7 @@ def _more(
 
 
 def _held(choice: choices.Choice, probed: Probe, state: str | None, exact: Any) -> Camera:
-    """The camera of a plan; of a model within the outline of the exact lens's pupil, see `candidates._model`."""
+    """The camera of a plan; of a model within the outline of the exact lens's pupil, see `candidates.model_judged`."""
     if not choice.camera.endswith(".onnx"):
         return camera_of(choice, probed, state)
     return OnnxCamera(
@@ -311,11 +307,11 @@ def _seen_in(pieces: Sequence[plan_errors.Moved] | None, budget_px: float) -> di
 
 def _effects(probed: Probe, dense: Probe) -> list[dict[str, Any]]:
     """Each effect by the probe and at fresh places."""
-    truth = {e.name: e for e in effects_of(dense, 0.0)}
+    truth = {e.name: e for e in effects_of(dense, 0.0, stray=False)}  # stray light is the same at any places
     return [
         {"name": e.name, "unit": e.unit, "probe": e.worth, "fresh": truth[e.name].worth}
-        for e in effects_of(probed, 0.0)
-        if e.name != "diffraction"
+        for e in effects_of(probed, 0.0, stray=False)
+        if e.name not in ("diffraction", "flare")
     ]
 
 

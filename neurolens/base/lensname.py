@@ -126,7 +126,7 @@ def _planned(path: Path) -> str | None:
     """Return the camera that a file of `neurolens plan` names; None for other files."""
     with suppress(InputError):  # the reader of lenses reports it
         camera = read_toml(path).get("camera")
-        return camera if isinstance(camera, str) and camera != "none" else None
+        return camera if isinstance(camera, str) else None
     return None
 
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 import os
 import shlex
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from neurolens.base.files import atomic_write_text, library, write_json
-from neurolens.base.records import NOISY, plain, program
+from neurolens.base.records import plain, program
 from neurolens.base.report import BULK, PART, Report
-from neurolens.base.settings import setting, setting_of
+from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
-from neurolens.optics.lens.shot import Dispersion, Shot
 
 if TYPE_CHECKING:
     from neurolens.optics.lens.prescription import Lens
@@ -44,9 +42,8 @@ examples:
   neurolens plan garden --lens laikin_double_gauss_50 --budget 0.25px
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
 
--o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
-models/ with what was fitted, and plan.toml: 'render' and 'export' take it for the camera, and 'train' fits a
-model of the shot from it, from scratch."""
+-o leaves plan.json (all of it), effects.png (where in the picture the effects are that a camera needs), models/ with
+what was fitted, and plan.toml, which 'render' and 'export' take for the camera."""
     kept = "models fitted so far are kept, the plan is not written"
 
     scene: Path = setting(
@@ -61,13 +58,6 @@ model of the shot from it, from scratch."""
         "render", "what runs the camera: our renderer, where the whole picture counts, or compiled C or onnxruntime in "
         "another program, where the camera alone counts (default: render)", option="for",
     )  # fmt: skip
-    comp: Collection[str] = setting(
-        (), "what compositing makes of the picture later, distortion (with its light, by an ST map), defocus or both "
-        "with a comma: the camera is held against the lens without it", metavar="EFFECTS",
-        kind=cli.words_of(("distortion", "defocus")),
-    )  # fmt: skip
-    dispersion: Dispersion = setting_of(Shot, "dispersion")
-    denoise: bool = setting(False, "noise is taken out later: charge no camera for it")
     zoom: str | None = setting(
         None, "state of the lens by name, or a focal length in mm between its states", metavar="STATE", common=True
     )
@@ -86,20 +76,17 @@ model of the shot from it, from scratch."""
         lens, scene = read_any(self.lens), load_scene(self.scene)
         folder = self.out or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
         cli.check_written(folder, "--output", "FOLDER")
-        with self.progress({"plan": 10}).stage("plan") as report:
+        with self.progress({"plan": 10}).stage("plan"):
             made = plan(
                 scene, lens, self.budget, target=self.target, models=shipped_models(lens, self.zoom),
-                folder=None if self.no_fit else folder / "models", explain=self.explain, report=report,
-                zoom=self.zoom, afterwards=self.comp, denoised=self.denoise, dispersion=self.dispersion or "full",
+                folder=None if self.no_fit else folder / "models", explain=self.explain, zoom=self.zoom,
             )  # fmt: skip
         took = sum(os.times()[:4]) - sum(began[:4])  # of the processor, compilers included
         folder.mkdir(parents=True, exist_ok=True)
-        written = ["plan.json", "effects.png"]
         if made.best:
-            atomic_write_text(folder / "plan.toml", made.to_toml(lens, folder))
-            written.append("plan.toml")
+            atomic_write_text(folder / "plan.toml", made.to_toml(folder))
         command = _command(self, made, folder)
-        answer = Planned(str(self.scene), str(self.lens), made, took, command, self.explain, folder, written)
+        answer = Planned(str(self.scene), str(self.lens), made, took, command, self.explain, folder)
         write_json(folder / "plan.json", plain(answer, full=False))
         plot_effects(made, folder / "effects.png", f"{scene.name} through {lens.name}")
         return self.answer(answer, code=0 if made.best else 1)
@@ -126,11 +113,10 @@ def _command(command: Plan, made: plans.Plan, folder: Path) -> str:
     if made.target == "c":
         if best.camera.startswith(("pinhole:", "thin:", "thick:")):  # which every renderer has
             return ""
-        film = "x".join(f"{v:g}" for v in asked.film_mm)
+        film = "x".join(f"{v:g}" for v in made.probed.shot.film_mm)
         shot = f"--film {film} --focus {asked.focus_m:g} --f-number {asked.f_number:.6g}".split()
         words = ["export", f"{folder}/plan.toml", "--whole-camera", *shot, "--to", "c", *state, "-o", "camera.c"]
     else:
-        state += ["--dispersion", command.dispersion] if command.dispersion not in (None, "full") else []
         words = ["render", str(command.scene), "--camera", f"{folder}/plan.toml", *state, "-o", "render.exr"]
         if model and shape is not None and shape.blades:  # models have no blades of their own
             words += ["--blades", f"{shape.blades}", "--blade-rotation", f"{shape.rotation_deg:g}"]
@@ -149,14 +135,12 @@ class Planned(Report):
     command: str
     every: bool = field(metadata=BULK)
     folder: Path = field(metadata=BULK)
-    written: list[str] = field(metadata=BULK)
 
     def text(self) -> str:
         """Return what the scene asks, the worth of each effect, the cameras where all were timed, and the answer."""
         every = [self._cameras()] if self.every else []
-        answer = [*_sentences(self.plan), *([f"  {self.command}"] if self.command else ())]
-        written = f"Written: {self.folder}/{', '.join(self.written)}"
-        return "\n\n".join([*self.dear(), self._needs(), self._effects(), *every, "\n".join(answer), written])
+        answer = "\n".join([*_sentences(self.plan), *([f"  {self.command}"] if self.command else ())])
+        return "\n\n".join([*self.dear(), self._needs(), self._effects(), *every, answer, f"Written: {self.folder}/"])
 
     def dear(self) -> list[str]:
         """Tell that a plan took more than its share of the time of the picture that it is for, and why.
@@ -187,34 +171,28 @@ class Planned(Report):
     def _effects(self) -> str:
         from neurolens.studies.plan.probe import STRAY
 
-        effects = self.plan.effects
         rows = [
-            (e.name, cli.number(e.worth, 3), cli.number(e.median, 3), "px" if e.unit == "px" else "of light",
-             f"{100 * e.over:.0f}%", e.why) if e.worth < math.inf else (e.name, "?", "", "", "", e.why)
-            for e in effects
+            (e.name, cli.number(e.worth, 3), "px" if e.unit == "px" else "of light", f"{100 * e.over:.0f}%",
+             "" if e.needed else "left out") if e.worth < math.inf else (e.name, "?", "", "", e.note)
+            for e in self.plan.effects
         ]  # fmt: skip
-        told = cli.table(("effect", "worth", "median", "", "beyond", ""), rows)
-        stray = ", ".join(e.name for e in effects if e.name in STRAY.values() and e.needed and e.worth < math.inf)
+        told = cli.table(("effect", "worth", "", "beyond", ""), rows)
+        stray = ", ".join(e.name for e in self.plan.effects if e.name in STRAY.values() and e.needed and not e.note)
         made = f"\n\nNo camera makes {stray}: a table [flare] in the scene does, or 'neurolens flare'."
         return told + made * bool(stray)
 
     def _cameras(self) -> str:
-        """List every camera with its figures: a disc marks the one to use, a ring one that no other betters."""
-        plan = self.plan
-        best, front = plan.best and plan.best.name, plan.front
+        """List every camera with its figures: a disc marks the one to use."""
         rows = [
-            (f"{'● ' if c.name == best else '○ ' if c.name in front else ''}{c.short}", cli.number(c.error_px, 3),
-             cli.number(100 * c.light_error, 2), "~" * c.noisy + cli.number(c.seconds, 3),
-             cli.number(c.camera_seconds, 2), cli.number(c.noise, 3), c.how)
-            for c in plan.choices
+            (f"{'● ' * (c == self.plan.best)}{c.short}", cli.number(c.error_px, 3), cli.number(100 * c.light_error, 2),
+             cli.number(c.seconds, 3), cli.number(c.noise, 3), c.how)
+            for c in self.plan.choices
         ]  # fmt: skip
-        heads = ("camera", "error, px", "light, %", "s", "in the camera", "noise", "")
         return (
-            f"{cli.table(heads, rows)}\n\n● to use, ○ no other betters it\n"
+            f"{cli.table(('camera', 'error, px', 'light, %', 's', 'noise', ''), rows)}\n\n● to use\n"
             "error, light: distance of footprints, and relative error of light, that 95% of the picture keep\n"
-            f"s: of the {'whole picture' if plan.work.whole else 'camera'}, one thread, to the exact lens's noise with "
-            f"the scene's samples; ~ the median of the camera's timed calls was over {NOISY:g} times the least\n"
-            "noise: times the paths that equal error takes"
+            f"s: of the {'whole picture' if self.plan.work.whole else 'camera'}, one thread, to the exact lens's noise "
+            "with the scene's samples\nnoise: times the paths that equal error takes, by the camera's weights and area"
         )
 
 
@@ -228,15 +206,13 @@ def _sentences(plan: plans.Plan) -> list[str]:
     how = f", {best.how}" * bool(best.how)
     lines = [f"Use {best.short}{how}: {cli.number(best.error_px, 3)} px of {plan.budget_px:g}."]
     if plan.work.whole:
-        lines.append(
-            f"The picture takes about {seconds(best.seconds)} s of one thread to the noise that the scene's samples "
-            f"have with the exact lens, the camera {seconds(best.camera_seconds)} s of that."
-        )
+        noise = "the noise that the scene's samples have with the exact lens"
+        lines.append(f"The picture takes about {seconds(best.seconds)} s of one thread to {noise}.")
     else:
         lines.append(f"The camera takes about {seconds(best.seconds)} s for all paths of the picture.")
     if len(plan.alike) > 1:
         lines.append(f"Any of these takes about as long: {', '.join(plan.alike)}.")
-    if (times := plan.work.noise[best.disperses]) > 1 and not plan.asked.denoised:
+    if (times := plan.work.noise[best.disperses]) > 1:
         more = f"Dispersion takes {seconds(times)} times the samples"
-        lines.append(f"{more}; --dispersion lateral leaves longitudinal colour out.")
+        lines.append(f"{more}; 'neurolens render --dispersion lateral' leaves longitudinal colour out.")
     return lines

@@ -200,8 +200,7 @@ class RenderChoice:
 class Experiment:
     """One resolved run: lens, domain, ray pairs, models, measurements and renders.
 
-    Models are fitted in order; with a `target` only until one has its error. `camera` is what `render` and `export`
-    take where this file (that of a plan) is named, as by `--camera`; a path in it is relative to the file.
+    Models are fitted in order; with a `target` only until one has its error.
     """
 
     WITHOUT_EFFECT: ClassVar = ("save_pairs",)
@@ -213,7 +212,6 @@ class Experiment:
     evaluation: EvaluationChoice = field(default_factory=EvaluationChoice)
     render: RenderChoice = field(default_factory=RenderChoice)
     target: TargetChoice | None = None
-    camera: str | None = None
 
     def __post_init__(self) -> None:
         labels = [m.label for m in self.model]
@@ -279,7 +277,7 @@ def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
         except ValueError:  # another drive
             return place
 
-    resolved = replace(_with_files(experiment, moved), camera=None)  # the run's own models are fitted from it
+    resolved = _with_files(experiment, moved)
     atomic_write_text(folder / "config.toml", to_toml(resolved))
     source = experiment.lens.file
     kept = folder / "lenses" / f"{lens_id_of(source)}.toml"

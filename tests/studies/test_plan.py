@@ -21,8 +21,6 @@ from neurolens.cameras.ideal import Pinhole
 from neurolens.cameras.reduced import Warped
 from neurolens.cli import main
 from neurolens.cli.plan import Planned
-from neurolens.models.cores import InvariantPolynomial
-from neurolens.models.file import read_model
 from neurolens.models.pairs import domain_of
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.shot import Shot
@@ -208,13 +206,9 @@ def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: flo
     assert found.best is not None and found.best.light_error <= 0.01
     assert found.best.name in (("exact",) if budget == 0 else ("pinhole + ST map", "thick + ST map"))
     assert all(c.seconds >= found.best.seconds for c in found.choices if c.meets(budget))
-    bright = [c for c in found.choices if c.light_error <= 0.01 and math.isfinite(c.seconds)]
-    better = {c.name: [o for o in bright if o.seconds <= c.seconds and o.error_px < c.error_px] for c in bright}
-    assert sorted(found.front) == sorted(name for name, others in better.items() if not others)
     again = decided(found.probed, found.choices, budget, "render", Work((1e6, 1e6)))
     assert again.best is not None and again.best.name == "exact" and {found.best.name, "exact"} <= set(again.alike)
-    coloured = [replace(c, noise=c.noise * (1 + c.disperses)) for c in found.choices]
-    parted = decided(found.probed, coloured, budget, "render", Work((1e6, 1e6), noise=(1.0, 2.0)))
+    parted = decided(found.probed, found.choices, budget, "render", Work((1e6, 1e6), noise=(1.0, 2.0)))
     assert parted.best is not None and parted.best.name == found.best.name
     assert budget == 0 or "exact" not in parted.alike
 
@@ -246,8 +240,12 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 @pytest.fixture(autouse=True, scope="module")
 def quick() -> Iterator[None]:
     """Focus is found by fewer rays. Flare and glare are those of test_probe_light."""
+
+    def unknown(*_: object) -> None:
+        raise InputError("lens", "flare", "(not asked)", "another test")
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Probe, "maps", property(lambda probed: probed.camera_maps))
+        patch.setattr("neurolens.studies.plan.probe.stray_light", unknown)
         patch.setattr(focusing, "_RINGS", 96)
         yield
 
@@ -262,7 +260,7 @@ def test_a_thick_lens_whose_picture_is_warped_is_cheapest(tmp_path: Path, monkey
     found = garden()
     monkeypatch.setattr(tried, "TERMS", (8,))
     targets: tuple[Target, ...] = ("c", "onnx")
-    best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t, ALONE).best for t in targets}
+    best = {t: decided(found, candidates(found, 1.0, t, folder=tmp_path), 1.0, t, ALONE).best for t in targets}
     assert best["c"] is not None and best["c"].name == "thick + ST map" and best["c"].error_px < 1
     assert best["onnx"] is not None and best["onnx"].name.endswith("shot-ols-8") and best["onnx"].error_px < 1
 
@@ -271,7 +269,7 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     """A wall in focus: places and light are right, so that its error is the RMS radius of the lens's footprints."""
     scene, lens = scene_from_tables(wall(3.0)), set_lens(read_lens(GAUSS))
     found = probe(scene, lens, across=8)
-    choices = {c.name: c for c in candidates(found, (0.0,), "render")}
+    choices = {c.name: c for c in candidates(found, 0.0, "render")}
     blur = np.percentile(blur_mm(found.seen, found.places.share) / 2, 95) / found.asked.pixel_mm
     assert choices["pinhole + ST map"].error_px == pytest.approx(blur, rel=0.02)
     assert choices["thick + ST map"].error_px == pytest.approx(blur, rel=0.02)  # in focus it is a point
@@ -285,9 +283,8 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     assert abs(choices["pinhole + ST map"].light_error - brighter) < 0.0045 < choices["pinhole"].light_error / 8
 
 
-@pytest.mark.usefixtures("no_plots")
-def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
+def test_a_plan_s_file_is_taken_by_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pictures of the file and of the model that it names agree."""
     drawn = list[object]()
     monkeypatch.setattr(effects_plot, "plot_effects", lambda made, path, title: drawn.append(path.name))
     monkeypatch.setattr(tried, "TERMS", (6,))
@@ -299,18 +296,12 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
     asked = ["--lens", str(lens), "--budget", "0.03px", "--for", "onnx", "-o", str(folder), "--quiet"]
     assert main(["plan", str(scene), *asked]) == 0 and drawn == ["effects.png"]
     record = json.loads((folder / "plan.json").read_text())
-    assert record["best"]["name"] in record["front"] and record["best"] in record["choices"]
+    assert record["best"] in record["choices"]
     assert (
         record["asked"]["f_number"] == pytest.approx(5, rel=1e-3)
         and record["best"]["error_px"] <= record["budget_px"] == 0.03
     )
     file, model = folder / "plan.toml", next((folder / "models").glob("*.onnx"))
-    quick = ["--quiet", "--set", "evaluation.vignetting_rays=2000"]
-    assert main(["train", str(file), "--output", str(tmp_path / "run"), *quick]) == 0
-    made, again = (read_model(f).at() for f in (model, tmp_path / "run" / "models" / "shot-ols-6.onnx"))
-    assert isinstance(made.core, InvariantPolynomial) and isinstance(again.core, InvariantPolynomial)
-    np.testing.assert_array_equal(made.core.exponents, again.core.exponents)
-    np.testing.assert_allclose(made.core.ab, again.core.ab, rtol=1e-9, atol=1e-12)
     pictures = [tmp_path / f"{k}.exr" for k in range(2)]
     for camera, picture in zip((file, model), pictures, strict=True):
         assert main(["render", str(scene), "--camera", str(camera), "-o", str(picture), "--quiet"]) == 0
@@ -322,7 +313,7 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
 def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) -> None:
     found = planned(0.0, 4.0, None)
     file = tmp_path / "plan.toml"
-    file.write_text(found.to_toml(set_lens(read_lens(LENS)), tmp_path))
+    file.write_text(found.to_toml(tmp_path))
     assert Path(str(resolve(file)).removeprefix("fused:")).resolve() == Path(LENS).resolve()
     assert str(resolve("experiments/quickstart.toml")) == "experiments/quickstart.toml"
 
@@ -333,7 +324,7 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
     model = Path("models/laikin_double_gauss_50.ols-60.onnx")
     shot = replace(found.shot, aperture=None)
     own, bare = (
-        next(c for c in tried.candidates(seen, (0.01,), "onnx", models=[model]) if c.camera == str(model))
+        next(c for c in tried.candidates(seen, 0.01, "onnx", models=[model]) if c.camera == str(model))
         for seen in (found, replace(found, shot=shot))
     )
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
@@ -343,7 +334,7 @@ def test_a_plan_prints_one_price_and_says_first_where_it_took_more_than_a_tenth_
     found = planned(0.0, 4.0, None)
     assert found.best is not None
     work = Work((10.0, 10.0), (1.0, 1.0))
-    told = Planned("", "", replace(found, work=work, best=replace(found.best, seconds=20.0)), 1.9, "", True, Path(), [])
+    told = Planned("", "", replace(found, work=work, best=replace(found.best, seconds=20.0)), 1.9, "", True, Path())
     text = told.text()
     assert text.count("about 20 s") == 1 and " ns" not in text and text.startswith("f/")
     assert replace(told, plan_s=300.0).text().startswith("This plan took 300 CPU seconds, 15 times its picture")
@@ -368,4 +359,4 @@ def test_light_that_the_lens_adds_is_looked_for_where_a_tenth_of_the_picture_has
         made = decided(found.probed, found.choices, 0.0, "render", Work((ns, ns)), explain=False)
         assert made.best is not None and (0.1 * made.best.seconds > 20) == looked
         (flare,) = (e for e in made.effects if e.name == "flare")
-        assert math.isinf(flare.worth) and flare.needed and flare.why.startswith("not known" if looked else "not look")
+        assert math.isinf(flare.worth) and flare.needed and flare.note.startswith("not known" if looked else "not look")

@@ -12,17 +12,15 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.base.progress import Report
-from neurolens.base.records import noisy
-from neurolens.base.report import OPTIONAL
-from neurolens.cameras.build import as_c, ideal_as, with_dispersion
+from neurolens.base.report import BULK
+from neurolens.cameras.build import as_c, ideal_as
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.cameras.reduced import Warped
@@ -33,10 +31,8 @@ from neurolens.models.fit import fit_model, prepare
 from neurolens.models.pairs import PairSettings, make_pairs
 from neurolens.models.polynomial import fit_planes
 from neurolens.models.targets import ModelSettings, Prepared
-from neurolens.studies.experiment import DomainChoice
 from neurolens.studies.plan import footprints as prints
-from neurolens.studies.plan.costs import ALONE, Work, noise, ns_a_ray
-from neurolens.studies.plan.footprints import Footprints
+from neurolens.studies.plan.costs import noise, ns_a_ray
 from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe
 
 Target = Literal["render", "c", "onnx"]
@@ -56,14 +52,15 @@ class Choice:
     Attributes:
         camera: the text that `--camera` or `export` takes.
         error_px, light_error: at the counted percentile; inf where it lacks light that the lens has.
-        noise: how many times as many paths it needs for an equal error, see `costs`.
+        noise: how many times as many paths as an even camera's its weights need for an equal error, see `costs`; with
+            the area of its picture, relative to the one asked for.
         disperses: whether its picture depends on the wavelength.
         how: what else it needs, or how it was made.
-        settings: those of a model that was fitted for the shot.
         ns: least processor's nanoseconds of one of its rays; inf where it was not timed.
-        spread: the median of its timed calls over the least.
         seconds: on one thread, for the whole picture to the noise of the exact lens, by `ns`; see `plan.priced`.
-        camera_seconds: the camera's share of them.
+        form, size: of models, "ols" or another method, and operations of a ray. A larger model is assumed to take no
+            less time than a smaller one of its form.
+        made: returns the camera whose rays are timed, which may compile it.
     """
 
     name: str
@@ -73,21 +70,16 @@ class Choice:
     noise: float
     disperses: bool = False
     how: str = ""
-    settings: ModelSettings | None = field(default=None, metadata=OPTIONAL)
     ns: float = math.inf
-    spread: float = 1.0
     seconds: float = math.inf
-    camera_seconds: float = math.inf
+    form: str = field(default="", metadata=BULK)
+    size: int = field(default=0, metadata=BULK)
+    made: Callable[[], Camera] | None = field(default=None, metadata=BULK, repr=False)
 
     @property
     def short(self) -> str:
         """Its name without that of the lens."""
         return self.name.rpartition(".")[2]
-
-    @property
-    def noisy(self) -> bool:
-        """Whether its timing spreads too far to tell it from one that is a little shorter: see `records.noisy`."""
-        return noisy({"min": 1.0, "median": self.spread})
 
     def meets(self, budget_px: float) -> bool:
         """Return whether it meets a budget of error."""
@@ -95,105 +87,77 @@ class Choice:
 
 
 def candidates(
-    probed: Probe, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Report | None = None, work: Work = ALONE,
+    probed: Probe, budget_px: float, target: Target, *, models: Sequence[Path] = (), folder: Path | None = None,
+    explain: bool = False,
 ) -> tuple[Choice, ...]:  # fmt: skip
-    """Try cameras until each of some budgets can be decided; arguments as for `studies.plan.plan`.
+    """Try cameras until a budget can be decided; arguments as for `studies.plan.plan`.
 
-    `work` is that of the target's paths.
+    Nothing is fitted where a pinhole or an ideal lens, which takes less time, meets the budget, unless all are asked
+    for. Only cameras that meet it are timed, and of models of one form the smallest and those of about its size.
     """
-    say = report or (lambda done, left=None: None)
-    say(0.2)
-    trial = Trial(probed, target, tuple(budgets_px), explain, work)
     with warnings.catch_warnings():  # of a film beyond the end of a model's range, which shows as error
         warnings.simplefilter("ignore", NeurolensWarning)
-        tried = [*_ideal(trial), *_exact(trial), *_shipped(trial, models)]
-        if folder is not None:
-            tried += _fitted(trial, folder, tried, lambda done, left=None: say(0.2 + 0.6 * done))
-        return tuple(_timed(trial, tried))
+        ideal = list(_ideal(probed, target))
+        tried = [*ideal, *_exact(probed, target), *_shipped(probed, models, target, budget_px, explain)]
+        if folder is not None and (explain or not any(c.meets(budget_px) for c in ideal)):
+            tried += _fitted(probed, folder, target, budget_px)
+        holds = [c for c in tried if c.meets(budget_px)]
+        least = {form: min(c.size for c in holds if c.form == form) for form in {c.form for c in holds}}
+        asked = [explain or (c in holds and not c.size > _CLOSE * least[c.form] > 0) for c in tried]
+        return tuple(timed(c, probed) if now else c for c, now in zip(tried, asked, strict=True))
 
 
-@dataclass(frozen=True)
-class Judged:
-    """A camera with its errors, and the function that makes the camera whose rays are timed, which may compile it.
+def timed(choice: Choice, probed: Probe) -> Choice:
+    """Return a camera with the time of its rays."""
+    assert choice.made is not None
+    return replace(choice, ns=ns_a_ray(choice.made(), probed.places))
 
-    Attributes:
-        form: of models, "ols" or another method.
-        size: operations of a ray. Where form and size are given, a larger model is assumed to take no less time than a
-            smaller one of the same form.
+
+def judged(
+    probed: Probe, name: str, spec: str, camera: Camera, made: Callable[[], Camera] | None = None, *, how: str = "",
+    area: float = 1.0, form: str = "", size: int = 0, beside: prints.Array | float = 0.0,
+) -> Choice:  # fmt: skip
+    """Hold a camera's footprints against the exact ones.
+
+    `area` is that of its picture, relative to the one asked for; `beside` is light outside the lens's pupil.
     """
-
-    choice: Choice
-    made: Callable[[], Camera]
-    form: str = ""
-    size: int = 0
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What cameras are tried for: scene, target, budgets, whether all are timed (`explain`), and a path's work."""
-
-    probed: Probe
-    target: Target
-    budgets_px: tuple[float, ...] = ()
-    explain: bool = False
-    work: Work = ALONE
-
-    def judged(
-        self, name: str, spec: str, seen: Footprints, made: Callable[[], Camera], *, how: str = "", area: float = 1.0,
-        disperses: bool = False, form: str = "", size: int = 0, beside: prints.Array | float = 0.0,
-    ) -> Judged:  # fmt: skip
-        """Hold a camera's footprints against the exact ones.
-
-        `area` is that of its picture, relative to the one asked for; `beside` is light outside the lens's pupil.
-        """
-        probed, share = self.probed, self.probed.places.share
-        apart = prints.distance_mm(probed.wanted, seen, share) / probed.asked.pixel_mm
-        light = np.abs(seen.light / np.maximum(probed.wanted.light, 1e-30) - 1) + beside
-        if "distortion" in probed.asked.afterwards:  # its map corrects light, too
-            light = np.where(seen.light > 0, 0.0, light)
-        error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
-        times = area * noise(seen.weight, share) * self.work.noise[disperses]
-        return Judged(Choice(name, spec, error, dim, times, disperses, how), made, form, size)
-
-    def timed(self, judged: Judged) -> Choice:
-        """Return a camera with the time of its rays."""
-        timing = ns_a_ray(judged.made(), self.probed.places)
-        spread = timing["median"] / timing["min"] if timing["min"] else 1.0
-        return replace(judged.choice, ns=timing["min"], spread=spread)
+    wanted, share = probed.seen, probed.places.share
+    seen = wanted if camera is probed.exact else prints.footprints(camera, probed.places)
+    apart = prints.distance_mm(wanted, seen, share) / probed.asked.pixel_mm
+    light = np.abs(seen.light / np.maximum(wanted.light, 1e-30) - 1) + beside
+    error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
+    paths, disperses = area * noise(seen.weight, share), camera.dispersive
+    return Choice(name, spec, error, dim, paths, disperses, how, form=form, size=size, made=made or (lambda: camera))
 
 
-def _ideal(trial: Trial) -> Iterator[Judged]:
-    """Yield pinhole, thin and thick lens, as they are and, where the target has that, with their picture warped later.
+def _ideal(probed: Probe, target: Target) -> Iterator[Choice]:
+    """Yield pinhole, thin and thick lens, as they are and, where that is worth it, with their picture warped later.
 
-    In our renderer and in C the thick lens takes the place of the thin one; onnxruntime runs none of them.
+    The thick lens is warped in place of the thin one; onnxruntime runs none of them.
     """
-    probed = trial.probed
-    for name in IDEAL if trial.target in OURS else ():
+    for name in IDEAL if target in OURS else ():
         spec = f"{name}:{probed.lens.path}"
         with suppress(InputError):  # a lens with cylinders has no thick lens; maps lack half a sphere, or a dark film
             camera = as_c(ideal_as(f"{name}:", probed.exact.lens, probed.shot))
-            made = lambda camera=camera: camera  # noqa: E731
-            yield trial.judged(name, spec, prints.footprints(camera, probed.places), made)
-            if name == "thin" or "distortion" in probed.asked.afterwards:
+            plain = judged(probed, name, spec, camera)
+            yield plain
+            if name == "thin":
                 continue
             maps = Warped(camera, probed.exact, probed.shot.focus_m)
             if maps.area < _MOST_OVERSCAN:
                 how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
-                seen = prints.footprints(maps, probed.places)
-                yield trial.judged(f"{name}{MAPPED}", spec, seen, made, how=how, area=maps.area)
+                yield judged(probed, f"{name}{MAPPED}", spec, maps, plain.made, how=how, area=maps.area)
 
 
-def _exact(trial: Trial) -> Iterator[Judged]:
-    """Yield the exact lens, which has no error with all of its dispersion, where the target runs it."""
-    probed, target = trial.probed, trial.target
+def _exact(probed: Probe, target: Target) -> Iterator[Choice]:
+    """Yield the exact lens, which has no error, where the target runs it."""
     if target == "render" or (target == "c" and probed.exact.runtime == "c"):
-        shown = with_dispersion(probed.exact, probed.shot)
-        seen = probed.seen if shown is probed.exact else prints.footprints(shown, probed.places)
-        yield trial.judged(EXACT, str(probed.lens.path), seen, lambda: shown, disperses=shown.dispersive)
+        yield judged(probed, EXACT, str(probed.lens.path), probed.exact)
 
 
-def model_judged(trial: Trial, file: Path, how: str = "", without: Collection[str] = ()) -> Judged | None:
+def model_judged(
+    probed: Probe, file: Path, target: Target, how: str = "", without: Collection[str] = ()
+) -> Choice | None:
     """Judge a model in the form that the target runs.
 
     The result is None where the model's domain is not the shot's, it has no such form, or its form is one of `without`.
@@ -202,20 +166,17 @@ def model_judged(trial: Trial, file: Path, how: str = "", without: Collection[st
     samples do not reach an outline's rim, so that two outlines of one lens would differ by a percent of light and 0.2%
     of the blur. Light that a model passes outside the exact outline counts as an error of light.
     """
-    compiled = trial.target in OURS and has_compiler()
+    compiled = target in OURS and has_compiler()
     with suppress(InputError, ModelError):
-        model, probed = load_model(file), trial.probed
+        model = load_model(file)
         form = model.card["fit"]["method"].partition("-")[0]
-        if form in without or (trial.target == "c" and not compiled):
+        if form in without or (target == "c" and not compiled):
             return None
-        whole = OnnxCamera(model, replace(probed.shot, runtime="onnxruntime"), outline=probed.exact.film.outline)
-        camera = with_dispersion(whole, probed.shot)
+        camera = OnnxCamera(model, replace(probed.shot, runtime="onnxruntime"), outline=probed.exact.film.outline)
         beside = prints.light_beside(camera, probed.places) / np.maximum(probed.seen.light, 1e-30)
-        return trial.judged(
-            file.stem, str(file), prints.footprints(camera, probed.places),
-            lambda: with_dispersion(whole.compiled(), probed.shot) if compiled else camera,
-            how=how, disperses=camera.dispersive, form=form, size=_operations(model), beside=beside,
-        )  # fmt: skip
+        made = camera.compiled if compiled else None
+        size = _operations(model)
+        return judged(probed, file.stem, str(file), camera, made, how=how, form=form, size=size, beside=beside)
     return None
 
 
@@ -226,28 +187,14 @@ def _operations(model: OnnxLens) -> int:
     return 0
 
 
-def _shipped(trial: Trial, files: Sequence[Path]) -> list[Judged]:
-    """Judge the models that exist: of each form from the smallest up to the first that meets the smallest budget."""
-    tried: list[Judged] = []
+def _shipped(probed: Probe, files: Sequence[Path], target: Target, budget_px: float, explain: bool) -> list[Choice]:
+    """Judge the models that exist: of each form from the smallest up to the first that meets the budget."""
+    tried: list[Choice] = []
     for file in sorted(files, key=lambda f: f.stat().st_size if f.is_file() else 0):
-        done = {j.form for j in tried if not trial.explain and j.choice.meets(min(trial.budgets_px))}
-        if judged := model_judged(trial, file, without=done):
-            tried.append(judged)
+        done = {c.form for c in tried if not explain and c.meets(budget_px)}
+        if choice := model_judged(probed, file, target, without=done):
+            tried.append(choice)
     return tried
-
-
-def _timed(trial: Trial, tried: Sequence[Judged]) -> Iterator[Choice]:
-    """Yield cameras with their time where it matters.
-
-    It matters for those that meet a budget; of models of one form, for the smallest and those of about its size.
-    """
-    asked = {id(j) for j in tried if trial.explain}
-    for budget_px in () if trial.explain else trial.budgets_px:
-        holds = [j for j in tried if j.choice.meets(budget_px)]
-        least = {form: min(j.size for j in holds if j.form == form) for form in {j.form for j in holds}}
-        asked |= {id(j) for j in holds if not j.size > _CLOSE * least[j.form] > 0}
-    for j in tried:
-        yield trial.timed(j) if id(j) in asked else j.choice
 
 
 TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of polynomials that are fitted for a shot
@@ -256,12 +203,7 @@ _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=5e-4)
 # for lenses with cylinders: more candidates take ten times as long, for the same errors
 _FIT_MIRROR = replace(_FIT, degree=5)
 _MOVED_TERMS = 16, 22  # with the first number of terms or more, planes are searched: once, for the second number
-PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
-
-
-def shot_domain(probed: Probe) -> DomainChoice:
-    """Return the domain of a probe as an experiment states it."""
-    return DomainChoice(probed.domain.film_radius_mm, probed.domain.focus_m, probed.shot.wavelength_nm)
+_PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 
 
 def shot_terms(probed: Probe) -> list[int]:
@@ -269,52 +211,37 @@ def shot_terms(probed: Probe) -> list[int]:
     return [n for n in TERMS if n >= (4 if probed.lens.anamorphic else 2)]
 
 
-def shot_fits(probed: Probe, folder: Path) -> Callable[[int], tuple[Path, ModelSettings]]:
+def shot_fits(probed: Probe, folder: Path) -> Callable[[int], Path]:
     """Return a function that fits a polynomial of so many terms to one shot alone.
 
-    It returns the model's file, in the folder, and its settings.
+    It returns the model's file, in the folder.
     """
     lens = probed.lens.with_aperture(None)
-    plain, model = prepare(make_pairs(lens, probed.domain, PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
+    plain, model = prepare(make_pairs(lens, probed.domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
     folder.mkdir(parents=True, exist_ok=True)
 
     @cache
     def moved() -> Prepared:  # planes for one size: a search takes a second, and other sizes agree on them
         return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
 
-    def fit(terms: int) -> tuple[Path, ModelSettings]:
+    def fit(terms: int) -> Path:
         settings = replace(model, name=f"shot-ols-{terms}", terms=terms)
         file = folder / f"{probed.lens.lens_id}.{settings.label}.onnx"
         planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
         export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
-        return file, replace(settings, planes=planes)  # as settings from which a training finds the same
+        return file
 
     return fit
 
 
-def _fitted(trial: Trial, folder: Path, tried: Sequence[Judged], say: Report) -> list[Judged]:
-    """Fit polynomials for the shot alone: the smallest that meets each budget, and those tried on the way to it.
+def _fitted(probed: Probe, folder: Path, target: Target, budget_px: float) -> list[Choice]:
+    """Fit polynomials for the shot alone: the smallest that meets the budget, and those tried on the way to it."""
+    fit, tried = shot_fits(probed, folder), list[Choice]()
 
-    Nothing is fitted where a pinhole or an ideal lens, which takes less time, meets a budget, unless all are asked for.
-    """
-    easy = [j.choice for j in tried if j.choice.name.startswith(IDEAL) and not trial.explain]
-    # No fitted model has an error of 0.
-    asked = [b for b in trial.budgets_px if (b > 0 or trial.explain) and not any(c.meets(b) for c in easy)]
-    if not asked:
-        return []
-    fit, sizes = shot_fits(trial.probed, folder), shot_terms(trial.probed)
+    def holds(terms: int) -> bool:
+        if choice := model_judged(probed, fit(terms), target, FITTED):
+            tried.append(choice)
+        return choice is not None and choice.meets(budget_px)
 
-    found: dict[int, Judged | None] = {}
-
-    def holds(budget_px: float, terms: int) -> bool:
-        if terms not in found:
-            file, settings = fit(terms)
-            judged = model_judged(trial, file, FITTED)
-            found[terms] = judged and replace(judged, choice=replace(judged.choice, settings=settings))
-        judged = found[terms]
-        return judged is not None and judged.choice.meets(budget_px)
-
-    for k, budget_px in enumerate(asked):
-        bisect.bisect_left(sizes, True, key=partial(holds, budget_px))
-        say((k + 1) / len(asked))
-    return [judged for judged in found.values() if judged]
+    bisect.bisect_left(shot_terms(probed), True, key=holds)
+    return tried

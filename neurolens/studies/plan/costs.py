@@ -12,14 +12,12 @@ a scene.
 from __future__ import annotations
 
 import math
-import statistics
 import time
 from dataclasses import dataclass
 
 import numpy as np
 
-from neurolens.base.records import Timing
-from neurolens.cameras.build import as_c, ideal_as, with_dispersion
+from neurolens.cameras.build import as_c, ideal_as
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.pictures.render.film import PixelGrid
 from neurolens.pictures.render.job import Job, develop
@@ -69,8 +67,8 @@ def noise(weight: Array, share: Array) -> float:
     return float((square[lit] / mean[lit] ** 2).mean()) if lit.mean() > 1 - _MOST_DARK else math.inf
 
 
-def ns_a_ray(camera: Camera, places: Places) -> Timing:
-    """Return the processor's nanoseconds for a ray: least and median of some calls on one thread."""
+def ns_a_ray(camera: Camera, places: Places) -> float:
+    """Return the processor's nanoseconds for a ray on one thread: the least of some calls."""
     rays = int(getattr(camera, "rays_a_call", RAYS_A_CALL))
     rng = np.random.default_rng(1)
     rows = rng.integers(0, places.film_mm.shape[1], rays)
@@ -81,27 +79,27 @@ def ns_a_ray(camera: Camera, places: Places) -> Timing:
         began = time.process_time()
         camera.sample(film, pupil, waves)
         ns.append(1e9 * (time.process_time() - began) / rays)
-    return {"min": min(ns), "median": statistics.median(ns), "repeats": _ROUNDS}
+    return min(ns)
 
 
 def work_of(probed: Probe) -> Work:
     """Measure the time of a path in our renderer, and what dispersion does to its noise.
 
-    Strips of the scene's picture are rendered through a thin lens and through the exact lens with its dispersion.
+    Strips of the scene's picture are rendered through a thin lens and through the exact lens.
     """
     scene, places = probed.scene, probed.places
-    thin, colours = as_c(ideal_as("thin:", probed.exact.lens, probed.shot)), with_dispersion(probed.exact, probed.shot)
+    thin = as_c(ideal_as("thin:", probed.exact.lens, probed.shot))
     shot = scene.settings.camera
     samples = min(shot.samples, _SAMPLES)
     paths = min(shot.width * shot.height * shot.samples // _PART, _STRIP_PATHS)
     strips = strips_of(scene, paths, samples)
     rest, variance = [], []
-    for camera, seen in ((thin, probed.thin_seen), (colours, probed.seen)):
+    for camera, seen in ((thin, probed.thin_seen), (probed.exact, probed.seen)):
         with shared_worlds():
             _strip(scene, camera, 0, (0, 1), samples)  # fits and compilations, done once, are no part of a path
             some = [[_strip(scene, camera, seed, rows, samples) for rows in strips] for seed in (0, 1)]
         ns = np.array([[seconds for _, seconds in row] for row in some]).min(axis=0).mean()
-        rest.append(max(float(ns) - ns_a_ray(camera, places)["min"], 0.0))
+        rest.append(max(float(ns) - ns_a_ray(camera, places), 0.0))
         one, two = (np.concatenate([picture for picture, _ in row]) for row in some)
         apart = np.square(one - two).mean(axis=-1)  # is twice the variance
         # brighter differences, from the rarest lights, are left to chance

@@ -12,7 +12,6 @@ pairing of rays, and holds what a picture shows: place, size and shape of the bl
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -28,7 +27,6 @@ _QUANTILES = 64
 # how far outside the pupil's outline light is looked for, in pupil radii; points there
 _BESIDE, _BESIDE_POINTS = 0.005, 24
 _STEP = 1e-3  # step of the first-order map, as a share of the film's width
-AFTERWARDS = ("distortion", "defocus")  # what compositing may do to a picture later
 
 
 @dataclass(frozen=True)
@@ -132,20 +130,6 @@ def light_beside(camera: Camera, places: Places) -> Array:
     square = 0.5 + 0.5 * (1 + _BESIDE) * edge / np.abs(edge).max(0)
     rays, shape = _sampled(camera, places, square)
     return np.asarray(2 * _BESIDE * rays.weight.astype(np.float64).reshape(shape).mean((1, 2)))
-
-
-def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Collection[str]) -> Footprints:
-    """Return the exact camera's footprints without the effects that `AFTERWARDS` adds to the picture later.
-
-    Without distortion they lie where a thin lens's do; without defocus they are points.
-    """
-    if not afterwards:
-        return exact
-    centre, place = centroids(exact, share)[0], exact.place_mm
-    goal = centroids(thin, share)[0] if "distortion" in afterwards else centre
-    from_centre = np.zeros_like(place) if "defocus" in afterwards else place - centre[:, :, None, None]
-    moved = np.where(exact.weight > 0, from_centre + goal[:, :, None, None], 0.0)
-    return Footprints(moved, exact.pupil_mm, exact.weight)
 
 
 def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:

@@ -22,25 +22,19 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import split_kind
-from neurolens.base.progress import Report as Progress
-from neurolens.base.records import pareto_front
 from neurolens.base.report import BULK
-from neurolens.base.settings import to_toml
 from neurolens.base.tomlfile import format_toml
 from neurolens.optics.lens.prescription import Lens
 from neurolens.pictures.render.scene import Scene
-from neurolens.studies.experiment import EvaluationChoice, Experiment, LensChoice
 from neurolens.studies.pages import SAVING, recommended
-from neurolens.studies.plan.candidates import EXACT, PAIRS, Choice, Target, candidates, shot_domain
+from neurolens.studies.plan.candidates import EXACT, Choice, Target, candidates
 from neurolens.studies.plan.costs import ALONE, Work, noise, ns_a_ray, work_of
-from neurolens.studies.plan.probe import LIGHT, Effect, Probe, SceneNeeds, effects_of, probe
+from neurolens.studies.plan.probe import Effect, Probe, SceneNeeds, effects_of, probe
 
 ALIKE = 1.2  # whose pictures take up to so many times the least: prices are no more accurate
-_BUDGETS = (1.0, 0.25, 0.05)  # for which polynomials are fitted where every camera is asked for
 SHARE = 0.1  # the most that a plan should take of its picture's time
 _WHOLE_S = 20.0  # the most CPU seconds of a plan with the light that the lens adds, whatever the picture
 
@@ -51,7 +45,6 @@ class Plan:
 
     Attributes:
         work: what a path takes besides its camera; none where the camera alone counts.
-        front: names of the cameras with the right light that no other betters in error and seconds.
         alike: names of the cameras within the budget that take about as long as the cheapest; the best is one of them.
     """
 
@@ -62,32 +55,20 @@ class Plan:
     effects: tuple[Effect, ...]
     choices: tuple[Choice, ...]
     best: Choice | None
-    front: tuple[str, ...]
     alike: tuple[str, ...]
     probed: Probe = field(metadata=BULK, repr=False)
 
-    def to_toml(self, lens: Lens, folder: Path) -> str:
-        """The text of a file in a folder, from which other commands go on; paths in it are relative to the folder.
-
-        `render` and `export` take it for the best camera. `train` takes it as the experiment that fits that camera,
-        where this is a model of the shot.
-        """
-        best = self.best
-        assert best is not None
-        kind, path = split_kind(best.camera)
-        camera, title = f"{kind}{os.path.relpath(path, folder)}", f"{lens.name}: {best.name}"
-        if best.settings is None:
-            return format_toml({"title": title, "camera": camera})
-        file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
-        choice = LensChoice(file, zoom=asked.zoom, f_number=asked.f_number)
-        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0)
-        domain = shot_domain(self.probed)
-        return to_toml(Experiment(title, choice, (best.settings,), domain, PAIRS, checks, camera=camera))
+    def to_toml(self, folder: Path) -> str:
+        """The text of a file in a folder, which `render` and `export` take for the best camera."""
+        assert self.best is not None
+        kind, path = split_kind(self.best.camera)
+        title = f"{self.probed.lens.name}: {self.best.name}"
+        return format_toml({"title": title, "camera": f"{kind}{os.path.relpath(path, folder)}"})
 
 
 def plan(
     scene: Scene, lens: Lens, budget_px: float = 0.25, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Progress | None = None, **look: Any,
+    folder: Path | None = None, explain: bool = False, zoom: str | None = None,
 ) -> Plan:  # fmt: skip
     """Find the cheapest camera for a scene within a budget of error.
 
@@ -99,30 +80,25 @@ def plan(
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
         explain: whether cameras beyond the budget are compiled and timed, too (else their seconds are infinite), and
             the light that the lens adds is looked for, however long that takes.
-        look: further arguments of `probe`: zoom, dispersion, and what happens to the picture later.
+        zoom: as of `probe`.
 
     Raises:
-        InputError: a budget is negative or no number; part of the dispersion for a target other than our renderer; as
-            `probe`.
+        InputError: a budget is negative or no number; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
-    ours = target == "render"
-    if not ours and (dispersion := look.get("dispersion", "full")) != "full":
-        raise InputError("plan", "dispersion", dispersion, f"full for {target}: it is a setting of our renderer")
-    probed = probe(scene, lens, **look)
-    work = work_of(probed) if ours else ALONE
+    probed = probe(scene, lens, zoom=zoom)
+    work = work_of(probed) if target == "render" else ALONE
     if not explain and exact_suffices(probed, work):
         models, folder = (), None
-    budgets = (*_BUDGETS, budget_px) if explain else (budget_px,)
-    tried = candidates(probed, budgets, target, models=models, folder=folder, explain=explain, report=report, work=work)
+    tried = candidates(probed, budget_px, target, models=models, folder=folder, explain=explain)
     return decided(probed, tried, budget_px, target, work, explain)
 
 
 def exact_suffices(probed: Probe, work: Work) -> bool:
     """Return whether even a model that costs nothing would save too little, so that nothing needs to be fitted."""
     rest = work.rest[probed.exact.dispersive]
-    exact = ns_a_ray(probed.exact, probed.places)["min"] if rest else math.inf
+    exact = ns_a_ray(probed.exact, probed.places) if rest else math.inf
     return recommended((0.0,), float, exact, rest, ALIKE) == exact
 
 
@@ -137,20 +113,17 @@ def decided(
     best = recommended(held, lambda c: c.seconds, exact, saving=saving)
     alike = tuple(c.name for c in held if c.seconds <= saving * held[0].seconds)
     stray = explain or best is None or not work.whole or SHARE * best.seconds > _WHOLE_S
-    bright = [c for c in choices if c.light_error <= LIGHT and math.isfinite(c.seconds)]
-    front = tuple(bright[i].name for i in pareto_front([(c.seconds, c.error_px) for c in bright]))
     effects = effects_of(probed, budget_px, stray)
-    return Plan(target, budget_px, probed.asked, work, effects, choices, best, front, alike, probed)
+    return Plan(target, budget_px, probed.asked, work, effects, choices, best, alike, probed)
 
 
 def priced(probed: Probe, tried: Sequence[Choice], work: Work) -> tuple[Choice, ...]:
     """Return cameras by rising seconds, to the noise that the exact lens has with the scene's samples."""
-    denoised, shot = probed.asked.denoised, probed.scene.settings.camera
+    shot = probed.scene.settings.camera
     exact = noise(probed.seen.weight, probed.places.share) * work.noise[probed.exact.dispersive]
-    paths = 1e-9 * shot.width * shot.height * shot.samples
+    paths = 1e-9 * shot.width * shot.height * shot.samples / exact
 
     def price(c: Choice) -> Choice:
-        own = paths * (1.0 if denoised else c.noise / exact)
-        return replace(c, seconds=own * (c.ns + work.rest[c.disperses]), camera_seconds=own * c.ns)
+        return replace(c, seconds=paths * c.noise * work.noise[c.disperses] * (c.ns + work.rest[c.disperses]))
 
     return tuple(sorted(map(price, tried), key=lambda c: c.seconds))
