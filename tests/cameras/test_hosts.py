@@ -86,6 +86,50 @@ def test_the_pinhole_of_each_host_sees_every_ray_in_its_own_pixel(host: str) -> 
         assert (counts == np.repeat(np.arange(4), 4)).mean() > 0.99
 
 
+def places(direction: Any) -> Any:
+    """Where a pinhole picture has the directions of 3DGRUT's camera frame, in pixels: tensors [..., 2]."""
+    torch = pytest.importorskip("torch")
+    return FOCAL_PX * direction[..., :2] / direction[..., 2:] + torch.tensor(SIZE) / 2
+
+
+def test_the_pinhole_of_3dgrut_itself_makes_our_rays() -> None:
+    utils = pytest.importorskip("threedgrut.datasets.utils", reason="needs 3DGRUT's sources")
+    found = picture(to="3dgrut", origin="pupil", device="cpu")
+    rows, columns = np.mgrid[: SIZE[1], : SIZE[0]]
+    pixels = np.broadcast_to(np.stack([columns, rows], -1), found["rays_dir"][..., :2].shape).reshape(-1, 2)
+    inside = places(found["rays_dir"]).reshape(-1, 2) - pixels
+    origin, along = utils.pinhole_camera_rays(*pixels.T, FOCAL_PX, FOCAL_PX, *SIZE, ray_jitter=lambda _: inside)
+    np.testing.assert_allclose(origin, found["rays_ori"].reshape(-1, 3), atol=1e-6)
+    np.testing.assert_allclose(along, found["rays_dir"].reshape(-1, 3), atol=1e-6)
+
+
+def test_the_pinhole_of_gsplat_itself_makes_our_rays() -> None:
+    cameras = pytest.importorskip("gsplat.cuda._torch_cameras", reason="needs gsplat from 1.6.0 on")
+    torch = pytest.importorskip("torch")
+    found, frame = (picture(to=to, origin="pupil", device="cpu", **POSE) for to in ("gsplat", "3dgrut"))
+    sizes = {"principal_points": torch.tensor([SIZE]) / 2, "focal_lengths": torch.full((1, 2), FOCAL_PX)}
+    pose = cameras._viewmat_to_pose(torch.linalg.inv(found["to_world"].float())[None])
+    camera = cameras._BaseCameraModel.create(*SIZE, "pinhole", **sizes)
+    at = places(frame["rays_dir"]).reshape(1, -1, 2)
+    origin, along, _ = camera.image_point_to_world_ray_shutter_pose(at, pose, pose)
+    np.testing.assert_allclose(origin[0], found["rays"][..., :3].reshape(-1, 3), atol=1e-6)
+    np.testing.assert_allclose(along[0], found["rays"][..., 3:].reshape(-1, 3), atol=1e-6)
+
+
+def test_the_pinhole_of_nerfstudio_itself_makes_our_rays() -> None:
+    """In the world, and the areas of pixels that the how-to has."""
+    cameras = pytest.importorskip("nerfstudio.cameras.cameras", reason="needs nerfstudio")
+    found, frame = (picture(to=to, origin="pupil", device="cpu", **POSE) for to in ("opengl", "3dgrut"))
+    turn, place = found["to_world"][:3, :3].float(), found["to_world"][:3, 3].float()
+    camera = cameras.Cameras(found["to_world"][None, :3].float(), FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2, *SIZE)
+    for s, at in enumerate(places(frame["rays_dir"])):
+        rays = camera.generate_rays(0, coords=at.flip(-1))
+        np.testing.assert_allclose(rays.origins, found["origin"][:, :, s] @ turn.T + place, atol=1e-6)
+        np.testing.assert_allclose(rays.directions, found["direction"][:, :, s] @ turn.T, atol=1e-6)
+        area = found["direction"][:, :, s, 2:].abs() ** 3 / FOCAL_PX**2  # theirs is that of a pixel to the right
+        np.testing.assert_allclose(rays.pixel_area, area, rtol=0.03)
+
+
 @pytest.mark.parametrize("host", HOSTS)
 def test_one_seed_gives_every_host_the_same_rays_of_the_world(host: str) -> None:
     ours, theirs = (lens(to=name, seed=7, units_per_m=100.0, **POSE) for name in ("opengl", host))
