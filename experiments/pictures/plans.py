@@ -208,7 +208,7 @@ def _more(
 
     yield from (c for c in map(costed, shipped) if c is not None)
     fit: Any = None
-    for terms in sorted({*choices.shot_terms(probed), *MORE_TERMS}):
+    for terms in sorted({*choices.TERMS, *MORE_TERMS}):
         file = folder / f"{Path(probed.lens.path).stem}.shot-ols-{terms}.onnx"
         if file.stem not in tried and file not in made:
             fit = fit or choices.shot_fits(probed, folder)

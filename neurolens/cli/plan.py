@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shlex
 from dataclasses import dataclass, field
@@ -69,17 +68,19 @@ what was fitted, and plan.toml, which 'render' and 'export' take for the camera.
         """Plan, write, print; return 1 where no camera for this target is within the budget."""
         began = os.times()
         from neurolens.optics.readers.any_format import read_any
+        from neurolens.optics.setting.states import set_lens
         from neurolens.pictures.render.scene import load_scene
         from neurolens.studies.plan.effects_plot import plot_effects
         from neurolens.studies.plan.plan import plan
 
-        lens, scene = read_any(self.lens), load_scene(self.scene)
+        tabled, scene = read_any(self.lens), load_scene(self.scene)
+        lens = tabled if self.zoom is None else set_lens(tabled, zoom=self.zoom)
         folder = self.out or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
         cli.check_written(folder, "--output", "FOLDER")
         with self.progress({"plan": 10}).stage("plan"):
             made = plan(
-                scene, lens, self.budget, target=self.target, models=shipped_models(lens, self.zoom),
-                folder=None if self.no_fit else folder / "models", explain=self.explain, zoom=self.zoom,
+                scene, lens, self.budget, target=self.target, models=shipped_models(tabled, self.zoom),
+                folder=None if self.no_fit else folder / "models", explain=self.explain,
             )  # fmt: skip
         took = sum(os.times()[:4]) - sum(began[:4])  # of the processor, compilers included
         folder.mkdir(parents=True, exist_ok=True)
@@ -143,7 +144,7 @@ class Planned(Report):
         return "\n\n".join([*self.dear(), self._needs(), self._effects(), *every, answer, f"Written: {self.folder}/"])
 
     def dear(self) -> list[str]:
-        """Tell that a plan took more than its share of the time of the picture that it is for, and why.
+        """Tell that a plan took more than its share of the time of the picture that it is for.
 
         Nothing is returned where it did not, or where the picture's time is not known.
         """
@@ -152,10 +153,9 @@ class Planned(Report):
         best = self.plan.best
         if best is None or not self.plan.work.whole or self.plan_s <= SHARE * best.seconds:
             return []
-        every, small = "every camera was timed, as asked", "setting up a lens takes seconds, however small the picture"
         ratio = self.plan_s / max(best.seconds, 1e-3)  # a picture's time is known no finer
         spent, times = (cli.number(float(f"{value:.2g}"), 3) for value in (self.plan_s, ratio))
-        return [f"This plan took {spent} CPU seconds, {times} times its picture: {every if self.every else small}."]
+        return [f"This plan took {spent} CPU seconds, {times} times its picture."]
 
     def _needs(self) -> str:
         """Tell what the scene asks of the lens."""
@@ -173,26 +173,28 @@ class Planned(Report):
 
         rows = [
             (e.name, cli.number(e.worth, 3), "px" if e.unit == "px" else "of light", f"{100 * e.over:.0f}%",
-             "" if e.needed else "left out") if e.worth < math.inf else (e.name, "?", "", "", e.note)
+             "" if e.needed else "left out")
             for e in self.plan.effects
         ]  # fmt: skip
         told = cli.table(("effect", "worth", "", "beyond", ""), rows)
-        stray = ", ".join(e.name for e in self.plan.effects if e.name in STRAY.values() and e.needed and not e.note)
-        made = f"\n\nNo camera makes {stray}: a table [flare] in the scene does, or 'neurolens flare'."
-        return told + made * bool(stray)
+        stray = [e for e in self.plan.effects if e.name in STRAY.values()]
+        if not stray:
+            return told + "\n\nFlare is not known" + ": --explain looks for it, in seconds" * (not self.every) + "."
+        needed = ", ".join(e.name for e in stray if e.needed)
+        made = f"\n\nNo camera makes {needed}: a table [flare] in the scene does, or 'neurolens flare'."
+        return told + made * bool(needed)
 
     def _cameras(self) -> str:
-        """List every camera with its figures: a disc marks the one to use."""
+        """List every camera with its figures."""
         rows = [
-            (f"{'● ' * (c == self.plan.best)}{c.short}", cli.number(c.error_px, 3), cli.number(100 * c.light_error, 2),
-             cli.number(c.seconds, 3), cli.number(c.noise, 3), c.how)
+            (c.short, cli.number(c.error_px, 3), cli.number(100 * c.light_error, 2), cli.number(c.seconds, 3), c.how)
             for c in self.plan.choices
-        ]  # fmt: skip
+        ]
         return (
-            f"{cli.table(('camera', 'error, px', 'light, %', 's', 'noise', ''), rows)}\n\n● to use\n"
+            f"{cli.table(('camera', 'error, px', 'light, %', 's', ''), rows)}\n\n"
             "error, light: distance of footprints, and relative error of light, that 95% of the picture keep\n"
             f"s: of the {'whole picture' if self.plan.work.whole else 'camera'}, one thread, to the exact lens's noise "
-            "with the scene's samples\nnoise: times the paths that equal error takes, by the camera's weights and area"
+            "with the scene's samples"
         )
 
 

@@ -353,10 +353,20 @@ def test_strips_are_a_little_of_the_picture_and_apart(shot: tuple[int, int, int]
     assert len(rows) == 1 or len(rows) * width * used <= paths
 
 
-def test_light_that_the_lens_adds_is_looked_for_where_a_tenth_of_the_picture_has_room_for_it() -> None:
+def test_light_that_the_lens_adds_is_looked_for_where_a_tenth_of_the_picture_has_room_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found = planned(0.0, 4.0, None)
+    seen = list[object]()
+
+    def known(*_: object) -> dict[str, np.ndarray]:
+        seen.append(1)
+        return {"flare": np.full((2, 3), 0.5)}
+
+    monkeypatch.setattr("neurolens.studies.plan.probe.stray_light", known)
     for ns, looked in ((1.0, False), (1e6, True)):
         made = decided(found.probed, found.choices, 0.0, "render", Work((ns, ns)), explain=False)
-        assert made.best is not None and (0.1 * made.best.seconds > 20) == looked
-        (flare,) = (e for e in made.effects if e.name == "flare")
-        assert math.isinf(flare.worth) and flare.needed and flare.note.startswith("not known" if looked else "not look")
+        assert made.best is not None and (0.1 * made.best.seconds > 20) == looked == bool(seen)
+        assert [e.worth for e in made.effects if e.name == "flare"] == [0.5] * looked
+        text = Planned("", "", made, 0.0, "", False, Path()).text()
+        assert ("--explain looks for it" in text) != looked and ("No camera makes flare" in text) == looked

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -30,7 +29,7 @@ from neurolens.models.export import export_onnx
 from neurolens.models.fit import fit_model, prepare
 from neurolens.models.pairs import PairSettings, make_pairs
 from neurolens.models.polynomial import fit_planes
-from neurolens.models.targets import ModelSettings, Prepared
+from neurolens.models.targets import ModelSettings
 from neurolens.studies.plan import footprints as prints
 from neurolens.studies.plan.costs import noise, ns_a_ray
 from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe
@@ -197,18 +196,14 @@ def _shipped(probed: Probe, files: Sequence[Path], target: Target, budget_px: fl
     return tried
 
 
-TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of polynomials that are fitted for a shot
+TERMS = (4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of polynomials that are fitted for a shot
 # Gates that alone block a smaller share of the rays are left out: they darken no pixel by a thousandth.
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=5e-4)
 # for lenses with cylinders: more candidates take ten times as long, for the same errors
 _FIT_MIRROR = replace(_FIT, degree=5)
-_MOVED_TERMS = 16, 22  # with the first number of terms or more, planes are searched: once, for the second number
+# With the first number of terms or more, planes are moved, to where a search for the second number finds them.
+_MOVED_TERMS = 16, 22
 _PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
-
-
-def shot_terms(probed: Probe) -> list[int]:
-    """Return the sizes of polynomials that are tried for a shot; with cylinders they count terms of x and of y."""
-    return [n for n in TERMS if n >= (4 if probed.lens.anamorphic else 2)]
 
 
 def shot_fits(probed: Probe, folder: Path) -> Callable[[int], Path]:
@@ -217,18 +212,17 @@ def shot_fits(probed: Probe, folder: Path) -> Callable[[int], Path]:
     It returns the model's file, in the folder.
     """
     lens = probed.lens.with_aperture(None)
-    plain, model = prepare(make_pairs(lens, probed.domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
+    moved = plain = prepare(make_pairs(lens, probed.domain, _PAIRS))
+    model = _FIT_MIRROR if lens.anamorphic else _FIT
+    least, searched = _MOVED_TERMS
+    if not lens.anamorphic:
+        moved = replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, searched, model.position_weight))
     folder.mkdir(parents=True, exist_ok=True)
-
-    @cache
-    def moved() -> Prepared:  # planes for one size: a search takes a second, and other sizes agree on them
-        return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
 
     def fit(terms: int) -> Path:
         settings = replace(model, name=f"shot-ols-{terms}", terms=terms)
         file = folder / f"{probed.lens.lens_id}.{settings.label}.onnx"
-        planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
-        export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
+        export_onnx(fit_model(moved if terms >= least else plain, settings), file, errors={})
         return file
 
     return fit
@@ -243,5 +237,5 @@ def _fitted(probed: Probe, folder: Path, target: Target, budget_px: float) -> li
             tried.append(choice)
         return choice is not None and choice.meets(budget_px)
 
-    bisect.bisect_left(shot_terms(probed), True, key=holds)
+    bisect.bisect_left(TERMS, True, key=holds)
     return tried

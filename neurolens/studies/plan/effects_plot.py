@@ -18,8 +18,7 @@ _A_ROW, _ROW_IN = 4, 1.9  # maps in a row, and the height of a row in inches
 
 def plot_effects(plan: Plan, path: Path, title: str) -> None:
     """Draw the map of each effect that a camera needs, or of all where it needs none, on one scale for each unit."""
-    known = [e for e in plan.effects if e.film is not None]
-    shown = [e for e in known if e.needed] or known
+    shown = [e for e in plan.effects if e.needed] or plan.effects
     units = [part for unit in ("px", "relative") if (part := [e for e in shown if e.unit == unit])]
     heights = [_ROW_IN * -(-len(part) // _A_ROW) for part in units]
     subtitle = f"f/{plan.asked.f_number:.3g}, focus {plan.asked.focus_m:g} m; 95% of the picture keeps these figures"
@@ -33,7 +32,7 @@ def _maps(figure: Any, effects: Sequence[Effect], film_mm: tuple[float, float]) 
     """Draw effects of one unit, upright, with their colour bar: light that the lens takes is violet."""
     from matplotlib.colors import Normalize
 
-    pixels, maps = effects[0].unit == "px", [np.asarray(e.film) for e in effects]
+    pixels, maps = effects[0].unit == "px", [e.film for e in effects]
     low, high = error_scale(map(np.abs, maps), 98)
     norm, colours = (log_norm(low, high), "magma") if pixels else (Normalize(-high, high), "PuOr_r")
     cells = figure.subplots(-(-len(effects) // _A_ROW), _A_ROW, squeeze=False)
@@ -44,7 +43,7 @@ def _maps(figure: Any, effects: Sequence[Effect], film_mm: tuple[float, float]) 
         picture = axes.imshow(shown, extent=(0, film_mm[0], 0, film_mm[1]), cmap=colours, norm=norm)
         worth = f"{effect.worth:.2g} px" if pixels else f"{100 * effect.worth:.2g}%"
         axes.set_title(f"{effect.name}, {worth}", fontsize=8)
-    bar = figure.colorbar(picture, ax=cells, extend="both", aspect=12 * len(cells), pad=0.015)
+    bar = figure.colorbar(picture, ax=cells[:, : len(maps)], extend="both", aspect=12 * len(cells), pad=0.015)
     bar.set_label("pixels" if pixels else "share of the light", fontsize=7)
     bar.ax.tick_params(labelsize=6.5)
     if pixels:

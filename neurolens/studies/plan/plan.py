@@ -68,26 +68,25 @@ class Plan:
 
 def plan(
     scene: Scene, lens: Lens, budget_px: float = 0.25, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, zoom: str | None = None,
+    folder: Path | None = None, explain: bool = False,
 ) -> Plan:  # fmt: skip
     """Find the cheapest camera for a scene within a budget of error.
 
     Where the cheapest camera saves too little to tell, it is the exact lens. In our renderer the whole picture counts.
 
     Args:
-        lens: as its file has it. budget_px: error of place and blur in pixels of the scene's picture.
+        lens: in its zoom state. budget_px: error of place and blur in pixels of the scene's picture.
         target: what runs the camera: our renderer with all it has, compiled C, or onnxruntime.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
         explain: whether cameras beyond the budget are compiled and timed, too (else their seconds are infinite), and
             the light that the lens adds is looked for, however long that takes.
-        zoom: as of `probe`.
 
     Raises:
         InputError: a budget is negative or no number; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
-    probed = probe(scene, lens, zoom=zoom)
+    probed = probe(scene, lens)
     work = work_of(probed) if target == "render" else ALONE
     if not explain and exact_suffices(probed, work):
         models, folder = (), None

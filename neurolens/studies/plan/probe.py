@@ -141,7 +141,7 @@ class SceneNeeds:
     Attributes:
         f_number: no wider than the lens opens. pixel_mm: pitch.
         nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
-        distant: share of the picture that shows things without a distance. dark: share that the lens leaves dark.
+        distant: share of the picture that shows things without a distance.
         light_nm: range of all but 0.2% of the scene's light, as the eye weighs it.
     """
 
@@ -151,7 +151,6 @@ class SceneNeeds:
     nearest_m: float | None
     farthest_m: float | None
     distant: float
-    dark: float
     light_nm: tuple[float, float]
 
 
@@ -161,11 +160,10 @@ class Effect:
 
     Attributes:
         worth: at the counted percentile, in pixels (RMS distance by which it moves light) or, where `relative`, as a
-            share of the light; inf where it is not known.
+            share of the light.
         over: share of the picture where it is beyond the budget.
         needed: whether a camera needs it.
-        note: the reason where the worth is not known.
-        film: [H, W] of `effect_maps`; None where it is not known.
+        film: [H, W] of `effect_maps`.
     """
 
     name: str
@@ -173,8 +171,7 @@ class Effect:
     over: float
     unit: Unit
     needed: bool
-    note: str = ""
-    film: Array | None = field(default=None, metadata=BULK, repr=False)
+    film: Array = field(metadata=BULK, repr=False)
 
 
 @dataclass(frozen=True)
@@ -182,7 +179,6 @@ class Probe:
     """A scene's places as the exact lens sees them, with its camera, its footprints there, and a thin lens's.
 
     Attributes:
-        shot: of the lens at its zoom.
         lens, domain: the lens is stopped down and focused; the domain is that of models of this shot.
         places: those with light, among `shape` rows and columns over the film.
         seen, thin_seen: footprints of the exact camera and of a thin lens.
@@ -210,16 +206,16 @@ class Probe:
         return film[:, ::-1]  # the top left of a picture is at +x, -y of the film
 
 
-def probe(scene: Scene, lens: Lens, *, across: int = _PLACES_ACROSS, zoom: str | None = None) -> Probe:
+def probe(scene: Scene, lens: Lens, *, across: int = _PLACES_ACROSS) -> Probe:
     """Look through the exact lens at a scene.
 
     Args:
-        across: places along the longer side. zoom: state of the lens by name or focal length; None leaves it as it is.
+        lens: in its zoom state. across: places along the longer side.
 
     Raises:
-        InputError: the scene's camera is none that the lens can be; the lens leaves the picture dark; an unknown state.
+        InputError: the scene's camera is none that the lens can be; the lens leaves the picture dark.
     """
-    lens, shot = lens if zoom is None else set_lens(lens, zoom=zoom), scene.settings.camera
+    shot = scene.settings.camera
     film, widest = shot.film_mm, first_order(lens).f_number
     f_number = max(shot.f_number or widest, widest)
     stopped, domain = set_lens(lens, f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
@@ -236,8 +232,8 @@ def probe(scene: Scene, lens: Lens, *, across: int = _PLACES_ACROSS, zoom: str |
         raise InputError(scene.name, "camera", lens.name, "a lens that lights some of this film")
     met = depth[np.isfinite(depth)]
     nearest, farthest = (float(met.min()), float(met.max())) if met.size else (None, None)
-    distant, dark = float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1]
-    asked = SceneNeeds(f_number, shot.focus_m, film[0] / shot.width, nearest, farthest, distant, dark, light_nm)
+    distant = float(np.isinf(depth).mean())
+    asked = SceneNeeds(f_number, shot.focus_m, film[0] / shot.width, nearest, farthest, distant, light_nm)
     seen, ideal = (prints.footprints(c, places) for c in (exact, ideal_as("thin:", exact.lens, real)))
     return Probe(scene, asked, real, stopped, domain, exact, places, (rows, columns), seen, ideal, small)
 
@@ -311,19 +307,16 @@ def passed_share(probed: Probe) -> Array:
 def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
     """Return the effects with their worth in this picture, largest first.
 
-    `stray`: whether ghosts, glare and stars are among them, which take seconds to draw.
+    `stray`: whether ghosts, glare and stars are among them where they are known, which take seconds to draw.
     """
-    maps, added = effect_maps(probed), dict[str, Array]()
+    maps, effects = effect_maps(probed), list[Effect]()
     if stray:
         with suppress(InputError):
             added = stray_light(probed.scene, probed.exact, probed.small)
-    effects = []
-    for name, (unit, value) in (maps | {k: ("relative", v) for k, v in added.items()}).items():
+            maps |= {k: ("relative", v) for k, v in added.items()}
+    for name, (unit, value) in maps.items():
         budget = budget_px if unit == "px" else LIGHT
         known = np.abs(value[np.isfinite(value)])
         worth = float(np.percentile(known, COUNTED))
-        effects.append(Effect(name, worth, float((known > budget).mean()), unit, worth > budget, film=value))
-    if not added:
-        note = "not known" if stray else "not looked for: --explain does, in seconds"
-        effects.append(Effect("flare", math.inf, 1.0, "relative", True, note))
+        effects.append(Effect(name, worth, float((known > budget).mean()), unit, worth > budget, value))
     return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
