@@ -19,6 +19,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
 from neurolens.base.find import CHARACTER, Entry, entries, said_of, words_of
 from neurolens.base.lensname import lens_id_of
+from neurolens.base.report import Report
 from neurolens.cli.arguments import Reporting, lens, output_path
 
 if TYPE_CHECKING:
@@ -56,11 +57,27 @@ class Library(Reporting):
                 records.append(_record(file, folder / names[k]))
                 report((k + 1) / len(files))
         atomic_write_text(folder / "index.html", _index(records))
-        failed = [f"{r['lens']}: {r['fault']}" for r in records if "fault" in r]
-        size = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
-        lines = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
-        data = {"folder": str(folder), "bytes": size, "lenses": records}
-        return self.answer(data, lambda: "\n".join(lines), 1 if failed else 0)
+        found = Pages(folder, sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()), records)
+        return self.answer(found, 1 if found.failed else 0)
+
+
+@dataclass(frozen=True)
+class Pages(Report):
+    """The pages of a library, with a record of each lens."""
+
+    folder: Path
+    bytes: int
+    lenses: list[dict[str, Any]]
+
+    @property
+    def failed(self) -> list[str]:
+        """The lenses that could not be shown, with the reasons."""
+        return [f"{record['lens']}: {record['fault']}" for record in self.lenses if "fault" in record]
+
+    def text(self) -> str:
+        """Return the index, its size, and what failed."""
+        shown = len(self.lenses) - len(self.failed)
+        return "\n".join([f"{shown} lenses, {self.bytes / 1e6:.1f} MB: {self.folder}/index.html", *self.failed])
 
 
 OPTIONS = [Library.add_options]

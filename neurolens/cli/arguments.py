@@ -280,21 +280,19 @@ class Reporting(Command):
     # Takes the answer where the command is called from Python (`cli.calls`), which prints nothing.
     tell: Callable[[Mapping[str, Any], str], None] | None = field(default=None, compare=False, repr=False)
 
-    def answer(
-        self, found: Report | Mapping[str, Any], text: Callable[[], str] | None = None, code: int = 0, *,
-        full: bool = False,
-    ) -> int:  # fmt: skip
-        """Print a report, or a mapping with its `text`, as JSON if --json asks for it, else as text; returns the exit
-        code. `full`: with what a report has in bulk."""
-        text = text or found.text  # type: ignore[union-attr]  # of a report
+    def answer(self, found: Report, code: int = 0, *, full: bool = False) -> int:
+        """Print a report, as JSON if --json asks for it, else as text; returns the exit code.
+
+        JSON has what a report has in bulk only where it is `full`.
+        """
         for line in filter(None, (self.told, compiled_so_far())):
             note(line)
         if self.tell is not None:
-            self.tell(plain(found, strict=False, full=full), text())
+            self.tell(plain(found, strict=False, full=full), found.text())
         elif self.json:
             print_json(plain(found, full=full))
         else:
-            print(printable(text()))
+            print(printable(found.text()))
         return code
 
     def progress(self, plan: Mapping[str, float] | None = None) -> Progress:
@@ -311,11 +309,11 @@ class Figures(Reporting):
         metavar="FOLDER", kind=Path, written=True, last=4, common=True,
     )  # fmt: skip
 
-    def answer(self, found: Report | Mapping[str, Any], *rest: Any, **more: Any) -> int:
+    def answer(self, found: Report, code: int = 0, *, full: bool = False) -> int:
         """Write the tables that are asked for, and print as any command; returns the exit code."""
         if self.csv is not None:
             write_tables(self.csv, found, self.called.split()[-1])
-        return super().answer(found, *rest, **more)
+        return super().answer(found, code, full=full)
 
 
 @contextmanager

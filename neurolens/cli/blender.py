@@ -13,7 +13,7 @@ import time
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,6 +27,7 @@ from neurolens.base.errors import InputError, NeurolensError, warn
 from neurolens.base.files import fingerprint_of, kept_in_cache, safe_name, sha256_of
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model, lens_id_of, maker_of
+from neurolens.base.report import BULK, Report
 from neurolens.base.settings import RANGE, setting
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.cameras.build import ideal_as, make_camera
@@ -117,11 +118,25 @@ class Build(cli.Reporting):
         if not packed:
             self.refuse("--models", str(folder), "a folder with a model for a shader")
         write_pack(self.out, packed)
-        data = {"file": str(self.out), "bytes": self.out.stat().st_size}
-        data |= {"lenses": {p.lens_id: [f.model or f.kind for f in p.forms] for p in packed}}
-        data |= {"left_out": {file.name: why for file, why in left.items()}, "seconds": time.perf_counter() - began}
-        shaders = sum(len(p.forms) for p in packed)
-        return self.answer(data, lambda: f"{self.out}: {len(packed)} lens{'es' * (len(packed) > 1)}, {shaders} shaders")
+        shaders = {p.lens_id: [f.model or f.kind for f in p.forms] for p in packed}
+        left_out, seconds = {file.name: why for file, why in left.items()}, time.perf_counter() - began
+        return self.answer(Packed(self.out, self.out.stat().st_size, shaders, left_out, seconds))
+
+
+@dataclass(frozen=True)
+class Packed(Report):
+    """A packed extension, with the shaders of each lens and the files that are left out."""
+
+    file: Path
+    bytes: int
+    lenses: Mapping[str, Sequence[str]]
+    left_out: Mapping[str, str]
+    seconds: float
+
+    def text(self) -> str:
+        """Return the file and how much is in it."""
+        count, shaders = len(self.lenses), sum(map(len, self.lenses.values()))
+        return f"{self.file}: {count} lens{'es' * (count > 1)}, {shaders} shaders"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,8 +167,21 @@ class Add(cli.Reporting):
         form = form_of(self.file, zoom=self.zoom, quiet=self.quiet)
         lens = packed_of([self.file], [form], zoom=self.zoom)
         add_lens(to, lens)
-        data = {"lens": lens.lens_id, "to": str(to), "forms": [f.model or f.kind for f in lens.forms]}
-        return self.answer(data, lambda: f"{lens.name} ({', '.join(data['forms'])}) is in {to}")
+        return self.answer(Added(lens.lens_id, to, [f.model or f.kind for f in lens.forms], lens.name))
+
+
+@dataclass(frozen=True)
+class Added(Report):
+    """A lens that was put into an extension; `name` is its name for people."""
+
+    lens: str
+    to: Path
+    forms: Sequence[str]
+    name: str = field(metadata=BULK)
+
+    def text(self) -> str:
+        """Return a sentence."""
+        return f"{self.name} ({', '.join(self.forms)}) is in {self.to}"
 
 
 def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from neurolens.base.errors import InputError, pip_install, warned
 from neurolens.base.files import atomic_path
@@ -20,6 +21,7 @@ from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.source import ReadOptions
 
 if TYPE_CHECKING:
+    from neurolens.optics.lens.glass import Glass as Named
     from neurolens.optics.lens.paraxial import FirstOrderLight
     from neurolens.optics.lens.prescription import Lens
 
@@ -215,22 +217,42 @@ examples:
             else:
                 catalogue.find(name, "argument", "NAME")
                 glasses += catalogue.same_name(name)
-        rows = [_record(glass) for glass in dict.fromkeys(glasses)]
+        return self.answer(Glasses([GlassFigures.of(glass) for glass in dict.fromkeys(glasses)]))
+
+
+@dataclass(frozen=True)
+class GlassFigures:
+    """Figures of one glass; internal transmittance is by wavelength in nm, empty where the source has none."""
+
+    glass: str
+    n_d: float
+    V_d: float
+    form: str
+    coefficients: Sequence[float]
+    range_nm: Sequence[float]
+    internal_transmittance_10mm: Mapping[str, float]
+
+    @staticmethod
+    def of(glass: Named) -> GlassFigures:
+        """Return the figures of a glass of a catalogue."""
+        waves = _TRANSMITTED_NM if glass.absorption else ()
+        through = {f"{nm:.0f}": math.exp(-_PLATE_MM * glass.absorption_per_mm(nm)) for nm in waves}
+        range_nm = [1000 * v for v in glass.range_um]
+        return GlassFigures(str(glass), glass.n_d, glass.V_d, glass.form, glass.coefficients, range_nm, through)
+
+    def cells(self) -> list[str]:
+        """Return the row of a table."""
+        through = [self.internal_transmittance_10mm.get(f"{nm:.0f}") for nm in _TRANSMITTED_NM]
+        return [self.glass, f"{self.n_d:.6f}", f"{self.V_d:.2f}", *map(cli.number, [*self.range_nm, *through])]
+
+
+@dataclass(frozen=True)
+class Glasses(Report):
+    """The glasses that were asked for."""
+
+    glasses: Sequence[GlassFigures]
+
+    def text(self) -> str:
+        """Return a row for each glass."""
         header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
-        cells = [
-            [r["glass"], f"{r['n_d']:.6f}", f"{r['V_d']:.2f}"]
-            + [cli.number(v) for v in r["range_nm"]]
-            + [cli.number(r["internal_transmittance_10mm"].get(f"{nm:.0f}")) for nm in _TRANSMITTED_NM]
-            for r in rows
-        ]
-        return self.answer({"glasses": rows}, lambda: cli.table(header, cells))
-
-
-def _record(glass: Any) -> dict[str, Any]:
-    """Return figures of one glass; internal transmittance is by wavelength in nm, empty where the source has none."""
-    figures = {name: getattr(glass, name) for name in ("n_d", "V_d", "form", "coefficients")}
-    through = {
-        f"{nm:.0f}": math.exp(-_PLATE_MM * glass.absorption_per_mm(nm)) for nm in _TRANSMITTED_NM if glass.absorption
-    }
-    range_nm = [1000 * v for v in glass.range_um]
-    return {"glass": str(glass), **figures, "range_nm": range_nm, "internal_transmittance_10mm": through}
+        return cli.table(header, [glass.cells() for glass in self.glasses])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,6 +13,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.lensname import is_model, split_kind
+from neurolens.base.report import OPTIONAL, Report
 from neurolens.base.settings import changed, group, setting
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.lenscamera import LensCamera
@@ -118,7 +119,7 @@ examples:
                 options = "--fix, --only, --whole-camera, --focus, --f-number, ..."
                 expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
                 self.refuse(options, "(with --to osl)", expected)
-            write: Callable[[Path], dict[str, Any]] = self._write_osl
+            write: Callable[[Path], Exported] = self._write_osl
         elif self.whole_camera or not is_model(file):
             if self.to == "onnx" or not whole:
                 what = "a camera" if self.whole_camera else "a lens file"
@@ -126,13 +127,12 @@ examples:
             write = self._write_camera if self.whole_camera else self._write_lens
         else:
             write = partial(self._write_model, fixed=fixed)
-        about = write(file)
-        data = {"file": str(self.out), "to": self.to, "bytes": self.out.stat().st_size, **about}
-        maps = about.get("inverse", {}).values()
-        lines = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
-        return self.answer(data, lambda: "\n".join([str(self.out), *lines]))
+        return self.answer(write(file))
 
-    def _write_model(self, file: Path, fixed: dict[str, list[float]]) -> dict[str, Any]:
+    def _exported(self, **figures: Any) -> Exported:
+        return Exported(self.out, self.to, self.out.stat().st_size, **figures)
+
+    def _write_model(self, file: Path, fixed: dict[str, list[float]]) -> Exported:
         """Write a model as source code or ONNX, with some of its inputs fixed."""
         loaded = load_model(file)
         if loaded.axes and (self.to == "onnx" or fixed or set(self.only) != set(_PARTS)):
@@ -141,33 +141,32 @@ examples:
         fix, models = _fixed_model(fixed, loaded.fitted) if fixed else (source.Fix(), loaded.file.nodes)
         if self.to == "onnx":
             _write_onnx_model(models, self.out, None if fixed else loaded.card, self.derivatives)
-            return _write_inverse(models[0], self.out) if self.inverse else {}
+            return self._exported(inverse=_write_inverse(models[0], self.out) if self.inverse else None)
         kept = source.Parts(*(name in self.only for name in _PARTS[1:]))
         stop = fix.stop_radius_mm if kept.vignetting else models[0].domain.stop_radius_mm
         extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
         written = source.export_source(
             models, self.out, self.to, loaded.card, parts=kept, fix=fix, name=self.name, extras=extras, notes=notes
         )
-        return _about(written, [m.domain.wavelength_nm[0] for m in models])
+        return self._source(written, [m.domain.wavelength_nm[0] for m in models])
 
-    def _write_lens(self, file: Path) -> dict[str, Any]:
+    def _write_lens(self, file: Path) -> Exported:
         """Write the exact lens of a file as source code."""
         from neurolens.cameras.shaders.lens_source import write_lens
 
-        return _about(
+        return self._source(
             write_lens(file, self.out, self.to, name=self.name, zoom=self.state.given.zoom, progress=self.progress())
         )
 
-    def _write_osl(self, file: Path) -> dict[str, Any]:
+    def _write_osl(self, file: Path) -> Exported:
         """Write a camera for Cycles."""
         shader = shader_of(file, zoom=self.state.given.zoom, name=self.name, quiet=self.quiet)
         atomic_write_text(self.out, shader.text)
-        return {
-            "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
-            "passing": shader.passing,
-        }  # fmt: skip
+        return self._exported(
+            function=shader.name, inputs=shader.parameters, operations_per_ray=shader.operations, passing=shader.passing
+        )
 
-    def _write_camera(self, file: Path) -> dict[str, Any]:
+    def _write_camera(self, file: Path) -> Exported:
         """Write the whole camera of a model or a lens file as source code."""
         shot = self.state.shot(self.film, runtime="onnxruntime")
         camera: Any = make_camera(file, shot, self.progress())
@@ -192,22 +191,46 @@ examples:
                 temporary.write_bytes(table.astype("<f4").tobytes())
             size = f"{table.shape[1]} wide, {len(table)} high"
             comment.append(f"outline: one float a texel, {size}: {beside.name}, little-endian, line by line.")
-        return _about(
+        return self._source(
             source.write_program(program, self.out, self.to, name, source.lines_of(comment), Extras(constants))
         )
 
+    def _source(self, written: source.Written, bands_nm: Sequence[float] = ()) -> Exported:
+        """Return the answer of source code."""
+        s = written.signature
+        return self._exported(
+            function=s.name, inputs=s.inputs, state=s.state, outputs=[*s.outputs, "status"],
+            bands_nm=bands_nm if s.bands > 1 else [], operations_per_ray=written.operations,
+        )  # fmt: skip
 
-def _about(written: source.Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
-    """Return what --json prints about source code."""
-    s = written.signature
-    return {
-        "function": s.name,
-        "inputs": s.inputs,
-        "state": s.state,
-        "outputs": [*s.outputs, "status"],
-        "bands_nm": bands_nm if s.bands > 1 else [],
-        "operations_per_ray": written.operations,
-    }
+
+@dataclass(frozen=True)
+class Exported(Report):
+    """A model, lens or camera as another program takes it.
+
+    Attributes:
+        bands_nm: the wavelengths of a function of several bands.
+        passing: of a shader, the share of its samples that pass.
+        inverse: the files of both inverse maps, with the share of rays that each finds.
+    """
+
+    file: Path
+    to: str
+    bytes: int
+    function: str | None = field(default=None, metadata=OPTIONAL)
+    inputs: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
+    state: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
+    outputs: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
+    bands_nm: Sequence[float] | None = field(default=None, metadata=OPTIONAL)
+    operations_per_ray: int | None = field(default=None, metadata=OPTIONAL)
+    passing: Mapping[float, float] | None = field(default=None, metadata=OPTIONAL)
+    inverse: Mapping[str, Mapping[str, Any]] | None = field(default=None, metadata=OPTIONAL)
+
+    def text(self) -> str:
+        """Return the files."""
+        maps = (self.inverse or {}).values()
+        lines = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
+        return "\n".join([str(self.file), *lines])
 
 
 def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
@@ -267,9 +290,9 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
         export_onnx(model, measured, errors, derivatives=derivatives)
 
 
-def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
+def _write_inverse(model: LensModel, out: Path) -> Mapping[str, Mapping[str, float | str]]:
     """Write both inverse maps beside the model's file; return their files and the share of rays that each finds."""
     from neurolens.models.export import export_inverse
     from neurolens.models.inverse import inverse_of
 
-    return {"inverse": export_inverse(inverse_of(model), out, load_model(out).card["errors"])}
+    return export_inverse(inverse_of(model), out, load_model(out).card["errors"])

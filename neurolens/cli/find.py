@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import one_line
 from neurolens.base.files import library
-from neurolens.base.find import Entry, Found, find
+from neurolens.base.find import Entry, find
+from neurolens.base.report import Report
 from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
 
@@ -40,34 +42,71 @@ examples:
     def run(self) -> int:
         """Print the lenses; return 1 where none has all words."""
         found = find(" ".join(self.words))
-        rows = [_row(entry) for entry in found.hits or found.near]
-        data = {"found": len(found.hits), "chosen": found.chosen and found.chosen.lens, "notes": list(found.notes)}
-        return self.answer(data | {"lenses": rows}, lambda: _text(found, rows), 0 if found.hits else 1)
+        lenses = [FoundLens.of(entry) for entry in found.hits or found.near]
+        chosen = found.chosen.lens if found.chosen else None
+        return self.answer(FoundLenses(len(found.hits), chosen, found.notes, lenses), 0 if found.hits else 1)
 
 
-def _row(entry: Entry) -> dict[str, Any]:
-    """Return what is told of a lens: its name in lenses/, its files, and figures of the index."""
-    keys = ("maker", "year", "efl_mm", "f_number", "t_stop", "mount", "match", "verdict", "character")
-    folder = library() / "lenses"
-    picture = folder / "thumbnails" / f"{entry.lens}.svg"
-    files = {"file": str(folder / f"{entry.lens}.toml"), "thumbnail": str(picture) if picture.is_file() else None}
-    return {"lens": entry.lens, "name": entry.name, **{key: entry.row.get(key) for key in keys}, **files}
+@dataclass(frozen=True)
+class FoundLens:
+    """A lens of the library: its name in lenses/, figures of the library's index, and its files."""
+
+    lens: str
+    name: str
+    maker: str | None
+    year: int | None
+    efl_mm: float | None
+    f_number: float | None
+    t_stop: float | None
+    mount: str | None
+    match: str | None
+    verdict: str | None
+    character: Any
+    file: Path
+    thumbnail: Path | None
+
+    @staticmethod
+    def of(entry: Entry) -> FoundLens:
+        """Return the lens of an entry of the index."""
+        figures: Any = {f.name: entry.row.get(f.name) for f in fields(FoundLens)[2:-2]}
+        folder = library() / "lenses"
+        picture = folder / "thumbnails" / f"{entry.lens}.svg"
+        shown = picture if picture.is_file() else None
+        return FoundLens(entry.lens, entry.name, **figures, file=folder / f"{entry.lens}.toml", thumbnail=shown)
+
+    def cells(self) -> tuple[str, ...]:
+        """Return the row of a table."""
+        light = f"T{self.t_stop:.3g}" if self.t_stop else f"f/{self.f_number:.3g}" if self.f_number else "-"
+        checked = _CHECKED.get(self.match or "", "no photographs") + ", doubtful" * (self.verdict == "doubtful")
+        return self.lens, one_line(self.name, 50), light, str(self.year or "-"), checked
 
 
-def _text(found: Found, rows: Sequence[Mapping[str, Any]]) -> str:
-    header = ("lens", "name", "light", "year", "checked by")
-    text = cli.table(header, [_cells(row) for row in rows[:_SHOWN]], left=len(header))
-    if not found.hits:
-        text = f"no lens has all these words; the nearest:\n{text}\nother commands scale any lens: --focal-length MM"
-        text = text if rows else "no lens has words like these"
-    elif len(rows) > _SHOWN:
-        text += f"\n{len(rows) - _SHOWN} more: further words leave fewer, --json shows all"
-    if found.chosen and len(rows) > 1:
-        text += f"\nother commands take {found.chosen.lens} by these words"
-    return "\n".join([*found.notes, text])
+@dataclass(frozen=True)
+class FoundLenses(Report):
+    """The lenses that a query finds.
 
+    Attributes:
+        found: how many have all words of the query; where none has, `lenses` are the nearest.
+        chosen: the lens that other commands take by these words.
+        notes: sentences about nicknames in the query.
+    """
 
-def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
-    light = f"T{row['t_stop']:.3g}" if row["t_stop"] else f"f/{row['f_number']:.3g}" if row["f_number"] else "-"
-    checked = _CHECKED.get(row["match"], "no photographs") + ", doubtful" * (row["verdict"] == "doubtful")
-    return row["lens"], one_line(row["name"], 50), light, str(row["year"] or "-"), checked
+    found: int
+    chosen: str | None
+    notes: Sequence[str]
+    lenses: Sequence[FoundLens]
+
+    def text(self) -> str:
+        """Return a table of the best lenses, and what to do next."""
+        header = ("lens", "name", "light", "year", "checked by")
+        text = cli.table(header, [lens.cells() for lens in self.lenses[:_SHOWN]], left=len(header))
+        if not self.found:
+            text = (
+                f"no lens has all these words; the nearest:\n{text}\nother commands scale any lens: --focal-length MM"
+            )
+            text = text if self.lenses else "no lens has words like these"
+        elif len(self.lenses) > _SHOWN:
+            text += f"\n{len(self.lenses) - _SHOWN} more: further words leave fewer, --json shows all"
+        if self.chosen and len(self.lenses) > 1:
+            text += f"\nother commands take {self.chosen} by these words"
+        return "\n".join([*self.notes, text])

@@ -6,8 +6,8 @@ import argparse
 import math
 import re
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
+from neurolens.base.report import BULK, OPTIONAL, PART, Report
 from neurolens.base.settings import changed, group, positive, setting
 from neurolens.base.units import in_unit
 from neurolens.cameras.build import make_camera
@@ -243,23 +244,23 @@ examples:
         states = list(self._states())
         shots = Shots(self, read_any(self.file), progress)
         first = shots.at(states[0])
-        results = {"lens": first.job.lens.name, "pairs": len(ghost_pairs(first.job.lens)), **first.metadata()}
+        found = Flared(first.job.lens.name, len(ghost_pairs(first.job.lens)), first.metadata(), first)
         if self.path is not None:
             _draw(first.job, self.path[0], Path(self.path[1]))
-            results["path"] = self.path[1]
+            found = replace(found, path=self.path[1])
         if self.out is not None:
-            results["out"] = [str(state.out) for state in states]
-            results["preview"] = [str(state.picture.with_suffix(".png")) for state in states]
+            previews = [state.picture.with_suffix(".png") for state in states]
             try:
-                results |= self._write_all(states, shots, progress)
+                layers, exposure = self._write_all(states, shots, progress)
+                outs = [state.picture for state in states]
+                found = replace(found, out=outs, preview=previews, layers=layers, exposure=exposure)
             except KeyboardInterrupt as error:
                 if self.frames.frames is not None:
                     error.add_note("the frames that are there are kept: the same command goes on")
                 elif kept := [str(path) for path in kept_beside(self.out)]:
                     error.add_note(f"the same command goes on from {' and '.join(kept)}")
                 raise
-        results["seconds"] = time.perf_counter() - began
-        return self.answer(results, lambda: _text(first, results))
+        return self.answer(replace(found, seconds=time.perf_counter() - began))
 
     def _states(self) -> Iterator[Flare]:
         """Yield the command with the settings of each frame."""
@@ -269,7 +270,7 @@ examples:
             out = self.out and numbered(self.out, digits)
             yield replace(self, state=self.state.at(**of_lens), frame=frame, out=out, **place)
 
-    def _write_all(self, states: list[Flare], shots: Shots, progress: Progress) -> dict[str, Any]:
+    def _write_all(self, states: list[Flare], shots: Shots, progress: Progress) -> tuple[tuple[str, ...], float]:
         """Write the picture, or those of the frames that are missing.
 
         Returns the names of the ghosts that are layers, and the exposure of the previews in stops.
@@ -282,8 +283,7 @@ examples:
             if len(single) < most:
                 warn(f"layers of {len(single)} single ghosts, not {most}: no other leaves light on the film")
         if self.frames.frames is None:
-            exposure = _write(states[0], shots, single, exposure, progress)
-            return {"layers": single, "exposure": exposure or 0.0}
+            return single, _write(states[0], shots, single, exposure, progress) or 0.0
         with progress.stage(f"{len(states)} frames") as report:
             for done, state in enumerate(states, start=1):
                 if self.restart or not state.picture.is_file():
@@ -291,7 +291,7 @@ examples:
                 elif exposure is None:  # the frames of all runs share it
                     exposure = read_metadata(state.picture).get("flare", {}).get("exposure")
                 report(done / len(states))
-        return {"layers": single, "exposure": exposure or 0.0}
+        return single, exposure or 0.0
 
 
 class Shot(NamedTuple):
@@ -455,8 +455,40 @@ def _draw(job: FlareJob, name: str, out: Path) -> None:
     lens_layout(ghost_layout(job.lens, pair, job.lights[0]), out)
 
 
-def _text(shot: Shot, results: dict[str, Any]) -> str:
-    lines = [f"{results['lens']}: {results['pairs']} pairs of surfaces"]
+@dataclass(frozen=True)
+class Flared(Report):
+    """The ghosts of the first frame, and the pictures of all frames.
+
+    Attributes:
+        pairs: how many pairs of surfaces reflect.
+        metadata: the lights and their brightest ghosts. shot: all ghosts.
+        path: the drawing of one ghost.
+        layers: the names of the ghosts that are layers. exposure: of the previews, in stops.
+    """
+
+    lens: str
+    pairs: int
+    metadata: Mapping[str, Any] = field(metadata=PART)
+    shot: Shot = field(metadata=BULK)
+    path: str | None = field(default=None, metadata=OPTIONAL)
+    out: Sequence[Path] | None = field(default=None, metadata=OPTIONAL)
+    preview: Sequence[Path] | None = field(default=None, metadata=OPTIONAL)
+    layers: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
+    exposure: float | None = field(default=None, metadata=OPTIONAL)
+    seconds: float = 0.0
+
+    def text(self) -> str:
+        """Return a table of each light's ghosts, and the files."""
+        lines = [f"{self.lens}: {self.pairs} pairs of surfaces", *_ghost_tables(self.shot)]
+        if self.layers:
+            lines.append(f"layers of the ghosts with the greatest values on the film: {', '.join(self.layers)}")
+        spans = [f"{f[0]} to {f[-1]}" if len(f) > 1 else str(f[0]) for f in (self.out, self.preview) if f]
+        end = f"{spans[0]}, and the preview {spans[1]} at {self.exposure:+g} stops" if spans else "done"
+        return "\n\n".join([*lines, f"{end}: {self.seconds:.1f} s"])
+
+
+def _ghost_tables(shot: Shot) -> list[str]:
+    lines = list[str]()
     head = ("ghost", "energy of the image's", "x mm", "y mm", "RMS radius mm", "rays that arrive %")
     lights = shot.job.lights
     for light, ghosts in zip(lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
@@ -470,9 +502,4 @@ def _text(shot: Shot, results: dict[str, Any]) -> str:
         lines.append(cli.table(head, rows))
     if more := len(lights[_SHOWN_LIGHTS:]):
         lines.append(f"and {more} more lights")
-    if results.get("layers"):
-        lines.append(f"layers of the ghosts with the greatest values on the film: {', '.join(results['layers'])}")
-    files = [results[key] for key in ("out", "preview") if key in results]
-    spans = [f"{names[0]} to {names[-1]}" if len(names) > 1 else names[0] for names in files]
-    end = f"{spans[0]}, and the preview {spans[1]} at {results['exposure']:+g} stops" if spans else "done"
-    return "\n\n".join([*lines, f"{end}: {results['seconds']:.1f} s"])
+    return lines

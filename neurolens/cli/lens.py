@@ -13,7 +13,7 @@ from neurolens.base.errors import one_line, warned
 from neurolens.base.files import library, sha256_of
 from neurolens.base.find import CHARACTER, read_index
 from neurolens.base.lensname import resolve
-from neurolens.base.report import OPTIONAL, PART, Report
+from neurolens.base.report import BULK, OPTIONAL, PART, Report
 from neurolens.base.settings import changed, setting
 from neurolens.cli import arguments as cli
 
@@ -146,7 +146,7 @@ examples:
 
         files = [file for path in paths for file in (lens_files(path) if path.is_dir() else [_file(path)])]
         rows = self._rows(files, checked)
-        return self.answer({"lenses": rows}, lambda: _list_text(rows, self.sort))
+        return self.answer(ListedLenses(rows, self.sort))
 
     def _rows(self, files: list[Path], checked: bool) -> list[dict[str, Any]]:
         """`studies.describe.library_row` of each lens, in the order of --sort; the library's index has some of them."""
@@ -382,20 +382,25 @@ def _place(sort: str, row: dict[str, Any]) -> tuple[Any, ...]:
     return (False, value.casefold() if isinstance(value, str) else strongest_first * value, row.get("efl_mm", 0.0))
 
 
-def _list_text(rows: list[dict[str, Any]], sort: str | None) -> str:
-    """Return the table; sorted by a character, it shows characters in place of other data."""
-    middle = (
-        [heading for _, heading in CHARACTER.values()]
-        if sort in CHARACTER
-        else ["half field", "film mm", "refr.", "states"]
-    )
-    header = ("lens", "name", "maker", "year", "EFL mm", "f/", *middle, "rims", "verdict")
-    text = cli.table(header, [_cells(row, sort in CHARACTER, len(header)) for row in rows], left=3)
-    doubtful = [row for row in rows if row["doubts"]]
-    guess = "\n\n~ follows rims that the source does not state" if sort in CHARACTER and "~" in text else ""
-    found = f"{guess}\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful or unreadable"
-    lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
-    return text + found + (":\n" + "\n".join(lines) if lines else "")
+@dataclass(frozen=True)
+class ListedLenses(Report):
+    """A row for each lens, as `studies.describe.library_row` makes it or the library's index has it."""
+
+    lenses: list[dict[str, Any]]
+    sort: str | None = field(metadata=BULK)
+
+    def text(self) -> str:
+        """Return the table; sorted by a character, it shows characters in place of other data."""
+        by_character = self.sort in CHARACTER
+        middle = [heading for _, heading in CHARACTER.values()]
+        middle = middle if by_character else ["half field", "film mm", "refr.", "states"]
+        header = ("lens", "name", "maker", "year", "EFL mm", "f/", *middle, "rims", "verdict")
+        text = cli.table(header, [_cells(row, by_character, len(header)) for row in self.lenses], left=3)
+        doubtful = [row for row in self.lenses if row["doubts"]]
+        guess = "\n\n~ follows rims that the source does not state" if by_character and "~" in text else ""
+        found = f"{guess}\n\n{len(self.lenses)} lenses, {len(doubtful)} of them doubtful or unreadable"
+        lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
+        return text + found + (":\n" + "\n".join(lines) if lines else "")
 
 
 def _cells(row: dict[str, Any], character: bool, count: int) -> list[str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from neurolens import __version__
 from neurolens.base.errors import note
 from neurolens.base.progress import duration
 from neurolens.base.records import plain
+from neurolens.base.report import BULK, PART, Report
 from neurolens.base.settings import positive, setting, whole
 from neurolens.cli import arguments as cli
 from neurolens.pictures.frames import Files
@@ -65,13 +67,40 @@ examples:
             )
         mi, _ = libraries()
         height, width = picture.shape[:2]
-        stats: dict[str, Any] = {"scene": self.scene, "width": width, "height": height, "samples": self.samples}
-        stats |= {"seed": self.seed, "seconds": time.perf_counter() - began}
-        stats |= {"mitsuba": mi.__version__, "variant": mi.variant()}
+        spent, versions = time.perf_counter() - began, (mi.__version__, mi.variant())
+        stats = Statistics(self.scene, width, height, self.samples, self.seed, spent, *versions)
         metadata = {"version": __version__, "camera": plain(camera.settings), "render": plain(stats)}
         attributes = standard_attributes(camera.settings, width, height)
         write_exr(self.out, picture, metadata=metadata, attributes=attributes)
         write_png(preview, picture, self.exposure)
-        size = f"{width} x {height} in {duration(float(stats['seconds']))} ({mi.variant()})"
-        data = {"file": str(self.out), "preview": str(preview), **stats, "camera": camera.settings}
-        return self.answer(data, lambda: f"{self.scene} through {camera.name}: {size}\n{self.out}\n{preview}")
+        return self.answer(Rendered(self.out, preview, stats, camera.settings, camera.name))
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What was rendered, in how many seconds, and by which version and variant of Mitsuba."""
+
+    scene: str
+    width: int
+    height: int
+    samples: int | None
+    seed: int
+    seconds: float
+    mitsuba: str
+    variant: str
+
+
+@dataclass(frozen=True)
+class Rendered(Report):
+    """A finished picture, with the settings of its camera."""
+
+    file: Path
+    preview: Path
+    took: Statistics = field(metadata=PART)
+    camera: Mapping[str, Any]
+    name: str = field(metadata=BULK)
+
+    def text(self) -> str:
+        """Return its size, time and files."""
+        size = f"{self.took.width} x {self.took.height} in {duration(self.took.seconds)} ({self.took.variant})"
+        return f"{self.took.scene} through {self.name}: {size}\n{self.file}\n{self.preview}"

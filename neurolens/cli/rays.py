@@ -7,7 +7,7 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.files import atomic_path, write_arrays
+from neurolens.base.report import Report
 from neurolens.base.settings import group
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import ALL_KEYS, Frames, frames_group, numbered
@@ -58,7 +59,7 @@ examples:
         """Make and write the rays of every frame."""
         write, progress = self._writer(), self.progress()
         fixed = vars(self.state.given) | vars(self.rays)
-        rows, made = list[dict[str, Any]](), None
+        rows, made = list[RayFile](), None
         for _, digits, values in self.frames.states(fixed, self.called, ALL_KEYS):
             place = {name: values.pop(name) for name in ("position_m", "look_at_m") if name in values}
             state = self.state.at(**values)
@@ -72,13 +73,12 @@ examples:
                 spent = time.process_time() - began
                 write(path, arrays, job.about)
             count = int(np.prod(self.picture)) * self.rays.samples
-            rows.append({
-                "file": str(path), "rays": count, "bytes_a_ray": path.stat().st_size / count, "passed": job.passed,
-                "cpu_ns_a_ray": 1e9 * spent / count, "compact_px": job.compact_px if self.rays.compact else None,
-                "arrays": {name: list(array.shape) for name, array in arrays.items()},
-            })  # fmt: skip
-        data = {"camera": self.camera, "to": self.rays.to, "frames": rows}
-        return self.answer(data, lambda: "\n".join(map(_line, rows)))
+            shapes, off = {name: array.shape for name, array in arrays.items()}, job.compact_px
+            rows.append(RayFile(
+                path, count, path.stat().st_size / count, job.passed, 1e9 * spent / count,
+                off if self.rays.compact else None, shapes,
+            ))  # fmt: skip
+        return self.answer(RayFiles(self.camera, self.rays.to, rows))
 
     def _on_disk(self, files: ExitStack, shape: tuple[int, ...], kind: Any) -> NDArray[Any]:
         """Return an array in a nameless file beside the output: what is made waits there, not in memory."""
@@ -124,9 +124,40 @@ def channels(arrays: Arrays, host: Host) -> Arrays:
     return planes
 
 
-def _line(row: Mapping[str, Any]) -> str:
-    shapes = [f"{name} [{', '.join(map(str, shape))}]" for name, shape in row["arrays"].items() if shape]
-    off = "" if row["compact_px"] is None else f", off by at most {row['compact_px']:.2g} pixels in the plane in focus"
-    passed, ns = 100 * row["passed"], cli.number(row["cpu_ns_a_ray"], 3)
-    text = f"{row['file']}: {row['rays']} rays, {passed:.3g}% pass, {ns} CPU ns and {row['bytes_a_ray']:.3g} bytes each"
-    return f"{text}{off}\n  {', '.join(shapes)}"
+@dataclass(frozen=True)
+class RayFile:
+    """The rays of a frame.
+
+    Attributes:
+        passed: share of the rays that pass.
+        compact_px: by how many pixels --compact moves points in the plane in focus, at most.
+        arrays: the shape of each array.
+    """
+
+    file: Path
+    rays: int
+    bytes_a_ray: float
+    passed: float
+    cpu_ns_a_ray: float
+    compact_px: float | None
+    arrays: Mapping[str, tuple[int, ...]]
+
+    def text(self) -> str:
+        """Return a line, and a line of the arrays."""
+        shapes = [f"{name} [{', '.join(map(str, shape))}]" for name, shape in self.arrays.items() if shape]
+        off = "" if self.compact_px is None else f", off by at most {self.compact_px:.2g} pixels in the plane in focus"
+        cost = f"{cli.number(self.cpu_ns_a_ray, 3)} CPU ns and {self.bytes_a_ray:.3g} bytes each{off}"
+        return f"{self.file}: {self.rays} rays, {100 * self.passed:.3g}% pass, {cost}\n  {', '.join(shapes)}"
+
+
+@dataclass(frozen=True)
+class RayFiles(Report):
+    """The rays of all frames, for the program `to`."""
+
+    camera: str
+    to: str
+    frames: Sequence[RayFile]
+
+    def text(self) -> str:
+        """Return the lines of each file."""
+        return "\n".join(frame.text() for frame in self.frames)

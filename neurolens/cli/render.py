@@ -29,7 +29,7 @@ from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.pictures.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
 from neurolens.pictures.frames.farm import how_to_resume, render_frames
 from neurolens.pictures.render.pictures import write_png
-from neurolens.pictures.render.renderer import RenderResult, Statistics, Watch, merge_tiles, tile_path
+from neurolens.pictures.render.renderer import Merged, RenderResult, Statistics, Watch, merge_tiles, tile_path
 from neurolens.pictures.render.settings import FilmSettings, SensorSettings
 
 _FARMS, _LONG = "farms", "long renders"  # titles in the help
@@ -212,7 +212,7 @@ examples:
                 missing, executor, folder, shown=list(frames.values()), restart=self.restart,
                 progress=self.progress(),
             )  # fmt: skip
-        return self._say_pictures(pictures)
+        return self.answer(RenderedTiles(pictures))
 
     def _merge(self) -> int:
         """Put tiles together to their picture."""
@@ -222,10 +222,7 @@ examples:
                 self.refuse(option, "(beside --merge)", "tiles, -o and --exposure alone")
         if not self.scene:
             self.refuse("--merge", "(no tiles)", "the tiles of a render")
-        return self._say_pictures(merge_tiles(list(self.scene), self.out, self.picture.exposure))
-
-    def _say_pictures(self, pictures: Sequence[Mapping[str, Any]]) -> int:
-        return self.answer({"pictures": pictures}, lambda: "\n".join(str(p["file"]) for p in pictures))
+        return self.answer(RenderedTiles(merge_tiles(list(self.scene), self.out, self.picture.exposure)))
 
 
 def _interrupted(stopping: Stopping, kept: str) -> int:
@@ -241,6 +238,17 @@ def _so_far(result: RenderResult, files: Files) -> str:
     spread = f" ({least} to {most})" if least < most else ""
     done, asked = result.stats.samples_done, result.stats.samples
     return f"{files.out} holds {done:.3g} of {asked} samples per pixel{spread}"
+
+
+@dataclass(frozen=True)
+class RenderedTiles(Report):
+    """Pictures that were put together from tiles."""
+
+    pictures: Sequence[Merged]
+
+    def text(self) -> str:
+        """Return the files."""
+        return "\n".join(str(picture.file) for picture in self.pictures)
 
 
 @dataclass(frozen=True)

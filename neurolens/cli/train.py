@@ -109,9 +109,8 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         if len(lenses) > 1:
             return self._run_many(lenses)
         folder, results = self._train(self.experiment or lenses[0], self.out, self.progress())
-        data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
         met = (results.get("target") or {"met": True})["met"]
-        return self.answer(data, lambda: _text(results, folder), 0 if met else 1)
+        return self.answer(Trained(folder, folder / "report.html", results), 0 if met else 1)
 
     def _train(self, file: Path, out: Path | None, progress: Progress) -> tuple[Path, dict[str, Any]]:
         """Run one experiment, or that of a lens file, in a folder; return the folder and the results."""
@@ -149,7 +148,32 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
             except NeurolensError as error:
                 failed[lens_id] = str(error)
                 print(f"neurolens: {one_line(f'{lens_id}: {error}', 3000)}", file=sys.stderr)
-        return self.answer({"folders": done, "failed": failed}, lambda: "\n".join(done), 2 if failed else 0)
+        return self.answer(TrainedEach(done, failed), 2 if failed else 0)
+
+
+@dataclass(frozen=True)
+class Trained(Report):
+    """A finished run, with the `records.Results` of its results.json."""
+
+    folder: Path
+    report: Path
+    results: Mapping[str, Any] = field(metadata=PART)
+
+    def text(self) -> str:
+        """Return the models, and where the run lies."""
+        return _text(self.results, self.folder)
+
+
+@dataclass(frozen=True)
+class TrainedEach(Report):
+    """The folders of runs, one for each lens; what failed, by lens."""
+
+    folders: Sequence[str]
+    failed: Mapping[str, str]
+
+    def text(self) -> str:
+        """Return the folders."""
+        return "\n".join(self.folders)
 
 
 def _text(results: Mapping[str, Any], folder: Path) -> str:

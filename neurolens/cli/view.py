@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
+from neurolens.base.report import PART, Report
 from neurolens.base.settings import LIGHT_NM, RANGE, setting, setting_of
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.shaders.lens_source import write_lens
@@ -30,7 +31,7 @@ from neurolens.optics.readers import lensfile
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.optics.setting.states import set_lens
-from neurolens.programs.view import Form, ViewLens, ghosts_glsl, path_glsl, section_svg, write_page
+from neurolens.programs.view import Form, Page, ViewLens, ghosts_glsl, path_glsl, section_svg, write_page
 
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
@@ -104,11 +105,22 @@ examples:
                 for entry in entries:
                     made.append(_view_lens(entry, Path(place), kinds, shaders, self.ghosts))
                     report(len(made) / len(entries))
-        about = write_page(self.out, made, kinds)
-        left = about["left_out"]
-        data = {"file": str(self.out), **about, "lenses": [lens.key for lens in made]}
-        more = f"; left out for its size: {', '.join(left)}" if left else ""
-        return self.answer(data, lambda: f"{self.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
+        page = write_page(self.out, made, kinds)
+        return self.answer(Viewed(self.out, page, [lens.key for lens in made]))
+
+
+@dataclass(frozen=True)
+class Viewed(Report):
+    """A page that was written."""
+
+    file: Path
+    page: Page = field(metadata=PART)
+    lenses: Sequence[str]
+
+    def text(self) -> str:
+        """Return the page's file and size."""
+        left = f"; left out for its size: {', '.join(self.page.left_out)}" if self.page.left_out else ""
+        return f"{self.file}: {len(self.lenses)} lenses, {self.page.bytes / 1e6:.2f} MB{left}"
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ def _check_gates(model: LensModel) -> None:
 
 def export_inverse(
     inverse: InverseModel, path: str | Path, errors: dict[str, Any] | None = None
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, dict[str, float | str]]:
     """Write both inverse maps beside a model's file, for other programs: NAME.stop.onnx and NAME.scene.onnx.
 
     Both give rays [5, N] (film x, y, pupil x, y, wavelength), scene_ray, transmittance, stop_xy_mm and status as the
@@ -136,12 +136,12 @@ def export_inverse(
         "index": front_index(model),
     }
     facts = {"steps": STEPS, "tolerance": TOLERANCE, "direction": model.direction, "front": shape}
-    found = convergence(inverse, *passing_rays(model, _CHECKED, seed=1))
+    found, told = convergence(inverse, *passing_rays(model, _CHECKED, seed=1)), dict[str, dict[str, float | str]]()
     for name, guess, build in (("stop", inverse.stop, stop_graph), ("scene", inverse.scene, scene_graph)):
         text = card_to_json({**card, "inverse": {"map": name, **facts, "fit": found[name]}})
         data = write_onnx(build(model, guess, ONNX), {CARD_KEY: text})
-        found[name]["file"] = str(write_file(base.with_name(f"{base.name}.{name}.onnx"), data))
-    return found
+        told[name] = {**found[name], "file": str(write_file(base.with_name(f"{base.name}.{name}.onnx"), data))}
+    return told
 
 
 def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:

@@ -312,7 +312,7 @@ def _drawn(domain: Domain, count: int, rng: np.random.Generator) -> Array:
     )  # fmt: skip
 
 
-def convergence(inverse: InverseModel, rays: Array, film_z: Array, steps: int = STEPS) -> dict[str, Any]:
+def convergence(inverse: InverseModel, rays: Array, film_z: Array, steps: int = STEPS) -> dict[str, dict[str, float]]:
     """Measure how often the inverse maps find the model's own rays: those of `rays` [5, N] that pass, in its precision.
 
     Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that is another

@@ -28,7 +28,7 @@ from neurolens.base.tasks import Failed, Shared, run_each
 from neurolens.optics.readers.glasses import more_glasses
 from neurolens.pictures.frames import Frame, Prepared, flare_choice, prepare, render_frame
 from neurolens.pictures.render.film import digest
-from neurolens.pictures.render.renderer import read_tile, tile_path, write_picture
+from neurolens.pictures.render.renderer import Merged, read_tile, tile_path, write_picture
 
 if TYPE_CHECKING:
     from neurolens.pictures.flare.layers import Choice
@@ -74,7 +74,7 @@ def render_frames(
     shown: Sequence[Frame] | None = None,
     restart: bool = False,
     progress: Progress | None = None,
-) -> list[dict[str, Any]]:
+) -> list[Merged]:
     """Render frames by tiles, wherever the executor runs them. Pictures are those of one machine, bit for bit.
 
     Args:
@@ -82,9 +82,6 @@ def render_frames(
         folder: where tiles are kept (default: OUT.exr.tiles for the first picture OUT.exr).
         shown: the frames that decide which ghosts become layers of flare, see `flare_choice`; None takes `frames`.
         restart: whether to render tiles that are there again.
-
-    Returns:
-        For each picture its file, preview, number of tiles and statistics.
 
     Raises:
         InputError: a scene or a camera has a mistake; this is found before anything is sent. NeurolensError: a tile has
@@ -100,7 +97,7 @@ def render_frames(
     shared = sha256(common).hexdigest(), choice
     todo = dict(_picture(each, out, folder, shared, prepared, restart) for out, each in frames.items())
     folder.mkdir(exist_ok=True)
-    pictures, done, count = dict[Path, dict[str, Any]](), 0, sum(len(picture.tiles) for picture in todo.values())
+    pictures, done, count = dict[Path, Merged](), 0, sum(len(picture.tiles) for picture in todo.values())
     tasks = (
         absolute(TileTask(f"{p.out.name}, tile {k} of {n}", replace(p.frame, tile=(k, n)), place, choice))
         for place, p, n in [(place, p, len(p.tiles)) for place, p in todo.items()]
@@ -147,7 +144,7 @@ def _picture(
     return place, _Picture(frame, out, tiles, {k for k, tile in tiles.items() if restart or not tile.is_file()})
 
 
-def _finish(picture: _Picture, prepared: Prepared) -> dict[str, Any]:
+def _finish(picture: _Picture, prepared: Prepared) -> Merged:
     """Put a picture together, with paths as they are on this machine, and remove its tiles."""
     tiles = [read_tile(tile) for tile in picture.tiles.values()]
     for tile in tiles:

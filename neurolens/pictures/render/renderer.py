@@ -474,11 +474,18 @@ def _statistics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def merge_tiles(paths: Iterable[Path], out: Path, exposure: float = 0.0) -> list[dict[str, Any]]:
-    """Check all tiles, then write their picture, or one for each frame: OUT.0001.exr and so on.
+@dataclass(frozen=True)
+class Merged:
+    """A picture that was put together from its tiles, with the statistics of its render."""
 
-    Returns:
-        For each picture its file, preview, number of tiles and statistics.
+    file: Path
+    preview: Path
+    tiles: int
+    took: Mapping[str, Any] = field(metadata=PART)
+
+
+def merge_tiles(paths: Iterable[Path], out: Path, exposure: float = 0.0) -> list[Merged]:
+    """Check all tiles, then write their picture, or one for each frame: OUT.0001.exr and so on.
 
     Raises:
         InputError: as `check_together`; an output is one of the tiles. OSError: an output cannot be written.
@@ -500,8 +507,8 @@ def merge_tiles(paths: Iterable[Path], out: Path, exposure: float = 0.0) -> list
     return [write_picture(tiles, outs[frame], exposure) for frame, tiles in frames.items()]
 
 
-def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str, Any]:
-    """Write the picture of all its tiles as one run writes it, and a preview; returns its file and statistics.
+def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> Merged:
+    """Write the picture of all its tiles as one run writes it, and a preview.
 
     Raises:
         InputError: as `merged`. OSError: it cannot be written.
@@ -513,7 +520,7 @@ def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str
         rgb = converted(rgb, conversion(space, SRGB)).astype(np.float32)
     write_channels(out, channels, space, metadata, _attributes(metadata, tiles[0].frame))
     write_png(preview := out.with_suffix(".png"), rgb, exposure)
-    return {"file": str(out), "preview": str(preview), "tiles": len(tiles), **render}
+    return Merged(out, preview, len(tiles), render)
 
 
 def _attributes(metadata: Mapping[str, Any], frame: int | None) -> dict[str, Any]:

@@ -124,14 +124,19 @@ class ViewLens:
     ghosts: tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]] | None = None
 
 
-def write_page(
-    out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int | None = None
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Page:
+    """The size of a page, the downloads that it has, and those that were left out for its size."""
+
+    bytes: int
+    downloads: Sequence[str]
+    left_out: Sequence[str]
+
+
+def write_page(out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int | None = None) -> Page:
     """Write the page with these `kinds` of downloads, "glsl" first.
 
     Where they do not fit, the last kinds are left out; in each kind files of exact lenses go first.
-
-    Returns the size of the page, and which downloads it has and which are left out.
 
     Raises:
         InputError: there is no lens, or the lenses do not fit without any download.
@@ -145,9 +150,7 @@ def write_page(
             text = _page(given, kinds[:count])
             if len(text.encode()) <= most_bytes:
                 atomic_write_text(out, text)
-                return {
-                    "bytes": len(text.encode()), "downloads": list(kinds[:count]), "left_out": [*of_exact, *left]
-                }  # fmt: skip
+                return Page(len(text.encode()), kinds[:count], [*of_exact, *left])
     raise InputError(out, "bytes", len(text.encode()), f"at most {most_bytes}: fewer lenses")
 
 

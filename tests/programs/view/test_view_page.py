@@ -184,10 +184,10 @@ def test_a_page_that_grows_too_large_leaves_files_out(tmp_path: Path) -> None:
     sizes, most = [], pages.MOST_BYTES
     for left in ([], ["c of exact lenses"], ["c"]):
         about = pages.write_page(out, [lens], ["glsl", "c"], most)
-        assert (about["left_out"], about["bytes"]) == (left, out.stat().st_size)
+        assert (about.left_out, about.bytes) == (left, out.stat().st_size)
         forms = data_of(out.read_text(encoding="utf-8"))["lenses"][0]["forms"]
         assert ["c" in form["files"] for form in forms] == [left != ["c"], not left]
-        sizes.append(most := about["bytes"] - 1)
+        sizes.append(most := about.bytes - 1)
     assert sizes == sorted(sizes, reverse=True)
     with pytest.raises(InputError, match="fewer lenses"):
         pages.write_page(tmp_path / "none.html", [lens], ["glsl"], 1000)
