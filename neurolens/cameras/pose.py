@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from neurolens.graph.ir import Graph
 from neurolens.optics.lens.shot import Shot
 
 _HAIR = 1e-18  # mm; added so that the axis stays finite
+TURNS = "tilt_sin", "tilt_cos", "swing_sin", "swing_cos"  # inputs of a call, for a film that is turned at run time
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,7 @@ class FilmPose:
     @cached_property
     def axes(self) -> NDArray[np.float64]:
         """Return the film's x, its y and its normal as columns [3, 3] in the lens frame."""
-        (sin, cos), (sway, stay) = ((math.sin(a), math.cos(a)) for a in (self.tilt, self.swing))
-        return np.array([[stay, -sway * sin, -sway * cos], [0.0, cos, -sin], [sway, stay * sin, stay * cos]])
+        return np.array(_axes(*(part(a) for a in (self.tilt, self.swing) for part in (math.sin, math.cos))))
 
     def covers_mm(self, film_mm: tuple[float, float], distance_mm: float) -> tuple[float, float]:
         """Return width and height of the least upright film that hides this film as seen from the pupil's middle.
@@ -76,13 +77,18 @@ class FilmPose:
 UPRIGHT = FilmPose()
 
 
+def _axes(sin: Any, cos: Any, sway: Any, stay: Any) -> list[list[Any]]:
+    """Return `FilmPose.axes` by sine and cosine of tilt and swing, which are floats or values of a graph."""
+    return [[stay, -sway * sin, -sway * cos], [0.0, cos, -sin], [sway, stay * sin, stay * cos]]
+
+
 @lru_cache(maxsize=16)
-def to_plane(pose: FilmPose, radius_mm: float, derivatives: tuple[str, ...] = ()) -> Graph:
+def to_plane(pose: FilmPose | None, radius_mm: float | None, derivatives: tuple[str, ...] = ()) -> Graph:
     """Write the graph from rays of a film to rays of the upright film plane.
 
     Args:
-        pose: how the film stands.
-        radius_mm: the last film radius of the outline.
+        pose: how the film stands; None takes a turn by `TURNS`, which are then inputs of the call.
+        radius_mm: the last film radius of the outline; None leaves central points where they are.
         derivatives: names of derivatives of `scene_ray` by a point of the plane, along x and y: inputs and outputs.
 
     Inputs are `film_mm` [2] on the film, `pupil_mm` [2], `area_mm2` and, for a whole call, `per_distance`. Outputs are
@@ -92,26 +98,29 @@ def to_plane(pose: FilmPose, radius_mm: float, derivatives: tuple[str, ...] = ()
     """
     g = Graph()
     film, pupil, area = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2")
-    moved = film - list(pose.moved_mm) if any(pose.moved_mm) else film
+    moved = film - list(pose.moved_mm) if pose is not None and any(pose.moved_mm) else film
     moves = [g.input(name, 6) for name in derivatives]
-    if not pose.turned:
+    if pose is not None and not pose.turned:
         g.outputs = {"central_mm": moved, "plane_mm": moved, "area_mm2": area, "lean": 0.0 * area}
         g.outputs |= dict(zip(derivatives, moves, strict=True))
         return g
-    per_distance, axes = g.input("per_distance", per_call=True), pose.axes
-    place, depth = g.affine(axes[:2, :2], moved), g.affine(axes[2:, :2], moved) * per_distance
+    per_distance = g.input("per_distance", per_call=True)
+    turns = _axes(*(g.input(name, per_call=True) for name in TURNS)) if pose is None else pose.axes.tolist()
+    rows = [[g.value(cell) for cell in row] for row in turns]
+    across, (x_z, y_z, facing) = [g.concat(*pair) for pair in zip(*rows[:2], strict=True)], rows[2]
+    place, depth = across[0] * moved[0] + across[1] * moved[1], (x_z * moved[0] + y_z * moved[1]) * per_distance
     nearer = 1.0 / (1.0 + depth)  # distance of the plane over that of the point, from the pupil
     way, central = pupil - place, place * nearer
-    within = (0.9999 * radius_mm / g.square(central).sqrt().maximum(_HAIR)).minimum(1.0)
-    g.outputs["central_mm"] = central * within
+    if radius_mm is not None:
+        central = central * (0.9999 * radius_mm / g.square(central).sqrt().maximum(_HAIR)).minimum(1.0)
+    g.outputs["central_mm"] = central
     g.outputs["plane_mm"] = place + way * (depth * nearer)
     g.outputs["lean"] = depth * nearer
-    facing = g.affine(-axes[None, :2, 2], way) * per_distance * nearer + axes[2, 2]
-    g.outputs["area_mm2"] = area * nearer * nearer * facing
+    g.outputs["area_mm2"] = area * nearer * nearer * (facing - g.dot(across[2], way) * per_distance * nearer)
     if moves:
         far = per_distance * nearer * nearer
         for k, name in enumerate(derivatives):
-            step = way * (far * axes[2, k]) + nearer * axes[:2, k]
+            step = way * (far * (x_z, y_z)[k]) + nearer * across[k]
             g.outputs[name] = moves[0] * step[0] + moves[1] * step[1]
     return g
 

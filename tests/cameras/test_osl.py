@@ -59,7 +59,7 @@ def inputs(film: np.ndarray, square: np.ndarray, **changed: float) -> dict[str, 
     """Of the graph, for film points [2, N] in mm, as the shader's frame makes them."""
     call = {"f_number": 1.8, "asked_m": 2.0, "roundness": 0.0, "rotation": 0.0, "count": 0, "in_colour": 1, "shaded": 1}
     call |= {"as_lens": 0, "at_pupil": 0, "unit_m": 1, "warned": 0, "pixel_x": 1 / 360, "pixel_y": 1 / 240}
-    call |= {"sensor_x_mm": FILM[0], "sensor_y_mm": FILM[1]} | changed
+    call |= {"sensor_x_mm": FILM[0], "sensor_y_mm": FILM[1], "tilt": 0.0, "swing": 0.0} | changed
     half = math.pi / max(call["count"], 3)
     first = math.radians(call.pop("rotation")) + half
     call |= {
@@ -68,6 +68,9 @@ def inputs(film: np.ndarray, square: np.ndarray, **changed: float) -> dict[str, 
         "edge_cos": math.cos(first),
         "edge_sin": math.sin(first),
     }
+    for name in ("tilt", "swing"):
+        angle = math.radians(call.pop(name))
+        call |= {f"{name}_sin": math.sin(angle), f"{name}_cos": math.cos(angle)}
     raster = 0.5 - film / np.array(FILM)[:, None]
     rows = {"raster_x": raster[:1], "raster_y": raster[1:], "first": square[:1], "second": square[1:]}
     return rows | {name: np.array([[float(value)]]) for name, value in call.items()}
@@ -115,6 +118,27 @@ def test_rays_are_those_of_the_model_in_the_frame_of_cycles() -> None:
     np.testing.assert_allclose(start * [1, 1, -1], rays.origin_m[:, lit].mean(1), atol=3e-4)
     np.testing.assert_allclose(way * [1, 1, -1], rays.direction[:, lit].mean(1), atol=2e-3)
     np.testing.assert_allclose(np.linalg.norm(found["direction"], axis=0), 1, atol=1e-4)
+
+
+@pytest.mark.parametrize("f_number", [1.8, 4.0])
+def test_a_turned_film_has_the_rays_and_the_light_of_the_camera_of_the_model(f_number: float) -> None:
+    """As the camera's own film, about both axes: means of position, direction and weight of three film points."""
+    camera = OnnxCamera(load_model(MODEL), Shot((24.0, 16.0), 2.0, f_number, film_tilt_deg=8.0, film_swing_deg=-5.0))
+    rng, count = np.random.default_rng(6), 30_000
+    plain = {"asked_m": 2.0, "f_number": f_number, "in_colour": 0}
+    for point in ((0.0, 0.0), (9.0, -7.0), (-11.0, 5.0)):
+        film, square = np.repeat(np.array(point)[:, None], count, 1), rng.random((2, count))
+        nm = np.full(count, 587.56, np.float32)
+        rays = camera.sample(film.astype(np.float32), square.astype(np.float32), nm)
+        found = evaluate(graph(), inputs(film, square, tilt=8.0, swing=-5.0, **plain))
+        lit, passed = rays.weight > 0, found["throughput"][0] > 0
+        assert passed.mean() > 0.98
+        assert found["throughput"].mean() == pytest.approx(rays.weight.mean(dtype=np.float64), rel=0.01)
+        for name, wanted, within in (("position", rays.origin_m, 2e-4), ("direction", rays.direction, 1e-3)):
+            means = found[name][:, passed].mean(1) * [1, 1, -1], wanted[:, lit].mean(1)
+            np.testing.assert_allclose(*means, atol=within)
+    upright = evaluate(graph(), inputs(film, square, **plain))["direction"]  # of the last point, which shows the turn
+    assert np.abs(upright[:, passed].mean(1) * [1, 1, -1] - rays.direction[:, lit].mean(1)).max() > 3e-3
 
 
 def test_fewer_terms_tell_which_rays_pass_and_move_none() -> None:
@@ -363,6 +387,23 @@ def test_lengths_are_in_units_of_the_scene() -> None:
         np.testing.assert_allclose(centimetres[name], scale * metres[name], rtol=1e-9, atol=1e-15)
     text = osl.write_camera(lens(), "gauss", [])[0]
     assert 'getattribute("cam:focal_distance", asked_m))\n        asked_m *= unit_m;' in text
+
+
+def test_derivatives_on_a_turned_film_are_those_of_neighbouring_pixels() -> None:
+    """The chief ray, by pixels half of one's size beside: at a small stop the pupil's own motion hardly counts."""
+    rng, point = np.random.default_rng(4), np.array([[9.0], [-7.0]])
+    square, pixel = rng.random((2, 2000)), 1 / 360
+    given = {"f_number": 16.0, "in_colour": 0, "tilt": 20.0, "swing": -10.0, "pixel_x": pixel}
+    ends = []
+    for step in (-0.5, 0.0, 0.5):
+        film = np.repeat(point - [[step * pixel * FILM[0]], [0.0]], 2000, 1)
+        ends.append(evaluate(graph(), inputs(film, square, **given)))
+    passed = np.all([end["throughput"][0] > 0 for end in ends], axis=0)
+    wanted = (ends[2]["direction"] - ends[0]["direction"])[:, passed].mean(1)
+    found = ends[1]["dDdx"][:, passed].mean(1)
+    np.testing.assert_allclose(found, wanted, atol=0.02 * np.linalg.norm(wanted))
+    upright = evaluate(graph(), inputs(film, square, **given | {"tilt": 0.0, "swing": 0.0}))["dDdx"]
+    assert np.linalg.norm(upright[:, passed].mean(1) - wanted) > 0.03 * np.linalg.norm(wanted)
 
 
 def test_derivatives_are_those_of_neighbouring_pixels() -> None:

@@ -31,6 +31,7 @@ from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
+from neurolens.cameras.pose import TURNS, to_plane
 from neurolens.cameras.pupil_outline import PupilTable
 from neurolens.cameras.sampling import stratified
 from neurolens.cameras.shaders.pupil import MAX_BLADES, Blades, PupilCircles, passing_share
@@ -73,6 +74,8 @@ _FRAME = """\
     float raster_x = raster[0], raster_y = raster[1], first = pair[0], second = pair[1];
     float pixel_x = pixel_right[0], pixel_y = pixel_up[1], sensor_x_mm = sensor[0], sensor_y_mm = sensor[1];
     float half_cos = cos(half_turn), half_sin = sin(half_turn), edge_cos = cos(first_edge), edge_sin = sin(first_edge);
+    float tilt_sin = sin(radians(tilt)), tilt_cos = cos(radians(tilt));
+    float swing_sin = sin(radians(swing)), swing_cos = cos(radians(swing));
     float count = blades, shaded = vignetting, as_lens = exposure, at_pupil = origin, warned = warn;
     float in_colour = dispersion > 1 ? 1 - few : dispersion;
 """
@@ -154,8 +157,8 @@ class OslLens:
 def parameters(lens: OslLens) -> list[Parameter]:
     """Return the inputs that a user turns, in their order in the shader.
 
-    They are f_number, focus_m, zoom_mm for a zoom's range, blades, roundness, rotation, exposure, vignetting,
-    dispersion, few, origin, unit_m and warn.
+    They are f_number, focus_m, zoom_mm for a zoom's range, blades, roundness, rotation, tilt, swing, exposure,
+    vignetting, dispersion, few, origin, unit_m and warn.
     """
     widest = float(f"{lens.f_number:.4g}")
     zoom = []
@@ -171,6 +174,10 @@ def parameters(lens: OslLens) -> list[Parameter]:
         Parameter("blades", "Blades", f"Of the stop, 3 to {MAX_BLADES}; 0 is round", 0, 0, MAX_BLADES),
         Parameter("roundness", "Roundness", "Of the blades: 0 straight, 1 round", 0.0),
         Parameter("rotation", "Rotation", "Of the blades in degrees", 0.0, -360.0, 360.0),
+        Parameter("tilt", "Film Tilt", "Of the film in degrees: the picture's lower half goes away from the lens", 0.0,
+                  -45.0, 45.0),
+        Parameter("swing", "Film Swing", "Of the film in degrees: the picture's left half goes away from the lens", 0.0,
+                  -45.0, 45.0),
         Parameter("exposure", "Exposure", "As Blender's camera, or as the lens: its stop and what glass and focus take",
                   0, widget="mapper", options="Blender:0|Lens:1"),
         Parameter("vignetting", "Vignetting", "Darkening towards the corners", 1, widget="boolean"),
@@ -186,10 +193,14 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
-    """Write a camera's shader and count a ray's operations with a round stop, for compilers fold known blades."""
+    """Write a camera's shader and count a ray's operations with a round stop and an upright film.
+
+    Compilers fold known blades and turns.
+    """
     program = osl_program(lens).with_shorter_sums().in_order_of_need()
     text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
-    return text, sum(osl_program(lens, {"count": 0.0}).count().values())
+    plain = {"count": 0.0, "tilt_sin": 0.0, "tilt_cos": 1.0, "swing_sin": 0.0, "swing_cos": 1.0}
+    return text, sum(osl_program(lens, plain).count().values())
 
 
 def osl_program(lens: OslLens, fixed: Mapping[str, float] | None = None) -> Program:
@@ -223,34 +234,40 @@ def osl_graph(camera: OslCamera) -> Graph:
     """Write the camera as a graph from floats (`_FRAME`) and the parameters to the `OUTPUTS`, [3] each."""
     g = Graph()
     call = _Call(g, camera)
-    film = (0.5 - g.concat(g.input("raster_x"), g.input("raster_y"))) * call.sensor
+    own = (0.5 - g.concat(g.input("raster_x"), g.input("raster_y"))) * call.sensor
     numbers = g.concat(g.input("first"), g.input("second"))
     nanometres, colour, square = light(camera.lens.wavelength_nm, numbers, call.number("in_colour"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
     sampler = camera.pupil.sampler(Blades, camera.margin)
-    pupil = g.inline(sampler, {"film_mm": film, "square": square, "wavelength_nm": nanometres, **per_call})
+    posed = {"film_mm": own, "per_distance": call.per_distance} | {name: call.number(name) for name in TURNS}
+    unknown = {"pupil_mm": own * 0.0, "area_mm2": own[0]}
+    central = g.inline(to_plane(None, None), posed | unknown)["central_mm"]
+    pupil = g.inline(sampler, {"film_mm": central, "square": square, "wavelength_nm": nanometres, **per_call})
+    turned = g.inline(to_plane(None, None), posed | pupil)
+    film = turned["plane_mm"]
     rays = g.concat(film, pupil["pupil_mm"], nanometres)
     ray = g.inline(camera.graph, {"rays": rays, **per_call})
     inputs = {"film_mm": film, **pupil, **ray, "lens_status": ray["status"], **per_call, **call.weighting()}
-    weighted = g.inline(weight_graph(unit=camera.unit), inputs)
+    weighted = g.inline(weight_graph(unit=camera.unit), inputs | {"area_mm2": turned["area_mm2"]})
+    moves = g.inline(to_plane(None, None, D_FILM), posed | pupil | ray)
     even = g.select(weighted["status"] <= float(st.PASSED), pupil["area_mm2"] / pupil["mean_area_mm2"], 0.0)
     weight = g.select(call.number("shaded") <= 0.5, even, weighted["weight"])
     weight = g.select(Blades(g).opened(ray["stop_xy_mm"] * (1.0 / call.stop)), weight, 0.0)
-    known = (g.square(film) <= camera.pupil.film_radius_mm**2) & call.focused
+    known = (g.square(central) <= camera.pupil.film_radius_mm**2) & call.focused
     warned = g.select(known, 0.0, call.number("warned"))
     # Beyond the film nothing has an area.
-    _set_outputs(g, camera, call, film, ray, colour * g.select(call.focused, weight, 0.0), warned)
+    _set_outputs(g, camera, call, own, ray["scene_ray"], moves, colour * g.select(call.focused, weight, 0.0), warned)
     return g
 
 
 def _set_outputs(
-    g: Graph, camera: OslCamera, call: _Call, film: Value, lens: Mapping[str, Value], throughput: Value, warned: Value
-) -> None:
+    g: Graph, camera: OslCamera, call: _Call, film: Value, ray: Value, moves: Mapping[str, Value], throughput: Value,
+    warned: Value,
+) -> None:  # fmt: skip
     """Set the outputs: rays in Cycles's frame (x right, y up, z ahead) and scene units, warnings as a pinhole's."""
     length = call.units_per_m * [1e-3, 1e-3, -1e-3]
     ahead = g.concat(film * -1.0, g.constant(camera.lens.efl_mm))
     ahead = ahead * (1.0 / g.square(ahead).sqrt())
-    ray = lens["scene_ray"]
     start = (ray[0:3] - g.concat(g.constant([0.0, 0.0]), call.origin_mm)) * length
     plain = warned <= 0.5
     g.outputs["position"] = g.select(plain, start, 0.0)
@@ -258,7 +275,7 @@ def _set_outputs(
     g.outputs["throughput"] = g.select(plain, throughput, g.constant([1.0, 0.0, 1.0]))
     for axis, name, step in zip((0, 1), D_FILM, ("x", "y"), strict=True):
         pixel = call.sensor[axis] * call.number(f"pixel_{step}")
-        rows = lens[name] * (pixel * g.concat(length * -1.0, g.constant([-1.0, -1.0, 1.0])))
+        rows = moves[name] * (pixel * g.concat(length * -1.0, g.constant([-1.0, -1.0, 1.0])))
         g.outputs[f"dPd{step}"], g.outputs[f"dDd{step}"] = rows[0:3], rows[3:]
 
 
@@ -278,6 +295,7 @@ class _Call:
         distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
         self.focused = g.constant(camera.limit_m * _NEAR) <= distance
         self.origin_mm = g.select(at_pupil <= 0.5, self.film_z, camera.entrance_mm)
+        self.per_distance = 1.0 / (self.film_z - camera.lens.table.pupil_z_mm)
         self.units_per_m = 1.0 / self.number("unit_m")
 
     def number(self, name: str) -> Value:
@@ -286,12 +304,12 @@ class _Call:
     def weighting(self) -> dict[str, Value]:
         """Return the numbers of `weight_graph`."""
         g, camera = self.g, self.camera
-        per_distance = 1.0 / (self.film_z - camera.lens.table.pupil_z_mm)
         middle, half = _film_position(camera)
         per_share = _in_turn(g, camera.per_exposure, self.share, (self.film_z - middle) * (1 / half))
-        per_lens, nominal = per_share * (1.0 / (self.share * self.share)), 4 * camera.lens.f_number**2 / math.pi
-        per_exposure = g.select(self.number("as_lens") <= 0.5, per_lens, nominal)
-        return {"per_distance": per_distance, "scale": per_distance * per_distance * per_exposure}
+        facing = self.number("tilt_cos") * self.number("swing_cos")  # a turned film, too, has 1 on the axis
+        per_lens = per_share * (1.0 / (self.share * self.share * facing))
+        per_exposure = g.select(self.number("as_lens") <= 0.5, per_lens, 4 * camera.lens.f_number**2 / math.pi)
+        return {"per_distance": self.per_distance, "scale": self.per_distance * self.per_distance * per_exposure}
 
 
 def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:

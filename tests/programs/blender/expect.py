@@ -10,7 +10,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,17 +35,20 @@ _EDGE_PX = 6
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens by its exact file, and the file from which its shader is written."""
+    """A lens by its exact file, the file from which its shader is written, and tilt and swing of its film (degrees)."""
 
     name: str
     exact: str
     shader: str
     film_mm: tuple[float, float]
+    tilt: float = 0.0
+    swing: float = 0.0
 
     def camera(self, focus_m: float, f_number: float, zoom_mm: float | None = None) -> Camera:
         """The exact one."""
         how: Literal["best", "internal"] = "internal" if self.name == "inside" else "best"
-        return make_camera(self.exact, Shot(self.film_mm, focus_m, f_number, zoom=zoom_mm, focus_mode=how))
+        shot = Shot(self.film_mm, focus_m, f_number, film_tilt_deg=self.tilt, film_swing_deg=self.swing)
+        return make_camera(self.exact, replace(shot, zoom=zoom_mm, focus_mode=how))
 
 
 _GAUSS = "lenses/laikin_double_gauss_50.toml"
@@ -54,6 +57,7 @@ LENSES = {
     lens.name: lens
     for lens in (
         Lens("rectilinear", _GAUSS, "models/laikin_double_gauss_50.ols-60.onnx", (36.0, 20.25)),
+        Lens("turned", _GAUSS, "models/laikin_double_gauss_50.ols-60.onnx", (36.0, 20.25), 8.0, -5.0),
         Lens("fisheye", "lenses/horimoto_fisheye_16.toml", "models/horimoto_fisheye_16.mlp-16x2.onnx", (36.0, 24.0)),
         Lens("anamorphic", "lenses/cooke_anamorphic_42.toml", "models/cooke_anamorphic_42.mlp-16x2.onnx", (23.0, 13.0)),
         Lens("exact", _GAUSS, _GAUSS, (36.0, 20.25)),
@@ -92,8 +96,11 @@ class Picture:
             "film_mm": self.lens.film_mm,
             "width": self.width,
             "height": self.height,
-            "custom": {"f_number": self.f_number, "focus_m": self.focus_m, "origin": 0},
-        }
+            "custom": {
+                "f_number": self.f_number, "focus_m": self.focus_m, "origin": 0, "tilt": self.lens.tilt,
+                "swing": self.lens.swing,
+            },
+        }  # fmt: skip
 
 
 def scene_point(made: Camera, film_mm: Sequence[float], away_m: float) -> Any:
@@ -199,6 +206,7 @@ def main(folder: Path) -> None:
         for number, (make, name) in enumerate(
             [
                 (grid, "rectilinear"),
+                (grid, "turned"),
                 (grid, "fisheye"),
                 (grid, "anamorphic"),
                 (bokeh, "rectilinear"),
@@ -206,11 +214,12 @@ def main(folder: Path) -> None:
             ]
         ):
             shots += make(LENSES[name])
-            report((number + 1) / 8)
+            report((number + 1) / 9)
         for zoom_mm in (96.0, 170.0):
             shots += grid(LENSES["zoom"], zoom_mm, 4.0)
         shots += grid(LENSES["inside"])
-        shots += [white_card(LENSES["rectilinear"], 1.83), white_card(LENSES["anamorphic"], 2.8)]
+        shots += [white_card(LENSES[name], 1.83) for name in ("rectilinear", "turned")]
+        shots += [white_card(LENSES["anamorphic"], 2.8)]
         shots += [white_card(LENSES["fisheye"], 2.8)]
     command_line(["stmap", _GAUSS, "--width", "120", "--film", "36x20.4", "-o", str(folder / "maps"), "--quiet"])
     handed = ["handover", _GAUSS, "--width", "120", "--film", "36x20.4", "--focus", "2", "--f-number", "4", "--quiet"]

@@ -53,6 +53,8 @@ def test_the_cheapest_that_holds_is_advised(tolerance: float, depths: list[float
     told = library.needs(lens(), setting(), depths, 2.0, tolerance)
     assert told.use == use and len(told.why) == 2 and all(line.endswith(".") for line in told.why)
     assert "20 px" in told.why[1]  # of distortion at the corner, of 200 um
+    turned = library.needs(lens(), setting(turned=True), depths, 2.0, tolerance)
+    assert turned.use == ("polynomial" if tolerance > 1 else use)  # Blender's own camera has no film to turn
 
 
 def test_what_keeps_no_tolerance_names_the_best() -> None:

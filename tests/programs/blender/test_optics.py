@@ -112,7 +112,7 @@ def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
     yield Studio(tmp_path_factory.mktemp("renders"))
 
 
-@pytest.mark.parametrize("lens", ["rectilinear", "fisheye", "anamorphic", "zoom", "inside"])
+@pytest.mark.parametrize("lens", ["rectilinear", "turned", "fisheye", "anamorphic", "zoom", "inside"])
 def test_points_lie_where_the_exact_lens_has_them(studio: Studio, lens: str) -> None:
     off, fringe = [], []
     for shot in named("grid", lens):
@@ -123,6 +123,11 @@ def test_points_lie_where_the_exact_lens_has_them(studio: Studio, lens: str) -> 
     print(lens, "off (px)", np.round(off, 3), "lateral colour off (um)", np.round(fringe, 2))
     assert max(off) < 0.1
     assert max(fringe) < 1.0
+
+
+def test_the_turn_of_the_film_is_there_to_be_measured() -> None:
+    spread = [max(s["found"]["rms_px"] for s in named("grid", lens)) for lens in ("rectilinear", "turned")]
+    assert spread[1] > 2 * spread[0]  # its focus lies on a tilted plane
 
 
 def test_lateral_colour_is_there_to_be_measured() -> None:
@@ -167,7 +172,7 @@ def test_focus_is_pulled_by_keyframes(studio: Studio) -> None:
     assert max(map(abs, wide)) < 0.03
 
 
-@pytest.mark.parametrize("lens", ["rectilinear", "anamorphic", "fisheye"])
+@pytest.mark.parametrize("lens", ["rectilinear", "turned", "anamorphic", "fisheye"])
 def test_white_card_is_that_of_the_exact_lens(studio: Studio, lens: str) -> None:
     [shot] = named("card", lens)
     studio.white(True)
@@ -179,7 +184,8 @@ def test_white_card_is_that_of_the_exact_lens(studio: Studio, lens: str) -> None
     rows, columns = wanted.shape
     seen = picture.reshape(rows, picture.shape[0] // rows, columns, -1).mean((1, 3))
     print(lens, "white card over the exact lens's, largest", np.abs(seen / wanted - 1).max(), "darkest", wanted.min())
-    assert np.abs(seen / wanted - 1).max() < 0.01
+    # The pupil of a turned film is that of an upright one where the chief ray meets it: corners lose up to 2%.
+    assert np.abs(seen / wanted - 1).max() < (0.025 if lens == "turned" else 0.01)
 
 
 def test_exact_shader_shows_what_the_model_does(studio: Studio) -> None:

@@ -70,6 +70,7 @@ def setting_of(scene: Any, found: Any) -> Setting:
         shift=(camera.shift_x, camera.shift_y),
         shift_side_mm=side,
         stereo=_stereo(camera, render),
+        turned=any(custom.get(name) for name in ("tilt", "swing")),
         unit_m=unit,
         lens_unit_m=lens_unit,
         on_gpu=_on_other_gpu(scene),

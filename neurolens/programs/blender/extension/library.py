@@ -227,6 +227,7 @@ class Setting:
         f_number: None takes the shader's.
         shift, shift_side_mm: Blender's shift, and the side in which Blender's own camera counts it.
         stereo: what each eye's view adds to shift X; () without stereo.
+        turned: whether the film is tilted or swung.
         unit_m, lens_unit_m: metres in a unit of the scene, by its unit scale, and as the lens takes it.
         on_gpu: whether a GPU is chosen that cannot run OSL cameras.
         darkens: whether the lens may weaken light, by vignetting or exposure.
@@ -242,6 +243,7 @@ class Setting:
     shift: tuple[float, float] = (0.0, 0.0)
     shift_side_mm: float = 0.0
     stereo: tuple[float, ...] = ()
+    turned: bool = False
     unit_m: float = 1.0
     lens_unit_m: float = 1.0
     on_gpu: bool = False
@@ -392,7 +394,8 @@ def needs(lens: LensFacts, setting: Setting, depths_m: Sequence[float], f_number
         dark = 1 - lens.field.at(lens.field.light, corner, focus)
         worth = f"distortion up to {_px(moved)} px, aberrations {_px(blurred)} px, corners {100 * dark:.0f}% darker"
     asked = f"At f/{f_number:.3g} depths in view are blurred by up to {_px(defocus)} px; {worth}."
-    if moved is not None and blurred is not None and max(moved, blurred) <= tolerance_px:
+    ideal = moved is not None and blurred is not None and max(moved, blurred) <= tolerance_px
+    if ideal and not setting.turned:  # Blender's own camera has no film to turn
         if defocus <= tolerance_px:
             return Advice(PINHOLE, ("Use Blender's camera without depth of field.", asked))
         return Advice(THIN, ("Use Blender's camera with its own depth of field.", asked))

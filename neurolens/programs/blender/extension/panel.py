@@ -19,6 +19,8 @@ _LABELS = {  # where Blender would show the bare name
     "f_number": "F-Number",
     "focus_m": "Focus (m)",
     "zoom_mm": "Zoom (mm)",
+    "tilt": "Film Tilt (degrees)",
+    "swing": "Film Swing (degrees)",
     "exposure": "Exposure: 0 Blender, 1 Lens",
     "origin": "Origin: 0 Film, 1 Pupil",
     "unit_m": "Metres per Unit",
@@ -333,7 +335,8 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         distance = column.row()
         distance.active = camera.dof.focus_object is None
         distance.prop(camera.dof, "focus_distance")
-        column.prop(camera, "sensor_width")
+        for name in ("sensor_width", "shift_x", "shift_y"):
+            column.prop(camera, name)
         for name in names:
             column.prop(custom, f'["{name}"]', text=_LABELS.get(name, name.capitalize()))
 
