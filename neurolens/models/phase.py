@@ -30,14 +30,16 @@ from neurolens.base.errors import InputError
 from neurolens.models.cores import Array, Phased, angle_vector
 from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
+from neurolens.models.targets import STOPPED_DOWN
 from neurolens.models.terms import (
     Exponents,
     Sweep,
     backward,
     forward,
-    invariant_exponents,
     monomials,
+    ordered,
     pinned_threads,
+    powers,
     replace_terms,
     solve,
 )
@@ -48,7 +50,11 @@ from neurolens.optics.trace.rays import optical_path, trace
 from neurolens.optics.trace.surfaces import Rays
 
 TERMS, FINE_WAVES = 120, 0.0015  # at most, and the RMS at which no term is added
-_DEGREE, _SURPLUS, _PASSES = 10, 1.5, 3  # of the candidates; terms before elimination over terms kept; of replacement
+# Candidates: largest degrees for the powers of w, and of all, those with (i + 1) (j + 1) (k + 1) up to the last number.
+# Over 380 to 780 nm the path bends by w^4 and w^5 more than by any high degree of the rays: with w^3 at most, 120 terms
+# left 0.85 waves of a fisheye in place of 0.006.
+_DEGREES, _CROSS = (14, 10, 8, 7, 6, 5, 4), 36
+_SURPLUS, _PASSES = 1.5, 3  # terms before elimination over terms kept; of replacement
 _CHOICE_RAYS, _RAYS = 8000, 16_000
 _DIRECTION = 4  # coefficients of s(P): more make the path less smooth
 _GREEN_NM = 546.0  # of the waves of a lens for visible light
@@ -86,8 +92,9 @@ def with_phase(model: LensModel, rays: FilmRays) -> LensModel:
         wanted = torch.from_numpy(path_um(core, waves))[None]
         variables = model.encoding(rays).invariants()
         allowed = FINE_WAVES * unit_um(lens)
-        exponents = _chosen(variables, wanted, allowed, dispersive=model.encoding.dispersive)
-        coefficients = solve(monomials(variables, exponents), wanted)[0].numpy()
+        weights = _weights(variables)
+        exponents = _chosen(variables, wanted, weights, allowed, dispersive=model.encoding.dispersive)
+        coefficients = solve(monomials(variables, exponents), wanted, weights)[0].numpy()
     return replace(model, core=replace(core, exponents=exponents, path=coefficients))
 
 
@@ -145,15 +152,28 @@ def _mean_direction(waves: Waves) -> tuple[float, ...]:
     return tuple((found / scale ** (1 + 2.0 * np.arange(_DIRECTION))).tolist())
 
 
-def _chosen(variables: Tensor, wanted: Tensor, allowed: float, *, dispersive: bool) -> Exponents:
-    """Choose terms [M, 4] for the path [1, N], whose RMS error may be the one allowed.
+def _weights(variables: Tensor) -> Tensor:
+    """Return weights [N] of rays: more for those that a closed stop leaves, and for the middle of the film.
+
+    Most pictures are taken with these, and images with a high Strehl ratio suffer most. Of rays drawn by area, they are
+    few.
+    """
+    rho, _, tau, _ = variables
+    return (1 + STOPPED_DOWN) / (tau.sqrt() + STOPPED_DOWN) / (rho.sqrt() + STOPPED_DOWN).sqrt()
+
+
+def _chosen(variables: Tensor, wanted: Tensor, weights: Tensor, allowed: float, *, dispersive: bool) -> Exponents:
+    """Choose terms [M, 4] for the path [1, N], whose RMS error, by the weights, may be the one allowed.
 
     Slopes of the path, which the rays give, save no terms as further equations: with 50 terms they left 0.047 waves in
     place of 0.036 (double Gauss f/1.8), 0.064 for 0.049 (zoom 14-24), 0.45 for 0.25 (Canon 50 mm f/1.2, aspheric).
     """
-    candidates = invariant_exponents(_DEGREE, dispersive=dispersive)
-    variables, wanted = variables[:, :_CHOICE_RAYS], wanted[:, :_CHOICE_RAYS]
-    sweep, enough = Sweep.of_columns(monomials(variables, candidates), wanted), allowed**2 * wanted.shape[1]
+    degrees = _DEGREES if dispersive else _DEGREES[:1]
+    every = [(*p, w) for w, most in enumerate(degrees) for p in powers(3, most)]
+    candidates = ordered([e for e in every if math.prod(k + 1 for k in e[:3]) <= _CROSS])
+    variables, wanted, weights = variables[:, :_CHOICE_RAYS], wanted[:, :_CHOICE_RAYS], weights[:_CHOICE_RAYS]
+    sweep = Sweep.of_columns(monomials(variables, candidates) * weights, wanted * weights)
+    enough = allowed**2 * float((weights**2).sum())
     for terms in range(1, math.ceil(_SURPLUS * TERMS) + 1):
         forward(sweep, terms)
         if sweep.residual <= enough:

@@ -21,15 +21,19 @@ from neurolens.models.assemble import EXACT, DirectionSeries, light_field, scene
 from neurolens.models.cores import STOP, Array, Phased
 from neurolens.models.model import LensModel
 from neurolens.models.phase import direction_at, foot_of
-from neurolens.optics.analysis.exit_pupil import Arrived, ExitPupil, fitted_pupil
+from neurolens.optics.analysis.exit_pupil import ExitPupil, fitted_waves
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.surfaces import Rays
 
-_RAYS = 32  # along a side of the rectangle about what passes
-_WIDER = 1.1  # the rectangle over what passes
+_RAYS = 28  # along a side of the box about what passes
+_LINE = np.linspace(-1, 1, _RAYS)
+_SQUARE = np.stack(np.meshgrid(_LINE, _LINE)).reshape(2, -1)
+_ROOM = 1.1  # the box over what passes
+_CHUNK = 4096  # rays whose terms fit the cache
+_AT_ONCE = 4  # places whose rays are evaluated in one go
 # Rays up to so many radii of stop and rims count: before they are led to the source (the second: may pass), and after.
-_NEAR, _ASIDE, _BEYOND = 1.2, 1.04, 1.08
+_NEAR, _ASIDE, _BEYOND = 1.2, 1.04, 1.1
 _RIM = 2.0  # a gate is (height / rim radius)^2 - 1; with this added it stands for a height and a rim of this radius
 _NEWTON = 8  # steps from a direction to its point on the focal plane
 _SEARCH, _ROUNDS = 65, 3  # points among which the chief ray is sought, and how often
@@ -67,9 +71,13 @@ def model_pupils(
         InputError: as `checked_path`.
     """
     known = _Known(model, checked_path(model, scene.lens, wavelengths_nm), scene, wavelengths_nm)
-    lit = np.hypot(*places_mm.T) <= model.domain.film_radius_mm * DOMAIN_SLACK
-    dark: list[ExitPupil | None] = [None] * len(wavelengths_nm)
-    return [known.pupils(place) if inside else dark for place, inside in zip(places_mm, lit, strict=True)]
+    found: list[list[ExitPupil | None]] = [[None] * len(wavelengths_nm) for _ in places_mm]
+    [lit] = np.nonzero(np.hypot(*places_mm.T) <= model.domain.film_radius_mm * DOMAIN_SLACK)
+    for k in range(0, len(lit), _AT_ONCE):
+        some = lit[k : k + _AT_ONCE]
+        for number, own in zip(some, known.pupils(places_mm[some].T), strict=True):
+            found[number] = own
+    return found
 
 
 def _forwards(cosines: Array) -> Array:
@@ -100,99 +108,106 @@ class _Known:
         slope = cosines / _forwards(cosines)
         pupil = point + slope * (self.model.domain.pupil_z_mm - z_mm)
         rows = np.concatenate([*np.broadcast_arrays(point, pupil), np.broadcast_to(nm, (1, pupil.shape[1]))])
-        found = evaluate(self.graph, {"rays": rows, "film_z_mm": np.full((1, 1), z_mm)})
-        return {name: np.broadcast_to(a, (len(a), pupil.shape[1])) for name, a in found.items()}
+        film = np.full((1, 1), z_mm)
+        parts = [
+            evaluate(self.graph, {"rays": rows[:, k : k + _CHUNK], "film_z_mm": film})
+            for k in range(0, rows.shape[1], _CHUNK)
+        ]
+        wide = [
+            {name: np.broadcast_to(a, (len(a), max(v.shape[1] for v in part.values()))) for name, a in part.items()}
+            for part in parts
+        ]
+        return {name: np.concatenate([part[name] for part in wide], 1) for name in wide[0]}
 
-    def pupils(self, place: Array) -> list[ExitPupil | None]:
-        """Return the pupils of a film place [2], by wavelength; None where no light arrives."""
-        film_z, first = self.scene.film_z_mm, self.waves[0]
+    def pupils(self, place: Array) -> list[list[ExitPupil | None]]:
+        """Return the pupils of film places [2, P], by place and wavelength; None where no light arrives."""
+        film_z, focal_z, stop_mm = self.scene.film_z_mm, self.core.focal_z_mm, self.scene.lens.stop_radius_mm
         chief, seen = self._chief(place)
+        middle, half, lit = self._box(place)
+        places, count, waves = place.shape[1], len(_SQUARE[0]), len(self.waves)
+
+        def each(values: Array) -> Array:
+            """Repeat values of places for their rays."""
+            return np.repeat(values, count, 1)
+
         source = self._source(seen)
-        point = (place + chief * (self.core.focal_z_mm - film_z))[:, None]
-        box = self._box(place)
-        if box is None:
-            return [None] * len(self.waves)
-        low, high = box
-        share = np.linspace(-_WIDER, _WIDER, _RAYS)
-        square = np.stack(np.meshgrid(share, share)).reshape(2, -1)
-        cosines = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * square
+        source = None if source is None else each(source) - self.front[:, None]
+        cosines = each(middle) + each(half) * np.tile(_SQUARE, places)
         light = np.concatenate([cosines, _forwards(cosines)[None]])
-        out = self.rays(point, cosines, self.core.focal_z_mm, first)
+        point, axis = each(place + chief * (focal_z - film_z)), each(seen[3:])
+        out = self.rays(point, cosines, focal_z, self.waves[0])
         foot, leaves, _ = foot_of(self.core, out["ray"])
-        way = seen[3:] + 0 * leaves
-        if source is not None:
-            way = source - self.front[:, None] - foot
-            way = way / np.linalg.norm(way, axis=0)
-        slope, back = cosines / _forwards(cosines), self.model.domain.pupil_z_mm - self.core.focal_z_mm
-        stop_mm = self.scene.lens.stop_radius_mm
+        way = axis if source is None else (source - foot) / np.linalg.norm(source - foot, axis=0)
+        slope, back = light[:2] / light[2], self.model.domain.pupil_z_mm - focal_z
         # Far outside the stop a model may fold: rays from there come back into it.
         stop = out["stop"]  # of these rays, it is a rim, too: beyond it polynomials of the others may come back
         near = self._passes(out, point + slope * back, _NEAR * stop_mm, _NEAR**2 - 1)
         # Rays of the source, by cosines: where those that leave so much aside come from.
         point = point + self._point_of(way) - self._point_of(leaves)
         aside = way - direction_at(self.core, point)
-        count, waves = cosines.shape[1], np.repeat(self.waves, cosines.shape[1])
-        points, ways = (np.tile(a, len(self.waves)) for a in (point, cosines))
-        out = self.rays(points, ways, self.core.focal_z_mm, waves)
-        ahead = np.concatenate([point - place[:, None], np.full((1, count), self.core.focal_z_mm - film_z)])
+        out = self.rays(np.tile(point, waves), np.tile(cosines, waves), focal_z, np.repeat(self.waves, places * count))
+        near &= (
+            self._passes(out, np.tile(point + slope * back, waves), _BEYOND * stop_mm, _BEYOND**2 - 1)
+            .reshape(waves, -1)
+            .all(0)
+        )  # the wavelengths have rays in the same directions, so that one design fits them all
+        ahead = np.concatenate([point - each(place), np.full((1, len(near)), focal_z - film_z)])
         shift = -(light * ahead).sum(0)
         if source is not None:
-            shift = shift + ((source - self.front[:, None]) * way).sum(0)
-        pupil = point + slope * back
-        parts = [{name: a[:, w * count : (w + 1) * count] for name, a in out.items()} for w in range(len(self.waves))]
-        for part in parts:  # the wavelengths have rays in the same directions, so that one design fits them all
-            near &= self._passes(part, pupil, _BEYOND * stop_mm, _BEYOND**2 - 1)
-        found = list[ExitPupil | None]()
-        for nm, part in zip(self.waves, parts, strict=True):
-            foot, _, _ = foot_of(self.core, part["ray"])
-            places, energy = self._across(foot, seen[3:, 0], source)
-            gates = part.get("gates", np.zeros((0, count))) + _RIM
-            at = np.concatenate([part["stop"][None], stop[None], np.stack([gates, 0 * gates], 1)])
-            limits = np.array([stop_mm, _ASIDE * stop_mm, *[_RIM] * len(gates)])
-            wave = part["path_um"][0] / 1000 + shift - (foot * aside).sum(0)
-            own = Arrived(cosines, place[:, None], at, part["power"][0], near, limits, 0, wave)
-            like = found[0] if found else None
-            found.append(fitted_pupil(self.scene.lens.aperture, own, places, energy, nm, like))
+            shift = shift + (source * way).sum(0)
+        foot, _, _ = foot_of(self.core, out["ray"])
+        wave = out["path_um"] / 1000 + np.tile(shift, waves) - (foot * np.tile(aside, waves)).sum(0)
+        crossed, energy = self._across(foot, np.tile(axis, waves), None if source is None else np.tile(source, waves))
+        gates = out.get("gates", np.zeros((0, foot.shape[1]))) + _RIM
+        at = [*out["stop"], *np.tile(stop, waves), *np.stack([gates, 0 * gates], 1).reshape(-1, foot.shape[1])]
+        rows = np.concatenate([wave, out["power"] * energy, crossed, at]).reshape(-1, waves, places, count)
+        limits = np.array([stop_mm, _ASIDE * stop_mm, *[_RIM] * len(gates)])
+        found = list[list[ExitPupil | None]]()
+        for k, shows in enumerate(near.reshape(places, count)):
+            aperture, box = self.scene.lens.aperture, (place[:, k], middle[:, k], half[:, k])
+            made = fitted_waves(aperture, self.waves, box, _SQUARE, shows, rows[:, :, k], limits) if lit[k] else None
+            found.append(made or [None] * waves)
         return found
 
     def _chief(self, place: Array) -> tuple[Array, Array]:
-        """Return the slope [2] of a film place's ray through the middle of the stop, and its scene ray [6, 1]."""
-        radius = float(np.hypot(*place))
-        along = place / radius if radius else np.array([1.0, 0.0])
-        back, reach = self.model.domain.pupil_z_mm - self.scene.film_z_mm, self.model.domain.pupil_radius_mm
-        low, high = -reach, reach
+        """Return the slopes [2, P] of film places' rays through the middle of the stop, and their scene rays [6, P]."""
+        radius = np.hypot(*place)
+        along = np.where(radius > 0, place / np.where(radius > 0, radius, 1.0), np.array([[1.0], [0.0]]))
+        back, every = self.model.domain.pupil_z_mm - self.scene.film_z_mm, np.arange(len(radius))
+        high = np.full(len(radius), self.model.domain.pupil_radius_mm)
+        low, ways = -high, np.repeat(along, _SEARCH, 1)
         for _ in range(_ROUNDS):
-            tried = np.linspace(low, high, _SEARCH)
-            slope = (tried - radius) / back
-            out = self.rays(
-                place[:, None], along[:, None] * slope / np.sqrt(1 + slope * slope), self.scene.film_z_mm, self.waves[0]
-            )
-            best = int(np.abs(along @ out["stop"]).argmin())
-            low, high = tried[max(best - 1, 0)], tried[min(best + 1, _SEARCH - 1)]
-        return along * slope[best], out["ray"][:, best : best + 1]
+            tried = np.linspace(low, high, _SEARCH, axis=-1)
+            slope = (tried - radius[:, None]) / back
+            cosines = ways * (slope / np.sqrt(1 + slope * slope)).reshape(-1)
+            out = self.rays(np.repeat(place, _SEARCH, 1), cosines, self.scene.film_z_mm, self.waves[0])
+            best = np.abs((ways * out["stop"]).sum(0)).reshape(slope.shape).argmin(1)
+            low, high = (tried[every, np.clip(best + k, 0, _SEARCH - 1)] for k in (-1, 1))
+        return along * slope[every, best], out["ray"].reshape(6, *slope.shape)[:, every, best]
 
     def _source(self, seen: Array) -> Array | None:
-        """Return the object point [3, 1] on a chief ray [6, 1]; None for a distant one."""
+        """Return the object points [3, P] on chief rays [6, P]; None for distant ones."""
         back = np.concatenate([seen[:3], -seen[3:]])  # light travels to the film
         found = self.scene.object_points(Rays(*torch.from_numpy(back)))
         return None if found is None else np.stack([c.numpy() for c in found])
 
-    def _box(self, place: Array) -> tuple[Array, Array] | None:
-        """Return the lowest and highest cosines [2] of light that passes to a film place; None in the dark."""
+    def _box(self, place: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return middles and half sides [2, P] of boxes of cosines that hold the light, and which places have any."""
         domain, lens, film_z = self.model.domain, self.scene.lens, self.scene.film_z_mm
-        low, high = np.full(2, -domain.pupil_radius_mm), np.full(2, domain.pupil_radius_mm)
+        low, high = (np.full(place.shape, sign * domain.pupil_radius_mm) for sign in (-1, 1))
+        share = (np.stack(np.meshgrid(_LINE, _LINE)).reshape(2, 1, -1) + 1) / 2
         for _ in range(2):
-            share = np.linspace(0, 1, _RAYS)
-            pupil = low[:, None] + (high - low)[:, None] * np.stack(np.meshgrid(share, share)).reshape(2, -1)
-            slope = (pupil - place[:, None]) / (domain.pupil_z_mm - film_z)
+            pupil = low[..., None] + (high - low)[..., None] * share
+            slope = (pupil - place[..., None]) / (domain.pupil_z_mm - film_z)
             cosines = slope / np.sqrt(1 + (slope * slope).sum(0))
-            out = self.rays(place[:, None], cosines, film_z, self.waves[0])
-            lit = self._passes(out, pupil, lens.stop_radius_mm)
-            if not lit.any():
-                return None
-            step = (high - low) / (_RAYS - 1)
-            low, high = pupil[:, lit].min(1) - step, pupil[:, lit].max(1) + step
-        return cosines[:, lit].min(1), cosines[:, lit].max(1)
+            rays = (np.repeat(place, share.shape[2], 1), cosines.reshape(2, -1), film_z, self.waves[0])
+            lit = self._passes(self.rays(*rays), pupil.reshape(2, -1), lens.stop_radius_mm).reshape(pupil.shape[1:])
+            seen, step = np.asarray(lit.any(1)), (high - low) / (_RAYS - 1)
+            low, high = _ends(pupil, lit, seen)
+            low, high = low - step, high + step
+        # The edges lie between rays, half a step beyond the last that pass.
+        first, last = _ends(cosines, lit, seen)
+        return (first + last) / 2, _ROOM * (last - first) / 2 * (1 + 1 / (_RAYS - 3)), seen
 
     def _passes(self, out: dict[str, Array], pupil: Array, stop_mm: float, gate: float = 0.0) -> NDArray[np.bool_]:
         """Return which rays [N] pass, of those through the pupil of the domain, outside which a model says anything."""
@@ -211,13 +226,24 @@ class _Known:
         return direction[:2] * (radius / np.where(sine > 0, sine, 1.0))
 
     def _across(self, foot: Array, axis: Array, source: Array | None) -> tuple[Array, Array | float]:
-        """Return places [2, N] on the plane across the chief ray, and the energy per area of it, as `bundles.Aim`."""
-        first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
-        first /= np.linalg.norm(first)
-        across = np.stack([first, np.cross(axis, first)])
+        """Return places [2, N] on the planes across chief rays, and the energy per area of them, as `bundles.Aim`.
+
+        `foot` and `source` [3, N] are counted from the front focal point; `axis` [3, N] are the chief rays.
+        """
+        first = np.where(
+            np.abs(axis[1]) < 0.9, np.cross(axis, [0.0, 1.0, 0.0], 0).T, np.cross(axis, [1.0, 0.0, 0.0], 0).T
+        )
+        first = first / np.linalg.norm(first, axis=0)
+        across = np.stack([first, np.cross(axis, first, axis=0)])
         if source is None:
-            return across @ foot, 1.0
-        way = source - self.front[:, None] - foot
-        met = foot - way * ((axis @ foot) / (axis @ way))
-        away = source - self.front[:, None] - met
-        return across @ met, (axis @ away) / np.linalg.norm(away, axis=0) ** 3
+            return (across * foot).sum(1), 1.0
+        way = source - foot
+        met = foot - way * ((axis * foot).sum(0) / (axis * way).sum(0))
+        away = source - met
+        return (across * met).sum(1), (axis * away).sum(0) / np.linalg.norm(away, axis=0) ** 3
+
+
+def _ends(values: Array, lit: NDArray[np.bool_], seen: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return the least and largest values [2, P] of [2, P, N] that are lit [P, N]; 0 where none is seen."""
+    ends = np.where(lit, values, np.inf).min(-1), np.where(lit, values, -np.inf).max(-1)
+    return np.where(seen, ends[0], 0.0), np.where(seen, ends[1], 0.0)

@@ -21,14 +21,25 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.optics.analysis.bundles import Aim, Filled
-from neurolens.optics.analysis.exit_pupil import Array, Arrived, ExitPupil, arrived, fitted_pupil, phasor
+from neurolens.optics.analysis.exit_pupil import (
+    Array,
+    Arrived,
+    ExitPupil,
+    arrived,
+    fitted_pupil,
+    open_shares,
+    phasor,
+    slopes,
+    summed,
+)
 from neurolens.optics.analysis.fields import Scene
 
 Field = NDArray[np.complex64]
 _RAYS = 36  # rays along a side of the rectangle about what is lit
 _WIDER = 1.1  # the rectangle over what is lit
 _PER_CYCLE = 2.5  # cells a cycle of the field needs
-_FEWEST, FINEST = 160, 512  # cells across the pupil: the edges need so many even in focus
+_FEWEST, FINEST = 80, 512  # cells across the pupil: the edges need so many even in focus
+_AT_ONCE = 2**17  # cells whose waves are summed in one go
 _RINGS = 6  # radii of the Airy disc that a window has at least
 _MOST_CELLS = 1024  # of the pupil along a side, whose rays are counted
 
@@ -151,54 +162,76 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
         pupils: by wavelength; None is dark. weights: [C, W] of wavelengths in each channel.
         pixel_mm, side: pixels, and how many along a side.
     """
-    some = [p for p in pupils if p is not None]
-    centre, size = _centre(some), (len(weights), side, side)
-    light, counted = np.zeros(size), np.zeros(size)
-    energy, seen = np.zeros(len(weights)), np.zeros(len(weights))
-    reach = side * pixel_mm / 2 * math.sqrt(2)
-    needed = [0 if p is None else cells_needed(p, reach + math.dist(p.centre_mm, centre)) for p in pupils]
-    by_rays = max(needed, default=0) > FINEST
-    for p, factor, few in zip(pupils, weights.T, needed, strict=True):
-        if p is None:
-            continue
-        off = centre - p.centre_mm
-        x, y = (o + (np.arange(side) - (side - 1) / 2) * pixel_mm for o in off)
-        cells = few if not by_rays else min(max(_FEWEST, 32 * math.ceil(p.blur_mm / pixel_mm / 4)), _MOST_CELLS)
-        share = p.open_share(cells)
-        rays, total, solid = _by_rays(p, x, y, pixel_mm, share)
-        counted += factor[:, None, None] * rays
-        energy += factor * total
-        seen += factor * solid
+    lit = [k for k, p in enumerate(pupils) if p is not None]
+    some, weights = [p for p in pupils if p is not None], weights[:, lit]
+    centre, reach = _centre(some), side * pixel_mm / 2 * math.sqrt(2)
+    if not some:
+        dark = np.zeros(len(weights))
+        return Spread(np.zeros((len(weights), side, side)), centre, dark, dark, False, math.nan)
+    needed = [cells_needed(p, reach + math.dist(p.centre_mm, centre)) for p in some]
+    rays = 32 * math.ceil(max(p.blur_mm for p in some) / pixel_mm / 4)  # across the pupil, to be counted by pixels
+    by_rays = max(needed) > FINEST
+    if by_rays:
+        needed = [min(max(_FEWEST, rays), _MOST_CELLS)] * len(some)
+    line = (np.arange(side) - (side - 1) / 2) * pixel_mm
+    parts, done = list[tuple[Array, ...]](), 0
+    while done < len(some):
+        group = some[done : done + max(1, _AT_ONCE // max(needed[done:]) ** 2)]
+        cells = max(needed[done : done + len(group)])
+        done += len(group)
+        x, y = np.array([centre - p.centre_mm for p in group]).T[..., None] + line
+        (share, weight), (cycles, light) = open_shares(group, cells), waves_of(group, cells)
+        area = np.array([np.prod(2 * p.half / cells) for p in group])
+        fold = max(k for k in (1, 2, 4) if k == 1 or cells // k >= max(rays, _FEWEST // 2))
+        counted = spent = _by_rays(group, x, y, pixel_mm, light * share, fold) * area[:, None, None]
         if not by_rays:
-            light += factor[:, None, None] * by_pixel(p, x, y, pixel_mm, cells_of(p, cells, share))
-    whole = np.where(energy > 0, energy, 1.0)[:, None, None]
-    light, counted = light / whole, counted / whole
-    differs = math.nan if by_rays or not some else float(np.abs(light - counted).sum() / 2 / len(weights))
-    light = counted if by_rays else light
-    return Spread(light, centre, light.sum((1, 2)), seen, by_rays, differs)
+            spent = by_pixel(group, x, y, pixel_mm, phasor(cycles, np.sqrt(light) * weight))
+        parts.append((counted, spent, *((s.sum((1, 2), dtype=np.float64) * area) for s in (light * share, share))))
+    *images, total, solid = (np.concatenate(part) for part in zip(*parts, strict=True))
+    energy = weights @ total
+    by_hits, shown = (
+        np.tensordot(weights, image, 1) / np.where(energy > 0, energy, 1.0)[:, None, None] for image in images
+    )
+    differs = math.nan if by_rays else float(np.abs(shown - by_hits).sum() / 2 / len(weights))
+    return Spread(shown, centre, shown.sum((1, 2)), weights @ solid, by_rays, differs)
 
 
 def irradiance(pupil: ExitPupil, x_mm: Array, y_mm: Array, field: Field) -> Array:
     """Return the irradiance [Y, X] at places from the pupil's centre, for 1 at the lens, by its `cells_of`."""
-    wave, size = pupil.wavelength_nm * 1e-6, 2 * pupil.half / len(field)
+    return irradiances([pupil], x_mm[None], y_mm[None], field[None])[0]
+
+
+def irradiances(pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, fields: Field) -> Array:
+    """Return what `irradiance` does, [W, Y, X], for pupils with places [W, X], [W, Y] and fields [W, cells, cells]."""
+    cells = fields.shape[1]
+    wave, half = np.array([p.wavelength_nm * 1e-6 for p in pupils]), np.array([p.half for p in pupils])
     x, y = (
-        phasor(np.outer(place, half / wave * middles(len(field))))
-        for half, place in zip(pupil.half, (x_mm, y_mm), strict=True)
+        phasor((h / wave)[:, None, None] * place[..., None] * middles(cells))
+        for h, place in zip(half.T, (x_mm, y_mm), strict=True)
     )
-    found = (x @ field @ y.T).T
-    return np.asarray((found.real**2 + found.imag**2) * np.float32((size.prod() / wave) ** 2), np.float64)
+    found = y @ (x @ fields).transpose(0, 2, 1)
+    scale = ((2 * half / cells).prod(1) / wave) ** 2
+    return np.asarray((found.real**2 + found.imag**2) * scale[:, None, None])
 
 
-def cells_of(pupil: ExitPupil, cells: int, open_share: Array | None = None) -> Field:
-    """Return the field [cells, cells] of the pupil's cells, each times its open share."""
-    share = pupil.open_share(cells) if open_share is None else open_share
-    return np.asarray(share.astype(np.float32) * pupil.field((middles(cells),) * 2), np.complex64)
+def waves_of(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the wavefronts in waves and the light per area of cosines (mm^2) in cells, [W, cells, cells]."""
+    figures = np.stack([np.moveaxis(p.figures[..., :2], -1, 0) for p in pupils])
+    figures[:, 0] *= np.array([1e6 / p.wavelength_nm for p in pupils])[:, None, None]
+    # Sums of waves have at most some 100 waves, of which float32 leaves 1e-5.
+    cycles, light = summed(figures.astype(np.float32), (middles(cells),) * 2).swapaxes(0, 1)
+    return cycles, np.maximum(light, 0)
+
+
+def cells_of(pupil: ExitPupil, cells: int) -> Field:
+    """Return the field [cells, cells] of the pupil's cells, each times its weight (`open_shares`)."""
+    return open_shares([pupil], cells)[1][0] * pupil.field((middles(cells),) * 2)
 
 
 def perfect_peak(pupil: ExitPupil, field: Field) -> float:
     """Return the irradiance in the middle of the image that the same pupil has without aberrations."""
-    total = float(np.abs(field).sum(dtype=np.float64) * np.prod(2 * pupil.half / len(field)))
-    return (total / (pupil.wavelength_nm * 1e-6)) ** 2
+    even, middle = pupil.perfect(), np.zeros(1)
+    return float(irradiance(even, middle, middle, cells_of(even, len(field)))[0, 0])
 
 
 def middles(cells: int) -> Array:
@@ -206,33 +239,30 @@ def middles(cells: int) -> Array:
     return (np.arange(cells) + 0.5) * 2 / cells - 1
 
 
-def by_pixel(pupil: ExitPupil, x_mm: Array, y_mm: Array, pixel_mm: float, field: Field) -> Array:
-    """Return the light [Y, X] on square pixels about places, for 1 at the lens, in mm^2."""
+def by_pixel(pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, pixel_mm: float, fields: Field) -> Array:
+    """Return the light [W, Y, X] on square pixels about places, as in `irradiances`, for 1 at the lens, in mm^2."""
     # The square of a field is as fine as lambda over the width of the pupil; two samples of that in each pixel.
-    parts = max(1, math.ceil(4 * float(pupil.half.max()) * pixel_mm / (pupil.wavelength_nm * 1e-6)))
+    parts = max(math.ceil(4e6 * float(p.half.max()) * pixel_mm / p.wavelength_nm) for p in pupils)
     step = pixel_mm / parts
-    x, y = (p[0] + (np.arange(-1, parts * len(p) + 1) - (parts - 1) / 2) * step for p in (x_mm, y_mm))
-    fine = irradiance(pupil, x, y, field)
+    x, y = (p[:, :1] + (np.arange(-1, parts * p.shape[1] + 1) - (parts - 1) / 2) * step for p in (x_mm, y_mm))
+    fine = irradiances(pupils, x, y, fields)
     for _ in range(2):  # the mean over a sample's width, f + f'' / 24
-        fine = ((22 * fine[1:-1] + fine[:-2] + fine[2:]) / 24).T
-    return np.asarray(fine.reshape(len(y_mm), parts, len(x_mm), parts).mean((1, 3)) * pixel_mm**2)
+        fine = ((22 * fine[:, 1:-1] + fine[:, :-2] + fine[:, 2:]) / 24).swapaxes(1, 2)
+    mean = fine.reshape(len(fine), y_mm.shape[1], parts, x_mm.shape[1], parts).mean((2, 4))
+    return np.asarray(mean * pixel_mm**2, np.float64)
 
 
 def _by_rays(
-    pupil: ExitPupil, x_mm: Array, y_mm: Array, pixel_mm: float, open_share: Array
-) -> tuple[Array, float, float]:
-    """Return the light [Y, X] of rays by pixel, all light of the pupil (mm^2), and its open solid angle."""
-    share = middles(len(open_share))
-    area = float(np.prod(2 * pupil.half / len(share)))
-    light = open_share * pupil.light((share, share)) * area
-    column, row = (
-        np.floor((hit - p[0]) / pixel_mm + 0.5).astype(int)
-        for hit, p in zip(pupil.hits((share, share)), (x_mm, y_mm), strict=True)
-    )
-    met = (column >= 0) & (column < len(x_mm)) & (row >= 0) & (row < len(y_mm)) & (light > 0)
-    found = np.bincount(row[met] * len(x_mm) + column[met], light[met], len(x_mm) * len(y_mm))
-    return (
-        np.asarray(found.reshape(len(y_mm), len(x_mm)), np.float64),
-        float(light.sum()),
-        float(open_share.sum()) * area,
-    )
+    pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, pixel_mm: float, light: Array, fold: int
+) -> Array:  # fmt: skip
+    """Return the light [W, Y, X] of rays by pixel, one for `fold` by `fold` cells, whose light is [W, cells, cells]."""
+    count, rows, columns = len(pupils), y_mm.shape[1], x_mm.shape[1]
+    cells = light.shape[1] // fold
+    light = light.reshape(count, cells, fold, cells, fold).sum((2, 4))
+    hits = summed(slopes(pupils).astype(np.float32), (middles(cells),) * 2)
+    at = np.stack([x_mm[:, 0], y_mm[:, 0]], 1)[..., None, None]
+    column, row = np.floor((hits - at) / pixel_mm + 0.5).astype(np.int32).swapaxes(0, 1)
+    met = (column >= 0) & (column < columns) & (row >= 0) & (row < rows) & (light > 0)
+    place = (np.arange(count)[:, None, None] * rows + row) * columns + column
+    found = np.bincount(place[met], light[met], count * rows * columns)
+    return np.asarray(found.reshape(count, rows, columns), np.float64)

@@ -9,7 +9,7 @@ and Wolf, section 4.1). All are polynomials fitted to a few thousand traced rays
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -33,6 +33,7 @@ _FEWEST = 240  # the fewest rays for their 120 terms
 _BEYOND = 1.15  # rays up to so many radii of a rim count for the polynomials
 _PARTS = 8  # of a cell along its side, where an edge crosses it
 _ROOM = 1.1  # the box of cosines over the rays that pass, between which edges lie
+_ELLIPSE = 0.96  # the part of a box's ellipse in which all rays of a model count, where no rim cuts them
 _FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
 
 
@@ -70,33 +71,11 @@ class ExitPupil:
 
     def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
         """Whether light passes at points [2, N] of the box (-1 to 1); a tuple of two axes stands for their grid."""
-        return self._lets(self._at(places, slice(2, None)))
-
-    def _lets(self, at: Array) -> NDArray[np.bool_]:
-        """Return whether light passes, from its places [K, ...] at the rims."""
-        inside = np.ones(at.shape[1:], bool)
-        for x, y, limit in zip(at[::2], at[1::2], self.limits_mm, strict=True):
-            inside &= x * x + y * y <= limit * limit
-        if self.aperture is not None:
-            inside[inside] = self.aperture.inside(at[0][inside], at[1][inside], self.limits_mm[0])
-        return inside
+        return _lets(self.aperture, np.array([self.limits_mm]), self._at(places, slice(2, None))[None])[0]
 
     def open_share(self, cells: int) -> Array:
-        """Return the share [cells, cells] of each cell of the box that light passes.
-
-        Cells on an edge are divided; places at the rims are linear between their corners.
-        """
-        at = self._at((np.linspace(-1, 1, cells + 1),) * 2, slice(2, None))
-        lit = self._lets(at)
-        corners = np.stack([lit[:-1, :-1], lit[1:, :-1], lit[:-1, 1:], lit[1:, 1:]])
-        share: Array = np.array(corners.all(0), np.float64)
-        i, j = edge = np.nonzero(corners.any(0) & ~corners.all(0))
-        part = (np.arange(_PARTS) + 0.5) / _PARTS
-        ways = [(1 - part[:, None]) * (1 - part), part[:, None] * (1 - part), (1 - part[:, None]) * part]
-        ways.append(part[:, None] * part)
-        ends = np.stack([at[:, i, j], at[:, i + 1, j], at[:, i, j + 1], at[:, i + 1, j + 1]], -1)
-        share[edge] = self._lets(ends @ np.stack(ways).reshape(4, -1)).mean(-1)
-        return share
+        """Return the share [cells, cells] of each cell of the box that light passes, as `open_shares`."""
+        return np.asarray(open_shares([self], cells)[0][0], np.float64)
 
     def field(self, places: Array | tuple[Array, Array]) -> NDArray[np.complex64]:
         """Return sqrt(e) exp(i k W) at points, which are as in `passes`."""
@@ -109,28 +88,79 @@ class ExitPupil:
         figures[..., 0] = 0
         return replace(self, figures=figures, centre_mm=np.zeros(2), hits_mm=np.zeros((2, 1)))
 
-    def light(self, places: Array | tuple[Array, Array]) -> Array:
-        """Return the light per area of cosines (mm^2) at points, which are as in `passes`."""
-        return np.asarray(np.maximum(self._at(places, slice(1, 2))[0], 0))
-
     def hits(self, places: Array | tuple[Array, Array]) -> Array:
         """Return where the rays of points, which are as in `passes`, meet the film: [2, ...] in mm from the centre."""
-        wave, room = self.figures[..., 0], ((0, 1), (0, 0))
-        slopes = [np.pad(chebyshev.chebder(wave), room), np.pad(chebyshev.chebder(wave, axis=1), room[::-1])]
-        return -_summed(np.stack(slopes) / self.half[:, None, None], places)
+        return summed(slopes([self])[0], places)
 
     def _at(self, places: Array | tuple[Array, Array], rows: slice) -> Array:
         """Return the figures [K, ...] at points, which are as in `passes`."""
-        return _summed(np.moveaxis(self.figures[..., rows], -1, 0), places)
+        return summed(np.moveaxis(self.figures[..., rows], -1, 0), places)
 
 
-def _summed(figures: Array, places: Array | tuple[Array, Array]) -> Array:
-    """Return Chebyshev series [K, D, D] at points, which are as in `ExitPupil.passes`."""
+def summed(figures: Array, places: Array | tuple[Array, Array]) -> Array:
+    """Return Chebyshev series [..., D, D] at points, as in `ExitPupil.passes`, in the precision of the figures."""
     if isinstance(places, tuple):
-        u, v = (_on_line(p.tobytes()) for p in places)
+        u, v = (_on_line(p.tobytes()).astype(figures.dtype) for p in places)
         return np.asarray(u @ figures @ v.T)
     u, v = (chebyshev.chebvander(p, _DEGREE) for p in places)
-    return np.stack([np.einsum("nk,nk->n", u @ figure, v) for figure in figures])
+    return np.asarray(((u @ figures) * v).sum(-1))
+
+
+def slopes(pupils: Sequence[ExitPupil]) -> Array:
+    """Return the series [W, 2, D, D] of where the rays of pupils meet the film, in mm from their centres."""
+    wave = np.stack([p.figures[..., 0] for p in pupils], -1)
+    by_u, by_v = (chebyshev.chebder(wave, axis=k) for k in (0, 1))
+    both = np.stack([np.pad(by_u, ((0, 1), (0, 0), (0, 0))), np.pad(by_v, ((0, 0), (0, 1), (0, 0)))])
+    return -both.transpose(3, 0, 1, 2) / np.array([p.half for p in pupils])[..., None, None]
+
+
+def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the share [W, cells, cells] of each cell of the box that light passes, by the pupils of a place.
+
+    Besides, what the middles of the cells weigh in sums over the open pupil, [W, cells, cells]: each part of a cell
+    counts for the nine middles about it, so that parabolas are summed exactly. With shares, the edges would leave an
+    error four times as large on 160 cells across as these do on 80. Cells on an edge are divided; places at the rims
+    are linear between their corners.
+    """
+    rims, aperture = max(len(p.limits_mm) for p in pupils), pupils[0].aperture
+    # The stop, which comes first, stands again for rims that only other wavelengths have.
+    kept = [[*range(len(p.limits_mm)), *[0] * (rims - len(p.limits_mm))] for p in pupils]
+    limits = np.array([np.array(p.limits_mm)[k] for p, k in zip(pupils, kept, strict=True)])
+    rows = [p.figures[..., 2:].reshape(*p.figures.shape[:2], -1, 2)[:, :, k] for p, k in zip(pupils, kept, strict=True)]
+    figures = np.stack(rows).reshape(len(pupils), *rows[0].shape[:2], -1).transpose(0, 3, 1, 2).astype(np.float32)
+    at = summed(figures, (np.linspace(-1, 1, cells + 1),) * 2)
+    lit = _lets(aperture, limits, at).view(np.int8)
+    count = lit[:, :-1] + lit[:, 1:]
+    count = count[:, :, :-1] + count[:, :, 1:]
+    w, i, j = edge = np.nonzero((count > 0) & (count < 4))
+    part = (np.arange(_PARTS) + 0.5) / _PARTS
+    ways = np.stack([np.outer(a, b).reshape(-1) for b in (1 - part, part) for a in (1 - part, part)]).astype(np.float32)
+    ends = np.stack([at[w, :, i, j], at[w, :, i + 1, j], at[w, :, i, j + 1], at[w, :, i + 1, j + 1]], -1)
+    inside = _lets(aperture, limits[w], ends @ ways).astype(np.float32)
+    whole = (count == 4).astype(np.float32)
+    t = part - 0.5
+    near = np.stack([t * (t - 1) / 2, 1 - t * t, t * (t + 1) / 2])
+    weight = np.pad(whole, ((0, 0), (1, 1), (1, 1)))
+    for axis in (1, 2):
+        beside = np.roll(weight, 1, axis) + np.roll(weight, -1, axis)
+        weight += np.float32(near[0].mean()) * (beside - 2 * weight)
+    given = inside @ (np.einsum("ap,bq->pqab", near, near).reshape(-1, 9) / _PARTS**2).astype(np.float32)
+    place = np.ravel_multi_index((w, i, j), weight.shape)[:, None] + np.add.outer(
+        np.arange(3) * (cells + 2), np.arange(3)
+    ).reshape(-1)
+    weight += np.bincount(place.reshape(-1), given.reshape(-1), weight.size).reshape(weight.shape)
+    whole[edge] = inside.mean(-1)
+    return whole, np.asarray(weight[:, 1:-1, 1:-1], np.float32)
+
+
+def _lets(aperture: Aperture | None, limits_mm: Array, at: Array) -> NDArray[np.bool_]:
+    """Return whether light passes [W, ...], from rims' radii [W, K] and its places at them [W, 2 K, ...]."""
+    squares = at * at
+    apart = limits_mm.astype(at.dtype).reshape(*limits_mm.shape, *[1] * (at.ndim - 2)) ** 2
+    inside = np.asarray((squares[:, ::2] + squares[:, 1::2] <= apart).all(1))
+    if aperture is not None:
+        inside[inside] = aperture.inside(at[:, 0][inside], at[:, 1][inside], float(limits_mm[0, 0]))
+    return inside
 
 
 def phasor(cycles: Array, amplitude: Array | float = 1.0) -> NDArray[np.complex64]:
@@ -154,7 +184,6 @@ class Arrived(NamedTuple):
         cosines, hits: [2, N] directions and places (mm) on the film. at: [S, 2, N] x and y in mm at each surface.
         power: [N] share of unpolarised light that arrives. exists: [N] False where a ray is lost.
         limits_mm: [S] radii of the surfaces. stop: the number of the stop among them.
-        wave_mm: [N] the wavefront W about `hits` [2, 1], which then are one place; None: it follows from all hits.
     """
 
     cosines: Array
@@ -164,7 +193,6 @@ class Arrived(NamedTuple):
     exists: NDArray[np.bool_]
     limits_mm: Array
     stop: int
-    wave_mm: Array | None = None
 
 
 def arrived(lens: Lens, rays: Rays, wavelength_nm: torch.Tensor | float) -> Arrived:
@@ -202,44 +230,89 @@ def fitted_pupil(
     middle, half = ((low + high) / 2, _ROOM * (high - low) / 2) if like is None else (like.middle, like.half)
     if not half.min() > _FLAT:
         return None
-    centre = rays.hits[:, inside].mean(1) if rays.wave_mm is None else rays.hits[:, 0]
+    centre = rays.hits[:, inside].mean(1)
     every = range(len(limits))
     cut = [rays.stop, *(k for k in every if k != rays.stop and part[k, near].max() > 1)]
-    wave = -(rays.hits[:, near] - centre[:, None]).reshape(-1) if rays.wave_mm is None else rays.wave_mm[near]
-    figures = _fitted(
-        (cosines[:, near] - middle[:, None]) / half[:, None], half, wave, places[:, near],
-        (rays.power * energy)[near], rays.at[cut][..., near].reshape(2 * len(cut), -1),
-    )  # fmt: skip
+    design = _design(np.ascontiguousarray((cosines[:, near] - middle[:, None]) / half[:, None]).tobytes())
+    along = np.concatenate([by / side for by, side in zip(design.slopes, half, strict=True)])
+    wave = _least(along[:, 1:])(-(rays.hits[:, near] - centre[:, None]).reshape(-1))
+    rows = [(rays.power * energy)[near], *places[:, near], *rays.at[cut][..., near].reshape(2 * len(cut), -1)]
+    figures = _fitted(design, half, wave[:, None], np.array(rows)[:, None])[0]
     through = inside.copy()
     if aperture is not None:
         through &= aperture.inside(rays.at[rays.stop, 0], rays.at[rays.stop, 1], float(limits[rays.stop]))
     through = through if through.any() else inside
     box = np.zeros((2, 2)) if box is None else box
     found = ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), aperture, np.zeros((2, 0)), box)
-    if rays.wave_mm is None:
-        return replace(found, hits_mm=(rays.hits - centre[:, None])[:, through])
-    hits = found.hits((cosines[:, through] - middle[:, None]) / half[:, None])
-    figures[1, 0, 0], figures[0, 1, 0] = (figures[1, 0, 0], figures[0, 1, 0]) + half * hits.mean(1)
-    return replace(found, centre_mm=centre + hits.mean(1), hits_mm=hits - hits.mean(1, keepdims=True))
+    return replace(found, hits_mm=(rays.hits - centre[:, None])[:, through])
 
 
-def _fitted(places: Array, half: Array, wave_mm: Array, disc_places: Array, power: Array, at_mm: Array) -> Array:
-    """Fit `ExitPupil.figures` by least squares to rays at points [2, N] of the box.
+def fitted_waves(
+    aperture: Aperture | None, wavelengths_nm: Sequence[float], box: tuple[Array, Array, Array], points: Array,
+    near: NDArray[np.bool_], rows: Array, limits_mm: Array,
+) -> list[ExitPupil | None] | None:  # fmt: skip
+    """Fit the exit pupils of one film place to rays in the same directions, of which the wavefront is known.
 
-    The wavefront is fitted to its values [N] or its slopes [2 N] (dW/dL, then dW/dM), the light per area of cosines by
-    the derivatives of the points on the disc.
+    Args:
+        aperture: as in `fitted_pupil`.
+        box: the place, the middle of the box of cosines and its half sides, [2] each.
+        points: [2, N] of the box in which rays come. near: [N] which of them count.
+        rows: [R, W, N] the wavefront (mm) about the place, light per area, x and y on a surface before the lens, then x
+            and y in mm at the stop and at the rims, whose radii are `limits_mm`.
     """
-    design = _design(np.ascontiguousarray(places).tobytes())
-    (by_u, by_v), solved = design.slopes, design.solved
-    if len(wave_mm) == places.shape[1]:
-        wave = solved(wave_mm)[1:]
-    else:
-        wave = _least(np.concatenate([by_u / half[0], by_v / half[1]])[:, 1:])(wave_mm)
-    mapped = solved(disc_places.T)
-    (au, bu), (av, bv) = (by_u @ mapped).T / half[0], (by_v @ mapped).T / half[1]
-    rest = solved(np.stack([power * np.abs(au * bv - av * bu), *at_mm], 1))
-    figures = np.zeros((_DEGREE + 1, _DEGREE + 1, 1 + rest.shape[1]))
-    figures[_ORDERS] = np.concatenate([np.concatenate([[0.0], wave])[:, None], rest], 1)
+    part = np.hypot(rows[4::2], rows[5::2]) / limits_mm[:, None, None]
+    inside = near & (part.max(0) <= 1)
+    if inside.sum(1).min() < 16 or near.sum() < _FEWEST:
+        return None
+    # Most pupils fill an ellipse in their boxes, so that one design fits them all.
+    round_ = (points * points).sum(0) <= _ELLIPSE**2
+    used = round_ if near[round_].all() and not inside[:, ~round_].any() else near
+    place, middle, half = box
+    cut = [k for k in range(len(limits_mm)) if k == 0 or part[k][:, used].max() > 1]
+    kept = [0, 1, 2, 3, *(4 + 2 * k + way for k in cut for way in (0, 1))]
+    design = _design(points[:, used].tobytes())
+    rows = rows[:, :, used]
+    wave = design.solved(rows[0].T)
+    hits = -np.stack([by @ wave / side for by, side in zip(design.slopes, half, strict=True)])
+    figures = _fitted(design, half, wave[1:], rows[kept[1:]])
+    found = list[ExitPupil | None]()
+    for k, nm in enumerate(wavelengths_nm):
+        through = inside[k, used]
+        if aperture is not None:
+            left = through & aperture.inside(rows[4, k], rows[5, k], float(limits_mm[0]))
+            through = left if left.any() else through
+        own = hits[:, through, k]
+        centre = own.mean(1)
+        figures[k, 1, 0, 0], figures[k, 0, 1, 0] = (figures[k, 1, 0, 0], figures[k, 0, 1, 0]) + half * centre
+        found.append(
+            ExitPupil(
+                nm, place + centre, middle, half, figures[k], tuple(limits_mm[cut]), aperture, own - centre[:, None],
+                np.zeros((2, 2)),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _fitted(design: _Design, half: Array, wave: Array, rows: Array) -> Array:
+    """Return `ExitPupil.figures` [W, D, D, K] by least squares to rays at points of the box.
+
+    The light per area of cosines has the derivatives of the points on the disc.
+
+    Args:
+        wave: [M - 1, W] coefficients of the wavefront, but the first.
+        rows: [R, W, N] power, x and y on the disc, x and y at rims.
+    """
+    (by_u, by_v), waves = design.slopes, wave.shape[1]
+    mapped = design.solved(rows[1:3].reshape(2 * waves, -1).T)
+    (au, bu), (av, bv) = (
+        (by @ mapped).T.reshape(2, waves, -1) / side for by, side in zip((by_u, by_v), half, strict=True)
+    )
+    light = (rows[0] * np.abs(au * bv - av * bu))[None]
+    rest = design.solved(np.concatenate([light, rows[3:]]).reshape(-1, light.shape[2]).T)
+    figures = np.zeros((waves, _DEGREE + 1, _DEGREE + 1, len(rows) - 1))
+    i, j = _ORDERS
+    figures[:, i[1:], j[1:], 0] = wave.T
+    figures[:, i, j, 1:] = rest.reshape(len(rest), -1, waves).transpose(2, 0, 1)
     return figures
 
 
@@ -254,9 +327,9 @@ class _Design(NamedTuple):
     solved: Callable[[Array], Array]
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)
 def _design(places: bytes) -> _Design:
-    """Return the design of points [2, N], which the wavelengths of a model have in common."""
+    """Return the design of points [2, N], which most pupils of models have in common."""
     # Chebyshev polynomials of each coordinate, and their slopes.
     value = [chebyshev.chebvander(p, _DEGREE) for p in np.frombuffer(places).reshape(2, -1)]
     turn = np.pad(chebyshev.chebder(np.eye(_DEGREE + 1)), [(0, 1), (0, 0)])

@@ -139,11 +139,11 @@ def test_all_light_is_in_the_image() -> None:
     assert small.inside[0] < large.inside[0] < 1
     assert large.inside[0] == pytest.approx(1, abs=3e-3)
     # Pixels tile: four small ones hold what a large one holds.
-    x = np.arange(-6, 7) * 0.004
-    field = cells_of(pupil, 256)
-    fine = by_pixel(pupil, np.arange(-13, 13) * 0.002 + 0.001, np.arange(-13, 13) * 0.002 + 0.001, 0.002, field)
+    x, near = np.arange(-6, 7)[None] * 0.004, np.arange(-13, 13)[None] * 0.002 + 0.001
+    field = cells_of(pupil, 256)[None]
+    [fine] = by_pixel([pupil], near, near, 0.002, field)
     tiles = fine.reshape(13, 2, 13, 2).sum((1, 3))
-    assert tiles == pytest.approx(by_pixel(pupil, x, x, 0.004, field), rel=1e-2, abs=1e-4 * tiles.max())
+    assert tiles == pytest.approx(by_pixel([pupil], x, x, 0.004, field)[0], rel=1e-2, abs=1e-4 * tiles.max())
 
 
 def test_an_image_turns_with_its_place() -> None:
