@@ -5,7 +5,7 @@ infinity, are rounded to float32 first, so that both precisions trace the same o
 that of the scene ray's direction as a distance on the film: the focal length times the difference of direction cosines.
 Where polynomials of a lens are summed about the middle of their zones (`optics/trace/shapes.py`), the same rays go
 through its powers, too, to show what that is worth.
-Exit code 1 where a lens with aspheres misses the goal. Writes precision.md and precision.json.
+Exit code 1 where a lens misses the goal. Writes precision.md and precision.json.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ _COLUMNS = lab.columns(
     ("worst, um", "worst_um", ".3g"), ("statuses differ, %", "status_differs", ".3f", 100),
 )  # fmt: skip
 _FAR = (
-    " The error of a long lens is the rounding of directions to float32, which its focal length multiplies: for 800 mm "
-    "one unit in the last place is 0.05 um."
+    " The error of a long lens is the rounding of points and directions to float32, which its focal length multiplies: "
+    "for 800 mm one unit in the last place of a direction is 0.05 um."
 )
 OPTIONS = (
     lab.count("rays", 20000, "rays per lens, before any is stopped (default 20000)", 100),
@@ -88,7 +88,7 @@ OPTIONS = (
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure all lens files and write the table; returns 1 where a lens with aspheres misses the goal."""
+    """Measure all lens files and write the table; returns 1 where a lens misses the goal."""
     lab.quiet_glasses()
     paths = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda path: path.stem, args.only, "lenses")
     rows = [measure(path, args.rays) for path in lab.counted(paths, "precision", args.quiet)]

@@ -14,11 +14,10 @@ from neurolens.base import status as st
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.arithmetic import NUMPY
 from neurolens.optics.trace.shapes import traced_curve
-from neurolens.optics.trace.surfaces import Hit, Rays, Test, cross, media, nearest_approach, rim_tests
+from neurolens.optics.trace.surfaces import UNIT_SLACK, Hit, Rays, Test, cross, media, nearest_approach, rim_tests
 
 Array = NDArray[np.float64]
 
-UNIT_SLACK = 1e-3  # how far a direction's squared length may be from 1; float32 rounding is a thousandth of it
 _CHUNK = 32768  # rays at a time: many enough to hide the cost of calls
 _FEWER = 0.8  # share of rays left, below which they are packed together
 

@@ -26,6 +26,7 @@ from neurolens.optics.trace.arithmetic import is_number, times
 from neurolens.optics.trace.films import TensorPassage
 from neurolens.optics.trace.shapes import centred, is_deep, start_of, traced_curve
 from neurolens.optics.trace.surfaces import (
+    UNIT_SLACK,
     Hit,
     Medium,
     Rays,
@@ -43,8 +44,6 @@ Towards = Literal["scene", "film"]
 
 # Rays per chunk: enough to hide the cost of calling an operator, few enough for a core's second-level cache.
 CHUNK = 32768
-# How far a direction's squared length may be from 1; float32 rounding is a thousandth of it.
-UNIT_SLACK = 1e-3
 # Once fewer than this share of the rays is left, `passing` packs them together.
 _FEWER = 0.8
 

@@ -66,6 +66,7 @@ class Medium(NamedTuple):
 
 
 AIR = Medium(1.0, 1.0, 1.0)
+UNIT_SLACK = 1e-3  # how far a direction's squared length may be from 1; float32 rounding is a thousandth of it
 _FARTHEST = 1e6  # largest parameter of a meeting along its ray, counted from the point nearest to the vertex
 
 
@@ -330,12 +331,17 @@ def refract(
         direction = [o.fma(bend, n, p, sense) for p, n in zip(r[3:], met.normal, strict=True)]
     else:
         pull = times(curvature, -sense)
-        ahead = o.fma(bend, sense, r.dz)
-        direction = [o.fma(bend, met.x, r.dx, pull), o.fma(bend, met.y, r.dy, pull), o.add_to(ahead, bend, met.z, pull)]
+        direction = [
+            o.fma(bend, met.x, r.dx, pull), o.fma(bend, met.y, r.dy, pull),
+            o.add_to(o.fma(bend, sense, r.dz), bend, met.z, pull),
+        ]  # fmt: skip
     if after is AIR:
         # The rounding of dz changes the length of a direction, and long gaps multiply that change: in float32 it was
         # nearly all error of a telephoto. In air, where the length is 1, dz makes up for it, exactly so along the axis.
-        direction[2] = o.fma(o.dot(direction, direction) - 1.0, -0.5 * sense, direction[2])
+        excess = o.dot(direction, direction) - 1.0
+        # Lost rays have any length, and guards keep them finite.
+        change = o.select(o.abs(excess), UNIT_SLACK, excess, 0.0) if o.guard else excess
+        direction[2] = o.fma(change, -0.5 * sense, direction[2])
     # Light from air is never totally reflected.
     return Outgoing(Rays(*met[:3], *direction), q, q2, [] if before is AIR else [(TINY, q2)])
 
