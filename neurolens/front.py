@@ -138,7 +138,7 @@ class _Chosen:
 
     @property
     def of_shot(self) -> dict[str, Any]:
-        """What is set, by the names of `Shot`, but a camera's film as "film"."""
+        """The settings that are given, by the names of `Shot`; a camera's film is named "film"."""
         return {k: v for k, v in vars(self._read).items() if k == "film"} | self._read.state.shot().given
 
     def set(self, **settings: Any) -> Self:
@@ -187,7 +187,7 @@ class Lens(_Chosen):
             return read_any(self._read.file)
 
     def _glasses(self) -> AbstractContextManager[None]:
-        """A block in which its own glasses are known."""
+        """Return a block in which the lens's own glasses are known."""
         return cli.more_glasses(self._read.glass)
 
     @cached_property

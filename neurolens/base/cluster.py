@@ -258,7 +258,7 @@ def unpack(data: bytes, folder: Path) -> list[Path]:
 
 
 def with_paths(value: T, move: Callable[[Path], Path]) -> T:
-    """Return a value of dataclasses and tuples with every path in it moved."""
+    """Return a copy of a value, which is made of dataclasses and tuples, with each path moved by `move`."""
     if isinstance(value, Path):
         return move(value)  # type: ignore[return-value]
     if isinstance(value, tuple):

@@ -83,7 +83,10 @@ class Entry:
 
     @classmethod
     def of(cls, lens: str, row: Mapping[str, Any]) -> Entry:
-        """Make the entry of a lens; of its figures, engraved ones give words, and computed ones only where none are."""
+        """Make the entry of a lens.
+
+        Its words come from engraved figures, or from computed ones where none is engraved.
+        """
         own = words_of(str(row.get("believed_to_be") or row.get("name") or lens))
         more = words_of(" ".join(str(row.get(key) or "") for key in ("name", "maker", "mount"))) + words_of(lens)
         spans = [word[:-2].split("-") for word in own if re.fullmatch(rf"{_N}-{_N}mm", word)]

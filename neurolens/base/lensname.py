@@ -131,6 +131,6 @@ def _planned(path: Path) -> str | None:
 
 
 def _beside(path: Path) -> Iterator[str]:
-    """Yield the files in the folder where a file is missing, written as the argument would name them."""
+    """Yield the files that lie where a file is missing, each written as the argument would name it."""
     with suppress(OSError):
         yield from sorted(str(path.parent / entry.name) for entry in os.scandir(path.parent) if entry.is_file())

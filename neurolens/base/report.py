@@ -96,7 +96,10 @@ def _add(value: Any, name: str, prefix: str, found: dict[str, Rows]) -> None:
 
 
 def _records(item: Any, axes: tuple[str, ...]) -> list[tuple[dict[str, Any], Any]]:
-    """Return the records of a list, of lists in a list, or of a mapping whose keys are an axis, with their marks."""
+    """Return the records in a list, in lists of a list, or in a mapping whose keys are an axis.
+
+    Each comes with the cells that say where it stood: the number of its list, or its key.
+    """
     marked: list[tuple[dict[str, Any], Any]] = []
     if isinstance(item, Mapping):
         marked = [({axes[0]: key}, value) for key, value in item.items()] if axes else []
@@ -108,7 +111,7 @@ def _records(item: Any, axes: tuple[str, ...]) -> list[tuple[dict[str, Any], Any
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:
-    """Return the single figures of a value by names that begin with its own; several texts become one."""
+    """Return the single figures inside a value, under names that begin with its own; a list of texts is one figure."""
     value = plain(value, full=False)
     if isinstance(value, list) and value and all(isinstance(v, str) for v in value):
         return {name: " | ".join(value)}

@@ -155,7 +155,7 @@ def bounded(low: float, high: float, unit: str = "a number", kind: type = float)
 
 @cache
 def rules_of(cls: Any) -> dict[str, Rule]:
-    """Return the rules of a dataclass's fields: of their bounds, of a list of texts, or of their types."""
+    """Return the rule of each field of a dataclass: from its bounds, from its list of texts, or from its type."""
     typed, rules = get_type_hints(cls, include_extras=True), dict[str, Rule]()
     for f in fields(cls):
         option, kind = f.metadata.get("option"), _kind(_hints(cls)[f.name])[0]
@@ -397,7 +397,7 @@ def read_config(cls: type[T], path: str | Path, overrides: Sequence[str] = ()) -
 
 
 def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Return a copy of `data` with each "dotted.key=value" set, in a list of tables in each of them.
+    """Return a copy of `data` with each "dotted.key=value" set; in a list of tables, every table gets the value.
 
     Values are TOML; a bare word is a string.
 

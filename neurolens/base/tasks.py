@@ -283,7 +283,7 @@ def cores() -> int:
 
 @cache
 def keep_memory() -> None:
-    """Let the C library (glibc) keep the memory of freed arrays, up to the sizes that it would come to by itself.
+    """Let the C library (glibc) keep the memory of freed arrays from the start, as it does by itself only later.
 
     Otherwise it returns the memory of every larger array, and a trace spends half of its time on getting pages again.
     Dask's nannies set MALLOC_TRIM_THRESHOLD_, which also stops the C library from raising these sizes. One call serves
@@ -296,7 +296,10 @@ def keep_memory() -> None:
 
 
 def _context(modules: list[str]) -> Any:
-    """Return what starts processes: forks of a threadless server that has imported the first task's modules."""
+    """Return the context of new processes: they are forked by a server without threads.
+
+    The server has imported the first task's modules, so that a process need not.
+    """
     kind = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context: Any = multiprocessing.get_context(kind)
     if kind == "forkserver":
@@ -415,7 +418,7 @@ class Stopping:
 
 
 class Unfinished(Exception):
-    """Leaves the block of a `Stopping`, and a stage of the progress without printing its last line."""
+    """The exception that leaves the block of a `Stopping`; a stage of the progress then prints no last line."""
 
 
 @contextmanager
@@ -432,7 +435,10 @@ def held() -> Iterator[None]:
 
 
 def end_at_once() -> None:
-    """Let signals that were not ignored end a process started inside `held`, those that wait now included."""
+    """Let signals end a process that was started inside `held`; a signal that waits ends it now.
+
+    Signals that were ignored before stay ignored.
+    """
     for number in ASKING:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)

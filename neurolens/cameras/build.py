@@ -136,7 +136,7 @@ def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
 
 
 def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
-    """Return one of `IDEAL_OF`, framed as a lens that stands ready for the shot, with that lens's entrance pupil.
+    """Return an ideal camera (`IDEAL_OF`) with the framing and the entrance pupil of a lens that is set for the shot.
 
     Chief rays of a film point meet the plane in focus where the lens's do, to first order. Since a film in best focus
     is not in the paraxial image, the ideal lens's focal length may differ from the lens's by a few thousandths. For a

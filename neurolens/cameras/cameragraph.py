@@ -169,7 +169,7 @@ def concentric_disk(square: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(function: Callable[[Array], Array]) -> Array:
-    """Fit a function of the squared angle, up to pi / 4 and in that unit, by a polynomial to float32's last bit."""
+    """Fit a polynomial in s = (angle / (pi / 4))^2, from 0 to 1, to a function of s, to float32's last bit."""
     fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
     return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
 

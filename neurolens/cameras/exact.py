@@ -151,7 +151,7 @@ class ExactCamera(LensCamera):
     def path_by_height(
         self, surfaces: list[int], film_mm: NDArray[Any], pupil_mm: NDArray[Any], wavelength_nm: NDArray[Any]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Trace rays of film points [2, N] through pupil points [2, N] for the effect of uneven surfaces.
+        """Trace rays of film points [2, N] through pupil points [2, N]: how do uneven surfaces change their paths?
 
         Returns:
             Optical direction cosines at the film [2, N]; and for each surface, [surfaces, 2, N], the distance of the

@@ -78,7 +78,7 @@ Spectrum = tuple[Array, Array]  # wavelengths in nm, and their weights
 
 
 def spectrum_of(camera: Any, light_nm: tuple[float, float] = LIGHT_NM, only_nm: float | None = None) -> Spectrum:
-    """Return one wavelength, or those of a range weighted by the eye's sensitivity, of those that the camera takes."""
+    """Return one wavelength, or several with the eye's sensitivity as weights; a camera limits them to its range."""
     low, high = camera.wavelength_nm or light_nm
     if only_nm is not None:
         if camera.wavelength_nm is not None and not low <= only_nm <= high:
@@ -90,7 +90,7 @@ def spectrum_of(camera: Any, light_nm: tuple[float, float] = LIGHT_NM, only_nm: 
 
 
 def frame_of(camera: Any) -> Frame:
-    """Return the ideal camera for any camera, by its first-order data (by rays, for x in models with cylinders)."""
+    """Return the ideal camera that stands beside any camera: by its first-order data, or by traced rays."""
     state, lens = camera.settings["lens_state"], getattr(camera, "lens", None)
     y = state["pinhole_focal_length_mm"], state["entrance_pupil_offset_mm"]
     if None in y:
@@ -110,7 +110,7 @@ def frame_of(camera: Any) -> Frame:
 
 
 def _measured(camera: Any) -> Frame:
-    """Measure the ideal camera of one without first-order data, by where rays close to the axis meet two planes."""
+    """Find the ideal camera beside one without first-order data: rays close to the axis are traced to two planes."""
     height = _SMALL * math.hypot(*camera.film_mm) / 2
     points = np.asarray(height * np.array([1, 1j, -1, -1j, 2, 2j, -2, -2j]), np.complex128)
     near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
@@ -231,7 +231,9 @@ def is_round(camera: Any) -> bool:
 
 @dataclass(frozen=True)
 class Polar:
-    """A map of the plane to itself, near the identity, given on rings by the ratio of where a point goes to the point.
+    """A map of the plane to itself, near the identity; places are complex numbers x + i y.
+
+    On rings it is tabulated as a ratio: the place to which a point goes, over the point.
 
     Attributes:
         end: radius of the last ring, mm; beyond it the map continues straight along the radius.
@@ -396,7 +398,7 @@ def field_of(
 
 
 def shown_at(camera: Any, field: Field, point: Complex, distance_m: float) -> Complex:
-    """Return the picture points that a field gives to what points [N] show at this distance; NaN where it is dark."""
+    """Return where a field puts the things that picture points [N] show at this distance; NaN where it is dark."""
     seen = traced_light(camera, point, field.spectrum, field.frame, field.target, distance_m)
     found: Complex = np.where(seen.light > 0, field.picture(seen.place), np.nan)
     return found

@@ -1,4 +1,4 @@
-"""Ideal lenses: the thick lens with principal planes and pupils of a real one, and the thin lens, where all are one.
+"""Ideal lenses: the thick lens has the principal planes and pupils of a real one; in the thin lens all coincide.
 
 The thick lens is that of Kolb, Mitchell and Hanrahan 1995, "A Realistic Camera Model for Computer Graphics". A ray of a
 film point through the exit pupil meets the rear principal plane H', and continues at the same height from the front one

@@ -157,7 +157,10 @@ class LensCamera:
 
     @cached_property
     def _front_discs(self) -> FrontDiscs:
-        """Find where the film's light crosses the front by rays at the pupil's edge, half of them from the film's."""
+        """Find where light to the film crosses the front surface, by rays at the pupil's edge.
+
+        Half of these rays start at the film's edge.
+        """
         rng, ray = np.random.default_rng(0), np.arange(_EDGE_RAYS)
         film = (rng.random((2, _EDGE_RAYS)) - 0.5) * np.array(self.film_mm)[:, None]
         film[:, ::2] *= 0.5 / np.abs(film[:, ::2] / np.array(self.film_mm)[:, None]).max(0)
@@ -226,7 +229,10 @@ class LensCamera:
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """Return the bound of `SpectralCamera`; None if too few rays pass, or no polynomial follows the shift."""
+        """Return how far companions may lie from the hero's film point; see `SpectralCamera`.
+
+        It is None if too few rays pass, or if no polynomial follows the shift.
+        """
         return self._shift.reach_mm if self._shift else None
 
     def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
@@ -325,7 +331,7 @@ class LensCamera:
         return with_film_derivatives(graph) if fitted is None else fitted.graph
 
     def _within(self, film: Array, share: float) -> Array:
-        """Return film points [2, N], those beyond a share of the outline's radius drawn in to it."""
+        """Return film points [2, N]; those beyond a share of the outline's radius are drawn in to that share."""
         axis, pose = np.array(self.film.pose.moved_mm)[:, None], self.film.pose
         off = film - axis
         place = off / (1 + pose.axes[2:, :2] @ off / self.film.distance_mm) if pose.turned else off

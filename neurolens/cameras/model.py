@@ -190,7 +190,7 @@ def best_focus_of_stops_mm(
 
 
 class _Spot(NamedTuple):
-    """The best film of rays of an axial point, with the rays.
+    """The rays of an axial point, and the film position at which their spot is smallest.
 
     Attributes:
         best_mm: the film plane.
@@ -290,7 +290,7 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
 
 
 def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float, spokes: int) -> FloatArray:
-    """Return pupil points [2, rings * spokes] about all that pass from the film's centre through a stop."""
+    """Return pupil points [2, rings * spokes] about all rays from the film's centre that pass a stop."""
     ring, spoke = (np.arange(_RINGS) + 0.5) / _RINGS, 2 * np.pi * (np.arange(spokes) + 0.5) / spokes
     low, high, half = (abs(domain["bounds"][name][0]) for name in ("low_mm", "high_mm", "half_mm"))
     reach = _WIDER * max(low, high, half) * min(1.0, stop_radius_mm / domain["stop_radius_mm"])
@@ -298,7 +298,7 @@ def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float, spokes: int) -> 
 
 
 def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
-    """Return the film in the paraxial image of a focus within the model's domain, whose films may lie next to it."""
+    """Return the film position of the paraxial image of the object in focus; the focus must lie in the domain."""
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
         return float(lens["film_z_mm"])  # its groups have moved
@@ -343,7 +343,7 @@ def _stop_radius(model: OnnxLens, shot: Shot) -> float:
 
 
 def _check_shot(model: OnnxLens, shot: Shot) -> None:
-    """Refuse settings that the model does not have, which its axes decide, too."""
+    """Refuse settings that the model does not take; what it takes depends on its axes, too."""
     axes = [a.name for a in model.axes]
     lacks = {name for name, axis in (("zoom", "zoom"), ("internal", "focus")) if axis not in axes}
     shot.check_taken(str(model.path), LensCamera.takes - lacks)

@@ -68,7 +68,7 @@ class FilmPose:
         return 2 * float(np.abs(x / away).max()), 2 * float(np.abs(y / away).max())
 
     def lean(self, film_mm: tuple[float, float], distance_mm: float) -> float:
-        """Return the largest size of the share that `to_plane` gives as `lean`."""
+        """Return the largest |lean| over the film; `to_plane` says what it is."""
         corners = np.array([[-1, -1, 1, 1], [-1, 1, -1, 1]]) * np.array(film_mm)[:, None] / 2
         depth = self.axes[2, :2] @ (corners - np.array(self.moved_mm)[:, None]) / distance_mm
         return float(np.abs(depth / np.maximum(1 + depth, 0.1)).max())

@@ -214,7 +214,7 @@ def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
     last = table.rows.shape[1] - 1
 
     def light(boxes: Float64Array, place: Float64Array) -> Float64Array:
-        """Return boxes [3, M] about what passes at fractional rows within boxes."""
+        """Search given boxes at fractional rows, and return boxes [3, M] about the rays that pass."""
         return _lattice(boxes, table.film_radius_mm * place / last, passing).boxes
 
     rows = np.minimum(np.arange(last + 1), last * (1 - 1e-6))
@@ -438,7 +438,9 @@ def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) ->
 
 
 def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array:
-    """Return distances at the ends of the spectrum from those [W, R, D] at shares of it, joined where they differ much.
+    """Return distances at both ends of the spectrum, from those [W, R, D] at shares of it.
+
+    Where the distances of a row differ much, both ends get the largest.
 
     At the edge of the light, lateral colour leaves some wavelengths dark before others.
     """
@@ -500,7 +502,7 @@ _LEANS, _LEAN_HALVINGS = np.linspace(0.5, 1.5, 11), 10  # where leaning outlines
 
 
 def leaning(outline: PupilOutline, passes: Passes, reach: float) -> PupilOutline:
-    """Return the outline of the rays of a turned film (`PupilOutline.lean`), which holds what passes as the other does.
+    """Return the outline for a turned film (`PupilOutline.lean`); it, too, holds all rays that pass.
 
     A ray of lean k with the central place c crosses the film plane of the outline at c + k q, for a point q of the
     pupil. Each vertex is sought again at both ends of k, and moves linearly between.
@@ -533,7 +535,10 @@ def leaning(outline: PupilOutline, passes: Passes, reach: float) -> PupilOutline
 
 
 def _keep_largest(needed: Float64Array, found: Float64Array, step: float) -> None:
-    """Raise what vertices [..., R, K + 1] need to what was found [rows, edges]; `step` is the place between rows."""
+    """Raise the needs of vertices [..., R, K + 1] to what was found [rows, edges] beside them.
+
+    `step` is the place between rows at which it was found.
+    """
     rows = len(found)
     for row in (slice(0, rows), slice(1, 1 + rows)) if step else (slice(0, rows),):
         for edge in (slice(0, -1), slice(1, None)):

@@ -151,7 +151,10 @@ class ReducedDispersion:
             self._fit(light)
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Return rays of the one wavelength, from the film points that show there what these points show at theirs."""
+        """Return rays of the reference wavelength.
+
+        They start at the film points that show, at that wavelength, what the given points show at theirs.
+        """
         base = self._base(film_mm, wavelength_nm)
         return self._tinted(self.camera.sample(base, pupil, self._reference(film_mm)), wavelength_nm)
 
@@ -177,13 +180,13 @@ class ReducedDispersion:
         return np.asarray(self.camera.natural(self._base(film_mm, wavelength_nm), pupil, self._reference(film_mm)))
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Return the camera's film points at the one wavelength, moved to where these wavelengths are shown."""
+        """Return film points of the reference wavelength, moved to where the given wavelengths are shown."""
         found = self._tinted(self.camera.to_film(point_m, pupil, self._reference(point_m)), wavelength_nm)
         shift = self._shifts(found.film_mm, wavelength_nm[None])[0]
         return replace(found, film_mm=found.film_mm + shift * (found.weight > 0))
 
     def _reference(self, rays: FloatArray) -> FloatArray:
-        """Return the one wavelength, as often as there are rays [R, N]."""
+        """Return the reference wavelength for every ray [R, N]."""
         return np.full(rays.shape[1], self._nm, np.float32)
 
     def _exposure(self, nm: float) -> float:
@@ -193,7 +196,7 @@ class ReducedDispersion:
         return float(self.camera.sample(middle, square, light).weight.mean(dtype=np.float64))
 
     def tints(self, wavelength_nm: FloatArray) -> FloatArray:
-        """Return the light of wavelengths, on the axis, over that of the one wavelength."""
+        """Return the light on the axis at some wavelengths, over that at the reference wavelength."""
         return np.interp(np.nan_to_num(wavelength_nm), self._lit_nm, self._tint).astype(np.float32)
 
     def _tinted(self, rays: Any, wavelength_nm: FloatArray) -> Any:
@@ -202,13 +205,13 @@ class ReducedDispersion:
         return replace(rays, weight=rays.weight * self.tints(wavelength_nm) * light, status=status)
 
     def _base(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """Return the film points that show at the one wavelength what these show at theirs."""
+        """Return the film points that show, at the reference wavelength, what the given points show at theirs."""
         # Over its own length the shift changes by a thousandth of itself, so it is not evaluated again at the other
         # end.
         return film_mm - self._shifts(film_mm, wavelength_nm[None])[0] if self.lateral else film_mm
 
     def _shifts(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """Return the shift [W, 2, N] from film points of the one wavelength to those of others [W, N]."""
+        """Return the shift [W, 2, N] from film points of the reference wavelength to those of others [W, N]."""
         shift = np.zeros((len(wavelength_nm), *film_mm.shape), np.float32)
         if not self.lateral:
             return shift
@@ -309,7 +312,7 @@ class Vignetted:
         self._cards = {"natural": natural, "optical": optical, "none": np.ones_like(value), "both": value}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Return the camera's rays, weighed anew."""
+        """Return the camera's rays, with weights that have only the vignetting that is kept."""
         return self._weighed(self.camera.sample(film_mm, pupil, wavelength_nm), film_mm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -317,7 +320,7 @@ class Vignetted:
         return self._weighed(self.camera.sample_differentials(film_mm, pupil, wavelength_nm), film_mm)
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Return the camera's rays of several wavelengths, each weighed anew at its own film point."""
+        """Return the camera's rays of several wavelengths; the weight of each has only the vignetting that is kept."""
         found = self.camera.sample_spectrum(film_mm, pupil, wavelength_nm)
         passed = found.weight > 0
         factor = np.stack([self._factors(p, film) for p, film in zip(passed, found.film_mm, strict=True)])
@@ -328,11 +331,11 @@ class Vignetted:
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """Return the bound of the camera inside; None if that cannot place companions."""
+        """Return the `companion_reach_mm` of the camera inside; None if that camera cannot place companions."""
         return getattr(self.camera, "companion_reach_mm", None)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Return the camera's film points, weighed anew."""
+        """Return the camera's film points, with weights that have only the vignetting that is kept."""
         return self._weighed(found := self.camera.to_film(point_m, pupil, wavelength_nm), found.film_mm)
 
     def _weighed(self, rays: Any, film_mm: FloatArray) -> Any:

@@ -228,6 +228,9 @@ def lens_state(
 def ideal_state(
     efl_mm: float, f_number: float, pinhole_mm: float, entrance_pupil_mm: float | None = None
 ) -> dict[str, Any]:
-    """Return the table of an ideal lens: nothing engraved, all light passes, the pupil where the pinhole would be."""
+    """Return the table `lens_state` of an ideal lens.
+
+    It has no engraved figures, all light passes, and the pupil lies where the pinhole would be.
+    """
     pupil = pinhole_mm if entrance_pupil_mm is None else entrance_pupil_mm
     return lens_state(nominal_mm=None, efl_mm=efl_mm, pinhole_mm=pinhole_mm, entrance_pupil_mm=pupil, f_number=f_number)

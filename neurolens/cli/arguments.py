@@ -212,7 +212,7 @@ class Command:
         return from_options(cls, args).completed()
 
     def completed(self) -> Self:
-        """Return the command with what `assumed` finds where nothing is given; its answer tells."""
+        """Return the command with values that `assumed` finds for what is not given; its answer names them."""
         told, whole = list[str](), self
         for name, (option, found) in self.assumed().items():
             if name == "state" or getattr(self, name) in (None, (), False):  # a state: where it lacks something
@@ -221,7 +221,7 @@ class Command:
         return replace(whole, told=f"assumed: {', '.join(told)}") if told else whole
 
     def assumed(self) -> dict[str, tuple[str, Callable[[], tuple[Any, str]]]]:
-        """Return by field, where none is given: its option, and what finds a value and the words that tell it."""
+        """Return, for each field that may be left out, its option, and a function that finds a value and its words."""
         found: dict[str, tuple[str, Callable[[], tuple[Any, str]]]]
         found = {"film": ("--film", self._film), "out": ("--output", self._output)}
         options = {f.name: f.metadata["option"] for f in fields(self) if "option" in f.metadata}
@@ -349,7 +349,7 @@ def rms_error(text: str) -> tuple[str, float]:
 
 
 def words_of(choices: Sequence[str], least: str = "") -> Callable[[str], tuple[str, ...]]:
-    """Return the type of an argument that lists some of `choices`, each once, with commas, `least` among them."""
+    """Return the type of an argument that lists some of `choices` with commas, each once; `least` must be there."""
 
     def convert(text: str) -> tuple[str, ...]:
         words = tuple(word.strip() for word in text.split(","))
@@ -397,7 +397,7 @@ def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: b
 
 
 def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
-    """Return -o and --output, the file or folder that a command writes; it is named where there is no default."""
+    """Return -o and --output, the file or folder that a command writes; without a default the command names it."""
     if assumed := default is ...:
         default, about = None, f"{about} (default: named after the input, in this folder)"
     return setting(
@@ -421,7 +421,7 @@ def film(default: Any = ..., about: str = "size of the film in mm", title: str =
 
 
 def film_like(picture: Path, film_mm: tuple[float, float], said: str) -> tuple[tuple[float, float], str]:
-    """Return the largest film of the shape of a picture (EXR) on another film, and what tells of it."""
+    """Return the largest film of a picture's shape (EXR) within another film, and a sentence about it."""
     from neurolens.pictures.render.pictures import header_of
 
     (left, top), (last, bottom) = header_of(picture)["displayWindow"]

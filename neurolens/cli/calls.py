@@ -1,4 +1,4 @@
-"""Commands as calls from Python: values take the place of words, and the answer that of what is printed.
+"""Commands as calls from Python: values replace the words of a command line, an answer replaces what is printed.
 
 The parser of a command reads both, so that a call takes what the command takes: names, units, defaults and errors.
 """

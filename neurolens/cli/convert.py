@@ -183,11 +183,11 @@ _PLATE_MM = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Glass(cli.Reporting):
-    """Look glasses up in the catalogue that ships with neurolens: index, Abbe number, the
-    wavelengths that the maker states the index for, and what 10 mm transmit inside (without
-    reflections). A name gives the glass of every maker that has one of that name, the one that a
-    lens file gets first; a six-digit code (517642) the glasses nearest to it, up to 0.01 in
-    n_d and 2 in V_d away."""
+    """Look glasses up in the catalogue that ships with neurolens. It prints their index, their Abbe number, the
+    wavelengths for which the maker states the index, and what 10 mm transmit inside (without reflections). A name finds
+    the glass of every maker that uses it; the first of these is the one that a lens file gets. A six-digit code
+    (517642) finds the nearest glasses, up to 0.01 in n_d and 2 in V_d away.
+    """
 
     epilog = """\
 examples:

@@ -257,7 +257,7 @@ class KernelFacts:
 
     @classmethod
     def of(cls, cell: Cell) -> KernelFacts:
-        """Return the one of a cell, which is dark where no light reaches it."""
+        """Return the facts of a cell, which is dark where no light reaches it."""
         distance = None if math.isinf(cell.distance_m) else cell.distance_m
         light, width = ([0.0] * 3, 0) if cell.kernel is None else (cell.kernel.energy.tolist(), cell.width_px)
         return cls(cell.field, distance, cell.place_px, light, width)

@@ -251,7 +251,7 @@ def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
 
 
 def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[source.Fix, tuple[LensModel, ...]]:
-    """Return what the numbers of --fix fix, by name, and the models that know it."""
+    """Return the quantities that --fix sets, and the models in which they are fixed."""
     from neurolens.optics.setting.focusing import best_focus_z_mm
     from neurolens.optics.setting.states import set_lens
 

@@ -79,7 +79,7 @@ examples:
         return self.answer(Handed(replace(found, files=files), writer.notes, writer.left, writer.fits))
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
-        """Return the maps of `stmap`, the light as grey with alpha, by which any program multiplies, and NVIDIA's."""
+        """Return the maps of `stmap`, a map of the light (grey with alpha, for programs that multiply) and NVIDIA's."""
 
         def light(*given: Any) -> dict[str, Any]:
             grey = illumination_map(*given)["Y"]

@@ -127,7 +127,10 @@ class PictureCommand(cli.Reporting):
 
 @dataclass(frozen=True, kw_only=True)
 class FieldCommand(PictureCommand):
-    """A command about the place of things in the picture of a lens, which says what one centre leaves of it."""
+    """A command about where things appear in the picture of a lens.
+
+    It also says how wrong a single centre of projection is for things at other distances.
+    """
 
     near: float | None = setting(
         None, "distance from the film to the nearest thing in view, whose parallax the command states in pixels "
@@ -143,7 +146,7 @@ class FieldCommand(PictureCommand):
         return self.near or float(f"{max(near_of(self.camera, **self._size()), 1.5 * pupil):.3g}")
 
     def parallax(self, camera: Camera, field: Field) -> list[dict[str, float]]:
-        """Return, by distance (at infinity and near), how far things are from where the field's one centre has them."""
+        """Return how far things, at infinity and near, appear from where the field's one centre puts them."""
         point = np.concatenate([lit_points(field, self.film, _SEEN), diagonal_points(field, self.film)])
         point = point[field.lit(point)]
         pixel = self.film[0] / self.picture[0], self.film[1] / self.picture[1]
@@ -396,7 +399,7 @@ class Maps(Report):
 
 
 def one_centre(parallax: list[dict[str, float]], before_film_mm: list[float]) -> str:
-    """Return what one centre leaves of things at other distances, as a sentence."""
+    """Return a sentence on how wrong one centre is for things at other distances."""
     told = [
         f"{cli.number(p['rms_px'], 2)} pixels RMS, {cli.number(p['worst_px'], 2)} at most, for things "
         f"{_where(p['distance_m'])}"

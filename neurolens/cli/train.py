@@ -127,8 +127,7 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         return folder, run_experiment(experiment, folder, progress=progress, command=command)
 
     def _changes(self) -> list[str]:
-        """Return the options as changes of the experiment's settings, KEY=VALUE; --set comes last, then what is of its
-        models."""
+        """Return the settings that change in the experiment, KEY=VALUE: by options, then by --set, then by --phase."""
         changes = ['lens.zoom="range"'] * self.zoom_range + ['lens.focus_mode="internal"'] * self.internal_focus
         if self.within is not None:
             unit = self.within[0].removeprefix("rms_")

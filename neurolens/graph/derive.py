@@ -311,7 +311,7 @@ class Solved:
     size: Value | None
 
     def judged(self, size: Value) -> tuple[Value, Value]:
-        """Return the best unknowns and the squared length of their residual, from that of the last unknowns."""
+        """Return the unknowns with the least residual, and its squared length; `size` is that of the last unknowns."""
         if self.best is None or self.size is None:
             return self.last, size
         g, better = size.graph, size <= self.size

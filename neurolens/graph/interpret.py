@@ -48,7 +48,9 @@ _PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], _Plan]] = WeakKeyDiction
 
 
 def _plan(graph: Graph) -> _Plan:
-    """Return the numbers of the nodes that the outputs need, in order, each with the values that no later node needs.
+    """Return the numbers of the nodes that the outputs need, in order.
+
+    Each comes with the values that no later node needs.
 
     A plan is kept as long as its graph.
     """

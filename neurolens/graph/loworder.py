@@ -327,7 +327,7 @@ def _same(found: Truths, wanted: Truths, samples: Mapping[str, NDArray[np.float3
 
 
 def _shared(graph: Graph) -> int | None:
-    """Return the node of which some rows say where rays go, and other rows the rest."""
+    """Return the node some of whose rows decide where rays go, while others serve the other outputs alone."""
     kept = live_rows(graph, {"scene_ray": graph.outputs["scene_ray"]})
     every = live_rows(graph, graph.outputs)
     shared = [

@@ -223,7 +223,10 @@ class _Writer:
         return names[0] if len(names) == 1 else self.op("Concat", *names, axis=0)
 
     def _state(self) -> list[tuple[Sequence[str], Sequence[str], bytes]]:
-        """Return the nodes that make all values that follow the state: one product, which is then cut and shaped."""
+        """Return the nodes that compute all values that follow the state.
+
+        They are one matrix product, whose result is cut and shaped.
+        """
         if self.mixing is None:
             return []
         if not self._moved and "features" in self.mixing.graph.outputs:
@@ -321,7 +324,7 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
 
 
 def _mixed_pairs(graph: Graph, number: int) -> list[tuple[int, int]]:
-    """Return pairs of different rows of a value whose products its quadratics take."""
+    """Return the pairs of different rows of a value that its quadratic forms multiply."""
     quadratics = (n for n in graph.nodes if n.kind == "quadratic" and n.inputs[0] == number)
     return sorted({p for n in quadratics for form in n.static for p in form if p[0] != p[1]})
 

@@ -171,7 +171,7 @@ class Hlsl(Glsl):
 
 
 class Slang(Hlsl):
-    """Slang, which is HLSL as far as this goes; its tables are buffers, which it has on every target."""
+    """Slang, which is like HLSL, but has its tables as buffers, as every target of it can read them."""
 
     about, cell = "For Slang.", "slang_cell"
     table_of = "StructuredBuffer<float> {}"
@@ -353,7 +353,7 @@ def write_osl(
 
 
 def urgent(lines: Sequence[str]) -> list[str]:
-    """Sort lines `float tN = ...;`: first those from which the longest chain of others leads on.
+    """Sort lines `float tN = ...;` so that those come first on which the longest chain of others depends.
 
     So few lines wait for one another. Compilers of shaders make no vectors of them and keep much of the given order.
     """

@@ -102,7 +102,9 @@ def fit_sparse(data: Prepared, features: Features) -> tuple[Tensor, Tensor]:
 
 
 def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] | None = None) -> Tensor:
-    """Fit [1 + G, M]: the transmittance to passing rays, each gate to those that reach it, most to those it decides.
+    """Fit coefficients [1 + G, M]: the transmittance to passing rays, then each gate to the rays that reach it.
+
+    The rays that a gate decides weigh most.
 
     Args:
         kept: the features that each gate may use; None: all.

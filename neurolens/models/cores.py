@@ -270,7 +270,9 @@ class Symmetric(Core):
         return int((self.ab != 0).sum() + (self.scalars != 0).sum())
 
     def rows(self, g: Graph, field: Field, units: Units, more: Sequence[Array] = ()) -> Value:
-        """Return rows A of the three vectors, B of them, scalars without `light`, and `more` coefficients [R, M].
+        """Return the rows of A for the three vectors, then of B, then the scalars without `light`.
+
+        Behind them stand the rows with `more` coefficients [R, M].
 
         No terms in w are written where it is 0.
         """
@@ -292,7 +294,7 @@ class Symmetric(Core):
         return ~self.serves & (self.exponents[:, -1] > 0)
 
     def light(self, g: Graph, field: Field) -> Value | None:
-        """Return the part of the transmittance whose terms in w nothing else has; None without any.
+        """Return the part of the transmittance with powers of w that no other output has; None without any.
 
         It is the sum of q_j(w) T_j(T_4(w)) over j, where T are Chebyshev polynomials and q_j are cubics, whose
         coefficients are short polynomials in the ray. Powers of w up to 20 would cancel, so that float32 would lose up
@@ -396,7 +398,10 @@ class Network(Core):
         return 12 if self.mirror else 6
 
     def rows(self, g: Graph, field: Field, units: Units, added: Value | None = None) -> Value:
-        """Return rows A of the three vectors, B of them, scalars; `added`, whose rows have the same order, is added."""
+        """Return the rows of A for the three vectors, then of B, then the scalars.
+
+        The rows of `added`, in the same order, are added to them.
+        """
         h = field.products(MIRROR if self.mirror else ROUND)
         for k, (weight, bias) in enumerate(self.hidden):
             if k == 0:  # shift and scale are folded into it; without dispersion the last invariant is 0

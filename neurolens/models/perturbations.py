@@ -247,7 +247,7 @@ class _Fit:
         return terms[used], bends[..., used], leans[..., used]
 
     def along(self, found: Answers, deviation: Tensor) -> tuple[Array, Array]:
-        """Fit what figures that leave the lens round change: `ab` [P, 3, 2, M] and `scalars` [P, 1 + G, M]."""
+        """Fit the changes by figures that leave the lens round: `ab` [P, 3, 2, M] and `scalars` [P, 1 + G, M]."""
         core, count = self.core, len(self.core.exponents)
         ab = np.zeros((len(deviation), 3, 2 * count))
         rows = np.zeros((len(deviation), *core.scalars.shape))
@@ -270,7 +270,10 @@ class _Fit:
 
 
 def _columns(chosen: list[int], count: int, place: list[int], terms: int) -> list[int]:
-    """Return where columns of `count` candidates a form stand among those of all terms, of which `place` are these."""
+    """Return where chosen candidates, `count` in each form, stand among the columns of all terms.
+
+    `place` are the numbers of the candidates among the terms.
+    """
     return [k // count * terms + place[k % count] for k in chosen]
 
 

@@ -186,10 +186,10 @@ def _chosen(variables: Tensor, wanted: Tensor, weights: Tensor, allowed: float, 
 
 
 def path_errors(model: LensModel, rays: FilmRays) -> dict[str, float]:
-    """Return errors of the path in float32 on rays that the lens passes, and how far it and the model's rays differ.
+    """Return the errors of the path, in float32, on rays that the lens passes; {} without a path.
 
     "phase_rms_waves" and "phase_max_waves" are in waves of `unit_um`. "phase_rays_um" is the median distance, on the
-    film, between where the slopes of the path and where the model's own rays say that light goes. {} without a path.
+    film, between where the slopes of the path and where the model's own rays say that light goes.
     """
     core = model.core
     if not isinstance(core, Phased):

@@ -306,10 +306,10 @@ class Prepared:
 def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
     """Return the micrometres on the film per unit of scaled position and per radian, to first order.
 
-    A direction error d moves the image by f d; a position error e on the front surface moves a point in the nearest
-    focused plane by e, and so its image by e times the magnification there; objects nearer than that plane count where
-    the domain knows of any (`Domain.nearest_m`). At infinity position does not count; the fit uses at least the
-    magnification of 20 focal lengths, so that near objects keep their place.
+    A direction error d moves the image by f d. A position error e on the front surface moves a point in the nearest
+    focused plane by e, and its image by e times the magnification there. Where the domain has objects nearer than that
+    plane (`Domain.nearest_m`), the magnification is theirs. For a lens at infinity a position error would count for
+    nothing; it counts with the magnification of 20 focal lengths, so that near objects keep their place.
     """
     f = abs(first_order(lens).efl_mm)
     nearest_m = min(*domain.focus_m, math.inf if domain.nearest_m is None else domain.nearest_m)

@@ -132,7 +132,7 @@ def _weight(rays: FilmRays) -> Tensor:
 
 
 def _opened(core: Core) -> tuple[Polynomial, Callable[[Polynomial], Core]]:
-    """Return the polynomial that has the transmittance, and what makes the core of another in its place."""
+    """Return the polynomial that holds the transmittance, and a function that makes a core with another one."""
     if isinstance(core, (InvariantPolynomial, MirrorPolynomial)):
         return core, lambda new: new
     if isinstance(core, (Phased, Refracted)):

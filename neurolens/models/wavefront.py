@@ -40,7 +40,7 @@ _SEARCH, _ROUNDS = 65, 3  # points among which the chief ray is sought, and how 
 
 
 def checked_path(model: LensModel, lens: Lens, wavelengths_nm: Sequence[float]) -> Phased:
-    """Return what has the model's path.
+    """Return the core that holds the model's optical path.
 
     Raises:
         InputError: a model without optical path; a film or a stop of its lens, or a wavelength, outside its domain.
@@ -210,7 +210,7 @@ class _Known:
         return (first + last) / 2, _ROOM * (last - first) / 2 * (1 + 1 / (_RAYS - 3)), seen
 
     def _passes(self, out: dict[str, Array], pupil: Array, stop_mm: float, gate: float = 0.0) -> NDArray[np.bool_]:
-        """Return which rays [N] pass, of those through the pupil of the domain, outside which a model says anything."""
+        """Return which rays [N] pass: only rays through the domain's pupil can, for a model knows no others."""
         lit = (out["stop"] ** 2).sum(0) <= stop_mm**2
         lit &= (pupil * pupil).sum(0) <= (self.model.domain.pupil_radius_mm * DOMAIN_SLACK) ** 2
         return np.asarray(lit & (out.get("gates", np.zeros((1, 1))) <= gate).all(0))

@@ -158,7 +158,7 @@ def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
 
 
 def enter_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """Return the channels of the picture of directions."""
+    """Return the channels of NVIDIA's map from pixels to directions."""
     planes = {name: np.empty(plates.picture[::-1], np.float32) for name in "RGB"}
     for rows, point in blocks(plates.picture, plates.pixel_mm, report):
         point = np.broadcast_to(point, (point.shape[0], plates.picture[0]))
@@ -170,7 +170,7 @@ def enter_map(field: Field, plates: Plates, report: Report = lambda share: None)
 
 
 def exit_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """Return the channels of the picture of places."""
+    """Return the channels of NVIDIA's map from directions, on a folded square, to places in the picture."""
     planes = {name: np.zeros((SIDE, SIDE), np.float32) for name in "RGB"}
     across = np.asarray((np.arange(SIDE) + 0.5) * (2 / SIDE) - 1, np.float64)
     for row, down in enumerate(across):

@@ -140,7 +140,7 @@ def how_to_resume(folder: Path) -> str:
 
 
 def read_psf(path: Path) -> tuple[dict[str, Any], Arrays]:
-    """Read a file of point spread: what it is of, and its arrays.
+    """Read a file of point spread: its `about.json`, and its arrays.
 
     Raises:
         InputError: it is no such file.

@@ -133,7 +133,7 @@ def wavelengths_nm(lens: Lens) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class TargetChoice:
-    """The error wanted, until which models are fitted in turn: film-equivalent RMS on held-out rays.
+    """The error wanted: models are fitted in turn until one keeps it (film-equivalent RMS on held-out rays).
 
     Attributes:
         um, px: the error in micrometres, or in pixels of a picture `pixels_across` wide on the 3:2 frame inscribed in

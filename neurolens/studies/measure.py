@@ -90,7 +90,7 @@ def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, see
 
 
 def with_more(fresh: FreshRays, seed: int) -> FreshRays:
-    """Add passing rays to `MORE` times as many as given; at most `MOST` are added."""
+    """Add passing rays until there are `MORE` times as many as before; at most `MOST` are added."""
 
     def without_crossings(pairs: PairSet) -> PairSet:
         """Return the rays without their data by surface, which take most of the memory."""

@@ -385,7 +385,7 @@ def program_candidate(
 
     @cache
     def room(count: int) -> dict[str, NDArray[Any]]:
-        """Return memory for outputs, which is used again and again, as by tracers and onnxruntime."""
+        """Return memory for outputs, which one pass after another uses, as tracers and onnxruntime do with theirs."""
         return compiled().outputs(count)
 
     def prepare(rays: FilmRays) -> Call:

@@ -135,7 +135,10 @@ def lens_program(
 
 
 def pupil_planes_mm(nodes: Sequence[Lens], axes: Sequence[Axis]) -> list[float]:
-    """Return the plane of pupil points at each node; of a range it is linear between knots, for the best one jumps."""
+    """Return the plane of pupil points (mm) at each node.
+
+    Over a zoom's range it is linear between knots, because the best plane jumps.
+    """
     if not axes:
         return [pupil_plane_z_mm(node) for node in nodes]
     (axis,) = axes

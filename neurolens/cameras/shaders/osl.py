@@ -108,7 +108,7 @@ class OslCamera:
 
     @cached_property
     def per_exposure(self) -> Array:
-        """Return the exposure; see `_per_exposure`."""
+        """Return how the exposure depends on the stop and the film position; see `_per_exposure`."""
         return _per_exposure(self)
 
 
@@ -193,9 +193,10 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
-    """Write a camera's shader and count a ray's operations with a round stop and an upright film.
+    """Write a camera's shader, and count the operations of a ray.
 
-    Compilers fold known blades and turns.
+    They are counted with a round stop and an upright film: a compiler leaves blades and turns out where it knows that
+    there are none.
     """
     program = osl_program(lens).with_shorter_sums().in_order_of_need()
     text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
@@ -264,7 +265,10 @@ def _set_outputs(
     g: Graph, camera: OslCamera, call: _Call, film: Value, ray: Value, moves: Mapping[str, Value], throughput: Value,
     warned: Value,
 ) -> None:  # fmt: skip
-    """Set the outputs: rays in Cycles's frame (x right, y up, z ahead) and scene units, warnings as a pinhole's."""
+    """Set the outputs: rays in Cycles's frame (x right, y up, z ahead) and scene units.
+
+    Warnings are rays of a pinhole, in magenta.
+    """
     length = call.units_per_m * [1e-3, 1e-3, -1e-3]
     ahead = g.concat(film * -1.0, g.constant(camera.lens.efl_mm))
     ahead = ahead * (1.0 / g.square(ahead).sqrt())
@@ -332,7 +336,7 @@ def _film_position(camera: OslCamera) -> tuple[float, float]:
 
 
 def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[str, NDArray[np.float32]]:
-    """Return rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph, with `at_stop`."""
+    """Return rays through the pupil as inputs of the lens's graph, and `at_stop`; nearly half have the widest stop."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * pupil.film_radius_mm * np.sqrt(rng.random(count))
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
@@ -377,7 +381,9 @@ def _powers(at: Array, values: Array, shape: tuple[int, int]) -> Array:
 
 
 def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, float]]:
-    """Fit best focus (mm) by powers of the stop's share and of the nearest distance over the distance.
+    """Fit the film position of best focus (mm) by powers of two numbers.
+
+    These are the stop's share, and the nearest distance over the distance in focus.
 
     Returns:
         Weights [2, N, M] for distances from the film and from the entrance pupil, and the nearest distance from either.

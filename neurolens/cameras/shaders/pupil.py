@@ -51,7 +51,9 @@ class Blades:
         self.scale = 1.0 - self.curvature * self.middle
 
     def _excess(self, point: Value) -> Value:
-        """Return a value to which `scale` times the point's distance along an edge's direction is added.
+        """Return the part of the test of an edge that is the same for all edges.
+
+        Added to it is `scale` times the point's distance along the edge's direction.
 
         The sum is above 0 beyond that edge; see `Aperture.opening`.
         """
@@ -221,7 +223,7 @@ class PupilCircles:
         return g
 
     def mixed(self, others: Sequence[PupilCircles], weights: Array) -> PupilCircles:
-        """Return the pupil in a state between states, with these weights of itself and of others of the same lens."""
+        """Return the pupil in a state between nodes: this pupil and others of the same lens, mixed by these weights."""
         states = [self, *others]
 
         def mean(values: Sequence[Array | float]) -> Array:

@@ -270,7 +270,7 @@ def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float, fl
 
 
 def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[NDArray[np.intp], float]]:
-    """Return the rays that pass in each zone, and the margin they lack if at most this share shall be lost."""
+    """Return, by zone, the rays that pass, and the margin that circles lack to lose at most this share of them."""
     passed = np.flatnonzero(rays.passed)
     zones = rays.zone[passed]
     ends = np.searchsorted(zones, np.arange(_ALL + 1), sorter=(order := np.argsort(zones, kind="stable")))

@@ -352,7 +352,7 @@ def _chebyshev(degree: int) -> np.polynomial.Chebyshev:
 
 
 def _with_terms(image: StopImage, numbers: Array, exponents: Exponents) -> StopImage:
-    """Return the image with terms of `_equations`, as powers."""
+    """Return the image with the terms that `_equations` has, written as powers."""
     if image.anamorphic:
         return replace(image, exponents=exponents, numbers=numbers)
     total: dict[tuple[int, ...], float] = {}

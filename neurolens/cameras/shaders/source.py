@@ -60,7 +60,10 @@ class Focusing:
     film_z_mm: tuple[float, float] | None = None
 
     def places(self, vergence: Array, stops: Array) -> Array:
-        """The film [D, S] for 1 / distance [D], as shares of the nearest's, at shares [S] of the stop; or paraxial."""
+        """Return film positions [D, S] for 1 / distance [D], over that of the nearest, and shares [S] of the stop.
+
+        They are of best focus; without shares, of the paraxial image.
+        """
         far = [self.nearest_m / v if v > 0 else np.inf for v in vergence]
         if stops.size:
             z = np.array([self.best(d, stops * self.stop_radius_mm) for d in far])
@@ -126,7 +129,10 @@ def film_function(
 
 
 def followed_rows(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]:
-    """A graph of the state's numbers, and in it numbers [nodes, n] that follow it, n rows; constants without axes."""
+    """Return a graph of the state's numbers, with n rows that follow the state, from their values [nodes, n].
+
+    Without axes they are constants.
+    """
     g, values = Graph(), np.asarray(nodes, np.float64)
     if not axes:
         return g, g.constant(values[0])
@@ -143,7 +149,7 @@ def _roots(count: int) -> Array:
 def _fitted(
     nodes: Sequence[Focusing], axes: Sequence[Axis], placed: Array, at: tuple[Array, Array], degrees: tuple[int, int]
 ) -> Graph:
-    """Fit the function by polynomials of these degrees: least squares of what is `placed` [nodes, D, S] there."""
+    """Fit polynomials of these degrees to the film positions `placed` [nodes, D, S], by least squares."""
     moved, by_stop = (len(places) > 1 for places in at)
     across, along = degrees[0] * moved, degrees[1] * by_stop
     # The degree is high in one variable alone, not in both.
@@ -275,7 +281,10 @@ def model_extras(model: OnnxLens, *, film: bool = True, stop_mm: float | None = 
 def followed(
     axes: Sequence[Axis], numbers: Iterable[tuple[str, Sequence[float], str]]
 ) -> tuple[dict[str, float], dict[str, Program]]:
-    """Numbers as constants or functions, of their name, their values at the nodes and their rule (`number_of`)."""
+    """Return numbers as constants, or as functions of the state.
+
+    Each is given by its name, its values at the nodes and its rule (`number_of`).
+    """
     found = {name: number_of(axes, values, rule) for name, values, rule in numbers}
     return (
         {name: value for name, value in found.items() if isinstance(value, float)},

@@ -237,7 +237,7 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
 
 
 def _film_light(scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> FilmLight:
-    """Return the light from a lens to film points at `height_mm` [F]; their rays `pupil` [F, P] show where it is."""
+    """Return the light that film points at `height_mm` [F] get from a lens, by rays about those of `pupil` [F, P]."""
     plane_z_mm = pupil_plane_z_mm(scene.lens)
     # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
     zero = torch.zeros_like(height_mm)

@@ -85,7 +85,7 @@ class Figure:
 
     @property
     def aspheric(self) -> bool:
-        """Whether the curve of the radius is no circle, or may become another because its conic is a tensor."""
+        """Whether the curve is no circle, or may turn into another one because its conic is a tensor."""
         return bool(self.powers) or not isinstance(self.conic, int | float) or self.conic != 0
 
     @property

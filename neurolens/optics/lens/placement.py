@@ -37,7 +37,7 @@ class Placement:
         return np.array(about_x) @ np.array(about_y) @ np.array([[f, -c, 0], [c, f, 0], [0, 0, 1]])
 
     def in_group(self, group: Placement, from_pivot_mm: float) -> Placement:
-        """Return the placement in the lens of a surface that is placed so in a group, which is placed as a whole.
+        """Return the placement in the lens of a surface that has this one in a group, which is placed as a whole.
 
         Args:
             from_pivot_mm: z of the surface's vertex in the centred lens, from the point about which the group turns.

@@ -1,4 +1,4 @@
-"""The light over image height for any rims, and the rims with which it is as measured at all apertures together.
+"""The light over image height for any rims, and a fit of the rims to the light measured at several apertures.
 
 The light of film points, for any rims and any stop, comes from one trace through the open lens. Rays through a grid of
 the pupil plane are traced without rims, and how far from the axis they meet each surface is kept. A rim or the stop

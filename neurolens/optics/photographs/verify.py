@@ -252,9 +252,9 @@ class Verified(Report):
         return _median(each)
 
     def told(self, figure: str, unit: str) -> str:
-        """Say the residual of "distortion", or of "light" at the widest aperture: median over focal lengths, and worst.
+        """Say in words the residual of "distortion", or of "light" at the widest aperture: its median and its worst.
 
-        For distortion the worst is a root mean square, for light it is at any height.
+        The median is over focal lengths. The worst is the largest RMS for distortion, and the largest value for light.
         """
         known = self.curves(figure)
         middle = f"median RMS {median(c.rms for _, c in known):.2g}"

@@ -40,7 +40,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Step:
-    """A surface on the walk: where the file names it, its turn, and the thickness behind it, in the file's unit."""
+    """A surface of the file: the line that names it, its turn, and the thickness behind it, in the file's unit."""
 
     line: Line
     turn: Turn | None

@@ -50,7 +50,7 @@ class Block:
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
     def crossed(self, curve: dict[str, Any], radius_x: float, conic_x: float | None) -> dict[str, Any]:
-        """Bend a curve in y, given as by `rotational`, in x too.
+        """Add a bend in x to a curve in y, which is given as by `rotational`.
 
         It is turned, or with a conic becomes a biconic. It is a cylinder where one of both is straight (an infinite
         radius), and round where both are the same.
@@ -64,7 +64,7 @@ class Block:
         return curve if same and not curve["asphere"] else curve | {"cylinder": "y", "across": (radius_x, conic_x)}
 
     def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
-        """A surface of Forbes's kind, as by `rotational`: coefficients from m = 0, and a normalisation radius."""
+        """Return a surface of Forbes's kind, as by `rotational`, from coefficients (m = 0 first) and their radius."""
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MOST_Q_TERMS:
             raise self.start.error(name, f"({len(values)} terms)", f"at most {MOST_Q_TERMS} terms")

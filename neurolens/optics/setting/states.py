@@ -330,7 +330,10 @@ def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
 
 
 def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:
-    """Return the lens with stop, half field (by image height) and nominal f-number between those of stating states."""
+    """Return the lens with stop, half field (by image height) and nominal f-number between those of its states.
+
+    Only states that state a figure count for it.
+    """
     x = [math.log(s.efl_mm) for s in states]
     place = min(max(math.log(efl_mm), x[0]), x[-1])
 

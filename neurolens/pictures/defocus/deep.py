@@ -37,7 +37,9 @@ Block = tuple[int, int, int, int]  # left, top, width, height
 
 
 def deep_layers(path: Path, header: Mapping[str, Any]) -> list[tuple[FloatArray, FloatArray]]:
-    """Read the opaque samples of a file's first part as layers of colours and depths: each pixel's first, then second.
+    """Read the opaque samples of a file's first part as layers of colours and depths.
+
+    The first layer has the nearest sample of each pixel, the second the next one, and so on.
 
     Raises:
         InputError: the file is damaged, has no colours or no depth, has another compression, or too many samples.

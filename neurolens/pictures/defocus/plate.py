@@ -150,7 +150,7 @@ def _lesser(step: FloatArray, axis: int) -> FloatArray:
 
 
 def _unmixed(w: FloatArray) -> FloatArray:
-    """Return inverse depth in which pixels on edges, whose own is a mean of both sides, have that of the nearer."""
+    """Return inverse depth in which pixels on an edge have that of its nearer side, not the mean of both sides."""
     found = w.copy()
     for axis in (0, 1):
         if w.shape[axis] < 5:

@@ -243,7 +243,7 @@ class Entrance:
 def entrances(
     tracer: GhostTracer, sine: float, film_radius_mm: float, wavelength_nm: float, seed: int = 0
 ) -> list[Entrance]:
-    """Find the discs through which the ghosts enter whose light reaches the film, brightest first.
+    """Find the ghosts whose light reaches the film, brightest first, and the disc through which each enters.
 
     Args:
         tracer: of a lens whose film is placed. sine: that of the largest angle between the axis and the light.

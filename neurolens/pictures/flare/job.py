@@ -49,7 +49,7 @@ class FlareJob:
     finer: int = 4
 
     def spectral(self, finer: int = 1, least: int = 1) -> SpectralRange:
-        """Return the range of light in its wavelengths, each cut into `finer` or more, so that there are `least`."""
+        """Return the range of light in bins: `finer` times as many as the settings say, and at least `least`."""
         bins = self.settings.bins
         return SpectralRange(*self.wavelength_nm, bins=bins * max(finer, -(-least // bins)))
 

@@ -232,7 +232,9 @@ def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
 
 
 def _bands(nm: Doubles, response: Doubles, grid: Grid, most: int) -> tuple[list[float], Doubles]:
-    """Choose wavelengths that stand for all of `nm` [W] in a ghost, with colours [K, 3] from responses [W, 3].
+    """Choose at most `most` wavelengths that stand for all of `nm` [W] in a ghost.
+
+    They come with colours [K, 3], from responses [W, 3].
 
     There are at most `most`.
 

@@ -338,7 +338,7 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
 
 
 def _flaring(camera: Any) -> Lens | None:
-    """Return the lens of a camera whose flare can be followed, which is so for upright films alone."""
+    """Return the lens of a camera, for its flare, which can be followed for upright films alone."""
     return None if any(camera.settings.get(name) for name in POSES) else getattr(camera, "lens", None)
 
 
@@ -365,7 +365,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
 
 
 def _state(frame: Frame) -> tuple[Any, ...]:
-    """Return what frames with the same lens share."""
+    """Return the settings that decide how a lens is set: frames that have them in common share the lens."""
     return tuple(value for name, value in vars(frame.shot).items() if name != "aperture")  # which is one for all
 
 

@@ -147,7 +147,10 @@ class Vertex:
 
 
 def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, radiance: FloatArray) -> None:
-    """Add the light of one point on one light, unless something is between, weighted against scattering into it."""
+    """Add the light of one point on one light, unless something is between.
+
+    Its weight allows for paths that are scattered into the light (multiple importance sampling).
+    """
     rough, world, paths = vertex.rough, vertex.world, vertex.paths
     keys = keys.cut(0, rough)
     origin = vertex.start()[:, :rough]
@@ -308,7 +311,10 @@ def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], aim: 
 def _add_emission(
     world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray, aim: bool, radiance: FloatArray
 ) -> None:
-    """Add the light of paths that run into a light, weighted against aiming at it."""
+    """Add the light of paths that were scattered into a light.
+
+    Its weight allows for paths that were aimed at the light (multiple importance sampling).
+    """
     if world.lights.black:
         return
     light = world.light.take(surface)

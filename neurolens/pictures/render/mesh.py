@@ -351,7 +351,7 @@ class _Body:
 
 
 def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:
-    """Return triangles in scene coordinates, none degenerate; `part` are those of a file that has been read.
+    """Return triangles in scene coordinates, none degenerate; `part` has them where their file has been read.
 
     Warns:
         NeurolensWarning: triangles of a file without area, which are left out.

@@ -59,7 +59,7 @@ def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: 
 
 
 def about(settings: SensorSettings, seed: int) -> dict[str, Any]:
-    """Return the metadata of the channels: the settings, the largest number that is read, and the electrons of one."""
+    """Return the metadata of the channels: the settings, the largest number, and how many electrons a step of it is."""
     most = 2**settings.bits - 1
     electrons = settings.full_well / (most - settings.black)
     known = {"black_level": settings.black, "seed": seed, "white_level": most, "electrons_per_number": electrons}

@@ -58,7 +58,7 @@ _SURFACES = 64
 
 
 def _frame(origin: Frame, u: Frame, v: Frame, size: Sequence[float] = (1.0, 1.0)) -> Frame:
-    """Coordinates in metres along unit vectors u and v as affine functions of a point, and the size, [1, 2, 5]."""
+    """Return a frame [1, 2, 5]: coordinates in metres along u and v as affine functions of a point, and the size."""
     return np.array([[[*axis, -(origin @ axis), length] for axis, length in zip((u, v), size, strict=True)]])
 
 
