@@ -1,6 +1,7 @@
 """Lenses by words: what photographers type, and the lens that they expect; of a library of any size, in time."""
 
 import json
+import re
 import shutil
 import subprocess
 import time
@@ -88,6 +89,22 @@ NOTHING = ["", " ", "?!", "lens", "xyzzy qwrtz", "\0", "\ud800", "鏡頭", "9" *
 def test_what_names_nothing_finds_nothing(nothing: str) -> None:
     found = find(nothing)
     assert (list(found.hits), found.chosen, list(found.near)) == ([], None, [])
+
+
+@pytest.mark.parametrize(
+    "code", ["@SUM(1)", "=x", "a; b", '"50/1.2"', "f/1.4!", "$noct", "noct|biotar", "helios <44>", "%noct", "noct\0"]
+)
+def test_signs_that_no_name_has_find_nothing_but_the_nearest(code: str) -> None:
+    """The same words without these signs find lenses, or are near some."""
+    bare, found = find(re.sub(r"[^\w\s/.]", " ", code)), find(code)
+    assert (list(found.hits), found.chosen) == ([], None)
+    assert len(found.near) == 3 or not bare.hits
+
+
+@pytest.mark.parametrize("said", ["(noct)", "Noct, 58mm", "[noct]", "NOCT: 58mm", "noct's 58mm"])
+def test_signs_that_names_have_do_no_harm(said: str) -> None:
+    found = find(said)
+    assert (found.hits or found.near)[0].lens == "nikon_nikkor_z_58mm_f0_95_s_noct"
 
 
 def test_a_text_is_read_as_it_is_engraved() -> None:

@@ -29,6 +29,8 @@ _NEAR, _LONGEST = 3, 300  # lenses that are offered where none has all words; ch
 _WHOLE, _BEGUN, _INSIDE = 3, 2, 1
 _LIKE = 0.5  # share of a query's mean word: a lens that is less alike is not near
 _IDLE = {"lens", "lenses", "mount", "the", "f", "mm"}  # words that people type, and that tell no lens from another
+# A query with a sign that no name of a lens has is code, or a mistake: its words are not taken for those of lenses.
+_NO_NAME = re.compile(r"[^\w\s./*()\[\],:'\N{RIGHT SINGLE QUOTATION MARK}&+-]")
 _N = r"\d{1,6}(?:\.\d+)?"
 _TOKEN = re.compile(
     rf"(?:\b[ft]/ ?|\b[ft](?=\d)|\b1:(?=[2-9]|\d\.))({_N})(?:-{_N})?|((?:18|19|20)\d0)'?s\b|({_N})-({_N}) ?mm"
@@ -41,9 +43,7 @@ def words_of(text: str) -> list[str]:
 
     Accents and capitals do not count; T-stops count as f-numbers; a number without a unit stays one.
     """
-    bare = unicodedata.normalize("NFKD", text[:_LONGEST].replace("\N{EN DASH}", "-")).casefold()
-    bare = "".join(c for c in bare if not unicodedata.combining(c))
-    bare = re.sub(r"(?<=\d),(?=\d)|(?<=[\W_]f\d)_(?=\d)", ".", bare).replace("_", " ")
+    bare = re.sub(r"(?<=\d),(?=\d)|(?<=[\W_]f\d)_(?=\d)", ".", _plain(text)).replace("_", " ")
     bare = re.sub(rf"(?<![a-z\d/.])({_N})/({_N})", _as_stop, bare)
     bare = re.sub(r"(?<=[a-z])(?=\d)(?<!\b[ft])", " ", bare)  # splits rf50
     found = []
@@ -57,6 +57,11 @@ def words_of(text: str) -> list[str]:
         else:
             found.append(f"{decade}s" if decade else f"{float(number):g}" if number else word)
     return found
+
+
+def _plain(text: str) -> str:
+    split = unicodedata.normalize("NFKD", text[:_LONGEST].replace("\N{EN DASH}", "-")).casefold()
+    return "".join(c for c in split if not unicodedata.combining(c))
 
 
 def _as_stop(found: re.Match[str]) -> str:
@@ -144,14 +149,14 @@ def find(text: str) -> Found:
 
     Of lenses that agree equally well, products come before designs, and a lens with few words in its name that the
     query leaves out comes before one with many. One lens is chosen where it agrees better than all others, or where its
-    whole name is given.
+    whole name is given. A query with a sign that names lack, such as @SUM(1), finds none.
     """
     words, notes = _translated(text)
     sorts = [word for word in words if word in CHARACTER]
     words = [word for word in words if word not in {*CHARACTER, *_IDLE}]
     if not words and not sorts:
         return Found((), None)
-    lenses = entries()
+    lenses, sound = entries(), not _NO_NAME.search(_plain(text))
 
     def key(entry: Entry) -> tuple[Any, ...]:
         said = {form for word in words for form in (word, f"{word}mm", f"f/{word}")}
@@ -160,7 +165,7 @@ def find(text: str) -> Found:
         strong, design = [-entry.strength(sort) for sort in sorts], not entry.row.get("believed_to_be")
         return -sum(map(entry.agrees, words)) - whole, strong, design, left, entry.name
 
-    hits = sorted((entry for entry in lenses if all(map(entry.agrees, words))), key=key)
+    hits = sorted((entry for entry in lenses if sound and all(map(entry.agrees, words))), key=key)
     if hits:
         alone = len(hits) == 1 or (key(hits[0])[0] < key(hits[1])[0])
         return Found(hits, hits[0] if alone else None, notes=notes)

@@ -116,10 +116,9 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
 
 
 def _is_words(text: str) -> bool:
-    """Test whether a text may be words of a lens, and no path, file name or code such as @SUM(1); f/1.2 and 50/1.2
-    contain a slash, too."""
+    """Test whether a text may be words of a lens, and no path or file name; f/1.2 and 50/1.2 contain a slash, too."""
     bare = re.sub(r"(?<=\b[fFtT])/|(?<=\d)/(?=[\d.])", " ", text)
-    return not re.search(r"[/\\=|<>;${}`]|@\w|\.[^\W\d][\w-]*$", bare)
+    return not re.search(r"[/\\]|\.[^\W\d][\w-]*$", bare)
 
 
 def _planned(path: Path) -> str | None:
