@@ -116,7 +116,7 @@ def write_results(path: str | Path, results: Results) -> None:
 def plain(value: Any, strict: bool = True, full: bool = True) -> Any:
     """Return `value` in JSON's own types: scalars and arrays of numpy and torch become numbers and lists, paths text.
 
-    A dataclass becomes a mapping of its fields, unless `full` without those in bulk; see `base.report`.
+    A dataclass becomes a mapping of its fields; fields in bulk are in it only if `full` asks for them (`base.report`).
 
     Infinity becomes the text "infinity" or "-infinity" and NaN null; unless `strict` both stay floats. In a path that
     is no UTF-8, the bytes that are no letters become \\u and four digits.

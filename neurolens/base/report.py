@@ -52,8 +52,9 @@ BULK, PART, OPTIONAL = {"bulk": True}, {"part": True}, {"optional": True}
 def over(*axes: str) -> dict[str, Any]:
     """Return the metadata of a field that is an array over these axes, or a mapping of such arrays.
 
-    An axis is another field, or a name for the number of a row. A mapping with numbers as keys has its axis in them.
-    Without axes the field is a mapping of arrays, each over the axes of the field that its key names.
+    An axis is another field of the dataclass, or a name under which rows are numbered. Where the field is a mapping
+    whose keys are numbers, the keys are the axis. Without axes the field is a mapping whose keys name other fields:
+    each array lies over the axes of the field that its key names.
     """
     return {"over": axes}
 
@@ -61,9 +62,10 @@ def over(*axes: str) -> dict[str, Any]:
 def tables_of(answer: Any, name: str) -> dict[str, Rows]:
     """Return the tables of an answer, a dataclass or a mapping, by name; each case is a row.
 
-    The table `name` is one row, that of single figures. Each list of records makes a table; tables inside a record
-    repeat its first figure. Arrays over the same axes (`over`) make a table, too, in which those over fewer of these
-    axes are repeated. Names within names are joined by a point; places in a list are numbers.
+    The table `name` has one row, with all single figures. Each list of records makes a table of its own; a table inside
+    a record repeats the record's first figure in every row. Arrays over the same axes (`over`) make one table, in which
+    arrays over fewer of these axes are repeated. Names within names are joined by a point; places in a list are
+    numbers.
     """
     found: dict[str, Rows] = {name: [{}]}
     _add(answer, name, "", found)

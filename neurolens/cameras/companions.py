@@ -157,11 +157,11 @@ def _shift_graphs(degrees: Degrees, weights: Array, tint: Array, scale: Array, w
 def lanes_graph(shift: Shift, companions: int, film_mm: Pair, pose: FilmPose) -> Graph:
     """Write the graph of all wavelengths of a ray, as if the lens let every companion pass.
 
-    Inputs are those of `Shift.of_hero`, its film point as `plane_mm`, `companion_nm` [companions], and the hero ray's
-    `film_mm` and `square` [2], `area_mm2` and `weight`. Outputs are `light` [companions], the weights that they would
-    have alone, 0 beyond the reach or the film of size `film_mm`, which stands in its `pose`; `places`, the film points
-    of all wavelengths, the hero's where there is no light; and `sure` [companions], which is above 0 where a companion
-    passes if the hero does.
+    Inputs are those of `Shift.of_hero` (its film point is named `plane_mm`), `companion_nm` [companions], and of the
+    hero ray `film_mm` and `square` [2], `area_mm2` and `weight`. Of the outputs, `light` [companions] has the weight
+    that each would have alone, which is 0 beyond the reach and beyond the film (of size `film_mm`, in its `pose`).
+    `places` has the film points of all wavelengths, which are the hero's where there is no light. `sure` [companions]
+    is above 0 where a companion passes if the hero does.
     """
     g = Graph()
     film, light, weight = g.input("film_mm", 2), g.input("companion_nm", companions), g.input("weight")

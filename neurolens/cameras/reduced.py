@@ -81,8 +81,8 @@ def film_shift(
         film_mm: [2, F].
         square: [2, F, P], pupil samples.
         wavelength_nm, reference_nm: the other wavelength, and that of the film points.
-        step_mm: by how much film points move along x and y, to tell how what they show moves; the steps lead towards
-            the middle, so that no point leaves the film.
+        step_mm: steps of film points along x and y, which tell how far the place that they show moves with them. They
+            lead towards the middle, so that no point leaves the film.
     """
     count, pupils = square.shape[1:]
     focus = camera.settings.get("focus_m")

@@ -61,9 +61,9 @@ class Analyse(cli.Figures):
       seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
       psf         point spread, geometric and by diffraction
 
-    Without WHAT all are shown. Rays fill the real stop; fields are angles of the chief ray in the scene, to the edge of
-    the film, or the text says which. Figures that do not settle as the pupil is sampled finer have fewer digits. Needs
-    the extra "train" (torch)."""
+    Without WHAT all are shown. Rays fill the real stop. Fields are angles of the chief ray in the scene, up to the edge
+    of the film, or up to what the text says. Figures that do not settle as the pupil is sampled finer have fewer
+    digits. Needs the extra "train" (torch)."""
 
     epilog = """\
 examples:

@@ -45,7 +45,7 @@ class Handover(StMap):
       README.md                    how to start, what each file leaves in pixels, what its standard cannot say
 
     With --frames there is one of each map, sample, projection and table of rays a frame; cameras are animated. What a
-    standard has no place for is not written, and said. Needs the extra "train" (scipy)."""
+    standard has no place for is left out, and the command says so. Needs the extra "train" (scipy)."""
 
     kept = "files that were written are whole; the same command goes on"
     epilog = f"""{cli.CAMERAS_HELP}

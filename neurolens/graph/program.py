@@ -368,8 +368,8 @@ class Program:
     def waits(self) -> bool:
         """Return whether a core that works on ray after ray, or vector after vector, mostly waits for results.
 
-        Counted for a core that does two operations a cycle, gives a result after 4 cycles and a quotient or root after
-        12; that it looks 144 operations ahead was chosen by measuring exact lenses and models.
+        It is counted for a core that does two operations a cycle, and has a result after 4 cycles, a quotient or a root
+        after 12. The core looks 144 operations ahead, a number that was chosen by measuring exact lenses and models.
         """
         ready, live = dict[int, int](), self.live()
         for k in live:

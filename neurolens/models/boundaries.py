@@ -125,7 +125,8 @@ def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] 
 def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidden: Features | None = None) -> Exponents:
     """Choose further exponents [K, 4], where the given ones [M, 4] fit the stop crossing or a gate badly; often none.
 
-    Forward selection goes by the gain of all those boundaries together, in squares of the error that each may have.
+    Terms are selected forwards by their gain over all those boundaries together. The gain of each boundary counts in
+    squares of the error that it may have.
 
     Args:
         first: the exponents before growth, which serves position and direction alone. Where these fit the stop

@@ -257,10 +257,10 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
 def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict[str, Any]:
     """Return rays with the answers of the float64 model, by which a client checks its own evaluation.
 
-    Rays within 0.01 of any boundary (relative) are left out, or within 0.001 where no passing ray is further from all;
-    so are rays whose status float32 changes. For every status that the model gives there are up to `others` rays.
-    `rounding` is the error that float32 may cause, of each output in its unit: eight times the reference evaluator's
-    error on these rays.
+    Rays near a boundary are left out: within 0.01 of it (relative), or within 0.001 where no passing ray lies farther
+    away. Rays whose status float32 changes are left out, too. For every status that the model gives there are up to
+    `others` rays. `rounding` is the error that float32 may cause, of each output in its unit: eight times the reference
+    evaluator's error on these rays.
     """
     # In some domains few rays pass; some are so wide that all passing rays lie near the boundaries.
     for count, least in ((20_000, 0.01), (600_000, 0.01), (600_000, 0.001)):

@@ -167,7 +167,7 @@ def draw(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays
 def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
     """Draw rays that meet everything that blocks light.
 
-    They are uniform over the domain; where little of it passes, as many lie near the passing rays; and a tenth as many
+    They are uniform over the domain. Where little of it passes, as many more lie near the passing rays. A tenth as many
     start at the edge of the first and the last film plane, where a rim may just begin to block.
     """
     rays = [sample_domain(domain, count, seed)]
@@ -397,7 +397,7 @@ def _batches(
 ) -> Iterator[tuple[PairSet, Tensor, float]]:
     """Trace rays of a domain in batches, beginning with ray number `first`, without the light's power.
 
-    With each batch come which of its rays pass, and how many rays of the domain it stands for."""
+    Each batch comes with the numbers of its rays that pass, and with how many rays of the domain it stands for."""
     drawn = found = 0
     while drawn <= 10000 * (found + 10):
         inputs, stands_for = draw(domain, size, seed, first + drawn)

@@ -344,9 +344,9 @@ def copy_errors(model: LensModel, copy: LensModel, lens: Lens) -> dict[str, floa
 def with_reach(model: LensModel, limits: Tolerances) -> tuple[LensModel, dict[str, float]]:
     """Return a model whose inputs go as far as its copies hold, and what its card says of them.
 
-    The card gives the worst errors of some copies within the limits, and how far copies hold: up to `decentre_mm` and
-    `tilt_deg` together, and up to `others` times the other limits, at most `LEFT` of what copies change is wrong, in
-    the root mean square over copies.
+    The card gives the worst errors of some copies within the limits. It also says how far copies hold: `decentre_mm`
+    and `tilt_deg` together, and `others`, a factor on the other limits. Up to there at most `LEFT` of what a copy
+    changes is wrong, as a root mean square over copies.
     """
     across = Tolerances(limits.decentre_mm, limits.tilt_deg, 0, 0, 0, 0)
     along = replace(limits, decentre_mm=0, tilt_deg=0)

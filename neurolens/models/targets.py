@@ -132,8 +132,8 @@ def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
 def choose_gates(lens: Lens, blocked: PairSet, drawn: int | None = None) -> tuple[Gate, ...]:
     """Choose the boundaries that block anything in the domain: the one that explains most blocked rays, then the next.
 
-    Rims come first, by the rays that refract all the way; then, for what the rims leave, discriminants. A gate of total
-    reflection covers the rays that miss the same surface, whose discriminant is lower still.
+    Rims are chosen first, by the rays that refract at all surfaces; then discriminants, for what the rims leave. A gate
+    of total reflection covers the rays that miss the same surface, whose discriminant is lower still.
 
     Args:
         blocked: rays that did not pass, of uniform ones over the domain.
@@ -308,8 +308,8 @@ def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
 
     A direction error d moves the image by f d. A position error e on the front surface moves a point in the nearest
     focused plane by e, and its image by e times the magnification there. Where the domain has objects nearer than that
-    plane (`Domain.nearest_m`), the magnification is theirs. For a lens at infinity a position error would count for
-    nothing; it counts with the magnification of 20 focal lengths, so that near objects keep their place.
+    plane (`Domain.nearest_m`), the magnification is theirs. For a lens focused at infinity a position error would count
+    for nothing; it counts with the magnification of 20 focal lengths, so that near objects keep their place.
     """
     f = abs(first_order(lens).efl_mm)
     nearest_m = min(*domain.focus_m, math.inf if domain.nearest_m is None else domain.nearest_m)

@@ -1,8 +1,9 @@
 """Fits the transmittance of models apart from where rays go, so that it can be fitted again when coatings change.
 
 What films reflect changes with the wavelength and the angle faster than any ray's path does. So the transmittance is a
-polynomial of its own terms: of those that serve position, direction and gates, which cost a product less, and of high
-powers of the wavelength with low ones of the ray. Networks have no part in it; they get such a polynomial beside them.
+polynomial with terms of its own. Some are those that serve position, direction and gates, which cost a product less;
+the others are high powers of the wavelength times low powers of the ray. Networks have no part in it; they get such a
+polynomial beside them.
 """
 
 from __future__ import annotations

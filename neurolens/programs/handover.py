@@ -486,8 +486,8 @@ def _block(fitted: projections.Projection) -> dict[str, Any]:
 def sight(camera: Camera, field: Field, point: Complex, near_m: float) -> Array:
     """Return lines of sight [N, 6] of picture points, in OpenCV's frame about the entrance pupil on the axis.
 
-    A line leads through the centroids of the light at infinity and near. It is the point of the line that is nearest to
-    the origin (m), and a unit direction; NaN where the picture is dark.
+    A line of sight leads through the centroids of the light at infinity and near. It is given by its point that is
+    nearest to the origin (m), and by a unit direction; both are NaN where the picture is dark.
     """
     way, at = (centroids_m(camera, field, point, d) for d in (math.inf, near_m))
     return np.concatenate([at - (at * way).sum(0) * way, way]).T * (OPENCV * 2)

@@ -1,6 +1,6 @@
 """Measures models by zone, on rays that no fit has used, traced once through the exact lens; fits models, too.
 
-A smaller stop changes no ray, but only which of them pass, which the crossing with the stop decides.
+A smaller stop changes no ray. It changes only which rays pass, and their crossings with the stop decide that.
 """
 
 from __future__ import annotations

@@ -205,8 +205,8 @@ def _fit_rims(
 def _least(features: Array, on_edge: Array, near: Array) -> Array:
     """Find numbers [M] for which a margin, with 1 as the last number, is nearly 0 on the edge.
 
-    There it is rather above 0 than below; it must not be below 0 for rays inside, and the numbers lie near others.
-    `on_edge` [N] is 1 or 0.
+    On the edge the margin is rather above 0 than below, and for rays inside it must not be below 0. The numbers stay
+    near given ones. `on_edge` [N] is 1 or 0.
     """
     size = np.sqrt(np.square(features).mean(1))
     matrix, numbers, weight = features[:-1] / size[:-1, None], near, on_edge

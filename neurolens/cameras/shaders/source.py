@@ -77,7 +77,7 @@ def number_of(axes: Sequence[Axis], nodes: Sequence[float], rule: str = "") -> f
 
     Args:
         nodes: its value at each node.
-        rule: "square" or "reciprocal" where that is what is mixed.
+        rule: "square" or "reciprocal" where the state mixes squares or reciprocals of the number; "" for the number.
     """
     values = np.array(nodes, np.float64)
     if (values == values[0]).all():

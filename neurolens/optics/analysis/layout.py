@@ -206,8 +206,8 @@ def element_outline(front: Section, back: Section, step: int = 1) -> Array:
     """Return the closed outline [K, 2] of the glass between two surfaces.
 
     It has both arcs, flats out to the wider rim, and the cylindrical edge. Where the flats would cross (a thin-edged
-    lens with unlike rims) the edge runs straight from rim to rim. One point of an arc in `step` is taken, a divisor of
-    64, so that its ends are among them.
+    lens with unlike rims) the edge runs straight from rim to rim. Of `step` points of an arc one is taken; `step`
+    divides 64, so that the ends are among them.
     """
     a, b = front.arc()[::step], back.arc()[::step]
     edge = max(front.semi_diameter_mm, back.semi_diameter_mm)

@@ -388,8 +388,8 @@ def _as_beside(lens: Lens) -> Lens | None:
 def narrowed(lens: Lens, draft: Draft) -> Lens:
     """Return the lens with rims no wider than their spheres and than where neighbours touch, in every state.
 
-    A table whose rims are not `drawn` stays as it is where rims are much wider (`_SLIGHTLY`) than their spheres, or
-    would have to be so narrow that they cut the beam of the axis: its figures are wrong.
+    Where rims are much wider than their spheres (`_SLIGHTLY`), or would have to be so narrow that they cut the beam of
+    the axis, the figures of the table are wrong. Such a table stays as it is, unless its rims are `drawn`.
     """
     found = narrowed_rims(lens)
     pairs = list(zip(lens.surfaces, found.surfaces, strict=True))

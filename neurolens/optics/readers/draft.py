@@ -52,8 +52,8 @@ class Block:
     def crossed(self, curve: dict[str, Any], radius_x: float, conic_x: float | None) -> dict[str, Any]:
         """Add a bend in x to a curve in y, which is given as by `rotational`.
 
-        It is turned, or with a conic becomes a biconic. It is a cylinder where one of both is straight (an infinite
-        radius), and round where both are the same.
+        The curve in y is turned about an axis along y; with a conic in x, the surface is a biconic. Where one of both
+        curves is straight (an infinite radius) it is a cylinder, and where both are the same it is round.
         """
         bent = bool(self.curvature or curve["asphere"])
         if math.isinf(radius_x):

@@ -186,8 +186,8 @@ def _glass(row: Table) -> dict[str, Any]:
 def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
     """Return the lens with the focal length that its file states.
 
-    Where the file states two for an anamorphic lens, they are those of its meridians; else the first of several, which
-    is that of the table, is taken.
+    The two focal lengths of an anamorphic lens are those of its meridians. Of several others the first is taken, which
+    is that of the table.
     """
     given = data.get("efl_mm")
     values = [given] if not isinstance(given, list) else given

@@ -379,8 +379,8 @@ def _moments(lens: Lens, object_z_mm: float, wavelength_nm: Array) -> tuple[Arra
     """Return x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes], and how far out it meets the stop.
 
     A ray meets the plane z = 0 at (x0, y0) with the slopes (tx, ty). The sum of (x0 + z tx)^2 + (y0 + z ty)^2 over rays
-    is least at the z where z times the sum of the second is minus the sum of the first. Both are 0 for a blocked ray;
-    the last result is the distance from the axis.
+    is least where z is minus the sum of the first result over that of the second. Both are 0 for a blocked ray. The
+    last result is the ray's distance from the axis.
     """
     rays = axial_rays(lens, object_z_mm)
     count, colours = len(rays.x), len(wavelength_nm)

@@ -162,8 +162,9 @@ def search(
 
     Grids cover the upper halves, since the lens is symmetric.
 
-    A coarse grid is traced first. Where enough of it passes, only the points follow that may lie beyond its extent by
-    less than one of its steps; elsewhere all points near those found, or all points.
+    A coarse grid is traced first. Where enough of it passes, the fine grid is traced only at points that may lie beyond
+    the extent found, by less than a coarse step. Elsewhere it is traced at all points near those found, or at all
+    points.
 
     Args:
         places, boxes: film points, and where to look from each.
@@ -344,8 +345,9 @@ def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> l
 def image_radius_mm(lens: Lens) -> tuple[float, str]:
     """Return the radius (mm) of the lit film, and where it comes from.
 
-    It is the file's own; else f tan(half field) below 60 degrees, and beyond the film radius whose mean passing ray
-    leaves at the half field; else where the relative illumination falls to 10%.
+    It is the file's own. Without one it follows from the half field: below 60 degrees it is f tan(half field), beyond
+    that the film radius whose passing rays leave, in the mean, at the half field. Without a half field it is where the
+    relative illumination falls to 10%.
     """
     if lens.image_radius_mm is not None:
         return lens.image_radius_mm, "the lens file"
@@ -395,8 +397,8 @@ def _illumination(lens: Lens, radii: Array, points: int = 48) -> tuple[Array, Ar
 def rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
     """Return the radius and z (mm) of the disc through which light comes to the film: the last rim.
 
-    On a cover glass that all but lies on the film, the light of a film point fills only a speck. Then it is the rim
-    before that, made wider by as much as the plates between shift rays.
+    On a cover glass that all but lies on the film, the light of a film point fills only a speck. Then the opening is
+    the rim before the plates, made wider by as much as they shift rays.
     """
     last, shift = len(lens.surfaces) - 1, 0.0
     while last > 1 and film_z - float(lens.vertices_mm[last]) < _CLOSE * lens.surfaces[last].semi_diameter_mm:

@@ -1,8 +1,8 @@
 """A lens set as a photographer does: zoom, size, aperture, f-number, focus, cover glass, coating, film offset in turn.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
-focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which
-keeps its interpolated value); a zoom of two moving groups has no freedom left. Such a lens is marked as derived.
+focal length. Focal length and image are then made exact by moving the groups behind the first varying gap, which keeps
+its interpolated value. A zoom of two moving groups has no freedom left. A lens that is set so is marked as derived.
 """
 
 from __future__ import annotations

@@ -82,9 +82,9 @@ def aspheres(camera: Any) -> list[int]:
 def responses(camera: Any, film_mm: NDArray[Any], square: NDArray[Any], nm: NDArray[Any]) -> Array:
     """Return how grooves move light: [aspheres, 5, N] for rays from film points [2, N] through pupil points [2, N].
 
-    Pupil points are those of the unit square. The five rows of an asphere are the distance (mm) from the axis at which
-    the ray meets it, and by how many mm light moves on the film, in x and y, for a slope of 1 there, then for a height
-    of 1 mm.
+    Pupil points are those of the unit square. The first of the five rows of an asphere is the distance (mm) from the
+    axis at which the ray meets it. The next two tell how far (mm, in x and y) light moves on the film for a slope of 1
+    of the surface there, the last two for a height of 1 mm.
     """
     surfaces = aspheres(camera)
     film_mm, pupil, _ = camera.film.start(*(v.astype(np.float32) for v in (film_mm, square, nm)))

@@ -123,13 +123,13 @@ def grids_of(
 def ghost_moves(tracer: GhostTracer, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float) -> tuple[Array, Array]:
     """Return how a ghost moves and changes on the film while its light moves over a patch.
 
-    The first array [2, 2] is how far (mm) the middle of its light moves along the patch's sides. The second [2] is how
-    much of its light comes or goes along the side where that is most, and its light.
+    The first array [2, 2] says how far (mm) the middle of the ghost's light moves along each side of the patch. The
+    second [2] has the light that comes or goes along the side where that is most, and the light of the ghost.
 
-    The middle moves as the ghost's edges do, which are mostly those of the stop; light through one point of the front
-    moves by another amount. Rays near rims have smaller weights, so that none comes or goes at once. Where rims cut
-    away light, the middle moves by up to that share of the radius as well, and the way is shortened by as much. It
-    stays at least `_SHORT` images of the side, for a ghost without a smear would show edges.
+    The middle moves as the ghost's edges do, which are mostly images of the stop; light through one point of the front
+    moves by another amount. Rays near rims weigh less, so that no ray comes or goes at once. Where rims cut light away,
+    the middle moves by up to that share of the radius as well, and the way is shortened by as much. A way is at least
+    `_SHORT` images of the side, because a ghost without a smear would show edges.
     """
     coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
 

@@ -358,9 +358,9 @@ def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int, wide
     """Spread the light of a picture [H, W, 3] by kernels that keep its sum, mirrored at the edges.
 
     Each pixel takes the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight. Photons of
-    unequal weight must be as little noisy, by `sums` [2, H, W] of weights and of squares. The step to the next kernel
-    is soft, and none is much wider than `widest` pixels. The kernel is Epanechnikov's, 2 / pi (1 - r^2) in units of its
-    radius.
+    unequal weight must have no more noise than these; `sums` [2, H, W] of weights and of squares tell it. The step to
+    the next kernel is soft, and none is much wider than `widest` pixels. The kernel is Epanechnikov's, 2 / pi (1 - r^2)
+    in units of its radius.
     """
     total, left, last = np.zeros_like(picture), np.ones(picture.shape[:2], np.float32), False
     while not last:

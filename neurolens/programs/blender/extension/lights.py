@@ -80,7 +80,7 @@ def see_faces(corners: Any, radiance: Any, eye: Any) -> tuple[Seen, Any]:
 
 
 def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
-    """Return starts and ends [count, 3] of rays from the pupil, with half axes [2, 3] about `eye`, to the light.
+    """Return starts of rays [count, 3] on the pupil, with half axes [2, 3] about `eye`, and their ends on the light.
 
     The pupil is an ellipse with these half axes. An edge that passes in front of the light covers pupil and light
     little by little, so that even a light without size dims smoothly.
