@@ -6,7 +6,6 @@ runs as C where the machine has a compiler, else in onnxruntime; both give the s
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -36,13 +35,12 @@ from neurolens.cameras.onnxlens import open_session, run_batches
 from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.sampling import FrontDiscs, arrived
-from neurolens.graph.c import Signature, padded_columns, write_blocks
-from neurolens.graph.compiler import has_compiler, load_compiled
+from neurolens.graph.c import padded_columns
+from neurolens.graph.compiled import CompiledGraph
+from neurolens.graph.compiler import has_compiler
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.onnx import write_onnx
-from neurolens.graph.program import Program, row_names
-from neurolens.graph.scalars import lower
 from neurolens.models.assemble import ONNX, SCALARS, Form
 from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.lens.shot import POSES, Runtime, Shot
@@ -56,9 +54,6 @@ Kind = Literal["rays", "differentials", "hero", "companion"]
 # Takes film points, pupil squares [2, N] and wavelengths [1, N], by name, to what `camera_rays` takes.
 GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 
-# Programs of more steps are not compiled. gcc 12 takes 48 s for 7100 steps in one loop, and its time grows faster than
-# their number; in parts (`PartWriter`) 20 s for 18,000: the gradients of an exact lens of 56 refractions.
-MAX_STEPS, MAX_STEPS_IN_PARTS = 12_000, 24_000
 _SAMPLES = 4096  # rays that derivatives of low order are fitted to
 _EDGES = (1e-4, 1e-3, 3e-3, 1e-2)  # distances from the square's edge of what counts as the pupil's edge
 _EDGE_RAYS = 2**16  # rays that find where light crosses the front surface
@@ -378,51 +373,15 @@ def padded(table: FloatArray, columns: int) -> FloatArray:
     return np.ascontiguousarray(np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(columns) - columns))))
 
 
-class CompiledProgram:
-    """Runs a camera's program as a compiled function.
+class CompiledProgram(CompiledGraph):
+    """Runs a camera's program as a compiled function, which gives derivatives by both film coordinates in one array."""
 
-    Args:
-        program: what is compiled.
-        rows: how many rows each result has, which the program gives one by one.
-        numbers: inputs of a whole call.
-        table: of the outline.
-    """
-
-    def __init__(self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray) -> None:
-        most = MAX_STEPS_IN_PARTS if program.waits() else MAX_STEPS
-        if len(program.steps) > most:
-            raise InputError("compiled camera", "steps", len(program.steps), f"up to {most} for a compiler")
-        self._rows = {name: (count, np.int32 if name == "status" else np.float32) for name, count in rows.items()}
-        self._signature = s = Signature.of(program, "camera")
-        self._numbers, self._table = np.array([numbers[name] for name in s.per_call], np.float32), table
-        self._call = load_compiled(write_blocks(program, "camera")).camera
-        pointer = ctypes.c_void_p
-        self._call.argtypes = [ctypes.c_size_t, pointer, pointer, pointer, ctypes.c_int, pointer, pointer]
-        self._call.restype = None
-
-    @classmethod
-    def of(cls, graph: Graph, numbers: dict[str, float], table: FloatArray) -> CompiledProgram:
-        """Compile the program of a graph."""
-        rows = {name: value.rows for name, value in graph.outputs.items()}
-        return cls(lower(graph).in_order_of_need(), rows, numbers, table)
-
-    def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+    def __call__(
+        self, rays: dict[str, FloatArray], into: Mapping[str, FloatArray] | None = None
+    ) -> dict[str, NDArray[Any]]:
         """Return the results [R, N] for inputs [R, N]; those of a camera are the input of `camera_rays`."""
-        count = next(iter(rays.values())).shape[1]
-        found: dict[str, NDArray[Any]] = {
-            name: np.empty((rows, count), kind) for name, (rows, kind) in self._rows.items() if name not in D_FILM
-        }
-        arrays = rays | found
-        if D_FILM[0] in self._rows:
-            found["d_film"] = np.empty((6, 2, count), np.float32)
-            arrays |= {name: found["d_film"][:, k] for k, name in enumerate(D_FILM)}
-        places: dict[str, int] = {}
-        for name, array in arrays.items():
-            address, step = array.ctypes.data, array.strides[0]
-            places |= {row: address + k * step for k, row in enumerate(row_names(name, len(array)))}
-        given, out = (
-            np.array([places[r] for r in rows], np.uintp) for rows in (self._signature.per_ray, self._signature.outputs)
-        )
-        numbers, table = self._numbers.ctypes.data, self._table.ctypes.data
-        self._call(count, given.ctypes.data, numbers, table, len(self._table), out.ctypes.data, places["status"])
-        return found
+        if D_FILM[0] not in self.rows:
+            return super().__call__(rays, into)
+        both = np.empty((6, 2, next(iter(rays.values())).shape[1]), np.float32)
+        found = super().__call__(rays, {name: both[:, k] for k, name in enumerate(D_FILM)})
+        return {name: a for name, a in found.items() if name not in D_FILM} | {"d_film": both}

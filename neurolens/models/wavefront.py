@@ -8,6 +8,7 @@ the plane wave of the direction d from R to S, which the model has, and (S - F) 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.status import DOMAIN_SLACK
+from neurolens.graph.compiled import CompiledGraph
+from neurolens.graph.compiler import has_compiler
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.models.assemble import EXACT, DirectionSeries, light_field, scene_ray, units_of
@@ -30,8 +33,10 @@ _RAYS = 28  # along a side of the box about what passes
 _LINE = np.linspace(-1, 1, _RAYS)
 _SQUARE = np.stack(np.meshgrid(_LINE, _LINE)).reshape(2, -1)
 _ROOM = 1.1  # the box over what passes
-_CHUNK = 4096  # rays whose terms fit the cache
 _AT_ONCE = 4  # places whose rays are evaluated in one go
+_FAR_UM = 1e30
+# Graphs of models, and the same compiled where the machine has a compiler.
+_KNOWN: WeakKeyDictionary[Phased, tuple[Graph, CompiledGraph | None]] = WeakKeyDictionary()
 # Rays up to so many radii of stop and rims count: before they are led to the source (the second: may pass), and after.
 _NEAR, _ASIDE, _BEYOND = 1.2, 1.04, 1.1
 _RIM = 2.0  # a gate is (height / rim radius)^2 - 1; with this added it stands for a height and a rim of this radius
@@ -85,39 +90,44 @@ def _forwards(cosines: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(1 - (cosines * cosines).sum(0), 1e-6)))
 
 
+def _graph(model: LensModel, core: Phased) -> Graph:
+    """Return the graph that tells all of a ray, also outside the domain of its model."""
+    g = Graph()
+    field = light_field(g, model.encoding, g.input("rays", 5), g.input("film_z_mm", per_call=True))
+    series = DirectionSeries.of(model, EXACT)
+    values = core.build(g, field, units_of(model, series, EXACT))
+    assert values.path_um is not None
+    g.outputs = {
+        "ray": scene_ray(model, values, series, EXACT), "power": values.transmittance,
+        "stop": values.vectors[STOP], "path_um": values.path_um,
+        "status": g.first_failure([(values.path_um, g.constant(_FAR_UM))], [1]).whole(),
+    }  # fmt: skip
+    if values.gates is not None:
+        g.outputs["gates"] = values.gates
+    return g
+
+
 class _Known:
-    """A model whose graph tells all of a ray, also outside its domain."""
+    """A model with its lens as it is set."""
 
     def __init__(self, model: LensModel, core: Phased, scene: Scene, wavelengths_nm: Sequence[float]) -> None:
         self.model, self.core, self.scene, self.waves = model, core, scene, wavelengths_nm
-        g, form = Graph(), EXACT
-        field = light_field(g, model.encoding, g.input("rays", 5), g.input("film_z_mm", per_call=True))
-        series = DirectionSeries.of(model, form)
-        values = core.build(g, field, units_of(model, series, form))
-        assert values.path_um is not None
-        g.outputs = {
-            "ray": scene_ray(model, values, series, form), "power": values.transmittance,
-            "stop": values.vectors[STOP], "path_um": values.path_um,
-        }  # fmt: skip
-        if values.gates is not None:
-            g.outputs["gates"] = values.gates
-        self.graph, self.front = g, np.array([0.0, 0.0, core.front_z_mm])
+        self.front = np.array([0.0, 0.0, core.front_z_mm])
+        if core not in _KNOWN:
+            graph = _graph(model, core)
+            _KNOWN[core] = graph, CompiledGraph.of(graph, {"film_z_mm": 0.0}) if has_compiler() else None
+        self.graph, self.run = _KNOWN[core]
 
     def rays(self, point: Array, cosines: Array, z_mm: float, nm: Array | float) -> dict[str, Array]:
         """Return what the model says of rays through points [2, N] of a plane, by cosines [2, N] of light."""
         slope = cosines / _forwards(cosines)
         pupil = point + slope * (self.model.domain.pupil_z_mm - z_mm)
         rows = np.concatenate([*np.broadcast_arrays(point, pupil), np.broadcast_to(nm, (1, pupil.shape[1]))])
-        film = np.full((1, 1), z_mm)
-        parts = [
-            evaluate(self.graph, {"rays": rows[:, k : k + _CHUNK], "film_z_mm": film})
-            for k in range(0, rows.shape[1], _CHUNK)
-        ]
-        wide = [
-            {name: np.broadcast_to(a, (len(a), max(v.shape[1] for v in part.values()))) for name, a in part.items()}
-            for part in parts
-        ]
-        return {name: np.concatenate([part[name] for part in wide], 1) for name in wide[0]}
+        if self.run is None:
+            found = evaluate(self.graph, {"rays": rows, "film_z_mm": np.full((1, 1), z_mm)})
+            return {name: np.broadcast_to(a, (len(a), pupil.shape[1])) for name, a in found.items()}
+        self.run.numbers[:] = z_mm
+        return {name: a.astype(np.float64) for name, a in self.run({"rays": rows.astype(np.float32)}).items()}
 
     def pupils(self, place: Array) -> list[list[ExitPupil | None]]:
         """Return the pupils of film places [2, P], by place and wavelength; None where no light arrives."""
@@ -219,10 +229,12 @@ class _Known:
         """Return the points P [2, N] of the focal plane whose directions s(P) are these [3, N]."""
         sine = np.hypot(*direction[:2])
         angle, rise = np.arctan2(sine, -direction[2]), np.polynomial.Polynomial(self.core.direction)
+        steep = rise.deriv()
         radius = angle / self.core.direction[0]
         for _ in range(_NEWTON):
             square = radius * radius
-            radius -= (radius * rise(square) - angle) / (rise(square) + 2 * square * rise.deriv()(square))
+            risen = rise(square)
+            radius -= (radius * risen - angle) / (risen + 2 * square * steep(square))
         return direction[:2] * (radius / np.where(sine > 0, sine, 1.0))
 
     def _across(self, foot: Array, axis: Array, source: Array | None) -> tuple[Array, Array | float]:

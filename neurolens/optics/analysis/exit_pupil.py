@@ -31,7 +31,7 @@ Array = NDArray[np.floating[Any]]
 _DEGREE = 14  # of the polynomials
 _FEWEST = 240  # the fewest rays for their 120 terms
 _BEYOND = 1.15  # rays up to so many radii of a rim count for the polynomials
-_PARTS = 8  # of a cell along its side, where an edge crosses it
+_PARTS = 6  # of a cell along its side, where an edge crosses it
 _ROOM = 1.1  # the box of cosines over the rays that pass, between which edges lie
 _ELLIPSE = 0.96  # the part of a box's ellipse in which all rays of a model count, where no rim cuts them
 _FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
@@ -136,7 +136,8 @@ def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.flo
     part = (np.arange(_PARTS) + 0.5) / _PARTS
     ways = np.stack([np.outer(a, b).reshape(-1) for b in (1 - part, part) for a in (1 - part, part)]).astype(np.float32)
     ends = np.stack([at[w, :, i, j], at[w, :, i + 1, j], at[w, :, i, j + 1], at[w, :, i + 1, j + 1]], -1)
-    inside = _lets(aperture, limits[w], ends @ ways).astype(np.float32)
+    parts = (ends.reshape(-1, 4) @ ways).reshape(*ends.shape[:2], -1)  # one product of matrices, not one for each edge
+    inside = _lets(aperture, limits[w], parts).astype(np.float32)
     whole = (count == 4).astype(np.float32)
     t = part - 0.5
     near = np.stack([t * (t - 1) / 2, 1 - t * t, t * (t + 1) / 2])

@@ -1,0 +1,72 @@
+"""Graphs that run as compiled C on arrays of rays."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.graph.c import Signature, write_blocks
+from neurolens.graph.compiler import load_compiled
+from neurolens.graph.ir import Graph
+from neurolens.graph.program import Program, row_names
+from neurolens.graph.scalars import lower
+
+Floats = NDArray[np.float32]
+# Programs of more steps are not compiled. gcc 12 takes 48 s for 7100 steps in one loop, and its time grows faster than
+# their number; in parts (`PartWriter`) 20 s for 18,000: the gradients of an exact lens of 56 refractions.
+MAX_STEPS, MAX_STEPS_IN_PARTS = 12_000, 24_000
+
+
+class CompiledGraph:
+    """Runs a program as a compiled function.
+
+    Args:
+        program: what is compiled, with a status.
+        rows: how many rows each result has, which the program gives one by one.
+        numbers: inputs of a whole call.
+        table: that lookups read.
+
+    Attributes:
+        numbers: inputs of a whole call, in their order; they may be changed.
+        rows: rows and kind of each result.
+    """
+
+    def __init__(self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: Floats) -> None:
+        most = MAX_STEPS_IN_PARTS if program.waits() else MAX_STEPS
+        if len(program.steps) > most:
+            raise InputError("compiled camera", "steps", len(program.steps), f"up to {most} for a compiler")
+        self.rows = {name: (count, np.int32 if name == "status" else np.float32) for name, count in rows.items()}
+        self._signature = s = Signature.of(program, "camera")
+        self.numbers, self._table = np.array([numbers[name] for name in s.per_call], np.float32), table
+        self._call = load_compiled(write_blocks(program, "camera")).camera
+        pointer = ctypes.c_void_p
+        self._call.argtypes = [ctypes.c_size_t, pointer, pointer, pointer, ctypes.c_int, pointer, pointer]
+        self._call.restype = None
+
+    @classmethod
+    def of(cls, graph: Graph, numbers: dict[str, float], table: Floats | None = None) -> Self:
+        """Compile the program of a graph; without a table it has no lookups."""
+        rows = {name: value.rows for name, value in graph.outputs.items()}
+        program = lower(graph).in_order_of_need()
+        return cls(program, rows, numbers, np.zeros((1, 1, 8), np.float32) if table is None else table)
+
+    def __call__(self, rays: dict[str, Floats], into: Mapping[str, Floats] | None = None) -> dict[str, NDArray[Any]]:
+        """Return the results [R, N] for inputs [R, N]; those in `into` are written there."""
+        count = next(iter(rays.values())).shape[1]
+        found: dict[str, NDArray[Any]] = dict(into or {})
+        found |= {name: np.empty((rows, count), kind) for name, (rows, kind) in self.rows.items() if name not in found}
+        places: dict[str, int] = {}
+        for name, array in (rays | found).items():
+            address, step = array.ctypes.data, array.strides[0]
+            places |= {row: address + k * step for k, row in enumerate(row_names(name, len(array)))}
+        given, out = (
+            np.array([places[r] for r in rows], np.uintp) for rows in (self._signature.per_ray, self._signature.outputs)
+        )
+        numbers, table = self.numbers.ctypes.data, self._table.ctypes.data
+        self._call(count, given.ctypes.data, numbers, table, len(self._table), out.ctypes.data, places["status"])
+        return found
