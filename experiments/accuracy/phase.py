@@ -3,8 +3,8 @@
 Errors are of rays that no fit has seen, in float32, over the whole film and stop: once for 400 to 700 nm and focus at
 infinity, once over all light and focus of the model. Strehl ratios are of the point spread at infinity and 546 nm, on
 the axis and at 0.7 of the film's radius, wide open and two and four stops down, from the model and from traced rays.
-Times are CPU seconds of this machine: of pupils, for nine wavelengths, and of the waves summed over them. 5 to 20 s a
-lens; lenses that are in the table are kept. Writes phase.md and phase.json.
+Times are CPU seconds of this machine, the least of three: of pupils, for nine wavelengths, and of the waves summed over
+them. 5 to 20 s a lens; lenses that are in the table are kept. Writes phase.md and phase.json.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from neurolens.optics.setting.states import set_lens
 
 WITHIN, STREHL_WITHIN, SEEN = 0.05, 0.01, 0.1  # waves; Strehl ratios, of those above the last
 _NM, _STOPS, _FIELDS = 546.0, (1.0, 2.0, 4.0), (0.0, 0.7)
-_FIT, _FRESH, _BATCH, _CELLS = 12_000, 6_000, 8192, 256
+_FIT, _FRESH, _BATCH, _CELLS, _TIMED = 12_000, 6_000, 8192, 256, 3
 
 
 def measure_lens(file: Path) -> Row:
@@ -86,16 +86,18 @@ def _strehls(model: LensModel) -> Row:
                 rows.append({"f_number": widest * closed, "field": share, **ratios})
     low, high = model.domain.wavelength_nm
     waves = [_NM, *np.linspace(max(low, 440.0), min(high, 640.0), 8)]
-    begun = time.process_time()
-    pupils_at(scene, places, waves)
-    traced = time.process_time()
-    made_pupils = model_pupils(model, scene, places, waves)
-    taken = time.process_time()
-    for some in made_pupils:
-        spread(some, np.ones((1, len(waves))), 0.003, 33)
-    summed = time.process_time()
-    times = [(b - a) / len(places) for a, b in ((begun, traced), (traced, taken), (taken, summed))]
-    return {"strehl": rows, "cpu_s": dict(zip(("traced", "model", "waves"), times, strict=True))}
+    times = []
+    for _ in range(_TIMED):
+        begun = time.process_time()
+        pupils_at(scene, places, waves)
+        traced = time.process_time()
+        made_pupils = model_pupils(model, scene, places, waves)
+        taken = time.process_time()
+        for some in made_pupils:
+            spread(some, np.ones((1, len(waves))), 0.003, 33)
+        summed = time.process_time()
+        times.append([(b - a) / len(places) for a, b in ((begun, traced), (traced, taken), (taken, summed))])
+    return {"strehl": rows, "cpu_s": dict(zip(("traced", "model", "waves"), np.min(times, 0).tolist(), strict=True))}
 
 
 def _strehl(pupil: ExitPupil) -> float:
