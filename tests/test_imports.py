@@ -61,7 +61,7 @@ LEAN_MODULES = {
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
     "__init__": 25, "__main__": 4, "base": 2020, "graph": 2660, "optics": 10060, "models": 4560, "cameras": 4260,
-    "pictures": 7590, "programs": 2760, "studies": 3330, "cli": 4265, "front": 210,
+    "pictures": 7590, "programs": 2760, "studies": 3175, "cli": 4265, "front": 210,
 }  # fmt: skip
 SLACK = 1.03
 
