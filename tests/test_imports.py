@@ -133,8 +133,9 @@ def test_imports_go_one_way() -> None:
     assert not wrong
 
 
-def test_no_imports_go_in_a_circle() -> None:
-    """Those inside functions and those for types alone count, too."""
+@cache
+def import_graph() -> dict[str, set[str]]:
+    """The modules that each module imports, inside functions and for types alone, too."""
     graph, known = {}, imports().keys()
     for path in MODULES:
         found = set()
@@ -143,11 +144,25 @@ def test_no_imports_go_in_a_circle() -> None:
                 names = {f"{node.module}.{alias.name}" for alias in node.names}
                 found |= names & known or {str(node.module)}
         graph[module_name(path)] = (found & known) - {module_name(path), "neurolens"}
-    assert sum(map(len, graph.values())) > len(graph)
+    return graph
+
+
+def test_no_imports_go_in_a_circle() -> None:
+    assert sum(map(len, import_graph().values())) > len(import_graph())
     try:
-        list(TopologicalSorter(graph).static_order())
+        list(TopologicalSorter(import_graph()).static_order())
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_training_reaches_no_renderer() -> None:
+    """Only who wants the pictures of an experiment hands it what renders them."""
+    reached, waiting = set[str](), ["neurolens.studies.train"]
+    while waiting:
+        new = import_graph()[waiting.pop()] - reached
+        reached |= new
+        waiting += new
+    assert "neurolens.models.fit" in reached and not [m for m in reached if m.startswith("neurolens.pictures")]
 
 
 def test_rooms_keep_within_their_bounds() -> None:

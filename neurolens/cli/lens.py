@@ -106,7 +106,8 @@ examples:
         from neurolens.models.pairs import domain_of
         from neurolens.optics.readers.any_format import read_any
         from neurolens.optics.setting.states import focus_mode_of, focus_of, set_lens
-        from neurolens.studies.describe import file_doubts, glass_table, layout_profile, lens_facts
+        from neurolens.studies.describe import file_doubts, glass_table, lens_facts
+        from neurolens.studies.plots import layout_profile
 
         began = time.perf_counter()
         with warned(file) as notes:

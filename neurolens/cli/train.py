@@ -124,7 +124,12 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
         words = ["neurolens", "train", *["--lens"] * (self.experiment is None), str(file)]
         words += [] if out is None else ["--output", str(out)]
         command = shlex.join([*words, *(word for change in changes for word in ("--set", change))])
-        return folder, run_experiment(experiment, folder, progress=progress, command=command)
+        renders = None
+        if experiment.render.scenes:
+            from neurolens.studies import scenes
+
+            renders = scenes.renders
+        return folder, run_experiment(experiment, folder, progress=progress, command=command, renders=renders)
 
     def _changes(self) -> list[str]:
         """Return the settings that change in the experiment, KEY=VALUE: by options, then by --set, then by --phase."""

@@ -11,7 +11,7 @@ import io
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +27,6 @@ from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.exact import axial_transmittance, state_of
 from neurolens.models.fitted import Domain
 from neurolens.models.pairs import sample_domain
-from neurolens.optics.analysis import layout
 from neurolens.optics.analysis.bundles import Filled
 from neurolens.optics.analysis.fields import Array, Scene
 from neurolens.optics.analysis.spots import spots, working_f_number
@@ -299,17 +298,6 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
             f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}"
         )
     return sentences
-
-
-def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
-    """Return a lens's section with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
-
-    Args:
-        lens: placed by `set_lens`; else the film is that of the domain's farthest focus.
-    """
-    if lens.film_z_mm is None:
-        lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
-    return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
 
 
 def read_quietly(path: Path) -> Lens:

@@ -6,7 +6,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.base.lensname import lens_id_of
+from neurolens.base.progress import Report
 from neurolens.base.settings import EYE_NM, RANGE, apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.models.fit import ModelSettings, StateSpace, axes_of
 from neurolens.models.fitted import Domain
@@ -194,6 +195,21 @@ class RenderChoice:
     def __post_init__(self) -> None:
         if self.seeds < 4:
             raise InputError("settings", "seeds", self.seeds, "at least 4 renders, for the noise floor")
+
+
+@dataclass
+class Pictures:
+    """What a run has of its pictures, as records for `results.json`; `settings` are those of their errors."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)
+    settings: Mapping[str, float] | None = None
+
+
+# Reads the scenes of a choice for a lens and a domain, and returns what renders them through models, by name, to a
+# folder: `scenes.renders`. A run is handed it, so that training loads no renderer.
+Renders = Callable[[RenderChoice, Lens, Domain], Callable[[Mapping[str, Path], Path, Report], Pictures]]
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,11 @@ from numpy.typing import ArrayLike
 from neurolens.base.errors import InputError
 from neurolens.base.records import NOISY, noisy, pareto_front, time_of
 from neurolens.models.axes import Axis
+from neurolens.models.fitted import Domain
+from neurolens.optics.analysis import layout
+from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.plots import FIELD_COLOURS, INK, drawing, plain_log_ticks
+from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.pages import Record, ns_text, number
 from neurolens.studies.rays import Illumination
 
@@ -35,6 +40,17 @@ _ERRORS = {
 CHOSEN = "#d55e00"
 _RING = {"ms": 13, "mfc": "none", "mec": CHOSEN, "mew": 1.8, "ls": "none"}
 _Point = tuple[float, float, Record, bool]  # time or size, error, the model, whether as C
+
+
+def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
+    """Return a lens's section with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
+
+    Args:
+        lens: placed by `set_lens`; else the film is that of the domain's farthest focus.
+    """
+    if lens.film_z_mm is None:
+        lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
+    return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
 
 
 def family_colour(family: str | None) -> str:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from neurolens.pictures.render.primitives import Rays
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import CameraSettings, Scene, load_scene
 from neurolens.pictures.render.world import world_of
-from neurolens.studies.experiment import RenderChoice
+from neurolens.studies.experiment import Pictures, RenderChoice
 from neurolens.studies.plots import error_scale, log_norm
 
 Image = NDArray[np.float64]
@@ -226,15 +227,6 @@ def side_by_side(
 EXACT = "exact"
 
 
-@dataclass
-class Pictures:
-    """Records for `results.json`: pictures, cameras, figures."""
-
-    images: list[dict[str, Any]] = field(default_factory=list)
-    cameras: list[dict[str, Any]] = field(default_factory=list)
-    figures: list[dict[str, Any]] = field(default_factory=list)
-
-
 def scene_cameras(
     lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings, fused: bool = False
 ) -> dict[str, Camera]:
@@ -270,12 +262,17 @@ def read_scenes(choice: RenderChoice, lens: Lens, domain: Domain) -> list[Scene]
     return scenes
 
 
-def render_all(
+def renders(choice: RenderChoice, lens: Lens, domain: Domain) -> Callable[[Mapping[str, Path], Path, Report], Pictures]:
+    """Read the scenes of an experiment, and return what renders them; see `experiment.Renders`."""
+    return partial(_render_all, choice, read_scenes(choice, lens, domain), lens, domain)
+
+
+def _render_all(
     choice: RenderChoice, scenes: Sequence[Scene], lens: Lens, domain: Domain, models: Mapping[str, Path],
     folder: Path, report: Report,
 ) -> Pictures:  # fmt: skip
     """Render every scene through every camera with several seeds, for the noise floor; pictures are their mean."""
-    records, fused = Pictures(), choice.fused and has_compiler()
+    records, fused = Pictures(settings=SETTINGS), choice.fused and has_compiler()
     done, total = 0, len(scenes) * (3 + len(models)) * choice.seeds
     for scene in scenes:
         film = replace(scene.settings.film, wavelengths="one")  # so that all cameras share their random numbers

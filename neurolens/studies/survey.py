@@ -58,10 +58,11 @@ from neurolens.optics.readers.source import MAX_BYTES, ReadOptions
 from neurolens.optics.setting.check import check_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.studies.check import check_model
-from neurolens.studies.describe import layout_profile, lens_row
+from neurolens.studies.describe import lens_row
 from neurolens.studies.experiment import DomainChoice
 from neurolens.studies.measure import CARD_KEYS, fit_and_measure, fresh_rays
 from neurolens.studies.pages import DASH, Column, flat, table
+from neurolens.studies.plots import layout_profile
 
 SCHEMA = 1
 # A lens that was read is "ok" or "doubtful"; a file that was not read is "refused", or has met a "fault" of neurolens.

@@ -26,8 +26,7 @@ from neurolens.optics.analysis.layout import lens_layout
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.check import card_errors, errors_at, random_states
-from neurolens.studies.describe import layout_profile
-from neurolens.studies.experiment import Experiment, keep_inputs
+from neurolens.studies.experiment import Experiment, Pictures, Renders, keep_inputs
 from neurolens.studies.measure import (
     FRESH,
     MORE,
@@ -40,9 +39,8 @@ from neurolens.studies.measure import (
     what_is_poor,
 )
 from neurolens.studies.pages import CLOSE_UM, exact_of, to_use, write_report
-from neurolens.studies.plots import illumination_plot, states_plot, trade_plot
+from neurolens.studies.plots import illumination_plot, layout_profile, states_plot, trade_plot
 from neurolens.studies.rays import Illumination, pixel_um, relative_illumination
-from neurolens.studies.scenes import SETTINGS, Pictures, read_scenes, render_all
 from neurolens.studies.speed import (
     EXACT,
     Race,
@@ -62,13 +60,14 @@ STATES, RAYS = 16, 8_000
 
 
 def run_experiment(
-    experiment: Experiment, out: str | Path, *, progress: Progress | None = None, command: str = ""
-) -> dict[str, Any]:
+    experiment: Experiment, out: str | Path, *, progress: Progress | None = None, command: str = "",
+    renders: Renders | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Run an experiment and write everything to one folder.
 
     It writes config.toml (resolved), lenses/ (its lens file), models/*.onnx, pictures/, results.json and report.html;
     for a lens in many states states.png in place of pictures. A run that was interrupted goes on when it is started
-    again: existing models are not fitted again.
+    again: existing models are not fitted again. An experiment with scenes needs `renders` (`scenes.renders`).
 
     Returns:
         The results, as in results.json (`records.Results`).
@@ -80,7 +79,10 @@ def run_experiment(
     progress = progress or Progress(quiet=True)
     with warnings.catch_warnings(record=True) as caught, pinned_threads():
         warnings.simplefilter("always")
-        parts = (_of_many_states if experiment.lens.many_states else _of_one_state)(experiment, folder, progress)
+        if experiment.lens.many_states:
+            parts = _of_many_states(experiment, folder, progress)
+        else:
+            parts = _of_one_state(experiment, folder, progress, renders)
     texts = sorted({str(w.message) for w in caught if issubclass(w.category, UserWarning)})
     results = Results(
         title=experiment.title,
@@ -97,13 +99,16 @@ def run_experiment(
     return asdict(results)
 
 
-def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any]:
+def _of_one_state(experiment: Experiment, folder: Path, progress: Progress, renders: Renders | None) -> dict[str, Any]:
     """Return the parts of `records.Results` for a lens in one state."""
     models, pictures = folder / "models", folder / "pictures"
     progress.plan(_plan(experiment))
     lens = experiment.lens.read()
     domain = experiment.domain.of(lens)
-    scenes = read_scenes(experiment.render, lens, domain)
+    drawn, render = Pictures(), None
+    if experiment.render.scenes:
+        assert renders is not None, "scenes, and nothing that renders them"
+        render = renders(experiment.render, lens, domain)
     for each in (models, pictures):  # late, so that an invalid lens leaves no folder
         each.mkdir(parents=True, exist_ok=True)
     settings = keep_inputs(experiment, folder)
@@ -134,10 +139,9 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
             name: relative_illumination(lens, domain, onnx_predictor(load_model(file)), **options)
             for name, file in shown.items()
         }
-    drawn = Pictures()
-    if scenes:
+    if render is not None:
         with progress.stage("render") as report:
-            drawn = render_all(experiment.render, scenes, lens, domain, shown, pictures, report)
+            drawn = render(shown, pictures, report)
     return {
         "lens": _describe_lens(lens),
         "domain": _describe_domain(lens, pairs),
@@ -147,7 +151,7 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
         "exact": exact_records(timed),
         "cameras": [*({"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL if n in timed.ns), *drawn.cameras],
         "images": drawn.images,
-        "image_settings": SETTINGS if drawn.images else None,
+        "image_settings": drawn.settings,
         "figures": _draw(pairs, records, timed, light, pictures, use) + drawn.figures,
     }
 

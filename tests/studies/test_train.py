@@ -18,6 +18,7 @@ from neurolens.models.pairs import make_pairs
 from neurolens.studies import measure
 from neurolens.studies.experiment import default_experiment, read_experiment
 from neurolens.studies.measure import fit_and_measure
+from neurolens.studies.scenes import renders
 from neurolens.studies.train import run_experiment, state_settings
 
 pytestmark = pytest.mark.slow
@@ -62,7 +63,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder.parent)
         experiment = read_experiment(Path(folder.name) / "small.toml")
-        return folder, run_experiment(experiment, Path(folder.name) / "out", progress=Progress(quiet=True))
+        out, quiet = Path(folder.name) / "out", Progress(quiet=True)
+        return folder, run_experiment(experiment, out, progress=quiet, renders=renders)
 
 
 def test_leaves_everything_in_one_folder(run: tuple[Path, dict]) -> None:
@@ -150,7 +152,7 @@ def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict
 def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) -> None:
     (tmp_path / "small.toml").write_text(SMALL.replace("ROOT", str(ROOT)))
     with pytest.raises(InputError, match=field):
-        run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out")
+        run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out", renders=renders)
     assert not (tmp_path / "out").exists()
 
 
