@@ -15,11 +15,11 @@ from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.spots import working_f_number
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.shot import Shot
-from neurolens.pictures.defocus.diffraction import Diffraction
+from neurolens.pictures.defocus.diffraction import Diffraction, channels_of
 from neurolens.pictures.flare.diffraction import far_field
 from neurolens.pictures.flare.exit_pupil import exit_pupil, outline
 from neurolens.pictures.flare.lights import Light
-from neurolens.pictures.render.pictures import read_channels
+from neurolens.pictures.render.pictures import read_channels, write_channels
 
 LENS, NM = "laikin_double_gauss_50", 546.0
 
@@ -127,3 +127,33 @@ def test_kernels_of_bokeh_are_sums_of_waves_or_spread_rays(tmp_path: Path, capsy
     assert sharp.sum() == pytest.approx(1, abs=0.01) and wide.sum() == pytest.approx(1, abs=1e-3)
     area = [np.count_nonzero(kernel > 0.3 * kernel.max()) for kernel in (sharp, wide)]
     assert area[1] > 100 * area[0]
+
+
+def test_a_point_of_a_plate_becomes_airys_disc(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`defocus` keeps its light, and green within a radius is that of Airy's discs of its wavelengths."""
+    size, pixel = 264, 0.003
+    planes = {name: np.zeros((size, size), np.float32) for name in "RGB"} | {
+        "Z": np.full((size, size), 1e4, np.float32)
+    }
+    for name in "RGB":
+        planes[name][132, 132] = 1.0
+    write_channels(tmp_path / "plate.exr", planes)
+    words = ["defocus", tmp_path / "plate.exr", "--lens", LENS, "--film", f"{size * pixel}x{size * pixel}", "--quiet"]
+    words += ["--focus", "inf", "--f-number", 22, "--samples", 64]
+    found = {}
+    for name, more in (("rays", ()), ("waves", ("--diffraction",))):
+        run_json(capsys, *words, *more, "-o", tmp_path / f"{name}.exr")
+        found[name] = read_channels(tmp_path / f"{name}.exr")[0]
+    for name in "RGB":
+        assert found["waves"][name].sum() == pytest.approx(found["rays"][name].sum(), rel=1e-3)
+    made = camera(size * pixel, 22.0)
+    n = working_f_number(Scene(made.lens), NM)  # type: ignore[attr-defined]
+    light, rays = (found[name]["G"] / found[name]["G"].sum() for name in ("waves", "rays"))
+    at = [float((rays.sum(k) * (np.arange(size) + 0.5)).sum()) for k in (1, 0)]
+    part = (np.arange(10 * size) + 0.5) / 10
+    away = np.hypot(part[:, None] - at[0], part - at[1])
+    for radius in (0.015, 0.024, 0.036):  # from the first dark ring on, where pixels of 3 um blur little
+        v = math.pi * radius / (np.array(channels_of("rgb", made.lens)["G"]) * 1e-6 * n)  # type: ignore[attr-defined]
+        inside = (away < radius / pixel).reshape(size, 10, size, 10).mean((1, 3))
+        assert (light * inside).sum() == pytest.approx((1 - j0(v) ** 2 - j1(v) ** 2).mean(), abs=0.01)
+        assert (rays * inside).sum() == pytest.approx(1, abs=1e-3)
