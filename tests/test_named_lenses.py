@@ -103,18 +103,21 @@ def magnification(lens: Lens) -> float:
 def test_lenses_magnify_at_their_nearest_focus_as_makers_state() -> None:
     """Within 3%, where the file's nearest state is within 5% of the product's nearest focus; `misses` names all others.
 
-    A unit focus would not do it: the 135 mm f/1.8 would have 0.39 where 0.25 is stated.
+    Of 50 lenses whose magnification a page states, 36 agree. Of the others, 8 have a table that ends at another
+    distance, 3 are within the digits stated, and 3 are not explained. A unit focus would not do it: the 135 mm f/1.8
+    would have 0.39 where 0.25 is stated.
     """
     table = tomllib.loads((Path(__file__).parent / "data" / "close_focus.toml").read_text(encoding="utf-8"))
-    assert table["pages"].keys() <= table["stated"].keys()
+    by_pages = {name for name, (figure, _) in table["pages"].items() if figure != "nearest"}
+    assert table["stated"].keys() == by_pages | table["makers"].keys()
     missing, agree = set(), 0
-    for name, (stated, limit_m) in table["stated"].items():
+    for name, (stated, limit_m) in (table["stated"] | table["from_memory"]).items():
         nearest_m = nearest_focus_m(focused(name))
         found = magnification(focused_inside(focused(name), 1.00001 * nearest_m))
         near = abs(found / stated - 1) <= 0.03 and abs(nearest_m / limit_m - 1) <= 0.05
-        agree += near
+        agree += near and name in table["stated"]
         missing |= set() if near else {name}
     assert missing == table["misses"].keys()
-    assert agree >= 20
+    assert (agree, len(table["stated"])) == (36, 50)
     film = set_lens(tabled("sony_fe_135mm_f1_8_gm"), focus_m=0.706)
     assert magnification(film) > 1.5 * table["stated"]["sony_fe_135mm_f1_8_gm"][0]

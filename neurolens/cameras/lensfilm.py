@@ -98,13 +98,6 @@ class LensScene:
                 passed[left] = self.passes(turn @ film[:, left], turn @ pupil[:, left], wavelength_nm)
         return passed
 
-    def axial_transmittance(self, wavelength_nm: tuple[float, float]) -> float | None:
-        """Return the axial ray's transmittance at the wavelength nearest the d line; None if the stop blocks it."""
-        axis = np.zeros((2, 1), np.float32)
-        out = self(axis, axis, np.clip([LINE_D_NM], *wavelength_nm).astype(np.float32))
-        through = float(out.transmittance[0])
-        return through if out.status[0] == st.PASSED and 0 < through <= 1 else None
-
     def squeeze(self, height_mm: float, wavelength_nm: tuple[float, float]) -> float | None:
         """Return the squeeze of a lens known by its rays alone.
 
@@ -120,6 +113,25 @@ class LensScene:
         if abs(squeeze - 1) < _ROUND:
             return 1.0
         return squeeze if math.isfinite(squeeze) and squeeze > 0 else None
+
+
+def axial_light(rays: LensRays, shape: tuple[int, int, int], slope: float, stop_mm: float, stopped: int) -> Array:
+    """Return the light [waves] on the axis that a round stop lets to the film, over pi, in surroundings of radiance 1.
+
+    It is the integral of transmittance times the cosine over solid angle; 1 / (4 N^2) for a perfect lens of f-number N.
+
+    Args:
+        rays: from the axial film point, in the order of `shape`: waves, even rings of the pupil, and spokes.
+        slope: of rays to the outer edge of the last ring.
+        stop_mm: radius of the stop. stopped: status of rays that it blocks.
+    """
+    edges = np.square(np.linspace(0, slope, shape[1] + 1))
+    seen = np.isin(rays.status, (st.PASSED, stopped)) & np.isfinite(rays.transmittance)
+    radius = np.hypot(*rays.stop_xy_mm.astype(np.float64)).reshape(shape) / stop_mm
+    with np.errstate(all="ignore"):  # a ring at the stop's edge counts in part
+        share = ((1 - radius) / np.gradient(radius, axis=1) + 0.5).clip(0, 1)
+    light = np.where(seen.reshape(shape) & np.isfinite(share), share * rays.transmittance.reshape(shape), 0.0)
+    return np.asarray(light.mean(axis=2) @ np.diff(edges / (1 + edges)))
 
 
 class LensFilm:

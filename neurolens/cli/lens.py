@@ -298,7 +298,11 @@ class Described(Report):
             ("focusing", *self._focusing()),
             ("rays that pass", f"{100 * facts.passing_share:.1f}%", share_of),
             *(("", f"{100 * e.share:.1f}%", e.text) for e in facts.ended),
-            ("T-stop", "-" if facts.t_stop is None else f"T{cli.number(facts.t_stop)}", "of the axial ray, d line"),
+            (
+                "T-stop",
+                "-" if facts.t_stop is None else f"T{cli.number(facts.t_stop)}",
+                "of all axial light, d line",
+            ),
             ("coatings", facts.coatings or "-", "of the surfaces between glass and air"),
         ]
         if glasses := dict.fromkeys(s.absorbs_as for s in self.surfaces if s.absorbs_as):
@@ -306,7 +310,7 @@ class Described(Report):
             rows.append(("absorption", "assumed", f"that of the nearest catalogue glasses: {names}"))
         if facts.white_rb:
             red, blue = facts.white_rb
-            rows.append(("white card", f"R/G {red:.3f}, B/G {blue:.3f}", "on the axis, in daylight D65"))
+            rows.append(("white card", f"R/G {red:.3f}, B/G {blue:.3f}", "on the axis at this stop, in daylight D65"))
         return _columns(rows)
 
 

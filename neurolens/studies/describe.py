@@ -24,7 +24,7 @@ from neurolens.base.errors import NeurolensError, warned
 from neurolens.base.lensname import maker_of, year_of
 from neurolens.base.report import PART, Report
 from neurolens.base.settings import LIGHT_NM
-from neurolens.cameras.exact import axial_transmittance, state_of
+from neurolens.cameras.exact import light_on_axis, state_of
 from neurolens.models.fitted import Domain
 from neurolens.models.pairs import sample_domain
 from neurolens.optics.analysis.bundles import Filled
@@ -73,8 +73,7 @@ class LensFacts(Report):
         passing_share: share of rays uniform over the domain's film and pupil discs that pass.
         coatings: as `Lens.coatings`.
         groups_reach_m: how near (m, from the film) the lens focuses by its groups; None where it moves as a whole.
-        t_stop: f-number over the root of the share of light at the d line that the axial ray keeps; None where that ray
-            does not pass.
+        t_stop: f-number of a lens without loss that puts as much light of the d line on the axis; None without light.
         white_rb: R/G and B/G (linear sRGB) of a white card on the axis in daylight D65; None without visible light.
         ended: what stops the other rays, largest share first.
         warnings: sentences.
@@ -158,12 +157,13 @@ def lens_facts(lens: Lens, domain: Domain) -> LensFacts:
 def white_rb(lens: Lens) -> tuple[float, float] | None:
     """Return R/G and B/G of a white card on the axis in daylight D65, in linear sRGB, of a lens placed by `set_lens`.
 
-    None where the axial ray does not pass, or the lens is made for other light.
+    It is of all rays through the stop: the film sees a pupil that is wider in blue light than in red, and steep rays
+    meet coatings that pass other colours. None where no ray passes, or the lens is made for other light.
     """
     if not lens.visible:
         return None
     light = SpectralRange(*LIGHT_NM, _BINS)
-    red, green, blue = light.film_rgb(axial_transmittance(lens, light.centres_nm.tolist(), LIGHT_NM))
+    red, green, blue = light.film_rgb(light_on_axis(lens, light.centres_nm.tolist(), LIGHT_NM))
     return (float(red / green), float(blue / green)) if green > 0 else None
 
 

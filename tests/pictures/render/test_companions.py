@@ -17,7 +17,7 @@ from shipped import whole
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, Note
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.exact import ExactCamera, axial_transmittance
+from neurolens.cameras.exact import ExactCamera, light_on_axis
 from neurolens.graph import compiler
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.shot import Shot
@@ -184,7 +184,7 @@ def test_without_vignetting_white_stays_white() -> None:
     assert several @ [0.2126, 0.7152, 0.0722] == pytest.approx(np.ones(several.shape[:2]), abs=0.25)
     # The exposure counts all wavelengths alike, and the eye few of those that glass absorbs.
     lens, nm = set_lens(read_lens(ROOT / "lenses" / f"{GAUSS}.toml")), np.linspace(400, 700, 61)
-    through, eye = axial_transmittance(lens, nm.tolist(), (400.0, 700.0)), np.exp(-0.5 * ((nm - 559) / 42) ** 2)
+    through, eye = light_on_axis(lens, nm.tolist(), (400.0, 700.0)), np.exp(-0.5 * ((nm - 559) / 42) ** 2)
     gain = np.average(through, weights=eye) / through.mean()
     assert 1 < gain < 1.015 and blocks(several) @ [0.2126, 0.7152, 0.0722] == pytest.approx([gain] * 2, abs=4e-3)
 
