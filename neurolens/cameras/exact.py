@@ -22,11 +22,11 @@ from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera
-from neurolens.cameras.lensfilm import LensScene, axial_light
+from neurolens.cameras.lensfilm import Array, LensScene, axial_light, film_slope
 from neurolens.cameras.onnxlens import BATCH, LensRays, LensRun
 from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTable, outline_of, wavelength_between
-from neurolens.cameras.sampling import film_slope, lens_state, t_stop_of
+from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, pruned
 from neurolens.models.assemble import SCALARS, Form
@@ -40,8 +40,7 @@ from neurolens.optics.setting.states import focus_mode_of, focus_of, set_lens
 from neurolens.optics.trace.surfaces import Rays, media
 from neurolens.optics.trace.tracegraph import exact_graph, light_limits
 
-# Rings and spokes of the pupil that tell the light on the axis, and their reach over the first-order pupil's.
-_RINGS, _SPOKES, _WIDER = 192, 8, 1.5
+_TURNS = 8  # azimuths for the light on the axis, where the lens is not round
 
 
 class ExactRun(LensRun):
@@ -219,7 +218,7 @@ def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float |
         pinhole_mm=chief_reach_mm(lens),
         entrance_pupil_mm=film_z - data.entrance_pupil_z_mm,
         f_number=data.f_number,
-        t_stop=t_stop_of(data.f_number, slope, light),
+        transmittance=light / slope**2,
         squeeze=abs(data.efl_mm / first_order(lens, meridian="x").efl_mm) if lens.anamorphic else 1.0,
     )
 
@@ -230,26 +229,23 @@ def light_on_axis(lens: Lens, at_nm: Sequence[float], wavelength_nm: tuple[float
     Args:
         lens: placed by `set_lens`. wavelength_nm: the range in which the wavelengths lie.
     """
-    film_z, stop_mm, plane_z = lens.film_z_mm, float(lens.stop_radius_mm), pupil_plane_z_mm(lens)
+    film_z, plane_z = lens.film_z_mm, pupil_plane_z_mm(lens)
     assert film_z is not None
-    open_ = lens.aperture is None or bool(lens.aperture.inside(np.zeros(1), np.zeros(1), 1.0))
-    if not (open_ and stop_mm > 0):
-        return np.zeros(len(at_nm))
-    seen = [first_order(lens, meridian=meridian) for meridian in ("y", *("x" * lens.anamorphic))]
-    slope = _WIDER * max(abs(film_slope(d.f_number, d.rear_focal_z_mm, d.exit_pupil_z_mm, film_z)) for d in seen)
-    shape = len(at_nm), _RINGS, 1 if lens.round else _SPOKES
-    reach, turn = slope * abs(film_z - plane_z), 2 * np.pi * (np.arange(shape[2]) + 0.5) / shape[2]
-    rays = np.zeros((5, *shape))
-    rays[2:4] = (
-        reach * ((np.arange(_RINGS) + 0.5) / _RINGS)[:, None] * np.stack([np.cos(turn), np.sin(turn)])[:, None, None]
-    )
-    rays[4] = np.asarray(at_nm)[:, None, None]
-    call = {"film_z_mm": np.array([[film_z]]), "stop_radius_mm": np.array([[stop_mm]])}
-    graph = _graph_of_matrices(replace(lens, aperture=None), wavelength_nm)
-    found = evaluate(graph, {"rays": rays.reshape(5, -1)} | call)
-    through = np.broadcast_to(found["transmittance"], (1, rays[0].size))[0]
-    out = LensRays(found["scene_ray"], through, found["stop_xy_mm"], found["status"][0])
-    return axial_light(out, shape, slope, stop_mm, st.blocked(lens.stop_index, st.RIM))
+    graph, nm = _graph_of_matrices(replace(lens, aperture=None), wavelength_nm), np.asarray(at_nm, np.float64)
+    call = {"film_z_mm": np.array([[film_z]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
+
+    def trace(pupil: Array) -> LensRays:
+        rays = np.zeros((5, len(nm), pupil.shape[1]))
+        rays[2:4], rays[4] = pupil[:, None], nm[:, None]
+        found = evaluate(graph, {"rays": rays.reshape(5, -1)} | call)
+        through = np.broadcast_to(found["transmittance"], (1, rays[0].size))[0]
+        return LensRays(found["scene_ray"], through, found["stop_xy_mm"], found["status"][0])
+
+    each = [first_order(lens, meridian=meridian) for meridian in ("y", *("x" * lens.anamorphic))]
+    slope = max(abs(film_slope(d.f_number, d.rear_focal_z_mm, d.exit_pupil_z_mm, film_z)) for d in each)
+    open_ = lens.aperture is None or lens.aperture.inside(np.zeros(1), np.zeros(1), 1.0)
+    of_stop = float(lens.stop_radius_mm), st.blocked(lens.stop_index, st.RIM)
+    return open_ * axial_light(trace, 1 if lens.round else _TURNS, slope, abs(film_z - plane_z), *of_stop)
 
 
 @lru_cache(maxsize=16)  # a camera, its T-stop and its tint ask for the same

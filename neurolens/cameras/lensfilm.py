@@ -7,7 +7,7 @@ pupil and the weights (`cameragraph`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 _ROUND = 0.02  # the squeeze of a model may differ from 1 by this error without a cylinder
 # Points on each side of the square over which the exposure on the axis is integrated.
 _QUADRATURE = 256
+_RINGS, _WIDER = 192, 1.5  # of the pupil, for the light on the axis; their reach over the first-order pupil's
 
 
 @dataclass(frozen=True)
@@ -115,23 +116,35 @@ class LensScene:
         return squeeze if math.isfinite(squeeze) and squeeze > 0 else None
 
 
-def axial_light(rays: LensRays, shape: tuple[int, int, int], slope: float, stop_mm: float, stopped: int) -> Array:
+def axial_light(
+    trace: Callable[[Array], LensRays], turns: int, slope: float, distance_mm: float, stop_mm: float, stopped: int
+) -> Array:
     """Return the light [waves] on the axis that a round stop lets to the film, over pi, in surroundings of radiance 1.
 
     It is the integral of transmittance times the cosine over solid angle; 1 / (4 N^2) for a perfect lens of f-number N.
 
     Args:
-        rays: from the axial film point, in the order of `shape`: waves, even rings of the pupil, and spokes.
-        slope: of rays to the outer edge of the last ring.
+        trace: takes points of the pupil [2, N] to rays of the axial film point, [waves * N].
+        turns: azimuths; 1 where the lens is round.
+        slope: `film_slope`. distance_mm: from pupil to film.
         stop_mm: radius of the stop. stopped: status of rays that it blocks.
     """
-    edges = np.square(np.linspace(0, slope, shape[1] + 1))
+    edges, turn = _WIDER * abs(slope) * np.linspace(0, 1, _RINGS + 1), 2 * np.pi * (np.arange(turns) + 0.5) / turns
+    middle = 0.5 * distance_mm * (edges[1:] + edges[:-1])[:, None]
+    rays = trace(np.stack([middle * np.cos(turn), middle * np.sin(turn)]).reshape(2, -1))
+    shape = -1, _RINGS, turns
     seen = np.isin(rays.status, (st.PASSED, stopped)) & np.isfinite(rays.transmittance)
     radius = np.hypot(*rays.stop_xy_mm.astype(np.float64)).reshape(shape) / stop_mm
     with np.errstate(all="ignore"):  # a ring at the stop's edge counts in part
         share = ((1 - radius) / np.gradient(radius, axis=1) + 0.5).clip(0, 1)
-    light = np.where(seen.reshape(shape) & np.isfinite(share), share * rays.transmittance.reshape(shape), 0.0)
-    return np.asarray(light.mean(axis=2) @ np.diff(edges / (1 + edges)))
+        light = np.where(seen.reshape(shape) & np.isfinite(share), share * rays.transmittance.reshape(shape), 0.0)
+    return np.asarray(light.mean(axis=2) @ np.diff(edges**2 / (1 + edges**2)))
+
+
+def film_slope(f_number: float, rear_focal_z_mm: float, exit_pupil_z_mm: float, film_z_mm: float) -> float:
+    """Return the slope at the film of the paraxial ray through the stop's edge: 1 / (2 N) at the rear focal point."""
+    pupil = exit_pupil_z_mm - rear_focal_z_mm
+    return 0.5 / f_number / (1 - (film_z_mm - rear_focal_z_mm) / pupil if math.isfinite(pupil) else 1)
 
 
 class LensFilm:

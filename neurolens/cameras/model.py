@@ -21,11 +21,11 @@ from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import kept_outline, searching_code
 from neurolens.cameras.lenscamera import LensCamera
-from neurolens.cameras.lensfilm import LensScene, axial_light
+from neurolens.cameras.lensfilm import Array, LensScene, axial_light, film_slope
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
-from neurolens.cameras.sampling import beyond_circle, common_light, film_slope, lens_state, t_stop_of
+from neurolens.cameras.sampling import beyond_circle, common_light, lens_state
 from neurolens.models.assemble import ONNX, SCALARS, Form
 from neurolens.models.card import state_for
 from neurolens.models.file import coefficients_text
@@ -280,27 +280,28 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
     breathes = any(a.name == "focus" for a in model.axes)
     squeeze = scene.squeeze(_SQUEEZED * radius, wavelength_nm)
     slope = film_slope(f_number, focal_points[1], exit_z, film_z)
-    light = _light_on_axis(scene, float(np.clip(LINE_D_NM, *wavelength_nm)), 1 if squeeze == 1.0 else _SPOKES)
+    light = _light_on_axis(scene, float(np.clip(LINE_D_NM, *wavelength_nm)), 1 if squeeze == 1.0 else _SPOKES, slope)
     return lens_state(
         nominal_mm=None if breathes else efl,
         efl_mm=efl,
         pinhole_mm=paraxial.reach_mm(efl, front_efl, focal_points, entrance, film_z),
         entrance_pupil_mm=film_z - entrance,
         f_number=f_number,
-        t_stop=t_stop_of(f_number, slope, light),
+        transmittance=light / slope**2,
         squeeze=squeeze,
     )
 
 
-def _light_on_axis(scene: ModelScene, wavelength_nm: float, spokes: int) -> float:
+def _light_on_axis(scene: ModelScene, wavelength_nm: float, turns: int, slope: float) -> float:
     """Return `axial_light`; 0 where nothing passes or the stop's shape is closed on the axis."""
-    if scene.aperture is not None and not scene.aperture.inside(np.zeros(1), np.zeros(1), 1.0):
-        return 0.0
-    domain, stop_mm = scene.lens.card["domain"], scene.stop_radius_mm
-    pupil = _axial_pupil(domain, stop_mm, spokes).astype(np.float32)
-    out = replace(scene, aperture=None)(np.zeros_like(pupil), pupil, np.full(pupil.shape[1], wavelength_nm, np.float32))
-    slope = float(np.hypot(*pupil[:, -1])) / (1 - 0.5 / _RINGS) / abs(scene.film_z_mm - domain["pupil_z_mm"])
-    return float(axial_light(out, (1, _RINGS, spokes), slope, stop_mm, scene.stopped)[0])
+
+    def trace(pupil: Array) -> LensRays:
+        points, waves = pupil.astype(np.float32), np.full(pupil.shape[1], wavelength_nm, np.float32)
+        return replace(scene, aperture=None)(np.zeros_like(points), points, waves)
+
+    distance_mm = abs(scene.film_z_mm - scene.lens.card["domain"]["pupil_z_mm"])
+    light = axial_light(trace, turns, slope, distance_mm, scene.stop_radius_mm, scene.stopped)
+    return float(light[0] * (scene.aperture is None or scene.aperture.inside(np.zeros(1), np.zeros(1), 1.0)))
 
 
 def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float, spokes: int) -> FloatArray:

@@ -198,7 +198,7 @@ def lens_state(
     pinhole_mm: float,
     entrance_pupil_mm: float,
     f_number: float,
-    t_stop: float | None,
+    transmittance: float | None = 1.0,
     squeeze: float | None = 1.0,
 ) -> dict[str, Any]:
     """Return the table `lens_state` of a camera's settings; None where a number is not defined.
@@ -208,9 +208,10 @@ def lens_state(
         efl_mm, pinhole_mm: as in the module.
         entrance_pupil_mm: distance from the film towards the scene.
         f_number: focal length over the entrance pupil's diameter in this state.
-        t_stop: that of a perfect lens which puts as much light of the d line on the axis; see `t_stop_of`.
+        transmittance: light on the axis over that of a lens without loss or aberrations.
         squeeze: as in the module.
     """
+    t_stop = f_number / math.sqrt(transmittance) if transmittance else None
     engraved = None if nominal_mm is None else round(abs(nominal_mm), 0 if abs(nominal_mm) >= 10 else 1)
     found = {
         "nominal_focal_length_mm": engraved,
@@ -232,21 +233,4 @@ def ideal_state(
     It has no engraved figures, all light passes, and the pupil lies where the pinhole would be.
     """
     pupil = pinhole_mm if entrance_pupil_mm is None else entrance_pupil_mm
-    own = {"f_number": f_number, "t_stop": f_number}
-    return lens_state(nominal_mm=None, efl_mm=efl_mm, pinhole_mm=pinhole_mm, entrance_pupil_mm=pupil, **own)
-
-
-def film_slope(f_number: float, rear_focal_z_mm: float, exit_pupil_z_mm: float, film_z_mm: float) -> float:
-    """Return the slope at the film of the paraxial ray through the stop's edge: 1 / (2 N) at the rear focal point."""
-    pupil = rear_focal_z_mm - exit_pupil_z_mm
-    nearer = pupil / (pupil + film_z_mm - rear_focal_z_mm) if math.isfinite(pupil) else 1.0
-    return 0.5 * nearer / f_number
-
-
-def t_stop_of(f_number: float, slope: float, light: float) -> float | None:
-    """Return the f-number over the root of the share of the light that a lens without loss or aberrations would pass.
-
-    Args:
-        slope: `film_slope`. light: on the axis, over pi, of all rays through the stop; None is returned where it is 0.
-    """
-    return f_number * abs(slope) / math.sqrt(light) if light > 0 else None
+    return lens_state(nominal_mm=None, efl_mm=efl_mm, pinhole_mm=pinhole_mm, entrance_pupil_mm=pupil, f_number=f_number)
