@@ -139,12 +139,13 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     decisions: list[dict[str, Any]] = []
     sizes, fitted = list[Path](), list[Path]()
     for number, target in enumerate(TARGETS):
-        # fits are the same for all targets
-        known, place = ([*case.shipped(), *fitted], None) if number else (case.shipped(), folder)
-        picks = {b: choices.candidates(probed, b, target, models=known, folder=place) for b in BUDGETS}
+        picks = dict[float, tuple[choices.Choice, ...]]()
+        for budget in sorted(BUDGETS):  # what was fitted for the least budget serves all, and all targets
+            known, place = ([*case.shipped(), *fitted], None) if fitted else (case.shipped(), folder)
+            picks[budget] = choices.candidates(probed, budget, target, models=known, folder=place)
+            fitted += [folder / f"{c.name}.onnx" for c in picks[budget] if c.how == choices.FITTED]
         # of a camera that was tried for several budgets, what is timed
         every = {c.name: c for c in sorted(sum(picks.values(), ()), key=lambda c: -c.ns)}
-        fitted = [folder / f"{c.name}.onnx" for c in every.values() if c.how == choices.FITTED]
         report(0.2 + 0.3 * number)
         every |= {c.name: c for c in _more(probed, target, folder, every, sizes, case.shipped())}
         report(0.3 + 0.3 * number)

@@ -6,7 +6,6 @@ shot of a lens alone: to its film, stop, focus and light.
 
 from __future__ import annotations
 
-import bisect
 import math
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -228,14 +227,14 @@ def shot_fits(probed: Probe, folder: Path) -> Callable[[int], Path]:
     return fit
 
 
-def _fitted(probed: Probe, folder: Path, target: Target, budget_px: float) -> list[Choice]:
-    """Fit polynomials for the shot alone: the smallest that meets the budget, and those tried on the way to it."""
-    fit, tried = shot_fits(probed, folder), list[Choice]()
+def _fitted(probed: Probe, folder: Path, target: Target, budget_px: float) -> Iterator[Choice]:
+    """Fit polynomials for the shot alone, from the smallest up to the first that meets the budget.
 
-    def holds(terms: int) -> bool:
+    Errors do not always fall with the size: a small model may place its film better than a larger one.
+    """
+    fit = shot_fits(probed, folder)
+    for terms in TERMS:
         if choice := model_judged(probed, fit(terms), target, FITTED):
-            tried.append(choice)
-        return choice is not None and choice.meets(budget_px)
-
-    bisect.bisect_left(TERMS, True, key=holds)
-    return tried
+            yield choice
+            if choice.meets(budget_px):
+                return
