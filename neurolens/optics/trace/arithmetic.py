@@ -37,7 +37,7 @@ class Arithmetic:
     Attributes:
         guard: whether lost rays stay finite, which derivatives and recorded crossings need.
         finite: whether totally reflected rays stay finite; where `guard` is set, they do anyway.
-        polish: how many steps an iteration takes after the one that decides whether it has converged.
+        polish: how many steps an iteration takes after the one that decides whether it has converged; 0 in float32.
     """
 
     guard = finite = False

@@ -335,7 +335,7 @@ def refract(
             o.fma(bend, met.x, r.dx, pull), o.fma(bend, met.y, r.dy, pull),
             o.add_to(o.fma(bend, sense, r.dz), bend, met.z, pull),
         ]  # fmt: skip
-    if after is AIR:
+    if after is AIR and not o.polish:
         # The rounding of dz changes the length of a direction, and long gaps multiply that change: in float32 it was
         # nearly all error of a telephoto. In air, where the length is 1, dz makes up for it, exactly so along the axis.
         excess = o.dot(direction, direction) - 1.0
