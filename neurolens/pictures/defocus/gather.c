@@ -35,7 +35,7 @@ enum { NOTHING, MET, HIDDEN };
 
 ALWAYS float lesser(float a, float b) { return a < b ? a : b; }
 ALWAYS float larger(float a, float b) { return a > b ? a : b; }
-ALWAYS int clamped(float v, int n) { return v > 0.0f ? v < n ? (int)v : n - 1 : 0; }
+ALWAYS int clamped(float v, int n) { return (int)lesser(larger(v, 0.0f), n - 1); }
 
 ALWAYS float depth_at(const struct layer *p, int x, int y) { return p->texel[4 * ((size_t)y * p->width + x) + 3]; }
 
@@ -50,13 +50,14 @@ ALWAYS void narrow(const struct layer *p, struct line r, float *low, float *high
         int level = 0;
         while (1 << (FINEST + level) < span && level < p->levels - 1) level++;
         const int shift = FINEST + level, wide = (p->width + (1 << shift) - 1) >> shift;
-        float least = INFINITY, most = -INFINITY;
-        for (int j = y0 >> shift; j <= y1 >> shift; j++)
-            for (int i = x0 >> shift; i <= x1 >> shift; i++) {
-                const float *const b = p->bounds + 2 * (p->start[level] + (size_t)j * wide + i);
-                least = lesser(least, b[0]);
-                most = larger(most, b[1]);
-            }
+        /* The line crosses four of these cells at most. Where it crosses fewer, some count twice, which is faster than
+           to ask how many there are. */
+        const float *const cells = p->bounds + 2 * p->start[level];
+        const float *const top = cells + 2 * (size_t)(y0 >> shift) * wide;
+        const float *const end = cells + 2 * (size_t)(y1 >> shift) * wide;
+        const int a = 2 * (x0 >> shift), b = 2 * (x1 >> shift);
+        const float least = lesser(lesser(top[a], top[b]), lesser(end[a], end[b]));
+        const float most = larger(larger(top[a + 1], top[b + 1]), larger(end[a + 1], end[b + 1]));
         const float before = *high - *low;
         *low = larger(*low, least);
         *high = lesser(*high, most);
@@ -115,21 +116,35 @@ ALWAYS int follow(const struct layer *p, struct line r, float low, float *w, int
     return *w >= 0.0f ? HIDDEN : NOTHING;
 }
 
-/* What a layer shows at a point of inverse depth w: the pixels around it, but those of other surfaces. */
-ALWAYS float colour(const struct layer *p, float x, float y, float w, int px, int py, int channel)
+/* What a layer shows in red, green and blue at a point of inverse depth w: for each, the pixels around the place that its
+   own line, at `place` in `ray`, sees there, but those of other surfaces. `px`, `py` is the pixel that was met. There is a
+   fourth value, which counts for nothing, because compilers make vectors of four. */
+ALWAYS void colours(
+    const struct layer *p, const float *ray, const int place[4], float w, int px, int py, float value[4])
 {
-    const float s = x - 0.5f, t = y - 0.5f, left = floorf(s), top = floorf(t), fx = s - left, fy = t - top;
-    const float reach = 1.5f * p->jump[(size_t)py * p->width + px];
-    float sum = 0.0f, part = 0.0f;
-    for (int k = 0; k < 4; k++) {
-        const int i = clamped(left + (k & 1) + 0.5f, p->width), j = clamped(top + (k >> 1) + 0.5f, p->height);
-        const float *const texel = p->texel + 4 * ((size_t)j * p->width + i);
-        if (!(fabsf(texel[3] - w) <= reach)) continue;
-        const float share = (k & 1 ? fx : 1.0f - fx) * (k >> 1 ? fy : 1.0f - fy);
-        sum += share * texel[channel];
-        part += share;
+    const size_t met = (size_t)py * p->width + px;
+    const float reach = 1.5f * p->jump[met];
+    float fx[4], fy[4], sum[4] = { 0.0f }, part[4] = { 0.0f };
+    int column[2][4], row[2][4];
+    for (int c = 0; c < 4; c++) {
+        const float *const q = ray + place[c];
+        const float s = q[0] + q[2] * w - 0.5f, t = q[1] + q[3] * w - 0.5f, left = floorf(s), top = floorf(t);
+        fx[c] = s - left;
+        fy[c] = t - top;
+        for (int k = 0; k < 2; k++) {
+            column[k][c] = clamped(left + k + 0.5f, p->width);
+            row[k][c] = clamped(top + k + 0.5f, p->height);
+        }
     }
-    return part > 0.05f ? sum / part : p->texel[4 * ((size_t)py * p->width + px) + channel];
+    for (int k = 0; k < 4; k++)
+        for (int c = 0; c < 4; c++) {
+            const float *const texel = p->texel + 4 * ((size_t)row[k >> 1][c] * p->width + column[k & 1][c]);
+            const float near = (k & 1 ? fx[c] : 1.0f - fx[c]) * (k >> 1 ? fy[c] : 1.0f - fy[c]);
+            const float share = fabsf(texel[3] - w) <= reach ? near : 0.0f;
+            sum[c] += share * texel[c];
+            part[c] += share;
+        }
+    for (int c = 0; c < 4; c++) value[c] = part[c] > 0.05f ? sum[c] / part[c] : p->texel[4 * met + c];
 }
 
 /* The rays of a place on the film, of one point of the pupil: between those of the four nodes around it that pass. */
@@ -152,7 +167,9 @@ void gather(
     const struct layer *layers, int count, struct table t, int width, int first, int rows, const uint8_t *sizes,
     float *sums)
 {
-    static const uint8_t place[3] = { 1, 0, 2 }, order[16] = { 0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5 };
+    /* where red, green and blue begin in a ray */
+    const int red = t.channels > 1 ? NUMBERS : 0, place[4] = { red, 0, 2 * red, 0 };
+    static const uint8_t order[16] = { 0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5 };
     const size_t node = (size_t)t.samples * t.stride;
     for (int y = 0; y < rows; y++)
         for (int x = 0; x < width; x++) {
@@ -185,12 +202,12 @@ void gather(
                     py = at_y;
                     p = layers + k;
                 }
+                float value[4] = { 0.0f };
+                if (met == MET) colours(p, ray, place, w, px, py, value);
+                else if (met == HIDDEN) memcpy(value, p->texel + 4 * ((size_t)py * p->width + px), sizeof value);
                 for (int c = 0; c < 3; c++) {
-                    const float *const q = ray + (t.channels > 1 ? NUMBERS * place[c] : 0);
-                    float value = met == NOTHING ? 0.0f : p->texel[4 * ((size_t)py * p->width + px) + c];
-                    if (met == MET) value = colour(p, q[0] + q[2] * w, q[1] + q[3] * w, w, px, py, c);
-                    sum[c] += q[4] * value;
-                    sum[3 + c] += q[4];
+                    sum[c] += ray[place[c] + WEIGHT] * value[c];
+                    sum[3 + c] += ray[place[c] + WEIGHT];
                 }
                 const float sx = line.ax + line.bx * w, sy = line.ay + line.by * w;
                 sum[6] += met == HIDDEN ? ray[WEIGHT] : 0.0f;
