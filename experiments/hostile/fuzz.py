@@ -68,8 +68,8 @@ OPTIONS = (
 )
 
 
-# of a command whose --quiet was damaged, and of one that assumes what is not given
-_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: )")
+# of a command whose --quiet was damaged: what it did, assumed and compiled
+_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: |compiled )")
 _TOLD = re.compile(r"neurolens: (warning: |'.*' is )")  # a warning, or which lens some words mean
 
 
