@@ -26,7 +26,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
 from neurolens.cli import main
 from neurolens.optics.lens.shot import Shot
-from neurolens.pictures.defocus.kernels import kernel_at, own_plate
+from neurolens.pictures.defocus.kernels import kernel_at, own_plate, tint
 from neurolens.pictures.defocus.picture import Gathered, defocus
 from neurolens.pictures.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
 from neurolens.pictures.render.pictures import read_exr, write_png
@@ -144,6 +144,7 @@ def point_light(field_mm: float, distance_m: float, samples: int = 32768) -> lab
     place, ahead = (fine[0] / 2, fine[1] / 2 - field_mm * _PER_MM * _FINER), distance_m - pinhole.before_film_mm / 1000
     kernel = kernel_at(camera, plate, place, 1 / ahead, place)
     assert kernel is not None
+    kernel = kernel.tinted(tint(camera))
     scene = (
         "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 1\n[environment]\ncolour = [0, 0, 0]\n"
         f"[[spheres]]\ncentre_m = [0, {(fine[1] / 2 - place[1]) / pinhole.reach_px[1] * ahead}, {-distance_m}]\n"

@@ -37,6 +37,7 @@ from neurolens.pictures.defocus.plate import (
     turned,
 )
 from neurolens.pictures.flare.canvas import LOST, draw_edges, edges_of
+from neurolens.pictures.render.colour import SpectralRange
 
 Array = NDArray[np.float64]
 _STEP_MM = 0.01  # of differences on the pupil's plane
@@ -52,6 +53,7 @@ _MARGIN = 2  # dark pixels around a kernel
 _A_GROOVE, _FINEST = 8, 1536  # cells for each groove of an asphere, and the most along a side
 _FINER = 3  # an odd number of boxes along a pixel's side, which show grooves finer than a pixel
 _LARGEST = 16384  # pixels a side of an atlas
+_TINT, _TINT_PUPIL = 64, 8  # wavelengths of white light, and points along both sides of the pupil at each
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,10 @@ class Kernel:
         found[y + rows.start :, x + columns.start :][: part.shape[0], : part.shape[1]] = part
         return np.asarray(found / np.maximum(self.energy, 1e-30), np.float32)
 
+    def tinted(self, by: Array) -> Kernel:
+        """Return the kernel of a white point, with the colour that the matrix of `tint` gives white light."""
+        return replace(self, light=np.maximum(self.light @ by.T, 0).astype(np.float32))
+
     @property
     def energy(self) -> Array:
         """Return the light of red, green and blue."""
@@ -174,7 +180,7 @@ def kernel_at(
     else:
         nm = table.nm[:, :1]
     aimed = _aimed(table, place_px, inverse_depth, guess_px, nm.reshape(-1))
-    aimed = aimed.on_grid(nm.size, cells)
+    aimed = aimed.on_grid(_edge(table, aimed.place, nm.reshape(-1)), cells)
     if grooves is not None:
         aimed = aimed.with_rings(table, nm.reshape(-1), grooves)
     lit = aimed.weight > 0
@@ -240,17 +246,18 @@ class _Aimed:
     slope: Array
     film_by_plate: Array
 
-    def on_grid(self, waves: int, cells: int) -> _Aimed:
-        """Return the rays as grids; places are extrapolated from `_RIM` to the outline, along the pupil's radii."""
+    def on_grid(self, edge: Array, cells: int) -> _Aimed:
+        """Return the rays as grids, from `_RIM` extrapolated along the pupil's radii to the edge at each wavelength."""
         place, weight, slope = (
-            v.reshape(*v.shape[:-1], waves, cells + 1, -1) for v in (self.place, self.weight, self.slope)
+            v.reshape(*v.shape[:-1], len(edge), cells + 1, -1) for v in (self.place, self.weight, self.slope)
         )
+        edge = edge[:, None, None]
         index, nearer = np.arange(cells + 1) - cells / 2, 1 - 2 / cells
         far, near = (np.hypot(*_disk(2 / cells * k * index)) for k in (1, nearer))
         within = _between(place, cells / 2 + nearer * index)
         solid = (weight > 0) & (_between(weight > 0, cells / 2 + nearer * index) > 1 - 1e-9) & (far > 0)
-        more = (1 / _RIM - 1) * far / np.where(far > 0, far - near, 1) * (place - within)
-        return _Aimed(place + np.where(solid, more, 0), weight, slope, self.film_by_plate)
+        more = (edge / _RIM - 1) * far / np.where(far > 0, far - near, 1) * (place - within)
+        return _Aimed(place + np.where(solid, more, 0), weight * edge**2, slope, self.film_by_plate)
 
     def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], colour: Array, finer: int) -> None:
         """Add the light of a wavelength to a kernel's picture, by quarters of the pupil.
@@ -301,6 +308,23 @@ class _Aimed:
         return np.asarray(np.linalg.lstsq(basis, self.slope[:, lit].T, rcond=None)[0].T)
 
 
+def _edge(table: RayTable, place: Array, nm: FloatArray) -> Array:
+    """Return how far out in the pupil's outline the light reaches, as the radius of a disk, for each wavelength.
+
+    An outline holds all rays that pass, and is a little larger. The light of points between `_RIM` and the outline, at
+    golden steps of area, beside that of points at `_RIM` tells the disk's area. `place` is of `_aimed`.
+    """
+    off = table.pupil - np.float32(0.5)
+    off = off[:, rim := np.abs(off).max(axis=0) > _RIM / 2 - 1e-6]
+    share = (np.arange(off.shape[1]) * (math.sqrt(5) - 1) / 2) % 1
+    pupil = 0.5 + np.concatenate([off, off * np.sqrt(1 + (1 / _RIM**2 - 1) * share)], axis=1).astype(np.float32)
+    own = np.tile(place.reshape(2, len(nm), -1)[..., rim], 2).reshape(2, -1)
+    weight = table.at(own, np.tile(pupil, len(nm)), np.repeat(nm, pupil.shape[1]))[:, 4]
+    inner, outer = weight.reshape(len(nm), 2, -1).sum(axis=2, dtype=np.float64).T
+    passing = np.divide(outer, inner, out=np.ones_like(inner), where=inner > outer)
+    return np.asarray(np.sqrt(_RIM**2 + (1 - _RIM**2) * passing))
+
+
 def _aimed(
     table: RayTable, target: tuple[float, float], w: float, guess: tuple[float, float], nm: FloatArray
 ) -> _Aimed:
@@ -340,6 +364,27 @@ def _aimed(
     # Where Newton's method leaves rays beside the point, their light goes where that of the others goes.
     share = kept.sum() / max(light.sum(), 1e-30)
     return _Aimed(place, kept / share if share > _SURE else light, slope, film_by_plate)
+
+
+def tint(camera: Camera) -> NDArray[np.float64]:
+    """Return the matrix [3, 3] by which a blurred picture gets the colour that the lens gives white light on the axis.
+
+    The blur takes wavelengths from where red, green and blue respond positively, each by itself. The film's responses
+    are negative elsewhere, and what a lens absorbs there counts, too, as does what it takes of the other two colours.
+    """
+    low, high = (min(max(v, LIGHT_NM[0]), LIGHT_NM[1]) for v in camera.wavelength_nm or LIGHT_NM)
+    light = SpectralRange(low, max(low, high), _TINT)
+    if not (light.colours and camera.dispersive):
+        return np.eye(3)
+    side = (np.arange(_TINT_PUPIL) + 0.5) / _TINT_PUPIL
+    square = np.tile(np.stack(np.meshgrid(side, side)).reshape(2, -1), _TINT).astype(np.float32)
+    nm = light.centres_nm.repeat(_TINT_PUPIL**2).astype(np.float32)
+    passed = camera.sample(np.zeros_like(square), square, nm).weight.reshape(_TINT, -1).mean(axis=1, dtype=np.float64)
+    if not passed.all():
+        return np.eye(3)
+    alone = np.maximum(light.response * light.basis, 0)
+    mixed = np.einsum("cn,kn,n->ck", light.response, light.basis, passed) / _TINT
+    return np.asarray(mixed / (alone @ passed / alone.sum(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -433,7 +478,7 @@ def kernels_over(
         ((i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1])
         for j, i in itertools.product(range(fields[1]), range(fields[0]))
     ]
-    least = plate.pinhole.before_film_mm / 1000
+    least, white = plate.pinhole.before_film_mm / 1000, np.eye(3) if wavelengths_nm else tint(camera)
     for distance in distances_m:
         if not distance > least:
             raise InputError("kernels", "distance_m", distance, f"above {least:g}, the entrance pupil")
@@ -441,6 +486,7 @@ def kernels_over(
         ahead, cells = distance - least, list[Cell]()
         for place in places:
             kernel = kernel_at(camera, plate, place, 1 / ahead, place, wavelengths_nm=wavelengths_nm, grooves=grooves)
+            kernel = kernel and kernel.tinted(white)
             field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
             cells.append(Cell(field, distance, place if kernel is None else kernel.middle_px, kernel))
             if max(fields) * (side := cells[-1].width_px) > _LARGEST:

@@ -32,9 +32,8 @@ from neurolens.base.tasks import in_order
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
 from neurolens.graph.compiler import c_source, load_compiled
-from neurolens.pictures.defocus.kernels import LARGEST, kernel_at
+from neurolens.pictures.defocus.kernels import LARGEST, kernel_at, tint
 from neurolens.pictures.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable, reduced
-from neurolens.pictures.render.colour import SpectralRange
 from neurolens.pictures.render.sampler import sobol
 
 _SET = 512  # points of the pupil in a set
@@ -55,7 +54,6 @@ _FINE_PX, _FINE = 0.25, 0.03  # steps of the radius between two kernels: in pixe
 _MOST_WORK = 4e9  # pixels of kernels in all
 _SAME = 0.01  # share of inverse depth within which two layers show the same thing
 _CELLS, _COLOURS = 24, 2
-_TINT, _TINT_PUPIL = 64, 8  # wavelengths of white light, and points along both sides of the pupil at each
 
 
 @dataclass(frozen=True)
@@ -375,27 +373,6 @@ def defocus(
     lost, number = max(hidden, 0) / max(light + hidden, 1e-30), sum(len(some.radius_px) for some in taken)
     _say(found := replace(found, highlights=number, lost=lost), len(plate.layers))
     return replace(found, rgb=np.maximum(found.rgb @ tint(camera).T, 0).astype(np.float32))
-
-
-def tint(camera: Camera) -> NDArray[np.float64]:
-    """Return the matrix [3, 3] by which a blurred picture gets the colour that the lens gives white light on the axis.
-
-    The blur takes wavelengths from where red, green and blue respond positively, each by itself. The film's responses
-    are negative elsewhere, and what a lens absorbs there counts, too, as does what it takes of the other two colours.
-    """
-    low, high = (min(max(v, LIGHT_NM[0]), LIGHT_NM[1]) for v in camera.wavelength_nm or LIGHT_NM)
-    light = SpectralRange(low, max(low, high), _TINT)
-    if not (light.colours and camera.dispersive):
-        return np.eye(3)
-    side = (np.arange(_TINT_PUPIL) + 0.5) / _TINT_PUPIL
-    square = np.tile(np.stack(np.meshgrid(side, side)).reshape(2, -1), _TINT).astype(np.float32)
-    nm = light.centres_nm.repeat(_TINT_PUPIL**2).astype(np.float32)
-    passed = camera.sample(np.zeros_like(square), square, nm).weight.reshape(_TINT, -1).mean(axis=1, dtype=np.float64)
-    if not passed.all():
-        return np.eye(3)
-    alone = np.maximum(light.response * light.basis, 0)
-    mixed = np.einsum("cn,kn,n->ck", light.response, light.basis, passed) / _TINT
-    return np.asarray(mixed / (alone @ passed / alone.sum(axis=1)))
 
 
 def _say(found: Gathered, layers: int) -> None:

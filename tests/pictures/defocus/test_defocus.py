@@ -14,6 +14,7 @@ import pytest
 from shipped import whole
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, DifferentialCamera
 from neurolens.cameras.field import field_of, frame_of
@@ -22,7 +23,7 @@ from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.graph.compiler import has_compiler
 from neurolens.optics.lens.shot import Shot
-from neurolens.pictures.defocus.kernels import kernel_at, kernels_over
+from neurolens.pictures.defocus.kernels import kernel_at, kernels_over, own_plate, tint
 from neurolens.pictures.defocus.picture import (
     SAMPLES,
     _sizes,
@@ -32,9 +33,11 @@ from neurolens.pictures.defocus.picture import (
     spread_over,
     take_highlights,
 )
-from neurolens.pictures.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, read_plate
+from neurolens.pictures.defocus.plate import DepthSettings, Layer, Plate, PlatePinhole, RayTable, read_plate
+from neurolens.pictures.render.colour import SpectralRange
 from neurolens.pictures.render.pictures import read_channels, read_exr, write_channels
 from neurolens.pictures.render.renderer import render
+from neurolens.pictures.render.sampler import sobol
 from neurolens.pictures.render.scene import load_scene
 from tests.command_line import failure, run_json
 
@@ -296,6 +299,33 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
         assert mean == pytest.approx(expected, abs=0.1)
         spread = math.sqrt((green * (mine + corner - mean) ** 2).sum())
         assert spread == pytest.approx(math.sqrt((weight * (theirs - expected) ** 2).sum()), rel=0.02, abs=0.1)
+
+
+@pytest.mark.parametrize(("up_mm", "w"), [(0.0, 1.3), *whole((12.0, 1.3), (0.0, 0.1), (12.0, 0.1))])
+def test_kernels_of_white_points_have_the_light_that_passes_the_pupil_in_each_colour(up_mm: float, w: float) -> None:
+    """Without Newton's method, areas or a pupil's grid: rays of all the film, pupil and light that see a square."""
+    shot, count, side, (width, height) = (
+        Shot((4.5, 30.0), 1.2, f_number=1.4, wavelength_nm=LIGHT_NM),
+        1 << 20,
+        48,
+        (360, 2400),
+    )
+    camera = make_camera(str(ROOT / "lenses" / "leica_summilux_m_50mm_f1_4.toml"), shot)
+    plate, place = own_plate(camera, (width, height)), (width / 2, height / 2 - up_mm * height / 30)
+    kernel = kernel_at(camera, plate, place, w, place)
+    assert kernel is not None
+    points = (sobol(count, 5) + 0.5) / 2.0**32
+    reach = np.array(kernel.light.shape[1::-1]) + 2 * side
+    film = np.subtract(kernel.corner_px, side)[:, None] + reach[:, None] * points[:2]
+    light = SpectralRange(*LIGHT_NM, 64)
+    wave = (points[4] * 64).astype(int)
+    pupil = points[2:4].astype(np.float32)
+    rays = RayTable(camera, plate, pupil, np.zeros(count, np.float32)).at(film, pupil, light.centres_nm[wave])
+    seen = (np.abs(rays[:, :2] + w * rays[:, 2:4] - place) < side / 2).all(axis=1) * rays[:, 4]
+    white = light.response * light.basis.sum(axis=0)
+    expected = (white[:, wave] * seen).mean(axis=1, dtype=np.float64) * reach.prod() / side**2
+    np.testing.assert_allclose(kernel.tinted(tint(camera)).energy, expected, rtol=8e-3)
+    assert kernel.tinted(tint(camera)).energy.sum() == pytest.approx(expected.sum(), rel=5e-3)
 
 
 def test_the_middle_of_a_disc_on_the_axis_is_smooth() -> None:
