@@ -176,12 +176,12 @@ def chosen(library: Library, names: Sequence[str]) -> tuple[Entry, ...]:
 
 _HEAD = """# Models that ship
 
-`python -m experiments models` made these models from experiments/data/models.toml. Every lens of lenses/ has the best
-polynomial of at most 64 coefficients per vector output. The historical lenses and 34 lenses by name also have the
-best network of two layers of 16 units, after 600 iterations. A few lenses have faster models, too. A model holds for
-the whole lit film, the full aperture, focus from infinity to near, and all wavelengths for which the glasses are
-known. It focuses by moving the whole lens, also where the lens file moves groups: `--focus-mode best` sets the exact
-lens so.
+`python -m experiments models` made these models from experiments/data/models.toml. Every lens of lenses/ that is not
+from LensVisualizer alone has the best polynomial of at most 64 coefficients per vector output; `neurolens train` fits
+the others. The historical lenses and 34 lenses by name also have the best network of two layers of 16 units, after 600
+iterations. A few lenses have faster models, too. A model holds for the whole lit film, the full aperture, focus from
+infinity to near, and all wavelengths for which the glasses are known. It focuses by moving the whole lens, also where
+the lens file moves groups: `--focus-mode best` sets the exact lens so.
 
 - **Errors** are those of held-out rays (`neurolens.studies.rays`), in micrometres at an image radius of 21.6 mm.
   Every card was checked on fresh rays. `neurolens evaluate models/FILE` checks a model again.

@@ -483,7 +483,8 @@ def page(
     agree = sorted(doubles.keys() - {row[0] for row in decided})
     return lab.page(
         "# Lenses of patents by a public collection",
-        f"`python -m experiments patent-lenses`: {count} files of lenses/ are made from it.",
+        f"`python -m experiments patent-lenses`: {count} files of lenses/ are made from it, and {len(doubles)} were "
+        "there from another table of the same product. Every other table has a cause here.",
         f"## Left out: {len(left_out)}",
         lab.table("lens|cause", [[key, why] for key, why in left_out.items()]),
         f"## In lenses/ already, from the same table: {len(doubles)}",
