@@ -25,11 +25,13 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import placed_settings
 from neurolens.cameras.field import Field, field_of
+from neurolens.cameras.pose import FilmPose
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.optics.analysis.layout import lens_layout
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import BY_LENSES, POSES
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
@@ -159,7 +161,7 @@ examples:
         "of a scene of --lights by --key; a frame that exists is kept."
     )
     restart: bool = setting(False, "make frames again that exist (with --frames)")
-    state: cli.LensState = cli.lens_state()
+    state: cli.LensState = group("state of the lens", names=(*BY_LENSES, *POSES), unset=True)
 
     frame: int | None = None
     position_m: tuple[float, float, float] | None = None  # of a scene's camera
@@ -329,9 +331,10 @@ class Shots:
         """The flare of the frame with these arguments."""
         if self._last is None or self._last[0] is not args:
             lens = self._lens(args.state)
-            lights, tracer = self._lights(args, lens), GhostTracer(lens)
+            pose = FilmPose.of(args.state.shot(args.film).whole())
+            lights, tracer = self._lights(args, lens), GhostTracer(lens, pose=pose)
             raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
-            job = FlareJob(lens, lights, raster, args.settings, threads=args.threads, ghosts=tracer)
+            job = FlareJob(lens, lights, raster, args.settings, threads=args.threads, ghosts=tracer, pose=pose)
             rays = max(_FEWEST, RANKED // max(len(lights), 1))
             self._last = args, Shot(job, [ghost_table(tracer, light, 550.0, rays) for light in lights])
         return self._last[1]

@@ -30,10 +30,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.tasks import in_order
 from neurolens.graph.compiler import c_source, load_compiled
-from neurolens.optics.lens.prescription import Lens
 from neurolens.pictures.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.pictures.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
 from neurolens.pictures.flare.job import FlareJob
@@ -204,11 +203,15 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
     The star of a point is 0 where rays make the image itself and at the pixels next to that, because a render has the
     light there. Energy is kept if the render's light is reduced by the sum of this layer on a film without edges. An
     extended light has the sum of its points' stars, also within its image. Diffracted light is assumed to pass the rear
-    of the lens unhindered. A light whose rays do not reach the film has no star. Fringes of one wavelength lie beyond
+    of the lens unhindered. A light whose rays do not reach the film has no star, and no light has one on a turned film,
+    where each point of a star has another focus. Fringes of one wavelength lie beyond
     the gamut of sRGB: see `in_gamut`. `done` is called with the share of the work.
     """
     raster, spectral = job.raster, job.spectral()
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
+    if job.pose.turned:
+        warn("no star: the layer starburst takes a film that is not turned; ghosts and glare take any")
+        return picture
     parts = [patch for light in job.lights for patch in patches(light, _PATCH_DEG)]
     for number, patch in enumerate(parts):
         colours = spectral.response * spectral.spectrum(patch.light.rgb) / (spectral.bins * job.exposure)
@@ -218,7 +221,7 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
         height, width = (n + k - 1 for n, k in zip((raster.height, raster.width), kernel.shape, strict=True))
         canvas = np.zeros((height, width, 3), np.float32)
         around = Raster((width / raster.per_mm, height / raster.per_mm), width, height)
-        for k, film in enumerate(_stars(job.lens, patch.light, spectral.centres_nm, around, job.threads)):
+        for k, film in enumerate(_stars(job, patch.light, spectral.centres_nm, around)):
             canvas += film[..., None] * colours[:, k].astype(np.float32)
             done((number + (k + 1) / spectral.bins) / len(parts))
         picture += canvas if smear is None else smeared(canvas, kernel)
@@ -226,15 +229,16 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
     return in_gamut(picture)
 
 
-def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, threads: int) -> Iterator[Floats]:
+def _stars(job: FlareJob, light: Light, wavelengths_nm: Array, raster: Raster) -> Iterator[Floats]:
     """Yield the star of a light at each wavelength: irradiance [H, W] for 1 at the lens; none if it is dark."""
+    lens, moved = job.lens, job.pose.moved_mm
     middle = exit_pupil(lens, light, float(wavelengths_nm.mean()))
     lines = [] if middle is None else outline(middle)
     if middle is None or not lines:
         return
     pixel = 1 / raster.per_mm
-    x = (raster.width / 2 - 0.5 - np.arange(raster.width)) * pixel
-    y = (np.arange(raster.height) + 0.5 - raster.height / 2) * pixel
+    x = (raster.width / 2 - 0.5 - np.arange(raster.width)) * pixel - moved[0]
+    y = (np.arange(raster.height) + 0.5 - raster.height / 2) * pixel - moved[1]
     reach = max(float(np.abs(p - c).max()) for p, c in zip((x, y), middle.centre_mm, strict=True))
 
     def one(nm: float, far: Spectrum) -> Floats:
@@ -248,7 +252,7 @@ def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, thre
         # At the wavelength of their mean phase, which goes as 1 / wavelength.
         like = exit_pupil(lens, light, float(1 / np.mean(1 / part)), middle) or middle
         far = outline_spectrum(like, lines, float(part.min()), pixel, reach + pixel, (number, len(parts)))
-        yield from in_order(threads, partial(one, far=far), part)
+        yield from in_order(job.threads, partial(one, far=far), part)
 
 
 def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: Array, pixel_mm: float) -> Floats:

@@ -9,7 +9,8 @@ struct ghost {
 struct job {
     struct lens lens;
     size_t n, at, count; /* rays of this block, number of its first ray, all rays */
-    float shift, reach, *out;
+    const float *film;
+    float reach, *out;
 };
 
 /* Whether any ray is still within reach of all rims after a step at surface k. */
@@ -25,7 +26,7 @@ static int go_on(const struct job *job, int k, int action, const float *from, fl
 
 static void arrive(const struct job *job, const float *from, int index)
 {
-    meet_film(job->n, from, BLOCK, job->shift, job->out + 4 * index * job->count + job->at, job->count);
+    meet_film(job->n, from, BLOCK, job->film, job->out + 4 * index * job->count + job->at, job->count);
 }
 
 /* Follow rays from before surface k to the film; `here` and `next` are overwritten. */
@@ -75,10 +76,10 @@ static void sweep(const struct job *job, const struct ghost *ghost, int count, f
 /* `start` has STATE rows of `count` rays, `room` is for (surfaces + 5) blocks, and `out` has four rows a ghost: x, y,
    power and worst. */
 void ghosts(
-    size_t count, int surfaces, int ghosts, float shift, float reach, const float *start, const int *functions,
-    const float *numbers, const struct ghost *ghost, float *room, float *out)
+    size_t count, int surfaces, int ghosts, float reach, const float *start, const int *functions, const float *numbers,
+    const float *film, const struct ghost *ghost, float *room, float *out)
 {
-    struct job job = { { surfaces, functions, numbers }, 0, 0, count, shift, reach, out };
+    struct job job = { { surfaces, functions, numbers }, 0, 0, count, film, reach, out };
     for (; ghosts && job.at < count; job.at += BLOCK) {
         job.n = count - job.at < BLOCK ? count - job.at : BLOCK;
         for (int r = 0; r < STATE; r++)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
+from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.graph.compiler import c_source
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.analysis.fields import Scene
@@ -69,7 +70,7 @@ class GhostRays(NamedTuple):
     """Rays of one wavelength that follow each ghost to the film.
 
     Attributes:
-        rows: [P, 4, N] film x and y (mm, lens frame), power and worst.
+        rows: [P, 4, N] x and y on the film (mm), power and worst.
     """
 
     rows: Floats
@@ -96,6 +97,7 @@ class GhostTracer:
     Args:
         lens: its film must be placed (`set_lens`).
         pairs: the ghosts to follow; None takes all of two reflections.
+        pose: how the film stands.
 
     Attributes:
         pairs: the ghosts, in the order of the results. stack: the lens's compiled steps.
@@ -104,7 +106,7 @@ class GhostTracer:
         InputError: there is no C compiler, or it fails; the lens has no film position; a pair is no ghost.
     """
 
-    def __init__(self, lens: Lens, pairs: Sequence[Pair] | None = None) -> None:
+    def __init__(self, lens: Lens, pairs: Sequence[Pair] | None = None, pose: FilmPose = UPRIGHT) -> None:
         self.lens = lens
         self.pairs: tuple[Pair, ...] = ghost_pairs(lens) if pairs is None else tuple(pairs)
         count = len(lens.surfaces)
@@ -113,10 +115,10 @@ class GhostTracer:
             if not (0 <= pair.first < pair.second < count and all(reflects(lens, k) for k in pair)):
                 raise InputError(lens.path, "ghost", pair.name, "two surfaces that reflect, the first nearer the front")
             needed |= {(pair.second, 2), (pair.first, 3)} | {(k, 1) for k in range(pair.first + 1, pair.second)}
-        self.stack = Stack(lens, needed)
+        self.stack = Stack(lens, needed, pose)
         self._call = self.stack.compiled(c_source("pictures/flare/ghosts.c", BLOCK=_BLOCK, LOST=LOST), "ghosts", {})
         whole, pointer = ctypes.c_int, ctypes.c_void_p
-        self._call.argtypes = [ctypes.c_size_t, whole, whole, ctypes.c_float, ctypes.c_float, *[pointer] * 6]
+        self._call.argtypes = [ctypes.c_size_t, whole, whole, ctypes.c_float, *[pointer] * 7]
 
     def trace(self, rays: Floats, wavelength_nm: float, *, direct: bool = False) -> GhostRays:
         """Follow light [6, N] (point in mm and unit direction towards the film, lens frame) along every ghost.
@@ -147,11 +149,11 @@ class GhostTracer:
         rows = [(second, first, k) for k, (first, second) in enumerate(pairs)] + [(surfaces, 0, len(pairs))] * direct
         rows.sort(key=lambda row: (row[0], -row[1]))
         out = np.zeros((len(rows), 4, start.shape[1]), np.float32)
-        numbers, shift = self.stack.numbers(wavelength_nm)
+        numbers, film = self.stack.numbers(wavelength_nm)
         room = np.empty((surfaces + 5) * STATE * _BLOCK, np.float32)
-        arrays = (start, self.stack.functions, numbers, np.array(rows, np.int32), room, out)
+        arrays = (start, self.stack.functions, numbers, film, np.array(rows, np.int32), room, out)
         pointers = [a.ctypes.data for a in arrays]
-        self._call(start.shape[1], surfaces, len(rows), shift, reach, *pointers)
+        self._call(start.shape[1], surfaces, len(rows), reach, *pointers)
         return GhostRays(out)
 
     def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
@@ -165,7 +167,7 @@ class Ghost:
 
     Attributes:
         pair: its surfaces. energy: its light on the film's plane over that of the same light's image.
-        centre_mm: the mean x, y of its light on the film, lens frame. size_mm: the root mean square distance from
+        centre_mm: the mean x, y of its light on the film. size_mm: the root mean square distance from
             there.
         passed: the share of the rays through the front disc that arrive.
     """
@@ -307,9 +309,7 @@ def ghost_graphs(lens: Lens, pairs: Sequence[Pair], wavelength_nm: tuple[float, 
     return [_graph(stack, pair, numbers, nodes, stack.numbers(at[0])[1], (short, long)) for pair in pairs]
 
 
-def _graph(
-    stack: Stack, pair: Pair, numbers: Array, nodes: Array, shift_mm: float, w_range: tuple[float, float]
-) -> Graph:
+def _graph(stack: Stack, pair: Pair, numbers: Array, nodes: Array, film: Floats, w_range: tuple[float, float]) -> Graph:
     g, (first, second), (short, long) = Graph(), pair, w_range
     rays, radius = g.input("entering", 5), g.input("stop_radius_mm", per_call=True)
     inverse_um = 1000.0 / rays[4]
@@ -330,5 +330,5 @@ def _graph(
             else:
                 call.append(g.constant(float(values[0])))
         state = g.inline(step, {"state": state, "call": g.concat(*call)})["after"]
-    g.outputs["arriving"] = g.inline(film_graph(), {"state": state, "shift_mm": g.constant(shift_mm)})["film"]
+    g.outputs["arriving"] = g.inline(film_graph(), {"state": state, "call": g.constant(film)})["film"]
     return g

@@ -13,6 +13,7 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
+from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.rays import Rays, Traced, trace
 from neurolens.pictures.flare.canvas import Doubles, Raster
@@ -29,7 +30,7 @@ class FlareJob:
     """Everything that decides the flare of one picture.
 
     Attributes:
-        lens: its film must be placed (`set_lens`).
+        lens: its film must be placed (`set_lens`). pose: how the film stands.
         wavelength_nm: range of light. threads: for the work.
         ghosts: traces the ghosts of the same lens and stop; left out, all ghosts of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".
@@ -47,6 +48,7 @@ class FlareJob:
     single: tuple[str, ...] = ()
     keep: Path | None = None
     finer: int = 4
+    pose: FilmPose = UPRIGHT
 
     def spectral(self, finer: int = 1, least: int = 1) -> SpectralRange:
         """Return the range of light in bins: `finer` times as many as the settings say, and at least `least`."""
@@ -55,13 +57,13 @@ class FlareJob:
 
     @property
     def exposure(self) -> float:
-        """The irradiance on the axis at the mean wavelength: see `axis_irradiance`."""
-        return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm))
+        """The irradiance where the axis meets the film, at the mean wavelength: see `axis_irradiance`."""
+        return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm)) * float(self.pose.axes[2, 2])
 
     @cached_property
     def tracer(self) -> GhostTracer:
         """Return the tracer of its ghosts."""
-        return self.ghosts or GhostTracer(self.lens)
+        return self.ghosts or GhostTracer(self.lens, pose=self.pose)
 
 
 @lru_cache(maxsize=32)

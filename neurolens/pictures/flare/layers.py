@@ -21,6 +21,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import Kept
 from neurolens.base.progress import Progress, Report
 from neurolens.base.tasks import in_order
+from neurolens.cameras.pose import FilmPose
 from neurolens.optics.lens.glass import inverse_square_um
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
@@ -280,14 +281,14 @@ def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quiet
     """
     settings, raster, spectral = job.settings, job.raster, job.spectral(least=_KNOWN)
     photons = -(-photons * settings.bins // spectral.bins)
-    lens, tracer, count = job.lens, PhotonTracer(job.lens, settings.scatter), spectral.bins
+    lens, tracer, count = job.lens, PhotonTracer(job.lens, settings.scatter, job.pose), spectral.bins
     edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
     firsts = range(0, photons, _AT_ONCE)
     whole = [(number, light, k) for number, light in enumerate(job.lights) for k in range(count)]
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
     sums = np.zeros((2, raster.height, raster.width), np.float32)
     same = lens, tracer.scatter, list(job.lights), raster, part, spectral.centres_nm, photons
-    known = digest((*same, settings.most_reflections, settings.seed))
+    known = digest((*same, job.pose, settings.most_reflections, settings.seed))
     kept, begun = Kept(job.keep and kept_file(job.keep, part), known, _KEEP_S), 0
     if (state := kept.load()) is not None:
         done_before, arrays = state[0].get("done", -1), state[1]
@@ -404,28 +405,32 @@ class Choice(NamedTuple):
     fade: bool
 
 
-def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: int, *, fade: bool = False) -> Choice:
+Filmed = tuple[Scene, Lens, FilmPose]
+
+
+def scene_choice(frames: Sequence[Filmed], raster: Raster, threads: int, *, fade: bool = False) -> Choice:
     """Choose the ghosts that `brightest` names in some frames of a scene that has the table [flare].
 
     Args:
-        frames: the scene with its camera in the frame's place, and the lens in its state.
+        frames: the scene with its camera in the frame's place, the lens in its state, and how the film stands.
         fade: whether lights fade before they are left out, as in an animation.
     """
     sources = SceneLights(frames[0][0])
-    return Choice(brightest([_scene_job(sources, *frame, raster, threads, fade) for frame in frames]), fade)
+    return Choice(brightest([_scene_job(sources, frame, raster, threads, fade) for frame in frames]), fade)
 
 
-def _scene_job(sources: SceneLights, scene: Scene, lens: Lens, raster: Raster, threads: int, fade: bool) -> FlareJob:
+def _scene_job(sources: SceneLights, filmed: Filmed, raster: Raster, threads: int, fade: bool) -> FlareJob:
     """Return the job of a scene's flare by the scene's own lights."""
+    scene, lens, pose = filmed
     settings = scene.settings.flare
     assert settings is not None and lens.film_z_mm is not None
     lights = keep(sources.seen(scene, lens.film_z_mm), settings.most, fade).lights
     light_nm = scene.settings.camera.wavelength_nm
-    return FlareJob(lens, lights, raster, settings, light_nm, threads)
+    return FlareJob(lens, lights, raster, settings, light_nm, threads, pose=pose)
 
 
 def scene_flare(
-    scene: Scene, lens: Lens, raster: Raster, white_balance: str | None, threads: int, progress: Progress,
+    filmed: Filmed, raster: Raster, white_balance: str | None, threads: int, progress: Progress,
     choice: Choice | None = None,
 ) -> Layers:  # fmt: skip
     """Make the layers of a scene that has the table [flare], by its own lights, for a lens whose film is placed.
@@ -436,8 +441,8 @@ def scene_flare(
     Raises:
         InputError: as `flare_layers`.
     """
-    choice, sources = choice or scene_choice([(scene, lens)], raster, threads), SceneLights(scene)
-    job = replace(_scene_job(sources, scene, lens, raster, threads, choice.fade), single=choice.single)
+    choice, sources = choice or scene_choice([filmed], raster, threads), SceneLights(filmed[0])
+    job = replace(_scene_job(sources, filmed, raster, threads, choice.fade), single=choice.single)
     matrix = sources.balance(white_balance).T.astype(np.float32)
     return {name: picture @ matrix for name, picture in flare_layers(job, progress).items()}
 

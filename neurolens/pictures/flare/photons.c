@@ -179,7 +179,7 @@ struct arrivals {
 static void at_film(struct room *room, struct light *light, int last, int n, struct arrivals *to)
 {
     float *const film = room->after, *const list = room->now;
-    if (n) meet_film(n, list, BLOCK, light->film[0], film, BLOCK);
+    if (n) meet_film(n, list, BLOCK, light->film, film, BLOCK);
     if (n && light->sensor > 0.0f) {
         draw(n, room->chances, &light->state);
         happen(run_film_scatter, n, list, film, 2, room, light->film, 6);
@@ -213,7 +213,7 @@ size_t photons(
     const struct lens lens = { surfaces, functions, numbers };
     struct room room;
     int waiting[2][4096] = { { 0 } };
-    struct light light = { most, scatters, boost, scattering, shares, shares[2], shares[3], seed, books };
+    struct light light = { most, scatters, boost, scattering, shares, shares[FILM + 1], shares[FILM + 2], seed, books };
     struct arrivals arrivals = { count, 0, place, weight, reflections, scattered };
     room.now = rows, room.then = rows + LIST, room.after = rows + 2 * LIST, room.turned = rows + 3 * LIST;
     room.wait[0] = rows + 4 * LIST, room.wait[1] = rows + (5 + surfaces) * LIST;

@@ -28,11 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.graph.compiler import c_source
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.shapes import sag_mm
-from neurolens.pictures.flare.steps import LOST, STATE, Floats, Place, Stack, entering, reflects
+from neurolens.pictures.flare.steps import FILM, LOST, STATE, Floats, Place, Stack, entering, reflects
 from neurolens.pictures.render.settings import Scatter
 
 BLOCK = 4096  # photons at a time: their states, 40 bytes at every surface, stay in the caches
@@ -54,7 +55,7 @@ class Photons(NamedTuple):
     """Photons that arrived at the film's plane, and how many others ended where.
 
     Attributes:
-        film_xy_mm: [2, M] in the lens frame. weight: [M], 1 each without a boost.
+        film_xy_mm: [2, M] on the film. weight: [M], 1 each without a boost.
         reflections, scattered: [M] how often surfaces reflected each photon, and how often it scattered.
         cast: all photons. left: photons that left the lens at the front. stopped: photons that ended at rims, at the
             barrel or beside the film. absorbed: photons that glass absorbed, or that total reflection sent where no
@@ -81,7 +82,7 @@ class PhotonTracer:
     """Traces photons through a set lens.
 
     Args:
-        scatter: what scatters photons; with None nothing does.
+        scatter: what scatters photons; with None nothing does. pose: how the film stands.
 
     Attributes:
         stack: the lens's compiled steps.
@@ -90,15 +91,15 @@ class PhotonTracer:
         InputError: as `GhostTracer`.
     """
 
-    def __init__(self, lens: Lens, scatter: Scatter | None = None) -> None:
+    def __init__(self, lens: Lens, scatter: Scatter | None = None, pose: FilmPose = UPRIGHT) -> None:
         every = range(len(lens.surfaces))
         places: list[Place] = [(k, way) for k in every for way in (0, 1)]
         places += [(k, way) for k in every for way in (2, 3) if reflects(lens, k)]
-        self.lens, self.scatter, self.stack = lens, scatter or Scatter(), Stack(lens, places)
+        self.lens, self.scatter, self.stack = lens, scatter or Scatter(), Stack(lens, places, pose)
         self._scattering = scatter_numbers(self.scatter, lens)
         driver = c_source(
             "pictures/flare/photons.c", BLOCK=BLOCK, CHANCES=CHANCES, NUMBERS=len(NUMBERS), LEVELS=LEVELS,
-            MOST_SCATTERS=MOST_REFLECTIONS,
+            MOST_SCATTERS=MOST_REFLECTIONS, FILM=FILM,
         )  # fmt: skip
         graphs = {"scatter": scatter_graph(), "film_scatter": film_scatter_graph()}
         self._call = self.stack.compiled(driver, "photons", graphs)
@@ -147,12 +148,12 @@ class PhotonTracer:
         boosts = np.ascontiguousarray(np.broadcast_to(boost, (surfaces, 2, LEVELS)), np.float32)
         if not ((boosts >= np.float32(low)) & (boosts <= high)).all():
             raise InputError("photons", "boost", float(boosts.min()), f"from {low:g} to {high:g}")
-        numbers, shift = self.stack.numbers(wavelength_nm)
+        numbers, film = self.stack.numbers(wavelength_nm)
         count = start.shape[1]
         place, weight = np.empty((2, count), np.float32), np.empty(count, np.float32)
         reflections, scattered, books = np.empty(count, np.int32), np.empty(count, np.int32), np.zeros(4, np.int64)
         room = np.empty((2 * surfaces + 5) * (STATE + 2) * BLOCK, np.float32)
-        shares = np.array([shift, scatter.mirror, scatter.barrel, scatter.sensor], np.float32)
+        shares = np.array([*film, scatter.mirror, scatter.barrel, scatter.sensor], np.float32)
         on_way = bool(scatter.barrel or scatter.dust or scatter.haze_per_mm)
         arrays = (start, self.stack.functions, numbers, boosts, self._scattering, room, place, weight, reflections)
         pointers = [a.ctypes.data for a in (*arrays, scattered, books)]
@@ -239,15 +240,20 @@ def film_scatter_graph() -> Graph:
     """Write the graph of photons that the film sends back.
 
     Its inputs are `row` and `call`. `row` is the state behind the last surface [8], the point on the film [2] and
-    random numbers [CHANCES]; `call` is the film's distance from that surface, and the share that the film reflects as a
-    mirror. Its output `event` [6] is the position and direction in the frame of the last surface.
+    random numbers [CHANCES]; `call` are the film's numbers, and the share that it reflects as a mirror. Its output
+    `event` [6] is the position and direction in the frame of the last surface, which is not mirrored.
     """
     g = Graph()
-    row, call = g.input("row", STATE + 2 + CHANCES), g.input("call", 2, per_call=True)
+    row, call = g.input("row", STATE + 2 + CHANCES), g.input("call", FILM + 1, per_call=True)
     choice, u, turn = row[STATE + 3], row[STATE + 4], row[STATE + 5 :]
-    diffuse = g.concat(turn * (1.0 - u).maximum(0.0).sqrt(), -u.sqrt().maximum(_FLAT))
-    direction = g.select(choice <= call[1], row[3:6], diffuse)
-    g.outputs["event"] = g.concat(row[STATE : STATE + 2], call[0], direction)
+    x, y, normal = (call[k : k + 3] * [1.0, 1.0, -1.0] for k in (1, 4, 7))
+    film, come = row[STATE : STATE + 2] - call[10:12], row[3:6] * [1.0, 1.0, -1.0]
+    aside = turn * (1.0 - u).maximum(0.0).sqrt()
+    diffuse = x * aside[0] + y * aside[1] + normal * u.sqrt()
+    mirrored = come - normal * (2.0 * g.dot(come, normal))
+    direction = g.select(choice <= call[FILM], mirrored, diffuse)
+    place = x * film[0] + y * film[1] + g.concat(g.constant([0.0, 0.0]), call[0])
+    g.outputs["event"] = g.concat(place, direction[0:2], direction[2].minimum(-_FLAT))
     return g
 
 

@@ -21,8 +21,8 @@ static void go(struct lens lens, int k, int action, size_t n, const float *from,
     steps[lens.functions[at]](n, in, lens.numbers + at * WIDTH, out);
 }
 
-/* Write x, y, power and worst of n rays where they meet the film, `shift` mm behind the last surface. */
-static void meet_film(size_t n, const float *from, size_t stride, float shift, float *to, size_t apart)
+/* Write x, y, power and worst of n rays where they meet the film; x and y are along the film. */
+static void meet_film(size_t n, const float *from, size_t stride, const float *film, float *to, size_t apart)
 {
     const float *in[STATE];
     float *out[4];
@@ -30,5 +30,5 @@ static void meet_film(size_t n, const float *from, size_t stride, float shift, f
         in[r] = from + r * stride;
     for (int r = 0; r < 4; r++)
         out[r] = to + r * apart;
-    run_film(n, in, &shift, out);
+    run_film(n, in, film, out);
 }

@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.ir import Graph, Value
@@ -40,6 +41,7 @@ Action = Literal["T", "R"]
 STATE = 8  # rows of a ray: x, y, z (mm, this step's frame), direction, power, `worst` (largest r^2 / R^2 at a rim)
 CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "absorbed_per_mm")
 DEGREE = 10  # the degree of a coating's reflectance
+FILM = 12  # numbers of a film: see `film_numbers`
 CURVE = ("stretch", "start_c", "start_cz", "last_step_mm")  # see `shapes.Curve`; `across` and the terms follow
 ACROSS = 3
 PLAIN = len(CALL) + DEGREE + 1  # how many numbers of the call a sphere takes
@@ -132,17 +134,29 @@ def step_graph(kind: Kind) -> Graph:
 
 
 def film_graph() -> Graph:
-    """Write the graph from a `state` behind the last surface to `film`: x, y (mm), power, worst.
+    """Write the graph from a `state` behind the last surface to `film`: x, y (mm) on the film, power, worst.
 
-    The film is `shift_mm` away. The power is 0 where any rim stopped the ray.
+    `call` has the film's numbers. The power is 0 where any rim stopped the ray.
     """
     g = Graph()
-    state, shift = g.input("state", STATE), g.input("shift_mm", per_call=True)
-    z, dz, worst = state[2] + shift, state[5], state[7]
-    place = state[0:2] - state[3:5] * (z / dz)
-    arrives = (worst <= 1.0) & (dz <= -TINY)
-    g.outputs["film"] = g.concat(place, g.select(arrives, state[6], 0.0), worst)
+    state, call = g.input("state", STATE), g.input("call", FILM, per_call=True)
+    start, way, worst = g.concat(state[0:2], state[2] + call[0]), state[3:6], state[7]
+    facing = g.dot(call[7:10], way)
+    place = start - way * (g.dot(call[7:10], start) / facing)
+    arrives = (worst <= 1.0) & (facing <= -TINY)
+    film = g.concat(g.dot(call[1:4], place), g.dot(call[4:7], place)) + call[10:12]
+    g.outputs["film"] = g.concat(film, g.select(arrives, state[6], 0.0), worst)
     return g
+
+
+def film_numbers(shift_mm: float, pose: FilmPose) -> Floats:
+    """Return the `FILM` numbers of a film, in the mirrored frame of light towards it.
+
+    They are its distance from the last surface along the axis, the directions of its x and y, its normal that points to
+    the lens, and `moved_mm` of its pose.
+    """
+    x, y, away = pose.axes.T * [1.0, 1.0, -1.0]
+    return np.array([shift_mm, *x, *y, *-away, *pose.moved_mm], np.float32)
 
 
 def _fresnel(n1: Value, n2: Value, n_step: Value, cos_i: Value, cos_t: Value) -> Value:
@@ -222,6 +236,7 @@ class Stack:
     Args:
         lens: its film must be placed (`set_lens`).
         places: the surfaces and actions that are needed; each kind of surface takes a moment to compile.
+        pose: how the film stands.
 
     Attributes:
         functions: [surfaces, actions] int32, the number of the compiled function, -1 where there is none.
@@ -230,12 +245,12 @@ class Stack:
         InputError: the lens has no film position, or ideal surfaces, which reflect nothing.
     """
 
-    def __init__(self, lens: Lens, places: Iterable[Place]) -> None:
+    def __init__(self, lens: Lens, places: Iterable[Place], pose: FilmPose = UPRIGHT) -> None:
         if lens.film_z_mm is None:
             raise InputError(lens.path, "film_z_mm", None, "a focused lens (set_lens)")
         lens.require_glass("reflections, of which flare is made")
         lens.require_centred("flare")
-        self.lens = lens
+        self.lens, self.pose = lens, pose
         # All aspheres with the same sort of terms get the degree of the highest one, so that they share a function.
         self._curves = {k: traced_curve(s, float) for k, s in enumerate(lens.surfaces) if not s.figure.plain}
         curves = self._curves.values()
@@ -264,7 +279,7 @@ class Stack:
         text = "" if mask is None else c_source("pictures/flare/mask.c", MASK=key)
         for number, kind in enumerate(self._kinds):
             text += function_text(step_graph(kind), f"step_{number}", f"run_{number}", "state", "after", "call")
-        text += function_text(film_graph(), "film", "run_film", "state", "film", "shift_mm")
+        text += function_text(film_graph(), "film", "run_film", "state", "film", "call")
         for called, graph in graphs.items():
             text += function_text(graph, called, f"run_{called}", "row", "event", "call")
         runs = ", ".join(f"run_{number}" for number in range(len(self._kinds)))
@@ -290,8 +305,8 @@ class Stack:
         )
 
     @lru_cache(maxsize=256)  # noqa: B019  a few stacks are kept, which are small
-    def numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
-        """Return the numbers of all steps [surfaces, actions, width], and the distance (mm) to the film."""
+    def numbers(self, wavelength_nm: float) -> tuple[Floats, Floats]:
+        """Return the numbers of all steps [surfaces, actions, width], and those of the film."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
         n = [float(glass.index_of(medium, wavelength_nm)) for medium in lens.media]
         a = [0.0, *(float(glass.absorption_of(s, wavelength_nm) or 0.0) for s in lens.surfaces)]
@@ -314,7 +329,7 @@ class Stack:
                     fit = reflectance_fit(s.coating.layers, n[k], n[k + 1], wavelength_nm)
                     numbers[k, which, len(CALL) : PLAIN] = fit
         assert lens.film_z_mm is not None
-        return numbers, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
+        return numbers, film_numbers(float(lens.film_z_mm) - z[len(lens.surfaces) - 1], self.pose)
 
     def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the reflectances [surfaces] for light towards the film.

@@ -29,7 +29,7 @@ from neurolens.base.records import plain
 from neurolens.base.settings import setting, setting_of, whole, with_changes
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.optics.lens.shot import POSES, Shot, film_size
+from neurolens.optics.lens.shot import Shot, film_size
 from neurolens.optics.readers.glasses import more_glasses
 from neurolens.pictures.defocus.diffraction import Diffraction
 from neurolens.pictures.render.behind import Behind
@@ -53,6 +53,7 @@ from neurolens.pictures.render.settings import LAYERS, FilmSettings, SensorSetti
 from neurolens.pictures.render.world import shared_worlds
 
 if TYPE_CHECKING:
+    from neurolens.cameras.pose import FilmPose
     from neurolens.optics.lens.apertures import Aperture
     from neurolens.optics.lens.prescription import Lens
     from neurolens.pictures.flare.canvas import Raster
@@ -325,21 +326,20 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
     """
     if prepared.scene.settings.flare is None:
         return {}
-    lens = _flaring(prepared.camera)
-    if lens is None:
-        warn(f"no flare of {prepared.camera.name}: that takes a lens file that is traced as it is, on an upright film")
+    flaring = _flaring(prepared.camera)
+    if flaring is None:
+        warn(f"no flare of {prepared.camera.name}: that takes a lens file that is traced as it is")
         return {}
     from neurolens.pictures.flare.layers import scene_flare
 
     with _errors_of_table(prepared.frame.scene):
-        return scene_flare(
-            prepared.scene, lens, _raster(prepared), prepared.film.white_balance, threads, progress, choice
-        )
+        filmed, balance = (prepared.scene, *flaring), prepared.film.white_balance
+        return scene_flare(filmed, _raster(prepared), balance, threads, progress, choice)
 
 
-def _flaring(camera: Any) -> Lens | None:
-    """Return the lens of a camera, for its flare, which can be followed for upright films alone."""
-    return None if any(camera.settings.get(name) for name in POSES) else getattr(camera, "lens", None)
+def _flaring(camera: Any) -> tuple[Lens, FilmPose] | None:
+    """Return the lens of a camera, for its flare, and how its film stands."""
+    return (camera.lens, camera.film.pose) if hasattr(camera, "lens") else None
 
 
 def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) -> Choice | None:
@@ -348,18 +348,20 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
     At most 16 of the frames, evenly spread, decide which ghosts are brightest. `prepared` is one of the frames, or
     another of the same camera and scene. The choice is None where there is no flare.
     """
-    if prepared.scene.settings.flare is None or _flaring(prepared.camera) is None:
+    if prepared.scene.settings.flare is None or (first := _flaring(prepared.camera)) is None:
         return None
     from neurolens.pictures.flare.layers import scene_choice
 
     scene = prepared.scene
-    lenses: dict[tuple[Any, ...], Lens] = {_state(prepared.frame): prepared.camera.lens}  # type: ignore[attr-defined]
-    scenes = []
+    flaring, scenes = {_state(prepared.frame): first}, []
     for frame in frames[:: -(-len(frames) // _CHOICE_FRAMES)]:
-        if _state(frame) not in lenses:
+        if _state(frame) not in flaring:
             shot = frame.whole_shot(scene.settings.camera, scene.aperture)
-            lenses[_state(frame)] = make_camera(str(frame.camera), replace(shot, runtime="onnxruntime")).lens  # type: ignore[attr-defined]
-        scenes.append((seen_from(scene, frame.scene, frame.position_m, frame.look_at_m), lenses[_state(frame)]))
+            found = _flaring(make_camera(str(frame.camera), replace(shot, runtime="onnxruntime")))
+            assert found is not None  # as the first
+            flaring[_state(frame)] = found
+        seen = seen_from(scene, frame.scene, frame.position_m, frame.look_at_m)
+        scenes.append((seen, *flaring[_state(frame)]))
     with _errors_of_table(prepared.frame.scene):
         return scene_choice(scenes, _raster(prepared), threads, fade=prepared.frame.number is not None)
 

@@ -257,7 +257,7 @@ def test_ends_of_the_range(shift_mm: float, rel: float) -> None:
     lens, nm = double_gauss(8.0, None, shift_mm), np.linspace(400.0, 700.0, 7)
     pixel = 0.015
     raster = Raster((53 * pixel, 53 * pixel), 53, 53)
-    stars = list(d._stars(lens, AXIS, nm, raster, 1))
+    stars = list(d._stars(FlareJob(lens, [], raster, threads=1), AXIS, nm, raster))
     x = np.arange(-26, 27) * pixel
     within = (np.arange(10) + 0.5) / 10 - 0.5
     fine = (x[:, None] + within * pixel).reshape(-1)

@@ -210,14 +210,15 @@ def test_a_scene_keeps_its_brightest_light_in_all_frames(tmp_path: Path) -> None
 
 
 def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The layers of a render are those of the command by the scene's lights, in the render's colours."""
+    """The layers of a render are those of the command by the scene's lights and film, in the render's colours."""
     scene, out = tmp_path / "scene.toml", tmp_path / "a.exr"
-    scene.write_text(SCENE)
+    scene.write_text(SCENE.replace("[film]", "film_tilt_deg = 8.0\nfilm_rise_mm = 2.0\n[film]", 1))
     lens = "lenses/cooke_triplet_50.toml"
     assert main(["render", str(scene), "--camera", lens, "-o", str(out), "--layers", "beauty", "--quiet"]) == 0
     found = read_layers(out)
     assert len(found) == 12 and not read_exr(out)[0].any()
     words = ["--lights", str(scene), "--coating", "single-layer", "--focus", "2", "--bins", "3"]
+    words += ["--film-tilt", "8", "--film-rise", "2"]
     words += ["--width", "36", "--colour-space", "ACEScg", "-o", str(out), "--quiet"]  # which holds these colours
     assert main(["flare", "cooke_triplet_50", "--film", "36x24", *words]) == 0
     ghosts = np.stack([found[f"ghosts.{c}"] for c in "RGB"], -1)

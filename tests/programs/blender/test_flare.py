@@ -238,12 +238,13 @@ def test_lights_behind_the_camera_are_written_as_such(scene: Any, tmp_path: Path
 def test_keys_of_a_lens_go_with_its_lights(scene: Any, tmp_path: Path) -> None:
     light(scene, "POINT", (0, 0, -4.0))
     scene.unit_settings.scale_length = 0.01
-    scene.camera.data.sensor_width, scene.camera.data.dof.focus_distance = 24.0, 250.0
+    data = scene.camera.data
+    data.sensor_width, data.dof.focus_distance, data.shift_x = 24.0, 250.0, 0.25
     assert bpy.ops.neurolens.apply(lens="gauss", kind="polynomial") == {"FINISHED"}
     (row,) = rows(tmp_path)
     assert row["distance_m"] == pytest.approx(0.04)
     assert json.loads((tmp_path / "lights.keys.json").read_text()) == [
-        {"frame": 1, "focus": pytest.approx(2.5), "f-number": pytest.approx(2.0)}
+        {"frame": 1, "focus": pytest.approx(2.5), "f-number": pytest.approx(2.0), "film-shift": 6.0, "film-rise": 0.0}
     ]
 
 
