@@ -24,7 +24,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lenscamera import LensCamera
 from neurolens.cameras.lensfilm import Array, LensScene, axial_light, film_slope
 from neurolens.cameras.onnxlens import BATCH, LensRays, LensRun
-from neurolens.cameras.pose import FilmPose
+from neurolens.cameras.pose import FilmPose, warn_beyond
 from neurolens.cameras.pupil_outline import COARSE, FINE, PupilOutline, PupilTable, outline_of, wavelength_between
 from neurolens.cameras.sampling import lens_state
 from neurolens.graph.interpret import evaluate
@@ -108,6 +108,7 @@ class ExactCamera(LensCamera):
             check_light(lens, nm)
         self.lens = set_lens(lens, replace(shot, focus_m=given.focus_m))
         shot = replace(shot, focus_m=focus_of(self.lens, given), focus_mode=focus_mode_of(self.lens, given))
+        warn_beyond(self.lens, FilmPose.of(shot))
         film_z, tabled, stop_mm = self.lens.film_z_mm, at_infinity(self.lens), float(self.lens.stop_radius_mm)
         assert film_z is not None  # `set_lens` places the film
         plane = pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm

@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import warn
 from neurolens.graph.ir import Graph
+from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
 
 _HAIR = 1e-18  # mm; added so that the axis stays finite
@@ -75,6 +77,17 @@ class FilmPose:
 
 
 UPRIGHT = FilmPose()
+
+
+def warn_beyond(lens: Lens, pose: FilmPose) -> None:
+    """Warn of a film that stands as the product's mount cannot hold its lens, where the lens file states how far."""
+    tilt, shift = math.degrees(math.hypot(pose.tilt, pose.swing)), math.hypot(*pose.moved_mm)
+    for asked, most, what in (
+        (tilt, lens.most_tilt_deg, "degrees of tilt"),
+        (shift, lens.most_shift_mm, "mm of shift"),
+    ):
+        if most is not None and asked > most * (1 + 1e-9):
+            warn(f"{lens.path}: {asked:.3g} {what} are more than the {most:g} of the product; they are taken as asked")
 
 
 def _axes(sin: Any, cos: Any, sway: Any, stay: Any) -> list[list[Any]]:

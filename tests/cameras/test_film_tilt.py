@@ -1,6 +1,7 @@
 """A film that is turned and moved: its rays are the lens's own from points of it in space; white light; focus."""
 
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.exact import ExactCamera
@@ -24,6 +25,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.loworder import with_film_derivatives
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import Rays, trace
 from neurolens.pictures.frames import Frame, prepare
 from neurolens.pictures.render.pictures import read_metadata
@@ -243,6 +245,21 @@ def test_cameras_without_a_film_to_turn_refuse_it() -> None:
     for name in ("thin", "pinhole", f"thick:{NAME}"):
         with pytest.raises(InputError, match="film_tilt_deg: .*left out"):
             make_camera(name, SHOT)
+
+
+def test_a_film_beyond_the_mount_of_the_product_is_told_in_a_line_each() -> None:
+    """As the lens file states it; a lens that is scaled to another focal length shifts as much farther."""
+    lens = read_lens(ROOT / "lenses" / "nikon_pc_e_nikkor_24mm_f3_5d_ed.toml")
+    assert (lens.most_tilt_deg, lens.most_shift_mm) == (8.5, 11.5)
+    within = Shot((24.0, 16.0), 2.0, 8.0, film_tilt_deg=-8.5, film_shift_mm=11.5, runtime="onnxruntime")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", NeurolensWarning)
+        ExactCamera(lens, within)
+    with pytest.warns(NeurolensWarning) as told:
+        ExactCamera(lens, replace(within, film_swing_deg=3.0, film_rise_mm=3.0))
+    said = [str(warning.message) for warning in told]
+    assert len(said) == 2 and "9.01 degrees of tilt are more than the 8.5" in said[0] and "11.9 mm of shift" in said[1]
+    assert set_lens(lens, focal_length_mm=2 * 24.642).most_shift_mm == pytest.approx(23.0, rel=0.01)
 
 
 def test_an_upright_film_is_no_pose_and_covers_itself() -> None:

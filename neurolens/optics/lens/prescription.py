@@ -132,6 +132,7 @@ class Lens:
         name, designer, source, notes: as stated in the lens file.
         believed_to_be: the product that the source's example is believed to be, or "".
         mount: the mounts that the product is made for, separated by commas, for people and searches only.
+        most_tilt_deg, most_shift_mm: how far the product tilts and shifts to either side; None where that is not known.
         measured: what photographs of that product tell (`optics.photographs.verify`), as pairs of key and value.
         rims: where the rim diameters come from: the "source", somebody who "estimated" them, a rule that "derived"
             them, or "photographs".
@@ -162,6 +163,8 @@ class Lens:
     notes: str = ""
     believed_to_be: str = ""
     mount: str = ""
+    most_tilt_deg: float | None = None
+    most_shift_mm: float | None = None
     measured: tuple[tuple[str, Any], ...] = ()
     rims: str = "source"
     film_z_mm: float | None = None
@@ -334,7 +337,7 @@ class Lens:
             )
             for c in self.configurations
         )
-        stated = lengths(self, "image_radius_mm", "film_z_mm", "stated_efl_mm", "stated_efl_x_mm")
+        stated = lengths(self, "image_radius_mm", "film_z_mm", "stated_efl_mm", "stated_efl_x_mm", "most_shift_mm")
         infinity = gaps(self.infinity_mm)
         return replace(self, surfaces=tuple(surfaces), configurations=tuple(states), infinity_mm=infinity, **stated)
 

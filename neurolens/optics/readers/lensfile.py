@@ -40,7 +40,8 @@ MAX_WAVELENGTHS = 100
 HEAD = {
     **{key: key for key in ("name", "believed_to_be", "designer", "mount", "source", "f_number")},
     **{"efl_mm": "stated_efl_mm", "efl_x_mm": "stated_efl_x_mm"},
-    **{key: key for key in ("image_radius_mm", "half_field_deg", "rims", "wavelengths_nm")},
+    **{key: key for key in ("most_tilt_deg", "most_shift_mm", "image_radius_mm", "half_field_deg", "rims")},
+    "wavelengths_nm": "wavelengths_nm",
 }
 LENS_KEYS = (
     "schema", *HEAD, "notes", "object_medium", "surfaces", "moved", "coating", "configuration", "aperture", "measured"
@@ -87,7 +88,8 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
         raise table.error("rims", data.get("rims", "(missing)"), expected)
     stated: dict[str, Any] = {key: table.text(key) for key in ("name", "source", "rims")}
     stated |= {key: table.text(key, required=False) for key in ("believed_to_be", "designer", "mount", "notes")}
-    stated |= {HEAD[key]: table.optional(key) for key in ("image_radius_mm", "efl_mm", "efl_x_mm")}
+    numbers = ("image_radius_mm", "efl_mm", "efl_x_mm", "most_tilt_deg", "most_shift_mm")
+    stated |= {HEAD[key]: table.optional(key) for key in numbers}
     lens = Lens(
         surfaces=surfaces,
         f_number=table.number("f_number", above=0),
