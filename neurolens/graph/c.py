@@ -136,6 +136,7 @@ class Writer:
         "select": "{0} <= {1} ? {2} : {3}",
         "pick": "{name}_pick({0}, {1}, {2})",
         "fma": "{macro}_FMA({0}, {1}, {2})",
+        "kept": "{0}",
     }
     place = "c[{}]"
     declared, kind, let, between = "{1} {0}", "float", "float", ", "

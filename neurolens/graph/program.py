@@ -21,10 +21,10 @@ from neurolens.base.status import OUTSIDE_DOMAIN
 # select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x cut to [-limit, limit];
 # NaN becomes one of the two ends (not in GLSL). Its limit is a number above 0. pick(t, x, y), which only `of_the_call`
 # makes, is x where t is 1, y where it is 0, bit by bit. lookup(indices ..., weights ...) is the sum of each weight
-# times its group's column of a table, in the cells at the indices (`Graph.lookup`).
+# times its group's column of a table, in the cells at the indices (`Graph.lookup`). kept(x) is x.
 KINDS = {
     "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "floor": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3,
-    "select": 4, "pick": 3,
+    "select": 4, "pick": 3, "kept": 1,
 }  # fmt: skip
 
 # Names of the rows of inputs and outputs. Of a lens, in millimetres of the lens frame and nanometres:
@@ -134,6 +134,7 @@ def rules_of(library: Any) -> dict[str, Callable[..., Any]]:
         "max": lambda a, b: library.where(a > b, a, b),  # NaN gives the second, as in written sources
         "min": lambda a, b: library.where(a < b, a, b),
         "fma": lambda a, b, c: a * b + c,
+        "kept": lambda a: a,
     }
 
 
@@ -172,8 +173,7 @@ class Program:
         mixture: mixes the tables by a state; without it `band` chooses one. Numbers that differ between tables that are
             mixed may be folded into sums alone.
         own_tables: numbers [cells, columns] that lookups read and that no caller gives, by name.
-        functions: steps that are a function of one other step whose slope is known (`adjoint`): that step, and the
-            coefficients of a series, or none for tanh.
+        tanh_of: steps that are tanh of another, and that step: `adjoint` has their slope at once.
     """
 
     tables: int = 1
@@ -181,7 +181,7 @@ class Program:
     outputs: dict[str, Expr] = field(default_factory=dict)
     mixture: Mixture | None = None
     own_tables: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    functions: dict[int, tuple[int, tuple[float, ...]]] = field(default_factory=dict)
+    tanh_of: dict[int, int] = field(default_factory=dict)
     _known: dict[Step, int] = field(default_factory=dict)
 
     def input(self, name: str, per_call: bool = False) -> Expr:
@@ -191,6 +191,10 @@ class Program:
         """Append a lookup: the weighted sum, over indices and groups, of one column of each group of `columns`."""
         arguments = tuple(e.argument for e in (*indices, *weights))
         return self._append(Step("lookup", arguments, table, column=column, columns=columns, indices=len(indices)))
+
+    def kept(self, argument: int, part: int) -> Expr:
+        """Append a step's number as a part of the way back finds it (`adjoint`), where writers keep it in memory."""
+        return self._append(Step("kept", (argument,), column=part))
 
     def literal(self, value: ArrayLike) -> Expr:
         """Return a number, or one for each table.
@@ -233,7 +237,9 @@ class Program:
         x = self.op("clamp", value, TANH_LIMIT)
         t = x * x
         found = x * self.horner(t, TANH_NUMERATOR) / self.horner(t, TANH_DENOMINATOR)
-        return self._function(found, value)
+        if isinstance(found.argument, int) and isinstance(value.argument, int):
+            self.tanh_of[found.argument] = value.argument
+        return found
 
     def select(self, a: Number, b: Number, then: Number, otherwise: Number) -> Expr:
         """Return `then` where a <= b, else `otherwise`, which NaN chooses too."""
@@ -245,13 +251,6 @@ class Program:
         value = terms[-1]
         for c in reversed(terms[:-1]):
             value = self.fma(value, t, c)
-        if self.tables == 1 and all(c.literal for c in terms):
-            return self._function(value, t, tuple(c.literal[0] for c in terms if c.literal))
-        return value
-
-    def _function(self, value: Expr, of: Expr, series: tuple[float, ...] = ()) -> Expr:
-        if isinstance(value.argument, int) and isinstance(of.argument, int):
-            self.functions[value.argument] = of.argument, series
         return value
 
     def _append(self, step: Step) -> Expr:
@@ -365,6 +364,15 @@ class Program:
 
         return self._rewritten(single)
 
+    def most_waiting(self) -> int:
+        """Return how many numbers wait for later steps, at the step where these are most."""
+        live = self.live()
+        last = {a: k for k in live for a in self.steps[k].arguments}
+        ends, waiting = Counter(last[k] for k in live if k in last), [0]
+        for k in live:
+            waiting.append(waiting[-1] + (k in last) - ends[k])
+        return max(waiting)
+
     def waits(self) -> bool:
         """Return whether a core that works on ray after ray, or vector after vector, mostly waits for results.
 
@@ -409,9 +417,10 @@ class Program:
             other = rule(k, step, given) if rule else None
             place[k] = other or found._append(replace(step, arguments=tuple(e.argument for e in given)))
         found.outputs = {name: moved(e.argument) for name, e in self.outputs.items()}
-        for k, (a, series) in self.functions.items():
-            if k in place and a in place:
-                found._function(place[k], place[a], series)
+        for k, a in self.tanh_of.items():
+            value, of = (place[n].argument if n in place else None for n in (k, a))
+            if isinstance(value, int) and isinstance(of, int):
+                found.tanh_of[value] = of
         return found
 
     def _sums(self, least: int) -> dict[int, tuple[int, int]]:

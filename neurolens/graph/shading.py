@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -21,7 +21,7 @@ import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.graph.c import NOTHING, Extras, Signature, Writer, comment_of, literal, part
-from neurolens.graph.program import Mixture, Program
+from neurolens.graph.program import Argument, Mixture, Program, Step
 
 _CAUTION = (
     "Results mean something where status is 0. A language that may ignore NaN cannot promise the status of one: rays "
@@ -197,6 +197,9 @@ class Wgsl(Glsl):
     constant, local = "var<private> ", "var "
 
 
+REGISTERS = 220  # numbers that a thread of CUDA holds, of 255; some registers have addresses
+
+
 class Cuda(Glsl):
     """CUDA, and C++ for the host."""
 
@@ -210,6 +213,24 @@ class Cuda(Glsl):
     header, given, ray, own_table = "{macro}_DEVICE {2} {0}({1})", "{}", True, True
     band, to_whole = "{name}_cell(float(band), {})", "int({})"
     number, array, constant = "#define {} {}", "float {0}[{1}] = {{\n    {2}\n}};", "{macro}_TABLE "
+    places: Mapping[Argument, str]
+
+    def steps(self) -> list[str]:
+        """Write the steps as lines. What is kept goes to memory: compilers would hold on to what is made again."""
+        steps = self.program.steps
+        kept = dict.fromkeys(steps[k].arguments[0] for k in self.program.live() if steps[k].kind == "kept")
+        self.places = {k: f"kept[{row}]" for row, k in enumerate(kept)}
+        stores = {self.value(k): f"    {place} = {self.value(k)};" for k, place in self.places.items()}
+        lines = [f"    volatile float kept[{len(kept)}];"] * bool(kept)
+        lines += [stores[self.value(k)] for k in kept if isinstance(k, int) and steps[k].kind == "input"]
+        for line in super().steps():
+            name = line.split()[1]
+            lines += [line, stores[name]] if name in stores else [line]
+        return lines
+
+    def step(self, step: Step) -> str:
+        """Write the expression of a step."""
+        return self.places[step.arguments[0]] if step.kind == "kept" else super().step(step)
 
     def kernel(self) -> str:
         """Write `code` and a kernel of arrays, NAME_rays(in, call, tables ..., out, n).

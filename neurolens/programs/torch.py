@@ -32,7 +32,7 @@ from neurolens.graph.c import Signature
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.program import WAVELENGTH, Argument, Program, Step, row_names, rules_of
 from neurolens.graph.scalars import lower
-from neurolens.graph.shading import Cuda
+from neurolens.graph.shading import REGISTERS, Cuda
 from neurolens.optics.lens.prescription import LINE_D_NM
 from neurolens.optics.lens.shot import Shot
 
@@ -261,7 +261,8 @@ class _Lens:
 
     def adjoint(self, by_light: bool) -> Program:
         """Return the program of the gradients by the inputs, with or without the wavelength."""
-        return adjoint(self.program, _FOUND, _GIVEN if by_light else _GIVEN[:-1])
+        registers = 0 if self.device.type == "cpu" else REGISTERS
+        return adjoint(self.program, _FOUND, _GIVEN if by_light else _GIVEN[:-1], registers)
 
     def _run(self, program: Program, rows: Sequence[str]) -> Run:
         """Return a program as a function of rows [R, N] of these names: a kernel on a GPU, C on the CPU, or torch."""
