@@ -170,8 +170,7 @@ def _prepared(program: Program, inputs: Collection[str]) -> tuple[Program, dict[
         if step.kind not in ("fma", "mul") or step.arguments[2:] and step.arguments[2] in moving:
             return None
         for before, of in ((0, 1), (1, 0)):
-            inner, t = given[before], given[of].argument
-            slope = inner
+            inner, slope, t = given[before], given[before], given[of].argument
             if step.arguments[of] not in moving or not isinstance(t, int):
                 continue
             if step.arguments[before] in moving:

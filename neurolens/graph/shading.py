@@ -223,10 +223,7 @@ class Cuda(Glsl):
         stores = {self.value(k): f"    {place} = {self.value(k)};" for k, place in self.places.items()}
         lines = [f"    volatile float kept[{len(kept)}];"] * bool(kept)
         lines += [stores[self.value(k)] for k in kept if isinstance(k, int) and steps[k].kind == "input"]
-        for line in super().steps():
-            name = line.split()[1]
-            lines += [line, stores[name]] if name in stores else [line]
-        return lines
+        return lines + [text for line in super().steps() for text in (line, stores.get(line.split()[1])) if text]
 
     def step(self, step: Step) -> str:
         """Write the expression of a step."""
