@@ -4,7 +4,8 @@ Errors are of rays that no fit has seen, in float32, over the whole film and sto
 infinity, once over all light and focus of the model. Strehl ratios are of the point spread at infinity and 546 nm, on
 the axis and at 0.7 of the film's radius, wide open and two and four stops down, from the model and from traced rays.
 Times are CPU seconds of this machine, the least of three: of pupils, for nine wavelengths, and of the waves summed over
-them. 5 to 20 s a lens; lenses that are in the table are kept. Writes phase.md and phase.json.
+them. 5 to 20 s a lens, and two minutes where networks are trained; lenses that are in the table are kept. Writes
+phase.md and phase.json.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from neurolens.cameras.model import load_model
 from neurolens.models.file import as_stored
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import passing_rays
-from neurolens.models.phase import TERMS, path_errors, with_phase
+from neurolens.models.phase import ENOUGH_WAVES, TERMS, path_errors, with_phase
 from neurolens.models.wavefront import model_pupils
 from neurolens.optics.analysis.diffraction import cells_of, irradiance, perfect_peak, pupils_at, spread
 from neurolens.optics.analysis.exit_pupil import ExitPupil
@@ -140,8 +141,9 @@ def page(rows: Sequence[Row]) -> str:
         ]
     refused = [f"- {r['lens']}: {r['refused']}" for r in rows if "refused" in r]
     return lab.page(
-        f"# The optical path of models\n\n`python -m experiments phase`\n\nUp to {TERMS} terms beside the rays. "
-        "Waves are of 546 nm; path and rays: the median distance on the film between where each says that light goes.",
+        f"# The optical path of models\n\n`python -m experiments phase`\n\nUp to {TERMS} terms beside the rays, and a "
+        f"network where they leave more than {ENOUGH_WAVES} waves and less than one. Waves are of 546 nm; path and "
+        "rays: the median distance on the film between where each says that light goes.",
         lab.goal_table("goal", goals), lab.table(columns, done, "-"),
         *(["No path:", "\n".join(refused)] if refused else []),
     )  # fmt: skip
