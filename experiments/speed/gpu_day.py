@@ -5,6 +5,12 @@ onnxruntime; of other packages it needs none. Other people's tracers are measure
 of optiland 0.6.3 and deeplens-core 2.5.6 have 16 MB (`pip install --no-deps`; `ray_peers` says what else they import).
 Without a GPU everything runs in software, as C++ by g++, to see that it works: its times mean nothing.
 
+    python -m experiments gpu-day -o found  # 8 minutes; with `--seconds 0`, without torch's compilers, about four
+    cp found/gpu_day.* experiments/results && python -m experiments answers
+
+What is measured is written at once, so that a run that is stopped leaves its tables. `--only LENS` measures one lens.
+The table of 2026-11-28 is of bare glass and of gradients without parts (`graph.adjoint`): run it again.
+
 Lenses of 2 to 56 refractions, exact and as the models that ship, are written as CUDA C++, compiled, and raced in two
 kinds of work: "stored", rays read from memory and results written there; "in place", as an integrator has them, rays
 made of their number and results added up. Whole cameras take film points and random numbers, make frames, and are
@@ -53,7 +59,7 @@ from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Progra
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import Cuda
 from neurolens.optics.lens.shot import Shot
-from neurolens.programs.torch import LensCamera, step_by_step
+from neurolens.programs.torch import LensCamera, Run, step_by_step
 
 MODELS = {**LENSES, "laikin_double_gauss_50": ("ols-36", "mlp-16x2")}
 LENS, CAMERA = "lens", "whole camera"
@@ -70,7 +76,7 @@ THREADS, EACH, BYTES = 128, 4, 4
 OPTIONS = (
     lab.count("rays", None, "of a timed call (default 8388608; in software 16384)"),
     lab.count("rounds", None, "repetitions of a timed call (default 15; in software 3)"),
-    lab.count("seconds", 420, "after which torch's compilers are waited for no longer (default 420; 0: no torch)", 0),
+    lab.count("seconds", 420, "after which torch's compilers are waited for no longer (default 420; 0: none)", 0),
     lab.option("--torch", metavar="LENS:FORM", default="", help=argparse.SUPPRESS),  # one job of a worker
     lab.ONLY,
     lab.out(),
@@ -375,7 +381,7 @@ def errors_of(made: Compiled, known: gpu.Subject, checked: gpu.Checked) -> lab.R
     return {"rms_um": rms, "wrong": wrong}
 
 
-# ---- Torch, in workers: its compilers take minutes, which they may spend beside each other. --------------------------
+# ---- Torch. Its compilers take minutes, which they may spend beside each other, in workers. --------------------------
 
 
 @contextmanager
@@ -386,50 +392,55 @@ def alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def torch_job(name: str, form: str, folder: Path, size: int, rounds: int) -> None:
-    """A lens in torch: step by step, as a CUDA graph of these steps, compiled; the exact one by the tracer, too. Its
-    row, a file of the folder, grows."""
-    known = gpu.subject_of(name)
-    subject = lens_subject(known, form)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+def in_steps(subject: Subject, device: torch.device, size: int) -> tuple[Run, Tensor]:
+    """A lens in torch, step by step, and rays for it."""
     numbers = {name: torch.tensor(number, device=device) for name, number in subject.call.items()}
-    run = step_by_step(subject.program, subject.rows, numbers, {})
-    given = drawn(subject, size).to(device)
-    ways: dict[str, list[float]] = {}
-    row: lab.Row = {"lens": name, "form": form, "seconds": ways}
+    return step_by_step(subject.program, subject.rows, numbers, {}), drawn(subject, size).to(device)
 
-    def measure(way: str, call: Callable[[], Any], count: int = size) -> None:
-        with alone(folder), torch.no_grad():
-            ways[way] = [t / count for t in event_times(call, rounds, device.type)]
-        atomic_write_text(folder / f"{name}.{form}.json", json.dumps(row))
 
-    if device.type == "cuda" or lab.operations_of(subject.program)["operations"] < 200:
-        from torch.fx.experimental.proxy_tensor import make_fx
-
-        begun = time.perf_counter()
-        compiled = torch.compile(make_fx(run)(given), dynamic=False)
-        with torch.no_grad():
-            found = compiled(given)
-            row["compile_s"] = time.perf_counter() - begun
-            row["compiled_differs"] = float((found - run(given)).nan_to_num().abs().max())
-        measure("compiled", lambda: compiled(given))
-    measure("eager", lambda: run(given))
+def torch_row(known: gpu.Subject, form: str, device: torch.device, size: int, rounds: int) -> lab.Row:
+    """A lens in torch: step by step, and as a CUDA graph of these steps; the exact one by the tracer, too."""
+    subject = lens_subject(known, form)
+    run, given = in_steps(subject, device, size)
+    ways: dict[str, Callable[[], Any]] = {"eager": lambda: run(given)}
     if form == EXACT:
         lens, domain = known.model.lens, known.model.domain
         fx, fy, px, py, nm = given
         z = torch.full_like(fx, subject.call[FILM_Z])
-        with suppress(NeurolensError, RuntimeError):
-            measure("tracer", lambda: rays.whole_trace(lens, fx, fy, z, px, py, domain.pupil_z_mm, nm))
-    if device.type == "cuda":
-        with alone(folder), torch.no_grad():
-            recorded = torch.cuda.CUDAGraph()
-            side = torch.cuda.Stream()
+        ways["tracer"] = lambda: rays.whole_trace(lens, fx, fy, z, px, py, domain.pupil_z_mm, nm)
+    row: lab.Row = {"lens": known.name, "form": form, "seconds": {}}
+    with torch.no_grad():
+        for way, call in ways.items():
+            with suppress(NeurolensError, RuntimeError):
+                row["seconds"][way] = [t / size for t in event_times(call, min(rounds, 5), device.type)]
+        if device.type == "cuda":
+            recorded, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
             with torch.cuda.stream(side):
                 run(given)
             torch.cuda.synchronize()
             with torch.cuda.graph(recorded):
                 run(given)
-        measure("CUDA graph", recorded.replay)
+            row["seconds"]["CUDA graph"] = [t / size for t in event_times(recorded.replay, rounds)]
+            del recorded
+            torch.cuda.empty_cache()
+    return row
+
+
+def torch_job(name: str, form: str, folder: Path, size: int, rounds: int) -> None:
+    """A lens compiled by torch; what was found is a file of the folder."""
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    run, given = in_steps(lens_subject(gpu.subject_of(name), form), device, size)
+    begun = time.perf_counter()
+    compiled = torch.compile(make_fx(run)(given), dynamic=False)
+    with torch.no_grad():
+        first = compiled(given)
+        found: lab.Row = {"compile_s": time.perf_counter() - begun}
+        with alone(folder):
+            found["compiled_differs"] = float((first - run(given)).nan_to_num().abs().max())
+            found["compiled"] = [t / size for t in event_times(lambda: compiled(given), rounds, device.type)]
+    atomic_write_text(folder / f"{name}.{form}.json", json.dumps(found))
 
 
 def workers(
@@ -447,24 +458,19 @@ def workers(
     }  # fmt: skip
 
 
-def collected(running: Mapping[str, subprocess.Popen[str]], folder: Path, until: float) -> list[lab.Row]:
-    """The rows of the workers that end in time; of others why there is none."""
-    rows = []
+def collected(running: Mapping[str, subprocess.Popen[str]], folder: Path, until: float) -> dict[str, lab.Row]:
+    """What the workers found that end in time, by their jobs; of others why there is nothing."""
+    rows: dict[str, lab.Row] = {}
     for key, process in running.items():
-        name, form = key.split(":")
         said = ""
         try:
             _, said = process.communicate(timeout=max(0.1, until - time.monotonic()))
         except subprocess.TimeoutExpired:
             process.kill()
             said = "torch's compiler was stopped when the time was over"
-        file = folder / f"{name}.{form}.json"
-        if file.is_file():
-            rows.append(json.loads(file.read_text(encoding="utf-8")))
-        else:
-            rows.append({"lens": name, "form": form, "seconds": {}})
-        if process.returncode or not file.is_file():
-            rows[-1]["reason"] = said.strip()[-200:]
+        file = folder / f"{key.replace(':', '.')}.json"
+        done = file.is_file() and not process.returncode
+        rows[key] = json.loads(file.read_text(encoding="utf-8")) if done else {"reason": said.strip()[-200:]}
     return rows
 
 
@@ -761,11 +767,16 @@ class Day:
             self._peers({m.subject.lens: m for m in made if (m.subject.kind, m.form) == (LENS, EXACT)})
             self.found["shaders"] = shaders_of(known.values(), self.args)
             self._say("shaders")
-        self.found["torch"] = collected(running, self.folder, self.begun + self.args.seconds)
+            self._torch(known)
+        compiled = collected(running, self.folder, self.begun + self.args.seconds)
         mine = {(r["lens"], r["form"]): min(r["seconds"]["stored"]) for r in _of(self.found["rows"], LENS)}
-        for row in (r for r in self.found["torch"] if r["seconds"]):
-            row["gain"] = min(min(t) for t in row["seconds"].values()) / mine[row["lens"], row["form"]]
-        self._say("torch")
+        for row in self.found["torch"]:
+            row |= compiled.get(f"{row['lens']}:{row['form']}", {})
+            if times := row.pop("compiled", None):
+                row["seconds"]["compiled"] = times
+            if row["seconds"]:
+                row["gain"] = min(min(t) for t in row["seconds"].values()) / mine[row["lens"], row["form"]]
+        self._say("torch's compiler")
         print(page_of(self.found))
 
     @contextmanager
@@ -816,6 +827,13 @@ class Day:
                 row["ratio"] = min(row["kernels"]["backward"]) / min(row["kernels"]["forward"])
                 rows.append(row)
         self._say("gradients")
+
+    def _torch(self, known: Mapping[str, gpu.Subject]) -> None:
+        rows = self.found.setdefault("torch", [])
+        for name, form in self.forms:
+            with self._unless_it_fails(f"{name}, {form} in torch"):
+                rows.append(torch_row(known[name], form, self.device, self.args.rays, self.args.rounds))
+        self._say("torch")
 
     def _peers(self, exact: Mapping[str, Compiled]) -> None:
         rows = self.found.setdefault("peers", [])

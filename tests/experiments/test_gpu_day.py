@@ -33,6 +33,7 @@ def test_it_runs_without_a_gpu(
         assert row["direction_urad"] < 10 and row["weight"] < 1e-3 and row["wrong"] < 1e-3
         assert set(row["frames"]) == set(gpu_day.FRAMES)
     assert all(r["off"] < 0.01 for r in found["gradients"])
+    assert [set(r["seconds"]) for r in found["torch"]] == [{"eager", "tracer"}, {"eager"}]
     assert "exact as CUDA C++" in [r["program"] for r in found["peers"] if r.get("seconds")]
 
 
