@@ -69,7 +69,7 @@ OPTIONS = (
 
 
 # of a command whose --quiet was damaged: what it did, assumed and compiled
-_PROGRESS = re.compile(r": (done in|stopped after|\d+%|assumed: |compiled )")
+_PROGRESS = re.compile(r": +(done in|stopped after|\d+%|assumed: |compiled )")
 _TOLD = re.compile(r"neurolens: (warning: |'.*' is )")  # a warning, or which lens some words mean
 
 
