@@ -80,7 +80,9 @@ def model_pupils(
     [lit] = np.nonzero(np.hypot(*places_mm.T) <= model.domain.film_radius_mm * DOMAIN_SLACK)
     for k in range(0, len(lit), _AT_ONCE):
         some = lit[k : k + _AT_ONCE]
-        for number, own in zip(some, known.pupils(places_mm[some].T), strict=True):
+        with np.errstate(invalid="ignore"):  # rays far outside, which are left out, may not exist
+            made = known.pupils(places_mm[some].T)
+        for number, own in zip(some, made, strict=True):
             found[number] = own
     return found
 
