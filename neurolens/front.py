@@ -219,7 +219,7 @@ class Lens(_Chosen):
 
     @property
     def t_stop(self) -> float:
-        """The f-number of a lens without loss that sends as much light of the d line to the axis, by all rays."""
+        """The f-number of a lens without loss that sends as much light to the axis, from 400 to 700 nm."""
         return self._figures["t_stop"]
 
     @property

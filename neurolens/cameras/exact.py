@@ -71,7 +71,9 @@ class ExactRun(LensRun):
         return pruned(self._graph, {"status": self._graph.outputs["status"]})
 
     @staticmethod
-    def _evaluated(graph: Graph, rays: FloatArray, film_z_mm: ArrayLike, stop_radius_mm: float) -> dict[str, Any]:
+    def _evaluated(
+        graph: Graph, rays: FloatArray, film_z_mm: ArrayLike, stop_radius_mm: float
+    ) -> dict[str, NDArray[Any]]:
         numbers = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
         call = {name: np.full((1, 1), value, np.float32) for name, value in numbers.items()}
         starts = range(0, max(rays.shape[1], 1), BATCH)
@@ -298,7 +300,7 @@ def searching_code() -> list[str]:
 def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOutline | None:
     """Return the outline of a key, from the cache, or else what `search` finds, which takes seconds."""
 
-    def searched() -> dict[str, Any]:
+    def searched() -> dict[str, list[Any]]:
         outline = search()
         return {k: np.asarray(v).tolist() for k, v in asdict(outline).items()} if outline is not None else {}
 

@@ -375,8 +375,8 @@ class Warped:
         flat: pinhole, thin or thick lens, with the same film.
         camera: the one to be shown.
         focus_m: from the film to the plane that the maps are of.
-        tables: whether to make tables of both fields, which takes seconds, or that of the camera, made before; without
-            tables, film points are traced.
+        tables: True makes tables of both fields, which takes seconds; a `Field` is the camera's own, made before. With
+            False film points are traced.
 
     Raises:
         InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.

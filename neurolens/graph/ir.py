@@ -138,7 +138,7 @@ class Value:
 
 Operand = Value | ArrayLike
 # Computed at once where all operands are numbers.
-_FOLDED: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative}
+_FOLDED: dict[str, np.ufunc] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative}
 
 
 @dataclass(eq=False)

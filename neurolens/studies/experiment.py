@@ -306,7 +306,7 @@ def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
 
 
 # Models in the order of their time as C, tried where an error is asked for.
-_LADDER: tuple[dict[str, Any], ...] = (
+_LADDER: tuple[dict[str, str | int], ...] = (
     *({"method": "ols", "terms": terms} for terms in (12, 20, 28, 40, 64, 100)),
     {"method": "mlp", "units": 16},
     {"method": "mlp", "units": 32, "steps": 150},

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeVar
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, library
 from neurolens.base.html import html, local_url
-from neurolens.base.records import NOISY, Results, error_of, noisy, pareto_front, program, reaches, time_of
+from neurolens.base.records import NOISY, ExactRecord, Results, error_of, noisy, pareto_front, program, reaches, time_of
 from neurolens.base.settings import RANGE
 
 C = TypeVar("C")
@@ -79,7 +79,7 @@ def exact_of(records: Iterable[R]) -> R | None:
     return min(timed, key=lambda r: time_of(r)["min"], default=None)
 
 
-def expected_exact(refractions: int) -> dict[str, Any]:
+def expected_exact(refractions: int) -> ExactRecord:
     """Return a record of the exact lens as C for where it was not timed."""
     return {"name": "exact C, expected", "ns_per_ray": {"min": REFRACTION_NS * refractions}}
 

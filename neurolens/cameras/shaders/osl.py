@@ -363,7 +363,7 @@ def _per_exposure(camera: OslCamera) -> Array:
         per_distance = 1 / (z - camera.lens.table.pupil_z_mm)
         call = {"film_z_mm": z, "stop_radius_mm": share * camera.lens.stop_radius_mm}
         call |= {"per_distance": per_distance, "scale": per_distance**2}
-        inputs: dict[str, Any] = {k: np.array([[v]]) for k, v in call.items()}
+        inputs: dict[str, NDArray[Any]] = {k: np.array([[v]]) for k, v in call.items()}
         inputs |= {"film_mm": np.zeros_like(square), "square": square, "wavelength_nm": nanometres[None]}
         inputs |= evaluate(camera.pupil.graph, inputs)
         inputs["rays"] = np.concatenate([inputs["film_mm"], inputs["pupil_mm"], inputs["wavelength_nm"]])

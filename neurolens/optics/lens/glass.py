@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.settings import LIGHT_NM
 from neurolens.base.status import DOMAIN_SLACK
-from neurolens.optics.lens.prescription import LINE_D_NM, Lens, Medium, Surface
+from neurolens.optics.lens.prescription import LINE_D_NM, Lens, Medium, MediumFields, Surface
 
 # Fraunhofer lines, nm (helium d; hydrogen F and C; mercury g).
 LINE_F_NM = 486.1327
@@ -363,7 +363,7 @@ def glass_of(name: str) -> Glass:
     return found
 
 
-def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
+def by_figures(name: str, n_d: float, V_d: float, place: str) -> MediumFields:
     """Return the fields of a surface whose glass the catalogue lacks: its n_d and V_d, and the name for people.
 
     Args:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import lens_id_of
@@ -105,6 +105,16 @@ class Medium:
     V_d: float | None = None
     material: str | None = None
     glass: str | None = None
+
+
+# What a file gives of a medium: some fields of `Medium` or of `Surface`.
+class MediumFields(TypedDict, total=False):
+    """What a file gives of a medium: some fields of `Medium` or of `Surface`."""
+
+    n_d: float
+    V_d: float | None
+    material: str | None
+    glass: str | None
 
 
 @dataclass(frozen=True)

@@ -273,7 +273,7 @@ class Verified(Report):
         return [(mm, curve) for mm, curve in each if curve is not None and math.isfinite(curve.rms)]
 
     @property
-    def measured(self) -> dict[str, Any]:
+    def measured(self) -> dict[str, str | float]:
         """The figures that a lens file and the cards of its models keep of the comparison."""
         figures = {
             "distortion_percent": self.distortion_percent,

@@ -8,15 +8,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.placement import Placement
-from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.prescription import Lens, MediumFields
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
-from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, placed, primary_first
+from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, ShapeFields, placed, primary_first
 from neurolens.optics.readers.glasses import by_indices, named_glass
 from neurolens.optics.readers.source import Line, ReadOptions, assume, by_word, read_lines, warn
 
@@ -417,7 +416,7 @@ def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
 
 def medium(
     command: Command, words: Sequence[str], private: Mapping[str, tuple[Command, Sequence[float]]]
-) -> dict[str, Any]:
+) -> MediumFields:
     """Return the fields of a surface for the medium behind it.
 
     It is a name, "NAME_MAKER", a code, n:V, n V, or nothing for air. A code is the fraction of the index and the Abbe
@@ -448,7 +447,7 @@ def medium(
     return {**known, "material": word}
 
 
-def _private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[str, Any]:
+def _private_glass(command: Command, wavelengths_nm: Sequence[float]) -> MediumFields:
     """Return the fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line."""
     if command.words and not re.match(r"[-+.0-9]", command.words[0]):
         expected = "an index at each wavelength of PWL: formulas of private glasses are not read"
@@ -456,7 +455,7 @@ def _private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[st
     return by_indices(command.line, f"PRV {command.word}", command.numbers(least=len(wavelengths_nm)), wavelengths_nm)
 
 
-def shape_of(block: Block) -> dict[str, Any]:
+def shape_of(block: Block) -> ShapeFields:
     """Return the radius and the figure of a surface, for `Block.row`.
 
     YTO is a curve in y (curvature CUY, K, A y^4, ...) turned about an axis along y at 1 / CUX; XTO is the same in x;
@@ -487,7 +486,7 @@ def shape_of(block: Block) -> dict[str, Any]:
     return {"radius_mm": 1 / other, "cylinder": axes[1]} if other else {"radius_mm": math.inf}
 
 
-def _biconic(block: Block) -> dict[str, Any]:
+def _biconic(block: Block) -> ShapeFields:
     """Read AAS; its higher terms are AR to DR, with their shares in x and y AP to DP."""
     conic_x = block.terms.get("KX", 0.0)
     for name, value in block.terms.items():
@@ -497,7 +496,7 @@ def _biconic(block: Block) -> dict[str, Any]:
     return block.crossed(block.rotational(), radius_x, conic_x)
 
 
-def _special(block: Block) -> dict[str, Any]:
+def _special(block: Block) -> ShapeFields:
     """Read ODD, a sum of ARn r^n over NRADIUS^n (0: none), or QBn and QCn, n = 4 + 2 m, of Forbes's sums."""
     kind, values = block.kind, dict(block.special or {})
     radius, block.conic = values.pop("NRADIUS", 0.0), values.pop("K", 0.0)

@@ -7,11 +7,11 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TypedDict
 
 from neurolens.base.settings import WAVELENGTH_NM, within
 from neurolens.optics.lens.figures import MOST_Q_TERMS, WIDEST_Q, figure_of, qcon_powers
-from neurolens.optics.lens.prescription import Surface
+from neurolens.optics.lens.prescription import MediumFields, Surface
 from neurolens.optics.readers.breaks import Step, Turn, placements
 from neurolens.optics.readers.forbes import qbfs_terms
 from neurolens.optics.readers.source import Line
@@ -24,6 +24,19 @@ _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the fil
 LEAST_RADIUS = 1e-3  # the least that coefficients of aspheres are normalised by, in the unit of the file
 
 
+class ShapeFields(TypedDict, total=False):
+    """What a file gives of a surface's shape: its radius, and keys of `optics.lens.figures.figure_of`."""
+
+    radius_mm: float
+    conic: float
+    asphere: Sequence[tuple[int, float]]
+    cylinder: str | None
+    across: tuple[float, float | None]
+    qcon: Sequence[float]
+    norm_mm: float
+    focal_mm: float
+
+
 @dataclass
 class Block:
     """One surface while a file is read, in the file's unit; readers add what else their formats say."""
@@ -34,7 +47,7 @@ class Block:
     conic: float = 0.0
     thickness: float = 0.0
     semi_diameter: float = UNKNOWN
-    medium: dict[str, Any] = field(default_factory=dict)
+    medium: MediumFields = field(default_factory=MediumFields)
     stop: bool = False
     aperture: bool = False  # as in `Row`
     solved: bool = False  # whether the thickness follows from others, or from the paraxial image
@@ -44,12 +57,12 @@ class Block:
     def radius(self) -> float:
         return 1 / self.curvature if self.curvature else math.inf
 
-    def rotational(self, asphere: Iterable[tuple[int, float]] = ()) -> dict[str, Any]:
+    def rotational(self, asphere: Iterable[tuple[int, float]] = ()) -> ShapeFields:
         """Return radius and figure of a surface of revolution, for `row`; the conic of a plane has no effect."""
         conic = self.conic if self.curvature else 0.0
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
-    def crossed(self, curve: dict[str, Any], radius_x: float, conic_x: float | None) -> dict[str, Any]:
+    def crossed(self, curve: ShapeFields, radius_x: float, conic_x: float | None) -> ShapeFields:
         """Add a bend in x to a curve in y, which is given as by `rotational`.
 
         The curve in y is turned about an axis along y; with a conic in x, the surface is a biconic. Where one of both
@@ -63,7 +76,7 @@ class Block:
         same = math.isclose(radius_x * self.curvature, 1.0, rel_tol=1e-12) and (conic_x or 0.0) == self.conic
         return curve if same and not curve["asphere"] else curve | {"cylinder": "y", "across": (radius_x, conic_x)}
 
-    def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
+    def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> ShapeFields:
         """Return a surface of Forbes's kind, as by `rotational`, from coefficients (m = 0 first) and their radius."""
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MOST_Q_TERMS:
@@ -81,7 +94,7 @@ class Block:
             raise self.start.error(name, found, str(error)) from None
         return self.rotational(terms)
 
-    def row(self, shape: dict[str, Any]) -> Row:
+    def row(self, shape: ShapeFields) -> Row:
         """Return the row of a surface with this `radius_mm` and figure, by the keys of `figures.figure_of`."""
         lengths = shape["radius_mm"], self.thickness, 2 * self.semi_diameter
         surface = Surface(*lengths, stop=self.stop, figure=figure_of(shape), **self.medium)
@@ -230,7 +243,7 @@ class Draft:
     nominal: float | None = None
     stop_given: bool = False
     skipped: Counter[str] = field(default_factory=Counter)
-    object_medium: dict[str, Any] = field(default_factory=dict)
+    object_medium: MediumFields = field(default_factory=MediumFields)
     wavelengths_nm: tuple[float, ...] = ()
 
     def in_file(self, text: str) -> str:

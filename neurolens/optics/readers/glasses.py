@@ -14,11 +14,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens import glass as catalogue
 from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass, by_figures
+from neurolens.optics.lens.prescription import MediumFields
 from neurolens.optics.readers.source import Line, assume, read_lines, warn
 
 _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
@@ -58,7 +58,7 @@ def named_glass(
     *,
     text: str | None = None,
     figures: tuple[float, float] | None = None,
-) -> dict[str, Any]:
+) -> MediumFields:
     """Return the fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
 
     For a discontinued glass its replacement, with the prefix "N-", is taken. A moulded variant of a glass ("..._MOLD",
@@ -103,7 +103,7 @@ def named_glass(
     return {"n_d": taken.n_d, "V_d": taken.V_d, "glass": short_name(taken), "material": name}
 
 
-def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm: Sequence[float]) -> dict[str, Any]:
+def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm: Sequence[float]) -> MediumFields:
     """Return a surface's fields from indices at wavelengths: n_d and V_d, with a warning; one index is n_d.
 
     Between the wavelengths the index is a polynomial of 1 / lambda^2 through the nearest four.

@@ -31,9 +31,9 @@ from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import parse_json
 from neurolens.optics.lens import paraxial
 from neurolens.optics.lens.figures import Figure, figure_of
-from neurolens.optics.lens.prescription import Configuration, Lens, Surface
+from neurolens.optics.lens.prescription import Configuration, Lens, MediumFields, Surface
 from neurolens.optics.readers.assemble import finish, first_order, lens_of
-from neurolens.optics.readers.draft import MAX_STATES, UNKNOWN, Draft, Row, State
+from neurolens.optics.readers.draft import MAX_STATES, UNKNOWN, Draft, Row, ShapeFields, State
 from neurolens.optics.readers.glasses import named_glass, same_glass
 from neurolens.optics.readers.source import MAX_SURFACES, ReadOptions, Table, read_text, warn
 from neurolens.optics.setting.rims import check_states
@@ -170,7 +170,7 @@ def _surface(row: Table, is_last: bool) -> Surface:
     )
 
 
-def _glass(row: Table) -> dict[str, Any]:
+def _glass(row: Table) -> MediumFields:
     """Read a glass; it becomes the catalogue's where the named glass has the same figures."""
     if row.data.get("n_d") is None:
         for key in ("V_d", "material"):
@@ -360,7 +360,7 @@ def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str])
     for key in given.keys() - set(_DEEPLENS_SURFACE):
         # ai2, ai4, ... repeat the list ai.
         skipped[key] += not (_repeats(key) or (key[:2] == "ai" and key[2:].isdecimal() and "ai" in given))
-    shape: dict[str, Any] = {}
+    shape: ShapeFields = {}
     if kind == "Aspheric":
         shape = {"conic": row.number("k") if "k" in row else 0.0, "asphere": row.series("ai", 2)}
     return Surface(
@@ -381,7 +381,7 @@ def _radius_mm(row: Table) -> float:
     return 1 / c if c else math.inf
 
 
-def _medium(row: Table) -> dict[str, Any]:
+def _medium(row: Table) -> MediumFields:
     name = row.data.get("mat2")
     if not isinstance(name, str):
         raise row.error("mat2", name, 'a glass, "n_d/V_d" or "air"')
@@ -454,7 +454,7 @@ def _blender_surface(row: Table) -> Surface:
     kind = row.text("type", required=False) or "spherical"
     if kind not in _TYPES:
         raise row.error("type", kind, f"one of {', '.join(_TYPES)}")
-    shape: dict[str, Any] = {}
+    shape: ShapeFields = {}
     if kind == "aspheric":
         conic = row.number("conic") if "conic" in row else 0.0
         shape = {"conic": conic, "asphere": row.series("aspheric_coeffs", 4)}

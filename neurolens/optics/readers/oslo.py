@@ -12,11 +12,10 @@ import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.placement import Placement
-from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.prescription import Lens, MediumFields
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
@@ -160,7 +159,7 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
             file.skipped[word] += 1
 
 
-def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
+def _glass(line: Line, rest: list[str]) -> MediumFields:
     """Read GLA with a name of the catalogue, or with one index."""
     if not rest:
         raise line.error("GLA", "(nothing)", "the name of a glass, or an index")

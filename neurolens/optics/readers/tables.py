@@ -30,13 +30,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.figures import Figure, figure_of
-from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.lens.prescription import Lens, MediumFields, Surface
 from neurolens.optics.readers.assemble import lens_of
-from neurolens.optics.readers.draft import INFINITE, MAX_STATES, Draft, Row, State
+from neurolens.optics.readers.draft import INFINITE, MAX_STATES, Draft, Row, ShapeFields, State
 from neurolens.optics.readers.glasses import same_glass
 from neurolens.optics.readers.source import MAX_SURFACES, Line, ReadOptions, assume, read_lines, warn
 
@@ -151,7 +150,7 @@ def _flaresim_surface(line: Line, words: list[str]) -> Surface:
     thickness, index, abbe, semi = (line.number_of(n, w) for n, w in zip(FIGURES[1:5], words[1:5], strict=True))
     radius = math.inf if stop else line.number_of("radius", words[0]) or math.inf
     kind: str | None = words[6].lower() if len(words) > 6 else None
-    shape: dict[str, Any] = {}
+    shape: ShapeFields = {}
     if kind == "toric" and not math.isinf(radius):
         along_y = line.number_of("type", words[7]) if len(words) > 7 else 0.0
         if along_y == 0:
@@ -258,7 +257,7 @@ def _bench_row(file: Bench, line: Line, words: list[str]) -> None:
     if radius.upper() == "FS":
         file.field_stops.add(k)
     plane = radius.upper().lstrip("+-") in _PLANE
-    medium: dict[str, Any] = {}
+    medium: MediumFields = {}
     if index:
         n_d, V_d = line.number_of("n_d", index), line.number_of("V_d", abbe) if abbe else None
         medium = {"n_d": n_d, "V_d": V_d, "material": glass or None, "glass": same_glass(glass or None, n_d, V_d)}

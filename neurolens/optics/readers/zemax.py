@@ -14,16 +14,15 @@ from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens import glass as catalogue
 from neurolens.optics.lens.placement import Placement
-from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.prescription import Lens, MediumFields
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
-from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, placed, primary_first
+from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, ShapeFields, placed, primary_first
 from neurolens.optics.readers.glasses import named_glass
 from neurolens.optics.readers.source import MAX_POWER, Line, ReadOptions, assume, by_word, read_lines, warn
 
@@ -284,7 +283,7 @@ def _thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> fl
     return math.inf if is_object and value >= INFINITE else value
 
 
-def _glass(file: File, line: Line, rest: list[str]) -> dict[str, Any]:
+def _glass(file: File, line: Line, rest: list[str]) -> MediumFields:
     """Read GLAS with name, type of solve, surface, n_d, V_d.
 
     Solve 1 is a model glass. Others leave the glass that is named (2 is a pickup that is carried out, 3 a glass that
@@ -418,7 +417,7 @@ def _set_field(file: File) -> None:
         warn(file.file, f"the field is given as type {file.field_type} (not an angle, not an image height): left out")
 
 
-def shape_of(block: Block) -> dict[str, Any]:
+def shape_of(block: Block) -> ShapeFields:
     """Return the radius and the figure of a surface, for `Block.row`.
 
     Even asphere: sum of PARM i r^(2 i). Odd asphere: sum of PARM i r^i. The extended ones have XDAT in the place of
@@ -490,7 +489,7 @@ def shape_of(block: Block) -> dict[str, Any]:
     return shape
 
 
-def _q_type(block: Block) -> dict[str, Any]:
+def _q_type(block: Block) -> ShapeFields:
     form, (radius, values) = block.extra.pop(1, (0.0, block.start))[0], block.extras(2)
     if form not in (0, 1):
         raise block.start.error(block.kind, f"(XDAT 1 {form:g})", "0 (Qbfs) or 1 (Qcon)")

@@ -341,7 +341,7 @@ def tile_path(out: Path, tile: tuple[int, int] | None) -> Path:
     return out.with_name(f"{out.stem}.tile-{number:0{len(str(count))}d}-of-{count}{out.suffix}")
 
 
-def windows(width: int, height: int, rows: Sequence[int]) -> dict[str, Any]:
+def windows(width: int, height: int, rows: Sequence[int]) -> dict[str, tuple[NDArray[np.int32], ...]]:
     """Return header values that place a band of rows in a picture of width x height."""
 
     def box(first: int, last: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

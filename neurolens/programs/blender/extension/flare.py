@@ -93,7 +93,7 @@ def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float, light: A
     return True
 
 
-def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[str, Any]]:
+def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[lights.Row]:
     """Yield the rows of all lights that renders show, at the scene's present frame."""
     scene, graph = context.scene, context.evaluated_depsgraph_get()
     view = np.array(found.evaluated_get(graph).matrix_world)
@@ -127,14 +127,14 @@ def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, 
     Raises:
         LensError: there is no light, or no such folder.
     """
-    scene, known, keys = context.scene, dict[str, list[dict[str, Any]]](), list[dict[str, Any]]()
+    scene, known, keys = context.scene, dict[str, list[lights.Row]](), list[dict[str, Any]]()
     before, frames = scene.frame_current, range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
     custom = found.data.cycles_custom if on_camera.applied(found.data) else {}
     try:
         for frame in frames:
             scene.frame_set(frame)
             for row in rows_now(context, found, frame, rays):
-                known.setdefault(row["light"], []).append(row)
+                known.setdefault(str(row["light"]), []).append(row)
             setting = on_camera.setting_of(scene, found)
             values = {"focus": setting.focus_m, "f-number": setting.f_number, "zoom": custom.get("zoom_mm")}
             values |= {f"film-{name}": custom.get(name) for name in ("tilt", "swing")}

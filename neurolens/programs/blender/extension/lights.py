@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 Kind = Literal["sphere", "rectangle", "disc", "distant"]
+Row = dict[str, str | float]  # of a list, by the names of its columns
 FAR = 1e6  # how many units of the scene away a distant light is put
 _TURN = math.pi * (3 - math.sqrt(5))  # angle of the sunflower's spiral
 _PLASTIC = 1.3247179572447460  # ratio of the R2 sequence (Roberts 2018): x^3 = x + 1
@@ -92,7 +93,7 @@ def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
     return eye + start @ pupil, seen.middle + end @ seen.sides
 
 
-def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, visible: float) -> dict[str, Any]:
+def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, visible: float) -> Row:
     """Return a row of a list; `view` [4, 4] is the camera's frame, which looks along -z, and `rgb` the irradiance."""
     way = (seen.middle - view[:3, 3]) @ (view[:3, :3] / np.linalg.norm(view[:3, :3], axis=0))
     far = max(float(np.linalg.norm(way)), 1e-9)
@@ -106,7 +107,7 @@ def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, v
     }  # fmt: skip
 
 
-def in_every_frame(rows: list[dict[str, Any]], frames: range) -> list[dict[str, Any]]:
+def in_every_frame(rows: list[Row], frames: range) -> list[Row]:
     """Add dark rows where a light is missing: otherwise it would shine between its keys and beyond them."""
     known, found = {row["frame"]: row for row in rows}, rows[:1]
     for frame in frames:
