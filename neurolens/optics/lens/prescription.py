@@ -107,7 +107,6 @@ class Medium:
     glass: str | None = None
 
 
-# What a file gives of a medium: some fields of `Medium` or of `Surface`.
 class MediumFields(TypedDict, total=False):
     """What a file gives of a medium: some fields of `Medium` or of `Surface`."""
 
