@@ -297,9 +297,8 @@ def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
     found = values.astype(np.float64)
     for axis in (0, 1):
         found = np.pad(found, [(_WINDOW // 2 + 1, _WINDOW // 2) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        sums = np.cumsum(found, axis=axis)
-        count = sums.shape[axis] - _WINDOW
-        found = (sums.take(range(_WINDOW, _WINDOW + count), axis) - sums.take(range(count), axis)) / _WINDOW
+        sums = np.moveaxis(np.cumsum(found, axis=axis, out=found), axis, 0)
+        found = np.moveaxis((sums[_WINDOW:] - sums[:-_WINDOW]) / _WINDOW, 0, axis)
     return found
 
 
@@ -372,7 +371,7 @@ def defocus(
     light = float(found.rgb.sum(dtype=np.float64))
     lost, number = max(hidden, 0) / max(light + hidden, 1e-30), sum(len(some.radius_px) for some in taken)
     _say(found := replace(found, highlights=number, lost=lost), len(plate.layers))
-    return replace(found, rgb=np.maximum(found.rgb @ tint(camera).T, 0).astype(np.float32))
+    return replace(found, rgb=np.maximum(found.rgb @ tint(camera).T.astype(np.float32), 0))
 
 
 def _say(found: Gathered, layers: int) -> None:
