@@ -19,6 +19,8 @@ from neurolens.graph.program import Argument, Mixture, Program, Step
 BLOCK = 256  # rays in a block
 PART, ROWS = 56, 128  # steps of a part, and rays that it does at a time: its numbers stay in the first cache
 MOST_WAITING = 512  # numbers that wait between parts; where more do, half as many rays keep them in the second cache
+# What the second cache holds: those numbers, and the code, some bytes a step. A block has at least a vector of rays.
+CACHE, STEP_BYTES, LEAST_ROWS = 1 << 19, 10, 16
 _DOUBLE = ContextVar("_DOUBLE", default=False)  # whether literals are those of double precision
 
 
@@ -248,7 +250,9 @@ class PartWriter(Writer):
             written.append(self._function(number, lines, made))
         calls = "\n".join(call for _, call in written)
         loop = part("parts.h", "in_parts", macro=self.macro, rows=max(1, rows), calls=calls)
-        block = f"#define {self.macro}_ROWS {ROWS if rows <= MOST_WAITING else ROWS // 2}\n"
+        fitting = max(0, CACHE - STEP_BYTES * sum(map(len, parts))) // (4 * max(1, rows))
+        most = min(ROWS if rows <= MOST_WAITING else ROWS // 2, 1 << fitting.bit_length() >> 1)
+        block = f"#define {self.macro}_ROWS {max(LEAST_ROWS, most)}\n"
         return block + "".join(text for text, _ in written), loop
 
     def _function(self, number: int, lines: Sequence[str], made: Sequence[str]) -> tuple[str, str]:
