@@ -301,7 +301,7 @@ def _light_on_axis(scene: ModelScene, wavelength_nm: float, turns: int, slope: f
 
     distance_mm = abs(scene.film_z_mm - scene.lens.card["domain"]["pupil_z_mm"])
     light = axial_light(trace, turns, slope, distance_mm, scene.stop_radius_mm, scene.stopped)
-    return float(light[0] * (scene.aperture is None or scene.aperture.inside(np.zeros(1), np.zeros(1), 1.0)))
+    return float(light[0] * (scene.aperture is None or scene.aperture.inside(np.zeros(1), np.zeros(1), 1.0)[0]))
 
 
 def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float, spokes: int) -> FloatArray:
