@@ -194,7 +194,7 @@ _LENS_AND_DOMAIN: dict[str, Rule] = {
     "lens.dispersive": (lambda v: isinstance(v, bool), "true or false"),
     "lens.efl_mm": (lambda v: _is_number(v) and v != 0, "a finite number other than 0"),
     **dict.fromkeys(("lens.f_number", "lens.stop_radius_mm"), _POSITIVE),
-    **dict.fromkeys(("lens.front_principal_z_mm", "lens.rear_principal_z_mm"), _NUMBER),
+    **dict.fromkeys((f"lens.{at}_z_mm" for at in ("front_principal", "rear_principal", "infinity_film")), _NUMBER),
     "domain": _TABLE,
     **dict.fromkeys(("domain.film_radius_mm", "domain.pupil_radius_mm", "domain.stop_radius_mm"), _POSITIVE),
     **dict.fromkeys(("domain.film_z_mm", "domain.wavelength_nm"), _RISING),
@@ -216,7 +216,7 @@ _RULES: dict[str, Rule] = {
     "fit.settings": _TABLE,
     "errors": (_are_errors, "a table of figures from 0 up, of tables of such, of texts and lists"),
 }
-_NODE_RULES = {**_LENS_AND_DOMAIN, "lens.infinity_film_z_mm": _NUMBER, "lens.film_z_mm": _NUMBER}
+_NODE_RULES = {**_LENS_AND_DOMAIN, "lens.film_z_mm": _NUMBER}
 _OPTIONAL: dict[str, Rule] = {
     "lens.stop_surface": (lambda v: _is_integer(v, 0, 9999), "an integer"),
     "lens.index_ratio": _POSITIVE,

@@ -178,6 +178,15 @@ def test_the_card_says_what_float32_costs(tmp_path: Path) -> None:
             load_model(new)
 
 
+def test_a_card_without_the_film_place_at_infinity_is_refused(tmp_path: Path) -> None:
+    """Shaders and cameras focus from it."""
+    cut = edited(
+        lens_models.exported("fisheye"), tmp_path / "x.onnx", lambda card: card["lens"].pop("infinity_film_z_mm")
+    )
+    with pytest.raises(ModelError, match="infinity_film_z_mm"):
+        load_model(cut)
+
+
 def put(array: dict[str, Any], form: str, at: slice, raw: bytes) -> None:
     """Other bytes in a stored array."""
     data = bytearray(base64.b64decode(array[form]))
