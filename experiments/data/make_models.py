@@ -29,6 +29,7 @@ from experiments.speed.promises import read_index
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
+from neurolens.base.find import read_index as read_lenses
 from neurolens.base.progress import Progress
 from neurolens.base.records import versions
 from neurolens.base.settings import LIGHT_NM, RANGE, read_config
@@ -103,11 +104,12 @@ class WholeFolder:
     """Every lens file of a folder in its default state, unless an entry has it: best polynomial, best network.
 
     Attributes:
-        without: lenses made from this collection are left out; they are fitted where somebody asks for them.
+        certain: of lenses by name only those of this collection that certainly agree with photographs of the product,
+            and those in `more`; `neurolens train` fits the others where somebody asks for them.
     """
 
     folder: Path
-    without: str = ""
+    certain: str = ""
     models: tuple[ModelSettings, ...] = field(default_factory=_default_models)
     more: More | None = None
 
@@ -117,8 +119,14 @@ class WholeFolder:
         Raises:
             InputError: a lens with more models that the folder does not have.
         """
-        files = [f for f in lens_files(root / self.folder) if not self.without or lab.of_collection(f) != self.without]
-        more = self.more or More((), ())
+        more, rows = self.more or More((), ()), read_lenses()
+
+        def kept(file: Path) -> bool:
+            collection, row = lab.of_collection(file), rows.get(file.name, {"row": {}})["row"]
+            certain = collection == self.certain and row.get("match") == "certain"
+            return certain or not collection or file.stem in more.lenses
+
+        files = [file for file in lens_files(root / self.folder) if not self.certain or kept(file)]
         unknown = {*more.lenses} - {file.stem for file in files}
         if unknown:
             raise InputError("settings", "lenses.more.lenses", sorted(unknown), f"names of lens files of {self.folder}")
@@ -176,12 +184,13 @@ def chosen(library: Library, names: Sequence[str]) -> tuple[Entry, ...]:
 
 _HEAD = """# Models that ship
 
-`python -m experiments models` made these models from experiments/data/models.toml. Every lens of lenses/ that is not
-from LensVisualizer alone has the best polynomial of at most 64 coefficients per vector output; `neurolens train` fits
-the others. The historical lenses and 34 lenses by name also have the best network of two layers of 16 units, after 600
-iterations. A few lenses have faster models, too. A model holds for the whole lit film, the full aperture, focus from
-infinity to near, and all wavelengths for which the glasses are known. It focuses by moving the whole lens, also where
-the lens file moves groups: `--focus-mode best` sets the exact lens so.
+`python -m experiments models` made these models from experiments/data/models.toml. The 38 historical lenses, and
+lenses of OpticsDatabase that photographs certainly confirm, have the best polynomial of at most 64 coefficients per
+vector output; `neurolens train` fits any other lens in a minute. The historical lenses and 36 by name also have the
+best network of two layers of 16 units, after 600 iterations. A few lenses have faster models, too. A model holds for
+the whole lit film, the full aperture, focus from infinity to near, and all wavelengths for which the glasses are
+known. It focuses by moving the whole lens, also where the lens file moves groups: `--focus-mode best` sets the exact
+lens so.
 
 - **Errors** are those of held-out rays (`neurolens.studies.rays`), in micrometres at an image radius of 21.6 mm.
   Every card was checked on fresh rays. `neurolens evaluate models/FILE` checks a model again.

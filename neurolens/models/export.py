@@ -157,6 +157,7 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
         InputError: what `export_onnx` refuses, and nodes whose graphs differ in more than numbers.
     """
     _check_gates(model.nodes[0])
+    model = replace(model, nodes=as_stored(model.nodes))
     card = card_of(model.at(*model.first_state), errors or {})
     facts = [lens_facts(node.lens, node.domain) for node in model.nodes]
     for fact, node in zip(facts, model.nodes, strict=True):  # at infinity focus, as photographers count
@@ -174,7 +175,7 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
         "reference": [{"state": list(s), **reference_rays(model.at(*s), 8, 1)} for s in _between_nodes(model)],
     }
     metadata = {CARD_KEY: card_to_json(card), MODEL_KEY: coefficients_text(model.nodes)}
-    return write_file(path, onnx_of(as_stored(model.nodes), model.axes, metadata))
+    return write_file(path, onnx_of(model.nodes, model.axes, metadata))
 
 
 def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
@@ -215,7 +216,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
         **phase,
         **({"copies": copies} if copies else {}),
         "errors": errors,
-        "reference": reference_rays(model),
+        "reference": reference_rays(*as_stored([model])),
         "versions": {
             "neurolens": neurolens.__version__,
             "torch": str(torch.__version__),
@@ -255,7 +256,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
 
 
 def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict[str, Any]:
-    """Return rays with the answers of the float64 model, by which a client checks its own evaluation.
+    """Return rays with the answers of a model as its file stores it, in float64, by which clients check their own.
 
     Rays near a boundary are left out: within 0.01 of it (relative), or within 0.001 where no passing ray lies farther
     away. Rays whose status float32 changes are left out, too. For every status that the model gives there are up to
