@@ -348,8 +348,8 @@ def refract(
 
 def reflect(o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int) -> Rays:
     """Return the rays with the normal part of their directions reversed."""
-    return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense)
-                            for p, n in zip(r[3:], normal_at(o, met, curvature), strict=True)))  # fmt: skip
+    normal = normal_at(o, met, curvature)
+    return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense) for p, n in zip(r[3:], normal, strict=True)))
 
 
 def through_ideal(o: Arithmetic, r: Rays, met: Hit, power: float) -> Rays:
