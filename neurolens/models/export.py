@@ -216,7 +216,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
         **phase,
         **({"copies": copies} if copies else {}),
         "errors": errors,
-        "reference": reference_rays(*as_stored([model])),
+        "reference": reference_rays(as_stored([model])[0]),
         "versions": {
             "neurolens": neurolens.__version__,
             "torch": str(torch.__version__),
