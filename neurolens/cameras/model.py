@@ -28,6 +28,7 @@ from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, ou
 from neurolens.cameras.sampling import beyond_circle, common_light, lens_state
 from neurolens.models.assemble import ONNX, SCALARS, Form
 from neurolens.models.card import state_for
+from neurolens.models.copied import Copied
 from neurolens.models.file import coefficients_text
 from neurolens.models.inverse import InverseModel, inverse_of
 from neurolens.optics.lens import paraxial
@@ -209,7 +210,7 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
     domain = scene.lens.card["domain"]
     colours, weights = paraxial.colours(wavelength_nm)
     reach = float(domain["film_radius_mm"])
-    round_ = scene.aperture is None and scene.squeeze(_SQUEEZED * reach, wavelength_nm) == 1.0
+    round_ = scene.aperture is None and _is_round(scene, wavelength_nm)
     spokes = 1 if round_ else _SPOKES  # one spoke of a round lens stands for all
     shape = len(colours), _RINGS, spokes
     pupil = np.tile(_axial_pupil(domain, scene.stop_radius_mm, spokes), len(colours))
@@ -251,16 +252,22 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
     return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
 
 
+def _is_round(scene: ModelScene, wavelength_nm: tuple[float, float]) -> bool:
+    """Tell whether all azimuths are alike: there is no squeeze, and no element is off the axis."""
+    copy = isinstance(scene.lens.fitted.core, Copied)
+    return not copy and scene.squeeze(_SQUEEZED * scene.lens.card["domain"]["film_radius_mm"], wavelength_nm) == 1.0
+
+
 def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilOutline | None:
     """Search the outline of a model with a round stop, or take it from the cache; see `kept_outline`.
 
-    With cylinders it is one for all azimuths, which fits none well.
+    With cylinders, or elements off the axis, it is one for all azimuths, which fits none well.
     """
     domain, model = scene.lens.card["domain"], coefficients_text([scene.lens.fitted])
 
     def search() -> PupilOutline | None:
         bounds = PupilTable.of(domain["bounds"])
-        if scene.squeeze(_SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
+        if _is_round(scene, wavelength_nm):
             return outline_of(bounds, scene.passes, wavelength_nm)
         return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE)
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.models import perturbations
@@ -25,7 +26,9 @@ from neurolens.models.pairs import draw
 from neurolens.models.perturbations import copy_errors, derivatives, exact_answers, steps_of, with_perturbations
 from neurolens.models.source import at_wavelength, copies_program, fused_program
 from neurolens.models.targets import film_equivalent
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.setting.copies import Off, Tolerances, draws_of, figure_names, perturbed
+from neurolens.optics.setting.states import set_lens
 from neurolens.studies.speed import CompiledSource
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -172,6 +175,21 @@ def test_a_copy_in_every_form(model: LensModel, rays: FilmRays, drawn: Off) -> N
     np.testing.assert_array_equal(found["status"], again.status)
     for name, row in zip(("dx", "dy"), again.rays[3:5], strict=True):
         np.testing.assert_allclose(found[name], row, atol=2e-6)
+
+
+def test_a_copy_is_focused_as_its_exact_lens(model: LensModel, tmp_path: Path) -> None:
+    """Rays of one azimuth, which suffice for a round lens, had placed the film of such a copy 0.6 mm off."""
+    off = Off.none(model.lens)
+    off.decentre_mm[2] = -0.1, 0.14  # which leaves the paraxial focus where it is
+    shot = Shot((36.0, 24.0), 5.0, f_number=2.8, focus_mode="best")
+    film_mm = []
+    for each in (Off.none(model.lens), off):
+        file = export_onnx(copy_of(model, each), tmp_path / "copy.onnx")
+        camera = OnnxCamera(load_model(file), shot)
+        exact = set_lens(perturbed(model.lens, each), f_number=2.8, focus_m=5.0, focus_mode="best")
+        film_mm.append((camera.film.film_z_mm, exact.film_z_mm))
+    (plain, wanted), (found, moved) = film_mm
+    assert found - plain == pytest.approx(moved - wanted, abs=0.005) and abs(plain - wanted) < 0.005
 
 
 def test_what_is_off_is_an_input(model: LensModel, rays: FilmRays, drawn: Off, tmp_path: Path) -> None:
