@@ -61,7 +61,7 @@ LEAN_MODULES = {
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
     "__init__": 25, "__main__": 4, "base": 2020, "graph": 2720, "optics": 10075, "models": 4580, "cameras": 4295,
-    "pictures": 7605, "programs": 2760, "studies": 3175, "cli": 4265, "front": 210,
+    "pictures": 7635, "programs": 2760, "studies": 3175, "cli": 4265, "front": 210,
 }  # fmt: skip
 SLACK = 1.03
 

@@ -23,16 +23,18 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, warn
+from neurolens.base.errors import InputError
 from neurolens.base.tasks import in_order
+from neurolens.cameras.pose import UPRIGHT
 from neurolens.graph.compiler import c_source, load_compiled
+from neurolens.optics.lens.paraxial import first_order
 from neurolens.pictures.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.pictures.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
 from neurolens.pictures.flare.job import FlareJob
@@ -45,6 +47,7 @@ _SPECTRUM = 4096  # samples a side of the outline's power spectrum
 _PARTS = 8  # of the range of wavelengths, out of focus
 _STARTS = 1 << 15  # elements of the outline at which pairs start
 _PATCH_DEG = 8.0  # of a patch of an extended light: see `patches`
+_FARTHEST_MM = 1e5  # exit pupils are no farther from the film: rays of a telecentric lens are parallel
 _GROUPS, _SAMPLES = 3, 64  # of elements out of focus; how many of a group keep their places, for each of up to 8 lines
 
 
@@ -203,15 +206,14 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
     The star of a point is 0 where rays make the image itself and at the pixels next to that, because a render has the
     light there. Energy is kept if the render's light is reduced by the sum of this layer on a film without edges. An
     extended light has the sum of its points' stars, also within its image. Diffracted light is assumed to pass the rear
-    of the lens unhindered. A light whose rays do not reach the film has no star, and no light has one on a turned film,
-    where each point of a star has another focus. Fringes of one wavelength lie beyond
-    the gamut of sRGB: see `in_gamut`. `done` is called with the share of the work.
+    of the lens unhindered. A light whose rays do not reach the film has no star. On a turned film all of a star has the
+    focus of its image. Fringes of one wavelength lie beyond the gamut of sRGB: see `in_gamut`. `done` is called with
+    the share of the work.
     """
+    if job.pose.turned:
+        return _on_turned_film(job, done)
     raster, spectral = job.raster, job.spectral()
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
-    if job.pose.turned:
-        warn("no star: the layer starburst takes a film that is not turned; ghosts and glare take any")
-        return picture
     parts = [patch for light in job.lights for patch in patches(light, _PATCH_DEG)]
     for number, patch in enumerate(parts):
         colours = spectral.response * spectral.spectrum(patch.light.rgb) / (spectral.bins * job.exposure)
@@ -227,6 +229,43 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
         picture += canvas if smear is None else smeared(canvas, kernel)
         done((number + 1) / len(parts))
     return in_gamut(picture)
+
+
+def _on_turned_film(job: FlareJob, done: Callable[[float], None]) -> Floats:
+    """Return the stars on a turned film: those of upright films through the images, seen from the exit pupil."""
+    from scipy import ndimage  # type: ignore[import-untyped]
+
+    raster, lens, turn, moved = job.raster, job.lens, job.pose.axes, job.pose.moved_mm
+    assert lens.film_z_mm is not None
+    back = min(abs(lens.film_z_mm - float(first_order(lens).exit_pupil_z_mm)), _FARTHEST_MM)
+    across = (raster.width / 2 - 0.5 - np.arange(raster.width)) / raster.per_mm - moved[0]
+    down = (np.arange(raster.height) + 0.5 - raster.height / 2) / raster.per_mm - moved[1]
+    place = np.tensordot(turn[:, :2], np.stack(np.meshgrid(across, down)), 1)  # of pixels, from the film's middle
+    picture = np.zeros((raster.height, raster.width, 3), np.float32)
+    for number, light in enumerate(job.lights):
+        image = exit_pupil(lens, light, 0.5 * sum(job.wavelength_nm))
+        if image is None:
+            continue
+        slope = image.middle / math.sqrt(1 - float(image.middle @ image.middle))
+        chief = back * np.append(slope, 1.0)  # from the middle of the pupil to the upright film
+        pupil = np.append(image.centre_mm, 0.0) - chief
+        rays = place - pupil[:, None, None]
+        rays[2] = np.maximum(rays[2], 0.1 * back)  # the film of a short lens may reach its pupil, as in `covers_mm`
+        depth = -back * float(turn[:, 2] @ pupil) / float(turn[:, 2] @ chief)  # of the image, from the pupil
+        scale = depth / rays[2]
+        spot = pupil[:2, None, None] + scale * rays[:2]  # where they meet the upright film through the image
+        most = 2 * max(raster.width, raster.height)
+        half = [min(math.ceil(float(np.abs(v).max()) * raster.per_mm) + 2, most) for v in spot]
+        size = [2 * n / raster.per_mm for n in half]
+        film = Raster((size[0], size[1]), 2 * half[0], 2 * half[1])
+        there = replace(lens, film_z_mm=lens.film_z_mm - back + depth)
+        upright = replace(job, lens=there, lights=[light], pose=UPRIGHT, raster=film, ghosts=None)
+        flat = starburst_picture(upright) * (upright.exposure / job.exposure)
+        at = half[1] - 0.5 + spot[1] * raster.per_mm, half[0] - 0.5 - spot[0] * raster.per_mm
+        share = scale**2 * np.tensordot(turn[:, 2], rays, 1) / rays[2]  # of light: pixels stand aslant, and farther
+        picture += np.stack([share * ndimage.map_coordinates(c, at, order=1) for c in np.moveaxis(flat, -1, 0)], -1)
+        done((number + 1) / len(job.lights))
+    return picture
 
 
 def _stars(job: FlareJob, light: Light, wavelengths_nm: Array, raster: Raster) -> Iterator[Floats]:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.graph.compiler import has_compiler
@@ -136,16 +134,28 @@ def test_a_turned_film_sends_light_back_about_its_own_normal(lens: Lens) -> None
     assert books.cast == books.weight.size + books.left + books.stopped + books.absorbed + books.cut
 
 
-def test_stars_move_with_the_film_and_are_left_out_on_a_turned_one(lens: Lens) -> None:
+def test_stars_move_with_the_film(lens: Lens) -> None:
     raster, light = Raster((12.0, 8.0), 60, 40), Light(0.0, 0.0)
-    settings = FlareSettings(bins=1, starburst=True, without=("ghosts",))
-    plain = FlareJob(lens, [light], raster, settings)
+    plain = FlareJob(lens, [light], raster, FlareSettings(bins=1, starburst=True, without=("ghosts",)))
     moved = replace(plain, pose=FilmPose(moved_mm=(2.0, -1.0)))  # ten pixels to the left, five up
     one, other = (flare_layers(job)["starburst"] for job in (plain, moved))
     inside = one[10:, 15:][:20, :20]
     np.testing.assert_allclose(other[5:][:20, 5:][:, :20], inside, rtol=0.05, atol=1e-3 * inside.max())
-    with pytest.warns(NeurolensWarning, match="no star: .* not turned"):
-        assert not flare_layers(replace(plain, pose=POSE))["starburst"].any()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        flare_layers(moved)
+
+
+def test_a_star_falls_on_its_image_on_a_turned_film(lens: Lens) -> None:
+    """It has the light of the upright one, and is that one on a film that is hardly turned."""
+    raster, light = Raster((24.0, 16.0), 120, 80), Light(3.0, 2.0)
+    plain = FlareJob(lens, [light], raster, FlareSettings(bins=1, starburst=True, without=("ghosts",)))
+    jobs = plain, replace(plain, pose=FilmPose(1e-9)), replace(plain, pose=POSE)
+    upright, hardly, turned = (flare_layers(job)["starburst"].sum(-1) for job in jobs)
+    np.testing.assert_allclose(hardly, upright, atol=1e-4 * upright.max())
+    found = GhostTracer(lens, [], POSE).trace(light_rays(lens, light, 0, 5000)[0], 550.0, direct=True)
+    x, y = np.average(found.film_xy_mm[0], axis=1, weights=found.power[0]) * raster.per_mm
+    rows, columns = np.indices(turned.shape)
+    near = np.where(np.hypot(columns - (59.5 - x), rows - (39.5 + y)) < 10, turned, 0.0)
+    assert turned.max() == near.max()
+    middle = [(near * v).sum() / near.sum() for v in (columns, rows)]
+    np.testing.assert_allclose(middle, [59.5 - x, 39.5 + y], atol=0.5)
+    light_of = [float(p.sum()) * job.exposure for p, job in ((upright, jobs[0]), (turned, jobs[2]))]
+    assert light_of[1] == pytest.approx(light_of[0], rel=0.05)
