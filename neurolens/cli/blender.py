@@ -180,7 +180,7 @@ class Added(Report):
     name: str = field(metadata=BULK)
 
     def text(self) -> str:
-        """Return a sentence."""
+        """Say which lens, in which forms, the extension has now."""
         return f"{self.name} ({', '.join(self.forms)}) is in {self.to}"
 
 

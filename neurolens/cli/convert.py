@@ -248,7 +248,7 @@ class GlassFigures:
 
 @dataclass(frozen=True)
 class Glasses(Report):
-    """The glasses that were asked for."""
+    """The figures of the glasses that a command names."""
 
     glasses: Sequence[GlassFigures]
 

@@ -101,6 +101,6 @@ class Rendered(Report):
     name: str = field(metadata=BULK)
 
     def text(self) -> str:
-        """Return its size, time and files."""
+        """Return the size of the picture, its time and its files."""
         size = f"{self.took.width} x {self.took.height} in {duration(self.took.seconds)} ({self.took.variant})"
         return f"{self.took.scene} through {self.name}: {size}\n{self.file}\n{self.preview}"

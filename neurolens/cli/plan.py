@@ -179,7 +179,8 @@ class Planned(Report):
         told = cli.table(("effect", "worth", "", "beyond", ""), rows)
         stray = [e for e in self.plan.effects if e.name in STRAY.values()]
         if not stray:
-            return told + "\n\nFlare is not known" + ": --explain looks for it, in seconds" * (not self.every) + "."
+            hint = "" if self.every else ": --explain looks for it, in about a minute"
+            return f"{told}\n\nFlare is not known{hint}."
         needed = ", ".join(e.name for e in stray if e.needed)
         made = f"\n\nNo camera makes {needed}: a table [flare] in the scene does, or 'neurolens flare'."
         return told + made * bool(needed)

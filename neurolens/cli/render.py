@@ -261,7 +261,7 @@ class Rendered(Report):
     camera: Mapping[str, Any]
 
     def text(self) -> str:
-        """Return its size, time and files."""
+        """Return the size of the picture, its time and its files."""
         took = self.took
         return (
             f"{took.scene} through {took.camera}: {took.settings['width']} x {took.settings['height']}, {took.samples} "

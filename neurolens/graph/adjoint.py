@@ -64,7 +64,7 @@ class _Values:
         self.kept = {*dear, *program.tanh_of, *(k for k in forward if program.steps[k].kind in _DEAR)}
 
     def back_to(self, k: int) -> None:
-        """Go back to a step, after which only those before it are asked for."""
+        """Tell that the way back has come to a step: it will not need the values of later steps again."""
         if (part := self.part.get(k, -1)) != self.now:
             self.now = part
             self.again.clear()

@@ -36,7 +36,7 @@ from neurolens.studies.plan.probe import Effect, Probe, SceneNeeds, effects_of, 
 
 ALIKE = 1.2  # whose pictures take up to so many times the least: prices are no more accurate
 SHARE = 0.1  # the most that a plan should take of its picture's time
-_WHOLE_S = 60.0  # the most CPU seconds of a plan with the light that the lens adds, whatever the picture
+_WHOLE_S = 60.0  # CPU seconds of a plan with the light that the lens adds: 40 to 87 in the 24 cases of `plans`
 
 
 @dataclass(frozen=True)
