@@ -49,7 +49,6 @@ def setup(app: Any) -> None:
     app.add_lexer("csv", TextLexer)
     app.connect("source-read", _prepare)
     app.connect("autodoc-process-docstring", _to_restructured_text, priority=400)  # before napoleon's
-    app.connect("build-finished", _copy_library)
 
 
 def _commands() -> str:
@@ -112,9 +111,3 @@ def _to_restructured_text(app: Any, what: str, name: str, of: object, options: A
     parts = re.split(r"(`[^`\n]*`)", text)
     parts[::2] = [re.sub(r"([*|]|(?<=\w)_(?!\w))", r"\\\1", part) for part in parts[::2]]
     lines[:] = re.sub(r"(`[^`\n]*`)(?=\w)", r"\1\\ ", "".join(parts)).split("\n")
-
-
-def _copy_library(app: Any, exception: Exception | None) -> None:
-    """Pages that are HTML already."""
-    if exception is None:
-        shutil.copytree(PAGES / "library", Path(app.outdir, "docs/pages/library"), dirs_exist_ok=True)
