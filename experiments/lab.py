@@ -346,9 +346,11 @@ def write_small(file: Path, forms: Iterable[tuple[Any, dict[str, Any]]], most_by
 
 def labelled(picture: Any, text: str) -> Any:
     """A picture of Pillow with its title in the upper left corner."""
-    from PIL import ImageDraw
+    from matplotlib import font_manager
+    from PIL import ImageDraw, ImageFont
 
-    ImageDraw.Draw(picture).text((12, 8), text, "white", font_size=20, stroke_width=2, stroke_fill="black")
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 18)
+    ImageDraw.Draw(picture).text((12, 8), text, "white", font, stroke_width=2, stroke_fill="black")
     return picture
 
 

@@ -60,6 +60,7 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.trace.rays import compile_tracing, trace
 from neurolens.optics.trace.tracegraph import exact_graph
+from neurolens.studies.plots import place_labels
 from neurolens.studies.speed import CompiledSource, Unavailable
 
 COUNT, SEED, LEAST_S = 100_000, 36, 0.004  # rays, their seed, and the least time of a sample
@@ -339,11 +340,12 @@ def draw(rows: Sequence[lab.Row], file: Path) -> None:
     with drawing(file, 9.0, 4.8 * len(titles)) as figure:
         for panel, name in zip(figure.subplots(len(titles), 1, squeeze=False)[:, 0], titles, strict=True):
             timed = sorted((r for r in rows if r["lens"] == name and r["ns"]), key=lambda r: r["ns"]["min"])
+            points: list[tuple[float, float]] = []
             for k, row in enumerate(timed, 1):
                 # The trace that all are compared with has no error, and a logarithm none.
                 x, y, colour = row["ns"]["min"], max(row["errors"]["film_um"], 1e-11), FAMILIES[row["family"]]
                 panel.plot(x, y, "s" if row["precision"] == "float64" else "o", color=colour, markersize=4)
-                panel.annotate(f"{k}", (x, y), (2, 4 if k % 2 else -9), textcoords="offset points", color=colour)
+                points.append((x, y))
                 words = f"{k}  {row['name']}, {row['precision']}"
                 panel.text(1.03, 1.02 - 0.05 * k, words, transform=panel.transAxes, fontsize=9, color=colour)
             title = titles[name].replace("`", "")
@@ -351,6 +353,7 @@ def draw(rows: Sequence[lab.Row], file: Path) -> None:
             plain_log_ticks(panel.xaxis, panel.yaxis)
             panel.margins(0.2)
             panel.set_ylabel("RMS error on the film, um (1e-11: the reference itself)")
+            place_labels(panel, points, [str(k + 1) for k in range(len(points))])
 
 
 OPTIONS = (

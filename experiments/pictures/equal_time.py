@@ -290,16 +290,18 @@ def page(rows: Sequence[Row]) -> str:
 
 def draw(rows: Sequence[Row], file: Path) -> None:
     """Draw the relative RMSE over seconds, both logarithmic: a panel a scene, a line a camera."""
-    with drawing(file, 4.2 * len(rows), 4.0) as figure:
-        for axes, row in zip(figure.subplots(1, len(rows), squeeze=False)[0], rows, strict=True):
+    with drawing(file, 3.0 * len(rows), 3.8) as figure:
+        panels = figure.subplots(1, len(rows), squeeze=False)[0]
+        for axes, row in zip(panels, rows, strict=True):
             for camera in row["cameras"]:
                 levels = [level for level in camera["levels"] if level["rel_mse"] > 0]
                 errors = [100 * math.sqrt(level["rel_mse"]) for level in levels]
                 axes.loglog([level["seconds_min"] for level in levels], errors, ".-", label=camera["name"])
-            axes.set(title=row["scene"], xlabel="seconds of one thread", ylabel="relative RMSE, %")
+            axes.set(title=row["scene"], xlabel="seconds of one thread")
             plain_log_ticks(axes.xaxis, axes.yaxis)
             axes.grid(alpha=0.3)
-        figure.axes[0].legend(fontsize=8)
+        panels[0].set_ylabel("relative RMSE, %")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
 def error_after(camera: Row, seconds: float) -> float:

@@ -186,7 +186,8 @@ def page(rows: list[lab.Row]) -> str:
         ("sharp pictures of their views, PSNR dB", "sharp_db", ".2f"), ("steps", "steps"), ("CPU s", "cpu_s", ".0f"),
     )  # fmt: skip
     command, table = "`python -m experiments radiance`", lab.table(shown, rows)
-    return lab.page("# A radiance field from photographs", command, str(__doc__), lab.machine_line(), table)
+    shown_too = (f"![{name}](radiance_{name.partition(' ')[0]}.png)" for name in ("lens", "thin lens", "pinhole"))
+    return lab.page("# A radiance field from photographs", command, str(__doc__), lab.machine_line(), table, *shown_too)
 
 
 OPTIONS = (lab.count("steps", 400, "of training (default 400)"), lab.AGAIN, lab.out())

@@ -58,6 +58,7 @@ from neurolens.graph.c import Signature
 from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
 from neurolens.graph.shading import Cuda
+from neurolens.optics.analysis.plots import FIELD_COLOURS, drawing, plain_log_ticks
 from neurolens.optics.lens.shot import Shot
 from neurolens.programs.torch import LensCamera, Run, step_by_step
 
@@ -681,50 +682,39 @@ def _of(rows: Sequence[lab.Row], kind: str) -> list[lab.Row]:
 
 def plot(found: lab.Row, file: Path) -> None:
     """Errors on the film against rays a second, a point a form and language."""
-    import matplotlib
+    from matplotlib.lines import Line2D
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(9, 5.5), layout="constrained")
+    blue, orange, green, _, pink, *_, grey = FIELD_COLOURS
+    key = {"exact": blue, "polynomial": green, "network": orange, "Optiland, DeepLens": pink}
+    if any(row["seconds"] for row in found.get("torch", [])):
+        key["torch"] = grey
     marks = dict(zip(MODELS, "os^D", strict=False))
     rates = {(r["lens"], r["form"]): r for r in _of(found.get("rows", []), LENS)}
-    for (lens, form), row in rates.items():
-        colour = "tab:blue" if form.startswith(EXACT) else "tab:green" if form.startswith("ols") else "tab:orange"
-        face = "none" if "fast" in form else colour
-        axes.plot(1 / min(row["seconds"]["in place"]), row["rms_um"], marks[lens], mfc=face, color=colour, ms=9)
-    for row in found.get("torch", []):
-        base = rates.get((row["lens"], row["form"]))
-        for way in ("eager", "compiled"):
-            if base and row["seconds"].get(way):
-                axes.plot(1 / min(row["seconds"][way]), base["rms_um"], marks[row["lens"]], color="0.5", ms=6)
-    for row in found.get("peers", []):
-        if row.get("seconds") and row["program"][0] in "OD":
-            axes.plot(1 / min(row["seconds"]), max(row["film_um"], 1e-3), marks[row["lens"]], color="tab:red", ms=7)
-    key = {
-        "exact": "tab:blue",
-        "polynomial": "tab:green",
-        "network": "tab:orange",
-        "torch": "0.5",
-        "Optiland, DeepLens": "tab:red",
-    }
-    lines = [plt.Line2D([], [], color=c, marker="s", ls="", label=name) for name, c in key.items()]
-    counts = {r["lens"]: r["refractions"] for r in found.get("rows", [])}
-    lines += [
-        plt.Line2D([], [], color="k", marker=marks[name], ls="", mfc="none", label=f"{count} refractions")
-        for name, count in counts.items()
-    ]
-    axes.legend(handles=lines, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    axes.set(
-        xscale="log",
-        yscale="log",
-        xlabel="rays a second, in place (open: fast roots)",
-        ylabel="RMS error on the film, um",
-    )
-    axes.set_title(found["about"]["device"], fontsize=10)
-    axes.grid(alpha=0.3, which="both")
-    figure.savefig(file, dpi=100)
-    plt.close(figure)
+    with drawing(file, 7.5, 4.8, found["about"]["device"]) as figure:
+        axes = figure.subplots()
+        for (lens, form), row in rates.items():
+            colour = blue if form.startswith(EXACT) else green if form.startswith("ols") else orange
+            face = "none" if "fast" in form else colour
+            axes.plot(1e-9 / min(row["seconds"]["in place"]), row["rms_um"], marks[lens], mfc=face, color=colour, ms=8)
+        for row in found.get("torch", []):
+            base = rates.get((row["lens"], row["form"]))
+            for way in ("eager", "compiled"):
+                if base and row["seconds"].get(way):
+                    axes.plot(1e-9 / min(row["seconds"][way]), base["rms_um"], marks[row["lens"]], color=grey, ms=6)
+        for row in found.get("peers", []):
+            if row.get("seconds") and row["program"][0] in "OD":
+                axes.plot(1e-9 / min(row["seconds"]), max(row["film_um"], 1e-3), marks[row["lens"]], color=pink, ms=6)
+        lines = [Line2D([], [], color=c, marker="s", ls="", label=name) for name, c in key.items()]
+        counts = {r["lens"]: r["refractions"] for r in found.get("rows", [])}
+        lines += [
+            Line2D([], [], color="k", marker=marks[name], ls="", mfc="none", label=f"{count} refractions")
+            for name, count in counts.items()
+        ]
+        figure.legend(handles=lines, loc="outside lower center", ncols=4)
+        axes.set(xscale="log", yscale="log", ylabel="RMS error on the film, um")
+        axes.set_xlabel("10^9 rays a second, in place (hollow: with fast roots)")
+        plain_log_ticks(axes.xaxis, axes.yaxis)
+        axes.grid()
 
 
 def run(args: argparse.Namespace) -> None:

@@ -62,7 +62,7 @@ def trade_plot(
     title: str, records: Sequence[Record], exact: Sequence[Record], path: Path, kinds: Kinds = FAMILIES,
     kind: str = "family", use: str | None = None,
 ) -> bool:  # fmt: skip
-    """Draw error against time (hollow: as C) and against size, logarithmic; returns whether there was anything to draw.
+    """Draw error against time (hollow: as C) and below against size; returns whether any time is there to draw.
 
     Exact tracers, which have no error, are lines at their time. The staircase is the front that nothing betters. From a
     noisy time (`records.noisy`) a line leads to the median of its rounds. A ring marks the model that is advised, at
@@ -84,28 +84,29 @@ def trade_plot(
     sizes = _points(shown, "coefficients_per_vector", error)
     sizes += [p for p in _points(shown, "parameters", error) if number(p[2], "coefficients_per_vector") is None]
     timings = [(number(r, error), r.get(key)) for r in shown for key in ("ns_per_ray", "fused_ns_per_ray")]
-    with drawing(path, 13.0, 5.8) as figure:
-        left, right = figure.subplots(1, 2, sharey=True)
-        _panel(left, times, "time per ray (ns, best of the rounds)", kinds, kind)
-        noisy_lines(left, [(e, t["min"], t["median"]) for e, t in timings if t is not None and noisy(t)])
-        for tracer in exact:
+    if not times:
+        return False
+    with drawing(path, 9.0, 10.8) as figure:
+        upper, lower = figure.subplots(2, 1, sharey=True)
+        _panel(upper, times, "time per ray (ns, best of the rounds)", kinds, kind)
+        _panel(lower, sizes, "coefficients of one vector output (networks: all weights)", kinds, kind)
+        noisy_lines(upper, [(e, t["min"], t["median"]) for e, t in timings if t is not None and noisy(t)])
+        for dashes, tracer in zip((":", "--", "-."), exact, strict=False):
             if time := number(tracer, "ns_per_ray.min"):
-                look = {"color": INK, "lw": 1.0, "ls": ":"}
+                look = {"color": INK, "lw": 1.0, "ls": dashes}
                 look |= {"color": CHOSEN, "lw": 2.0} if tracer["name"] == use else {}
                 label = f"{tracer['name']} {ns_text(time_of(tracer))}" + ": use" * (tracer["name"] == use)
-                left.axvline(time, label=label, **look)
+                upper.axvline(time, label=label, **look)
         advised = [(x, number(r, error)) for r in shown if r["name"] == use and (x := number(time_of(r), "min"))]
         if advised:
-            left.plot(*advised[0], "o", label=f"use {use}", **_RING)
-        _panel(right, sizes, "coefficients of one vector output (networks: all weights)", kinds, kind)
-        left.set_ylabel(_ERRORS[error])
-        plain_log_ticks(left.yaxis)
+            upper.plot(*advised[0], "o", label=f"use {use}", **_RING)
         figure.suptitle(f"{title}: error against time and size", x=0.01, ha="left", fontweight="bold")
-        legends = [axes.get_legend_handles_labels() for axes in (left, right)]
+        legends = [axes.get_legend_handles_labels() for axes in (upper, lower)]
         handles = {label: h for legend in legends for h, label in zip(*legend, strict=True)}
-        figure.legend(handles.values(), handles.keys(), loc="outside right upper")
-        for axes, points in ((left, times), (right, sizes)):
-            plain_log_ticks(axes.xaxis)
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
+        for axes, points in ((upper, times), (lower, sizes)):
+            axes.set_ylabel(_ERRORS[error])
+            plain_log_ticks(axes.xaxis, axes.yaxis)
             axes.grid(True, which="major")
             if points:
                 place_labels(axes, [p[:2] for p in points], [str(p[2]["name"]) for p in points])
@@ -115,7 +116,7 @@ def trade_plot(
 def noisy_lines(axes: Any, lines: Sequence[tuple[Any, float, float]]) -> None:
     """Draw lines, at heights, from the least of a noisy time to its median."""
     if lines:
-        label = f"noisy: to the median, over {NOISY:g} times the least"
+        label = f"to the median of a noisy time, over {NOISY:g} times its least"
         axes.hlines(*zip(*lines, strict=True), color=INK, lw=0.8, alpha=0.6, label=label)
 
 
@@ -150,7 +151,7 @@ def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Seque
     pixels, frame = axes.transData.transform(np.reshape(points, (-1, 2))), axes.get_window_extent(renderer)
     taken: list[Any] = []
     for at, point, label in zip(pixels, points, labels, strict=True):
-        note = axes.annotate(label, point, textcoords="offset pixels", xytext=(0, 0), fontsize=6.4, color="#333333")
+        note = axes.annotate(label, point, textcoords="offset pixels", xytext=(0, 0), fontsize=7.5, color="#333333")
         extent = note.get_window_extent(renderer)
 
         def cost(corner: tuple[float, float], at: Any = at, extent: Any = extent) -> float:

@@ -103,7 +103,7 @@ def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, l
                 axes.plot(distances, values, color=colour, ls=dashes, lw=1.8, label=label)
         panels[0].set_title(f"Focus breathing of {lens.name}", loc="left", fontweight="bold")
         panels[0].legend(loc="best")
-        labels = ("field of view (degrees,\nacross the image circle)", "focal length (mm)", "magnification")
+        labels = ("field of view (degrees,\nwithout distortion)", "focal length (mm)", "magnification")
         for axes, label in zip(panels, labels, strict=True):
             axes.set_ylabel(label)
             axes.grid(True)

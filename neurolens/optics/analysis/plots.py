@@ -71,7 +71,7 @@ def drawing(path: str | Path, width_in: float, height_in: float, title: str = ""
 
 
 def plain_log_ticks(*axes: Any) -> None:
-    """Label logarithmic axes 0.1, 1, 10 rather than by powers, with 2 and 5 between where that leaves few ticks."""
+    """Label logarithmic axes 0.1, 1, 10,000 rather than by powers; with 2 and 5 between where that leaves few ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis in axes:
@@ -79,7 +79,7 @@ def plain_log_ticks(*axes: Any) -> None:
         subs = (1.0,) if high / max(low, 1e-300) > 400 else (1.0, 2.0, 5.0)
         axis.set_major_locator(LogLocator(base=10, subs=subs, numticks=15))
         axis.set_minor_locator(LogLocator(base=10, subs=tuple(range(2, 10)), numticks=60))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}" if value < 1e4 else f"{value:.0e}"))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.7g}"))
         axis.set_minor_formatter(NullFormatter())
 
 
@@ -271,7 +271,7 @@ def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> None
     rows, columns = len(data.field_deg), min(_SHIFTS, len(data.shift_mm))
     shifts, half = np.linspace(data.shift_mm[0], data.shift_mm[-1], columns), _half_width(data)
     size = 1.4 + 1.6 * max(columns, 2), 1.75 * rows + 1.3
-    with drawing(path, *size, title, f"Spots through focus; {subtitle}") as figure:
+    with drawing(path, *size, title, f"Spots{' through focus' * (columns > 1)}; {subtitle}") as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for i, j in np.ndindex(rows, columns):
             axes = grid[i, j]
@@ -281,7 +281,7 @@ def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> None
         for j, axes in enumerate(grid[0]):
             axes.set_title(f"film {1000 * shifts[j]:+.0f} µm" if abs(shifts[j]) > 1e-12 else "film in place")
         for i, axes in enumerate(grid[:, 0]):
-            name = f"{_field_name(float(data.field_deg[i]))}, {data.height_mm[i]:.1f} mm"
+            name = f"{_field_name(float(data.field_deg[i]))}, {abs(data.height_mm[i]):.1f} mm"
             axes.set_ylabel(f"{name}\ntangential (µm)", size=8.5)
         for axes in grid[-1]:
             axes.set_xlabel("sagittal (µm)", size=8.5)

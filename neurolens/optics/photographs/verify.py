@@ -428,10 +428,10 @@ _MOST = 6  # of apertures, or focal lengths, that are drawn
 def plot_verified(found: Verified, path: Path, title: str) -> None:
     """Draw distortion, lateral colour and light over image height; of a zoom, some of its focal lengths."""
     head = f"points: photographs, lensfun's {found.profile} ({found.certainty}); lines: rays."
-    subtitle = f"{head}\n{'; '.join(found.verdict)}"
-    with drawing(path, 13.5, 5.2, title, subtitle) as figure:
+    subtitle = "\n".join((head, *found.verdict))
+    with drawing(path, 9.8, 4.4, title, subtitle) as figure:
         left, middle, right = figure.subplots(1, 3)
-        labels = "distortion, % of the height, mean removed", "beside green, µm", "light beside the axis, stops"
+        labels = "distortion less its mean, % of the height", "beside green, µm", "light beside the axis, stops"
         for axes, label in zip((left, middle, right), labels, strict=True):
             axes.grid(True)
             axes.set(xlabel="image height, mm", ylabel=label)
