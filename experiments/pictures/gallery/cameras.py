@@ -296,7 +296,7 @@ CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "pinhole": partial(ideal_camera, "pinhole:"),
     "post": lambda shot, surrogate: PostProcessed(thin_camera(shot, surrogate), exact_camera(shot, surrogate)),
 }
-TITLES = {"exact": "exact lens", "thin": "thin lens", "post": "post-process"}  # others are called by their names
+TITLES = {"exact": "exact lens", "surrogate": "model", "thin": "thin lens", "post": "post-process"}
 
 
 def camera_of(column: str, shot: Shot, surrogate: Surrogate | None) -> Camera:

@@ -195,7 +195,8 @@ _HEAD = """\
 Small scenes after the figures of two theses (Steinert 2009, Willi 2021). Each is drawn through the exact lens, a
 model of it, and a thin lens with its pupil, which shows the plane in focus at the same size. The last column is the
 difference of model and exact lens in luminance, from the same random numbers. The difference and all numbers are
-those of the renders; the pictures are shown after Open Image Denoise. A table below each figure measures the effect.
+those of the renders; the pictures are shown after Open Image Denoise. A table below each figure measures the effect;
+what is below 0.001 stands as 0.
 Axes are millimetres of film, and pictures are upright. `python -m experiments gallery` made this page; the command
 beside an effect makes that effect alone.
 """
@@ -226,11 +227,16 @@ def effect_table(record: Record) -> str:
     rows = []
     for p in panels:
         for k, (quantity, figures) in enumerate(p["measured"].items()):
-            values = [None if figures.get(c) is None else f"{figures[c]:.3g}" for c in cameras]
+            values = [None if figures.get(c) is None else _short(figures[c]) for c in cameras]
             ends = ("", "") if k else (p["label"], _surrogate_error(p["surrogate"]))
             rows.append([ends[0], quantity_name(quantity), *values, ends[1]])
-    head = ["panel", "measured", *(TITLES.get(c, c) for c in cameras), "RMS of the surrogate"]
+    head = ["panel", "measured", *(TITLES.get(c, c) for c in cameras), "RMS of the model"]
     return lab.table(head, rows, "–")
+
+
+def _short(value: float) -> str:
+    """Three digits without an exponent; what is below a thousandth is the rounding of a 0."""
+    return f"{float(f'{value:.3g}'):,.10g}" if abs(value) >= 1e-3 else "0"
 
 
 def quantity_name(key: str) -> str:
@@ -282,7 +288,7 @@ def run(args: argparse.Namespace) -> None:
 
 DPI = 100  # a picture of 360 pixels is 3.6 inches wide: one pixel of it, one of the figure
 MOST_BYTES = 400_000
-_LEFT, _GAP, _TOP, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.98, 0.2  # inches
+_LEFT, _GAP, _TOP, _FOOT, _BAR, _LABEL = 0.6, 0.1, 0.78, 0.42, 0.98, 0.24  # inches
 
 
 @dataclass(frozen=True)
@@ -327,7 +333,7 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
     scale = rounded_up(max((float(np.percentile(m, 99.5)) for m in maps), default=1e-6))
     with style():
         figure, boxes, bar = _page(rows, bool(maps))
-        figure.text(0.006, 1 - 0.08 / figure.get_figheight(), title, fontsize=12.5, fontweight="bold", va="top")
+        figure.text(0.006, 1 - 0.08 / figure.get_figheight(), title, fontsize=15, fontweight="bold", va="top")
         shown = None
         for index, (row, places) in enumerate(zip(rows, boxes, strict=True)):
             for k, (column, place) in enumerate(zip([*row.pictures, "difference"], places, strict=False)):
@@ -338,32 +344,32 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
                 extent = (x - width / 2, x + width / 2, y - height / 2, y + height / 2)
                 look: dict[str, Any] = {"extent": extent, "interpolation": "nearest"}
                 if column == "difference":
-                    shown = axes.imshow(row.difference, cmap="magma", vmin=0, vmax=scale, **look)
+                    shown = axes.imshow(100 * row.difference, cmap="magma", vmin=0, vmax=100 * scale, **look)
                 else:
                     axes.imshow(to_srgb(lab.denoised(row.pictures[column]), row.exposure), **look)
                 _axes(axes, first=k == 0)
                 if k == 0:
-                    axes.set_title(row.label, loc="left", fontsize=8.6, pad=3)
+                    axes.set_title(row.label, loc="left", fontsize=10.5, pad=3)
                 if index == 0:
-                    name = TITLES.get(column, "|surrogate - exact|" if column == "difference" else column)
+                    name = TITLES.get(column, "|model - exact|" if column == "difference" else column)
                     top = places[0][1] + places[0][3] + _LABEL / figure.get_figheight()
-                    figure.text(place[0], top, name, fontsize=9.5, fontweight="bold", va="bottom")
+                    figure.text(place[0], top, name, fontsize=12, fontweight="bold", va="bottom")
         if shown is not None:
-            colours = figure.colorbar(shown, cax=figure.add_axes(bar), format="%.1e")
-            colours.set_label("share of white", fontsize=8)
-            colours.ax.tick_params(labelsize=7)
+            colours = figure.colorbar(shown, cax=figure.add_axes(bar), ticks=[0, 50 * scale, 100 * scale], format="%g")
+            colours.set_label("% of white", fontsize=9)
+            colours.ax.tick_params(labelsize=9)
             colours.outline.set_visible(False)
         _save_small(figure, path)
 
 
 def _axes(axes: Any, first: bool) -> None:
-    axes.tick_params(labelsize=6.5, length=2, pad=1.5)
+    axes.tick_params(labelsize=8.5, length=2, pad=1.5)
     axes.locator_params(nbins=4)
     for spine in axes.spines.values():
         spine.set_visible(False)
     if first:
-        axes.set_ylabel("film y (mm)", fontsize=7, labelpad=1)
-        axes.set_xlabel("film x (mm)", fontsize=7, labelpad=1)
+        axes.set_ylabel("film y (mm)", fontsize=9, labelpad=1)
+        axes.set_xlabel("film x (mm)", fontsize=9, labelpad=1)
     else:
         axes.set_xticks([])
         axes.set_yticks([])
