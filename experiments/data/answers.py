@@ -471,8 +471,8 @@ def tracer() -> Answer:
         f"99% of rays in float32 within {short(worst)} um on the film",
         f"Of {read:,} public lens files {int(agree[1]):,} agree with ray-optics within 1e-4 in focal length, image "
         "plane and chief rays, and each of the others differs by something that ray-optics is known to leave out. "
-        f"Float64 stays within {off * 1e6:.1g} nm of 50 digits; float32, which cameras use, stays within {short(worst)} um "
-        f"of float64 on the film (99th percentile of the rays, worst of {len(rows)} lenses).",
+        f"Float64 stays within {off * 1e6:.1g} nm of 50 digits; float32, which cameras use, stays within "
+        f"{short(worst)} um of float64 on the film (99th percentile of the rays, worst of {len(rows)} lenses).",
         "Float32 beside float64 on the film, for every lens file, from the best lens to the worst.",
         draw,
         "held against|cases|found|what it is",
