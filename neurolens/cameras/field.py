@@ -327,13 +327,13 @@ class Field:
         return self.light.shape[1] == 1
 
     def lit(self, point: Complex) -> NDArray[np.bool_]:
-        """Test whether light arrives at picture points."""
+        """Test whether light arrives at points x + i y (mm) of the lens's picture, of any shape."""
         if (self.light > 0).all():
             return np.asarray(np.abs(point) <= self.end_mm * (1 + 1e-9))
         return self.relative_light(point) > 0
 
     def relative_light(self, point: Complex) -> Array:
-        """Return the light at picture points over that on the axis; 0 beyond the end of the light."""
+        """Return the light at picture points (as `lit`) over that on the axis; 0 beyond the end of the light."""
         value = np.maximum(on_rings(self.light, self.end_mm, point), 0.0)
         return np.where(np.abs(point) <= self.end_mm * (1 + 1e-9), value, 0.0)
 

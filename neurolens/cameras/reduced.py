@@ -196,7 +196,7 @@ class ReducedDispersion:
         return float(self.camera.sample(middle, square, light).weight.mean(dtype=np.float64))
 
     def tints(self, wavelength_nm: FloatArray) -> FloatArray:
-        """Return the light on the axis at some wavelengths, over that at the reference wavelength."""
+        """Return the light [N] on the axis at wavelengths [N] (nm), over that at the reference wavelength."""
         return np.interp(np.nan_to_num(wavelength_nm), self._lit_nm, self._tint).astype(np.float32)
 
     def _tinted(self, rays: Any, wavelength_nm: FloatArray) -> Any:

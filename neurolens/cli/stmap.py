@@ -343,8 +343,10 @@ class MapsOfFrame:
     """Figures of the maps of a frame.
 
     Attributes:
+        field_deg: widest angle to the axis. plane_m: from the film to the plane of the maps.
         shift_px: how far distortion moves points at most. there_and_back_px: the most that both maps leave.
-        pixel_aspect_of_one_pinhole: of what a pinhole at the y meridian's pupil shows in the plane at `plane_m`.
+        pixel_aspect_of_one_pinhole: of what a pinhole at the y meridian's pupil shows in that plane.
+        parallax: for each distance in m, how far things there lie from their place in the maps, in pixels.
     """
 
     frame: int | None

@@ -315,7 +315,8 @@ class RayPairs:
 def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float, power: bool = True) -> PairSet:
     """Trace camera rays to their exact images, and note every crossing on the way.
 
-    `power` tells whether to follow the light's power, too, which with thin films takes several times as long.
+    The pupil plane is at `pupil_z` (mm, lens frame). `power` tells whether to follow the light's power, too, which with
+    thin films takes several times as long.
     """
     rays = camera_rays(inputs.film_x, inputs.film_y, inputs.film_z, inputs.pupil_x, inputs.pupil_y, pupil_z)
     every, parts = range(len(lens.surfaces)), []

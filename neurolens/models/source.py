@@ -237,7 +237,7 @@ def copies_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = F
     """
     if len(models) > 1:
         raise InputError(
-            "fix", "wavelengths", len(models), "one at most, for what is off in a copy is an argument, too"
+            "fix", "wavelengths", len(models), "one at most for a model of copies, whose figures are arguments, too"
         )
     nodes, graph, transform = copy_nodes(models[0])
     program = fused_program(nodes, parts, fix)

@@ -265,7 +265,7 @@ def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor)
 
 
 def pupil_middle(domain: Domain, radius: Tensor) -> Tensor:
-    """Return the middle [N] of the passing rays on the pupil plane, along the film point's direction (mm)."""
+    """Return the middle [N] (mm) of the passing rays on the pupil plane, for film points at [N] mm, along these."""
     low, high = (torch.tensor(v, dtype=radius.dtype) for v in (domain.bounds.low_mm, domain.bounds.high_mm))
     middle = torch.where(low <= high, (low + high) / 2, 0.0)
     place = (radius / domain.bounds.film_radius_mm * (len(middle) - 1)).clamp(0, len(middle) - 1)

@@ -129,7 +129,7 @@ class Aim:
         return more / (torch.sqrt(self.distance2 + more) + torch.sqrt(self.distance2))
 
     def at(self, pattern: Pattern) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Aim at the points of a pattern: u, v of the rays, whether they were found, and d(beam) / d(stop share)."""
+        """Aim at the points of a pattern: u, v (mm) [F W P], whether rays were found, and d(beam) / d(stop share)."""
         goal = torch.stack([-pattern.tangential, pattern.sagittal])[:, None, None].expand(2, *self.shape).flatten(1)
         everything = torch.arange(goal.shape[1])
         uv = self._newton(torch.zeros_like(goal), goal, everything, _DIRECT)

@@ -63,7 +63,7 @@ def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
 
 
 def stop_for(lens: Lens, f_number: float) -> float:
-    """Return the radius of the stop at an f-number of a profile; at the widest f-number it is that of the file."""
+    """Return the radius (mm) of the stop at an f-number of a profile; at the widest it is that of the file."""
     if f_number <= _STOP_SLACK * lens.f_number:
         return lens.stop_radius_mm
     return float(stop_radius_mm(at_infinity(lens), f_number))

@@ -159,7 +159,10 @@ def _with_corners(line: Array) -> Array:
 
 
 def coverage(lines: Sequence[Array], cells: int) -> Array:
-    """Return the share [cells, cells] of each cell of the box inside an outline; exact if `cells` divides `CELLS`."""
+    """Return the share [cells, cells], x before y, of each cell of the box -1 to 1 that closed lines [2, N] enclose.
+
+    It is exact if `cells` divides `CELLS`.
+    """
     share = np.zeros((cells + 1, cells))
     for line in lines:
         a = (line + 1) / 2 * cells

@@ -76,7 +76,7 @@ def plates_of(fields: Sequence[Field], picture: tuple[int, int], film_mm: tuple[
 
 
 def undistort_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
-    """Return the channels of the map that makes the undistorted picture."""
+    """Return the map [H, W] of the undistorted picture: R, G are places in the plate (0 to 1), B is where light is."""
 
     def read(place: Complex) -> tuple[Complex, NDArray[np.bool_]]:
         point = field.picture(place)

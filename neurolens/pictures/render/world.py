@@ -473,7 +473,7 @@ class World:
         return normal, shading
 
     def reflectance(self, surface: Index, point: FloatArray, bins: Index) -> FloatArray:
-        """Return the reflectance [lanes, N] at wavelength bins [N], textures included."""
+        """Return the reflectance [lanes, N] of surfaces [N] at points [3, N] (m) and wavelength bins [N]."""
         value = self.palette.look_up(self.reflectance_row.take(surface), bins)
         self.textures.apply(value, surface, point, bins)
         return value

@@ -123,7 +123,7 @@ def render(
         count = min(each, spp - start)
         picture = np.array(mi.render(scene, sensor=lens, spp=count, seed=seed + (number << 16)), np.float32)
         if picture.ndim != 3 or picture.shape[2] < 3:
-            raise InputError("mitsuba scene", "film", f"({picture.shape})", "a film of red, green and blue")
+            raise InputError("mitsuba scene", "film", picture.shape, "a film of red, green and blue")
         total += picture[..., :3] * count
         if progress is not None:
             progress((start + count) / spp)
