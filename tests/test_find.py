@@ -57,6 +57,8 @@ LENSES = Path(__file__).parents[1] / "lenses"
         ("fish eye nikkor", "nikon_fisheye_nikkor_6mm_f2_8"),
         ("serenar 1950s", "canon_serenar_"),
         ("1840", "petzval_portrait_100"),
+        ("tilt-shift 24", "nikon_pc_e_nikkor_24mm_f3_5d_ed"),
+        ("nikkor macro 200mm", "nikon_af_micro_nikkor_200mm_f4d_if_ed"),
         ("swirl", "petzval_portrait_100"),
         ("swirly lens", "petzval_portrait_100"),
         ("85mm soft", "pentax_smc_f_85mm_f2_8_soft"),
@@ -112,6 +114,14 @@ def test_a_text_is_read_as_it_is_engraved() -> None:
     assert words_of("NIKKOR-S Auto 5,8cm F1.4") == ["nikkor", "s", "auto", "58mm", "f/1.4"]
     assert words_of("canon_ef_50mm_f1_8") == words_of("Canon EF 50mm f/1.8")
     assert words_of("smc Pentax-F 85mm f/2.8 Soft")[:4] == ["smc", "pentax", "f", "85mm"]
+
+
+@pytest.mark.parametrize(
+    ("word", "stated"), [("tilt", "most_tilt_deg ="), ("shift", "most_shift_mm ="), ("anamorphic", "cylinder")]
+)
+def test_a_kind_finds_every_lens_whose_file_states_it(word: str, stated: str) -> None:
+    files = {file.stem for file in LENSES.glob("*.toml") if stated in file.read_text(encoding="utf-8")}
+    assert files and files <= {entry.lens for entry in find(word).hits}
 
 
 def test_every_whole_name_of_the_library_chooses_its_lens() -> None:

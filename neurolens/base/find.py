@@ -29,6 +29,8 @@ _NEAR, _LONGEST = 3, 300  # lenses that are offered where none has all words; ch
 _WHOLE, _BEGUN, _INSIDE = 3, 2, 1
 _LIKE = 0.5  # share of a query's mean word: a lens that is less alike is not near
 _IDLE = {"lens", "lenses", "mount", "the", "f", "mm"}  # words that people type, and that tell no lens from another
+# What makers' names say of a lens's kind in other words: Nikon's PC and Canon's TS-E tilt and shift; Micro is macro.
+_KINDS = {r"\b(?:pc|ts-e|t/s)\b": "tilt shift", r"\b(?:micro|makro)\b": "macro"}
 # A query with a sign that no name of a lens has is code, or a mistake: its words are not taken for those of lenses.
 _NO_NAME = re.compile(r"[^\w\s./*()\[\],:'\N{RIGHT SINGLE QUOTATION MARK}&+-]")
 _N = r"\d{1,6}(?:\.\d+)?"
@@ -92,10 +94,12 @@ class Entry:
 
         Its words come from engraved figures, or from computed ones where none is engraved.
         """
-        own = words_of(str(row.get("believed_to_be") or row.get("name") or lens))
+        name = str(row.get("believed_to_be") or row.get("name") or lens)
+        own = words_of(name)
         more = words_of(" ".join(str(row.get(key) or "") for key in ("name", "maker", "mount"))) + words_of(lens)
         spans = [word[:-2].split("-") for word in own if re.fullmatch(rf"{_N}-{_N}mm", word)]
         more += [*(end for span in spans for end in span), "zoom" if spans else "prime"]
+        more += words_of(" ".join(kind for said, kind in _KINDS.items() if re.search(said, _plain(name))))
         more += ["anamorphic"] * bool(row.get("efl_x_mm"))
         more += [f"{row['year']}", f"{row['year'] // 10}0s"] if row.get("year") else []
         if row.get("f_number") and not any(word.startswith("f/") for word in own):

@@ -21,8 +21,8 @@ _CHECKED = {"certain": "photographs", "likely": "photographs, a likely match"}
 @dataclass(frozen=True, kw_only=True)
 class Find(cli.Reporting):
     """Find lenses of the library by words: product, maker, focal length, f-number, mount, year or decade, nickname,
-    and what a lens is known for (swirl, bubbles, soft, flare, cat's eye: the strongest first). Accents and
-    capitals do not matter. Where no lens has all words, the three nearest are shown. --json adds each lens's file, its
+    kind (zoom, prime, macro, fisheye, tilt, shift, anamorphic), and what a lens is known for (swirl, bubbles, soft,
+    flare, cat's eye: the strongest first). Accents and capitals do not matter. Where no lens has all words, the three nearest are shown. --json adds each lens's file, its
     drawing and its figures.
 
     Every command takes such words where it takes a lens, if one lens is meant by them."""
@@ -33,6 +33,7 @@ examples:
   neurolens find helios 44
   neurolens find summilux 1950s
   neurolens find 85mm swirl
+  neurolens find tilt 24mm
   neurolens lens "nikkor z 58" """
 
     words: tuple[str, ...] = setting(
