@@ -110,7 +110,7 @@ class ExactCamera(LensCamera):
             check_light(lens, nm)
         self.lens = set_lens(lens, replace(shot, focus_m=given.focus_m))
         shot = replace(shot, focus_m=focus_of(self.lens, given), focus_mode=focus_mode_of(self.lens, given))
-        warn_beyond(self.lens, FilmPose.of(shot))
+        warn_beyond(self.path, self.lens, FilmPose.of(shot))
         film_z, tabled, stop_mm = self.lens.film_z_mm, at_infinity(self.lens), float(self.lens.stop_radius_mm)
         assert film_z is not None  # `set_lens` places the film
         plane = pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm

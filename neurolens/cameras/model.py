@@ -24,7 +24,7 @@ from neurolens.cameras.exact import kept_outline, searching_code
 from neurolens.cameras.lenscamera import LensCamera
 from neurolens.cameras.lensfilm import Array, LensScene, axial_light, film_slope
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.cameras.pose import FilmPose
+from neurolens.cameras.pose import FilmPose, warn_beyond
 from neurolens.cameras.pupil_outline import COARSE, PupilOutline, PupilTable, outline_of
 from neurolens.cameras.sampling import beyond_circle, common_light, lens_state
 from neurolens.models.assemble import ONNX, SCALARS, Form
@@ -100,7 +100,8 @@ class OnnxCamera(LensCamera):
             outline = outline.on_plane(float(domain["pupil_z_mm"]), film_z)
         else:
             outline = _outline_of(round_stop, used)
-        covered = FilmPose.of(shot).covers_mm(shot.film_mm, film_z - float(domain["pupil_z_mm"]))
+        warn_beyond(self.path, model.fitted.lens, pose := FilmPose.of(shot))
+        covered = pose.covers_mm(shot.film_mm, film_z - float(domain["pupil_z_mm"]))
         notes = beyond_circle(covered, domain["film_radius_mm"], "the model's picture", "stay dark")
         poor = ", ".join(card["errors"].get("poor") or ())
         f_number = lens["f_number"] * lens["stop_radius_mm"] / stop

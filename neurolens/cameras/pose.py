@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,15 +80,19 @@ class FilmPose:
 UPRIGHT = FilmPose()
 
 
-def warn_beyond(lens: Lens, pose: FilmPose) -> None:
-    """Warn of a film that stands as the product's mount cannot hold its lens, where the lens file states how far."""
+def warn_beyond(path: Path, lens: Lens, pose: FilmPose) -> None:
+    """Warn of a film that stands as the product's mount cannot hold its lens, where the lens file states how far.
+
+    Args:
+        path: of the lens or the model, which the warning names.
+    """
     tilt, shift = math.degrees(math.hypot(pose.tilt, pose.swing)), math.hypot(*pose.moved_mm)
     for asked, most, what in (
         (tilt, lens.most_tilt_deg, "degrees of tilt"),
         (shift, lens.most_shift_mm, "mm of shift"),
     ):
         if most is not None and asked > most * (1 + 1e-9):
-            warn(f"{lens.path}: {asked:.3g} {what} are more than the {most:g} of the product; they are taken as asked")
+            warn(f"{path}: {asked:.3g} {what} are more than the {most:g} of the product; they are taken as asked")
 
 
 def _axes(sin: Any, cos: Any, sway: Any, stay: Any) -> list[list[Any]]:

@@ -25,7 +25,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import placed_settings
 from neurolens.cameras.field import Field, field_of
-from neurolens.cameras.pose import FilmPose
+from neurolens.cameras.pose import FilmPose, warn_beyond
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.optics.analysis.layout import lens_layout
@@ -332,6 +332,7 @@ class Shots:
         if self._last is None or self._last[0] is not args:
             lens = self._lens(args.state)
             pose = FilmPose.of(args.state.shot(args.film).whole())
+            warn_beyond(args.file, lens, pose)
             lights, tracer = self._lights(args, lens), GhostTracer(lens, pose=pose)
             raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
             job = FlareJob(lens, lights, raster, args.settings, threads=args.threads, ghosts=tracer, pose=pose)

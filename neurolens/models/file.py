@@ -58,6 +58,7 @@ _MAX_NODES = 256  # states of one model
 _MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
 _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 42  # of a prescription, as `optics.readers.lensfile` has them
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
+_MOST = ("most_tilt_deg", "most_shift_mm")  # of a prescription, where the lens file states them
 _NOWHERE = -1.0  # a film position in no domain, which replaces that of the call where the state is out of range
 DERIVATIVES = {"film": RAY[:2], "pupil": RAY[2:]}
 _DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError, RuntimeError)
@@ -388,7 +389,8 @@ def packed_lens(lens: Lens) -> dict[str, Any]:
             if f.name != "figure" and (f.default is MISSING or value != f.default):
                 row[f.name] = _plain(value)
         rows.append(row | _plain(surface.figure.record()))
-    return {**{k: _plain(getattr(lens, k)) for k in _LENS}, "path": Path(lens.path).name, "surfaces": rows}
+    most = {k: _plain(value) for k in _MOST if (value := getattr(lens, k)) is not None}
+    return {**{k: _plain(getattr(lens, k)) for k in _LENS}, **most, "path": Path(lens.path).name, "surfaces": rows}
 
 
 def _plain(value: Any) -> Any:
@@ -420,4 +422,5 @@ def unpacked_lens(packed: dict[str, Any]) -> Lens:
             name, layers, *origin = values["coating"]
             values["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers), *origin)
         surfaces.append(Surface(**values))
-    return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS})
+    most = {k: float(packed[k]) for k in _MOST if k in packed}
+    return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS}, **most)

@@ -1,5 +1,6 @@
 """A film that is turned and moved: its rays are the lens's own from points of it in space; white light; focus."""
 
+import json
 import math
 import warnings
 from dataclasses import replace
@@ -17,12 +18,14 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.lensfilm import whole_camera
+from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pose import FilmPose
 from neurolens.cli import main
 from neurolens.cli.keys import frames_of
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.loworder import with_film_derivatives
+from neurolens.models.file import packed_lens, unpacked_lens
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
@@ -247,19 +250,45 @@ def test_cameras_without_a_film_to_turn_refuse_it() -> None:
             make_camera(name, SHOT)
 
 
-def test_a_film_beyond_the_mount_of_the_product_is_told_in_a_line_each() -> None:
-    """As the lens file states it; a lens that is scaled to another focal length shifts as much farther."""
+def stating(folder: Path, tilt_deg: float, shift_mm: float) -> Path:
+    """The lens file of `NAME`, of a product that tilts and shifts so far."""
+    text = (ROOT / "lenses" / f"{NAME}.toml").read_text(encoding="utf-8")
+    file = folder / "shift.toml"
+    file.write_text(f"most_tilt_deg = {tilt_deg}\nmost_shift_mm = {shift_mm}\n{text}", encoding="utf-8")
+    return file
+
+
+def test_a_film_beyond_the_mount_of_the_product_is_told_in_a_line_each(tmp_path: Path) -> None:
+    """As the lens file states it, which a model's file holds; a lens that is scaled shifts as much farther."""
     lens = read_lens(ROOT / "lenses" / "nikon_pc_e_nikkor_24mm_f3_5d_ed.toml")
     assert (lens.most_tilt_deg, lens.most_shift_mm) == (8.5, 11.5)
-    within = Shot((24.0, 16.0), 2.0, 8.0, film_tilt_deg=-8.5, film_shift_mm=11.5, runtime="onnxruntime")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", NeurolensWarning)
-        ExactCamera(lens, within)
-    with pytest.warns(NeurolensWarning) as told:
-        ExactCamera(lens, replace(within, film_swing_deg=3.0, film_rise_mm=3.0))
-    said = [str(warning.message) for warning in told]
-    assert len(said) == 2 and "9.01 degrees of tilt are more than the 8.5" in said[0] and "11.9 mm of shift" in said[1]
     assert set_lens(lens, focal_length_mm=2 * 24.642).most_shift_mm == pytest.approx(23.0, rel=0.01)
+    model = load_model(ROOT / "models" / f"{MODEL}.onnx")
+    assert packed_lens(model.fitted.lens).keys().isdisjoint({"most_tilt_deg", "most_shift_mm"})
+
+    def said(tilt_deg: float, shift_mm: float) -> list[str]:
+        stated = read_lens(stating(tmp_path, tilt_deg, shift_mm))
+        packed = json.loads(json.dumps(packed_lens(stated)))
+        model.fitted = replace(model.fitted, lens=unpacked_lens(packed))  # type: ignore[misc]
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", NeurolensWarning)
+            ExactCamera(stated, SHOT)
+            OnnxCamera(model, SHOT)
+        return [str(warning.message) for warning in told]
+
+    assert said(12.81, 6.41) == []
+    exact, modelled = np.array(said(2.0, 3.0)).reshape(2, 2).tolist()
+    assert (
+        "12.8 degrees of tilt are more than the 2 " in exact[0] and "6.4 mm of shift are more than the 3 " in exact[1]
+    )
+    assert modelled == [text.replace(str(tmp_path / "shift.toml"), str(model.path)) for text in exact]
+
+
+def test_flare_tells_of_a_film_beyond_the_mount(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = stating(tmp_path, 2.0, 3.0)
+    assert main(["flare", str(file), "--light", "10,5", "--film-tilt", "2.1", "--film-rise", "3", "--json"]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert f"{file}: 2.1 degrees of tilt are more than the 2 of the product" in line
 
 
 def test_an_upright_film_is_no_pose_and_covers_itself() -> None:
