@@ -164,7 +164,7 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
     corners, weights, is_round = light.shape
     counts = [min(math.ceil(math.degrees(side) / most_deg + 1e-9), most) for side in _lengths(corners)]
     if 1 < max(counts) and most != CELLS:
-        weights = weights.repeat(FADE, 0).repeat(FADE, 1)
+        weights = _in_disc(FADE * CELLS) if is_round else weights.repeat(FADE, 0).repeat(FADE, 1)
         at, nodes = np.linspace(0, CELLS, len(weights) + 1), np.arange(CELLS + 1)
         for axis in (0, 1):
             corners = np.apply_along_axis(lambda v: np.interp(at, nodes, v), axis, corners)
@@ -181,6 +181,13 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
                 sides = np.stack([c + d - a - b, b + d - a - c]) / 2
                 parts.append(Patch(part, sides, own[top:below, left:right], is_round and counts == [1, 1]))
     return parts
+
+
+def _in_disc(cells: int) -> Array:
+    """Return the share of each cell [cells, cells] of a square that lies in its disc: whole cells would show steps."""
+    at = (np.arange(4 * cells) + 0.5) / (4 * cells) - 0.5
+    inside = at[:, None] ** 2 + at**2 < 0.25
+    return inside.reshape(cells, 4, cells, 4).mean((1, 3))
 
 
 def _shares(count: int, cells: int) -> Array:

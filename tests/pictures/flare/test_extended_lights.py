@@ -26,6 +26,7 @@ from neurolens.pictures.flare.lights import (
     SceneLights,
     flat_shape,
     light_towards,
+    patches,
     sides_across,
     with_disc,
 )
@@ -98,6 +99,24 @@ def test_ghosts_of_a_disc_are_the_integral_over_it() -> None:
     assert disc.sum() == pytest.approx(right.sum(), rel=0.03)  # one ghost is cut by a rim
     off, off_of_point = (np.abs(v - right).sum() / right.sum() for v in (disc, point))
     assert off < 0.03 and off_of_point > 0.1
+
+
+def test_patches_of_a_wide_disc_are_a_disc() -> None:
+    """8 degrees: none of its light lies beyond the edge, where cells of the whole light stood out by 0.5 degrees; its
+    variance is a quarter of the radius squared."""
+    light = Light(12.0, 6.0)
+    ahead, across, places, shares = light.towards, sides_across(light.towards), [], []
+    for patch in patches(with_disc(light, 8.0), 2.0):
+        cells, own = np.argwhere(patch.weights > 0), patch.weights[patch.weights > 0] / patch.weights.sum()
+        corners = cells[:, None] + [[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0.5]]
+        off = (corners - own @ (cells + 0.5)) / patch.weights.shape @ patch.sides
+        towards = patch.light.towards / (patch.light.towards @ ahead) + off
+        places.append(towards @ across.T / math.tan(math.radians(4)))
+        shares.append(own * patch.light.rgb[0])
+    place, share = np.concatenate(places), np.concatenate(shares)
+    assert share.sum() == pytest.approx(1) and np.hypot(*place.T).max() < 1.04
+    assert share @ place[:, 4] ** 2 == pytest.approx([0.25, 0.25], rel=0.005)
+    assert share @ place[:, 4] == pytest.approx([0, 0], abs=1e-3)
 
 
 def test_a_window_in_larger_pixels_is_that_in_the_picture_s(monkeypatch: pytest.MonkeyPatch) -> None:
