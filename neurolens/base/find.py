@@ -94,16 +94,16 @@ class Entry:
 
         Its words come from engraved figures, or from computed ones where none is engraved.
         """
-        name = str(row.get("believed_to_be") or row.get("name") or lens)
-        own = words_of(name)
-        more = words_of(" ".join(str(row.get(key) or "") for key in ("name", "maker", "mount"))) + words_of(lens)
+        own = words_of(name := str(row.get("believed_to_be") or row.get("name") or lens))
+        kinds = [
+            "anamorphic" if row.get("efl_x_mm") else "",
+            *(k for n, k in _KINDS.items() if re.search(n, _plain(name))),
+        ]
+        more = words_of(" ".join([*(str(row.get(key) or "") for key in ("name", "maker", "mount")), lens, *kinds]))
         spans = [word[:-2].split("-") for word in own if re.fullmatch(rf"{_N}-{_N}mm", word)]
         more += [*(end for span in spans for end in span), "zoom" if spans else "prime"]
-        more += words_of(" ".join(kind for said, kind in _KINDS.items() if re.search(said, _plain(name))))
-        more += ["anamorphic"] * bool(row.get("efl_x_mm"))
         more += [f"{row['year']}", f"{row['year'] // 10}0s"] if row.get("year") else []
-        if row.get("f_number") and not any(word.startswith("f/") for word in own):
-            more.append(f"f/{row['f_number']:.2g}")
+        more += [] if "f/" in " ".join(own) or not row.get("f_number") else [f"f/{row['f_number']:.2g}"]
         return cls(lens, row, frozenset(own), frozenset([*own, *more]))
 
     @property

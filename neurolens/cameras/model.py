@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -95,13 +96,10 @@ class OnnxCamera(LensCamera):
         best = paraxial if shot.focus_mode == "paraxial" else best_focus_z_mm(start, shot.focus_m, used)
         film_z = _film_z(model, best, shot.film_offset_mm, lens["f_number"] * lens["stop_radius_mm"] / stop)
         scene = replace(start, film_z_mm=film_z)
-        round_stop = replace(scene, aperture=None)
-        if outline is not None:
-            outline = outline.on_plane(float(domain["pupil_z_mm"]), film_z)
-        else:
-            outline = _outline_of(round_stop, used)
-        warn_beyond(self.path, model.fitted.lens, pose := FilmPose.of(shot))
-        covered = pose.covers_mm(shot.film_mm, film_z - float(domain["pupil_z_mm"]))
+        pupil_z, pose = float(domain["pupil_z_mm"]), FilmPose.of(shot)
+        found = outline.on_plane(pupil_z, film_z) if outline else _outline_of(replace(scene, aperture=None), used)
+        warn_beyond(self.path, model.fitted.lens, pose)
+        covered = pose.covers_mm(shot.film_mm, film_z - pupil_z)
         notes = beyond_circle(covered, domain["film_radius_mm"], "the model's picture", "stay dark")
         poor = ", ".join(card["errors"].get("poor") or ())
         f_number = lens["f_number"] * lens["stop_radius_mm"] / stop
@@ -115,12 +113,11 @@ class OnnxCamera(LensCamera):
             "lens_state": _state_of(scene, used, f_number),
             "notes": [*([f"the model is poor, as its card says: {poor}"] if poor else []), *notes],
         }
-        self.place(outline, scene, shot, about, progress)
+        self.place(found, scene, shot, about, progress)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """Return the graph of the model in the camera's state, with its stop."""
         scene = self.film.scene
-        assert isinstance(scene, ModelScene)
         # Series decode unit directions, whose range is tested; to test the length, too, takes eight passes in
         # onnxruntime.
         unit = form is ONNX and self.model.fitted.direction == "angle"
@@ -136,7 +133,6 @@ class OnnxCamera(LensCamera):
     ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
         """Find film points by the model's inverse map of scene rays; where it finds none, the status is NO_SOLUTION."""
         scene = self.film.scene
-        assert isinstance(scene, ModelScene)
         out = self._inverse.from_scene(position, direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
         return out.rays[:4], np.maximum(out.transmittance, 0).astype(np.float32), scene.status_of(out)
 
@@ -151,10 +147,10 @@ class ModelScene(LensScene):
     lens: OnnxLens
 
 
-_RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, because the stop's edge falls between two
-_WIDER = 1.3  # radius of their disc over that of the axial pupil at the stop in use
-_STEPS = 4  # steps towards the film points whose rays meet the object
-_SHIFT = 1e-3  # step of differences, as a share of the film radius
+# Rays of the best focus, of which many rings, because the stop's edge falls between two; radius of their disc over that
+# of the axial pupil at the stop in use.
+_RINGS, _SPOKES, _WIDER = 192, 24, 1.3
+_STEPS, _SHIFT = 4, 1e-3  # towards film points whose rays meet the object; of differences, over the film radius
 _SQUEEZED = 0.05  # height of the rays that tell a squeeze, as a share of the film radius
 _BLUR_MM = 0.002  # a spot that grows by this much is worth a warning
 
@@ -173,62 +169,51 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
     Raises:
         InputError: no ray passes.
     """
-    with suppress(InputError):  # of a glass that is not in the catalogues here
-        if lens := _exact_lens(scene):
-            return focusing.best_focus_z_mm(lens, focus_m, wavelength_nm)
-    return _axial_spot(scene, focus_m, wavelength_nm).best_mm
+    best = _by_the_lens(scene, lambda lens: focusing.best_focus_z_mm(lens, focus_m, wavelength_nm))
+    return _axial_spot(scene, focus_m, wavelength_nm)[0] if best is None else best
 
 
 def best_focus_of_stops_mm(
-    scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float], stops_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float], stops_mm: Array
+) -> Array:
     """Return `best_focus_z_mm` at stop radii up to the scene's, from one set of rays."""
-    with suppress(InputError):
-        if lens := _exact_lens(scene):
-            return focusing.best_focus_of_stops_mm(lens, focus_m, stops_mm.tolist(), wavelength_nm)
-    spot = _axial_spot(scene, focus_m, wavelength_nm)
-    found = scene.lens.rays(*spot.rays, scene.film_z_mm, scene.stop_radius_mm)
-    radius = np.where(spot.passed, np.hypot(*found.stop_xy_mm), np.inf)
+    rule = focusing.best_focus_of_stops_mm
+    if (by_lens := _by_the_lens(scene, lambda lens: rule(lens, focus_m, stops_mm.tolist(), wavelength_nm))) is not None:
+        return by_lens
+    best, rays, moments = _axial_spot(scene, focus_m, wavelength_nm)
+    radius = np.hypot(*scene.lens.rays(*rays, scene.film_z_mm, scene.stop_radius_mm).stop_xy_mm)
     edge_mm = scene.stop_radius_mm * _WIDER / _RINGS  # from ring to ring: rays at a stop's edge count in part
-    share = ((stops_mm[:, None] - radius) / edge_mm + 0.5).clip(0, 1)
-    along, across = np.where(spot.passed, spot.moments, 0.0) @ share.T
+    share = np.nan_to_num((stops_mm[:, None] - radius) / edge_mm + 0.5).clip(0, 1)
+    along, across = moments @ share.T
     shift = -along / across
     # The object keeps its distance from the film: where the film moves, the image moves by the square of its scale.
-    whole = spot.best_mm - scene.film_z_mm
     lens = scene.lens.card["lens"]
     scale = 0.0 if math.isinf(focus_m) else (scene.film_z_mm - lens["infinity_film_z_mm"]) / lens["efl_mm"]
-    best: NDArray[np.float64] = scene.film_z_mm + shift + (shift - whole) * scale**2
-    return best
+    return np.asarray(scene.film_z_mm + shift + (shift + scene.film_z_mm - best) * scale**2)
 
 
-def _exact_lens(scene: ModelScene) -> Lens | None:
-    """Return the lens of a scene, of which the model's file has that of a model of one state as designed."""
-    fitted = scene.lens.fitted
-    if scene.lens.axes or "copy" in fitted.settings:
-        return None
-    return fitted.lens.with_stop_radius(scene.stop_radius_mm).with_aperture(scene.aperture)
+def _by_the_lens(scene: ModelScene, rule: Callable[[Lens], Any]) -> Any:
+    """Return what a rule gives for the lens of a scene; None where the model's file does not have it.
 
-
-class _Spot(NamedTuple):
-    """The rays of an axial point, and the film position at which their spot is smallest.
-
-    Attributes:
-        best_mm: the film plane.
-        rays: film points and pupil points [2, N], and wavelengths [N].
-        moments: [2, N], whose sums over rays tell the best film.
-        passed: [N], whether rays pass.
+    A file has the lens of one state, as designed. Its glasses may be in a catalogue that this machine does not have.
     """
+    fitted = scene.lens.fitted
+    with suppress(InputError):
+        if not (scene.lens.axes or "copy" in fitted.settings):
+            return rule(fitted.lens.with_stop_radius(scene.stop_radius_mm).with_aperture(scene.aperture))
+    return None
 
-    best_mm: float
-    rays: tuple[FloatArray, FloatArray, FloatArray]
-    moments: FloatArray
-    passed: NDArray[np.bool_]
 
-
-def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> _Spot:
+def _axial_spot(
+    scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]
+) -> tuple[float, tuple[FloatArray, FloatArray, FloatArray], FloatArray]:
     """Find the least spot by the model's own rays; spot and colours are those of `focusing.best_focus_z_mm`.
 
     There rays come from the object. Here, Newton's method finds for each pupil point the film point whose ray meets it.
+
+    Returns:
+        The film plane of that spot; the film points and pupil points [2, N] and wavelengths [N] of the rays; and
+        moments [2, N], whose sums over rays tell the best film: 0 of rays that do not pass.
     """
     domain = scene.lens.card["domain"]
     colours, weights = paraxial.colours(wavelength_nm)
@@ -266,13 +251,13 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
                 turn = cell[::-1] * np.array([-1.0, 1.0])[:, None, None, None]
             weight = weights[:, None, None] * np.abs(out[0] * turn[1] - out[1] * turn[0])
             moments = weight.reshape(-1) * np.stack([(film * slope).sum(0), (slope**2).sum(0)])
-        passed = (status == st.PASSED) & np.isfinite(moments).all(0)
-        along, across = np.where(passed, moments, 0.0).sum(1)
+        moments = np.where((status == st.PASSED) & np.isfinite(moments).all(0), moments, 0.0)
+        along, across = moments.sum(1)
         if not across > 0:
             raise InputError(scene.lens.path, "focus_mode", "best", "a model that lets axial light pass")
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0).clip(-reach, reach)  # rays that do not pass may go anywhere
-    return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
+    return best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments
 
 
 def _is_round(scene: ModelScene, wavelength_nm: tuple[float, float]) -> bool:
@@ -307,12 +292,11 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
     focal_points = lens["front_principal_z_mm"] - front_efl, lens["rear_principal_z_mm"] + efl
     exit_z = float(lens.get("exit_pupil_z_mm", math.nan))
     entrance = paraxial.entrance_pupil_z_mm(efl, front_efl, focal_points, exit_z)
-    breathes = any(a.name == "focus" for a in model.axes)
     squeeze = scene.squeeze(_SQUEEZED * radius, wavelength_nm)
     slope = film_slope(f_number, focal_points[1], exit_z, film_z)
     light = _light_on_axis(scene, float(np.clip(LINE_D_NM, *wavelength_nm)), 1 if squeeze == 1.0 else _SPOKES, slope)
     return lens_state(
-        nominal_mm=None if breathes else efl,
+        nominal_mm=None if any(a.name == "focus" for a in model.axes) else efl,
         efl_mm=efl,
         pinhole_mm=paraxial.reach_mm(efl, front_efl, focal_points, entrance, film_z),
         entrance_pupil_mm=film_z - entrance,

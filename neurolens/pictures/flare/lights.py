@@ -125,9 +125,7 @@ def flat_shape(towards: NDArray[np.floating[Any]], sides: NDArray[np.floating[An
     """Return a shape of even radiance about a direction [3]: a parallelogram of sides [2, 3] or the ellipse in it."""
     at = np.linspace(-0.5, 0.5, CELLS + 1)
     corners = towards + at[:, None, None] * sides[0] + at[:, None] * sides[1]
-    middle = (np.arange(CELLS) + 0.5) / CELLS - 0.5
-    inside = middle[:, None] ** 2 + middle**2 < 0.25 if round_ else np.ones((CELLS, CELLS))
-    return Shape(corners, inside.astype(np.float64), round_)
+    return Shape(corners, _in_disc(CELLS) if round_ else np.ones((CELLS, CELLS)), round_)
 
 
 def with_disc(light: Light, diameter_deg: float) -> Light:
@@ -186,8 +184,7 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
 def _in_disc(cells: int) -> Array:
     """Return the share of each cell [cells, cells] of a square that lies in its disc: whole cells would show steps."""
     at = (np.arange(4 * cells) + 0.5) / (4 * cells) - 0.5
-    inside = at[:, None] ** 2 + at**2 < 0.25
-    return inside.reshape(cells, 4, cells, 4).mean((1, 3))
+    return np.asarray((at[:, None] ** 2 + at**2 < 0.25).reshape(cells, 4, cells, 4).mean((1, 3)))
 
 
 def _shares(count: int, cells: int) -> Array:
@@ -199,8 +196,7 @@ def _shares(count: int, cells: int) -> Array:
 
 def _lengths(corners: Array) -> tuple[float, float]:
     """Return the lengths in radians of a shape's two kinds of sides, along their middles."""
-    half = CELLS // 2
-    along, across = corners[-1, half] - corners[0, half], corners[half, -1] - corners[half, 0]
+    along, across = (of[-1, CELLS // 2] - of[0, CELLS // 2] for of in (corners, corners.swapaxes(0, 1)))
     return float(np.linalg.norm(along)), float(np.linalg.norm(across))
 
 
@@ -219,8 +215,9 @@ class Track:
 
     def at(self, frame: float) -> Light | None:
         """Return the light at a frame; None while it stands behind the lens."""
-        values = (float(np.interp(frame, self.keys[:, 0], column)) for column in self.keys.T[1:])
-        azimuth, elevation, r, g, b, diameter, near, shown = values
+        azimuth, elevation, r, g, b, diameter, near, shown = (
+            float(np.interp(frame, self.keys[:, 0], column)) for column in self.keys.T[1:]
+        )
         if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
             return None
         rgb = shown * r, shown * g, shown * b
