@@ -15,7 +15,7 @@ from neurolens.optics.readers.codev import read_seq
 from neurolens.optics.readers.json_lens import is_blender, read_blender, read_json_lens
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.readers.oslo import read_len
-from neurolens.optics.readers.source import ReadOptions, read_text
+from neurolens.optics.readers.source import ReadOptions, lines_of, read_text
 from neurolens.optics.readers.tables import read_flaresim, read_opticalbench, read_table
 from neurolens.optics.readers.zemax import read_zmx
 
@@ -91,7 +91,7 @@ def format_of(path: str | Path) -> Format:
     Raises:
         InputError: neither tells the format.
     """
-    head = "\n".join(read_text(path)[:_HEAD].splitlines())
+    head = "\n".join(lines_of(read_text(path)[:_HEAD]))
     suffix = Path(path).suffix.lower()
     by_content = next((f for f in FORMATS if re.search(f.like, head, re.MULTILINE | re.IGNORECASE)), None)
     by_suffix = [f for f in FORMATS if suffix in f.suffixes]

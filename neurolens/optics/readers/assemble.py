@@ -32,7 +32,7 @@ def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
     options = options or ReadOptions()
     if +draft.skipped:
         listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
-        warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
+        warn(draft.file, f"left out, unknown or without effect on rays: {', '.join(listed)}")
     try:
         draft = with_stop(_without_negative_zeros(draft), options.stop)
         draft = _without_dummies(draft)

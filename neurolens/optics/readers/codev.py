@@ -15,8 +15,17 @@ from neurolens.optics.lens.prescription import Lens, MediumFields
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
-from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, ShapeFields, placed, primary_first
-from neurolens.optics.readers.glasses import by_indices, named_glass
+from neurolens.optics.readers.draft import (
+    INFINITE,
+    LEAST_RADIUS,
+    Draft,
+    Positions,
+    ShapeFields,
+    from_axis_deg,
+    placed,
+    primary_first,
+)
+from neurolens.optics.readers.glasses import by_code, by_indices, named_glass
 from neurolens.optics.readers.source import Line, ReadOptions, assume, by_word, read_lines, warn
 
 UNITS = {"M": "mm", "C": "cm", "I": "in"}
@@ -37,6 +46,7 @@ REFUSED = by_word(
     ("RMD", "a surface that refracts: the lens model has no mirrors"),
     ("BEN RET GLB", "tilts and decentres by XDE to CDE, DAR and REV: a bend belongs to a mirror"),
     ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
+    ("INS DEL FLY SCA", "surfaces as they are: commands that edit a lens are not carried out"),
 )
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
 SHAPES = ("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "AAS")
@@ -45,11 +55,13 @@ SPECIAL = {"ODD": "AR", "QBF": "QB", "QCN": "QC"}
 ALONG = ("KX", "KY", "AR", "BR", "CR", "DR", "AP", "BP", "CP", "DP")  # of AAS
 # Coefficients of an ASP surface: r^4, r^6, ... r^20.
 LETTERS = {letter: 4 + 2 * k for k, letter in enumerate("ABCDEFGHJ")}
-NONE_BUT_0 = ("CUF", "XOD", "YOD", "ZOD")
+NONE_BUT_0 = ("CUF", "XOD", "YOD", "ZOD", "ADX", "ADY", "ARO")
 TURNS = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
+# Solves of a surface, with what they give.
+SOLVES = {**dict.fromkeys(("UMY", "UCY", "IMY", "ICY"), "curvature"), **dict.fromkeys(("HMY", "HCY"), "thickness")}
 READ = (
     *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM DAR REV".split(),
-    *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0, *TURNS),
+    *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0, *TURNS, *SOLVES),
 )
 ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
 # Control codes, fields, vignetting factors, weights and wavelengths, which move no ray in a zoom.
@@ -243,7 +255,7 @@ def _surface(file: File, command: Command) -> None:
         case "CIR":
             if words and words[0].upper() in ("OBS", "HOL"):
                 raise line.error("CIR", words[0], "a round opening without a hole")
-            block.semi_diameter, block.aperture = command.first(words), True
+            block.semi_diameter, block.aperture = command.first([w for w in words if w.upper() != "CLR"]), True
         case "RDY" | "RDX" | "CUY" | "CUX":
             value = command.first(words)
             curvature = value if name.startswith("C") or value == 0 else 1 / value
@@ -257,7 +269,10 @@ def _surface(file: File, command: Command) -> None:
             block.kind = name
         case _ if name in NONE_BUT_0:
             if value := command.first(words):
-                raise line.error(name, value, "0: Fresnel surfaces and pivots of tilts are not read")
+                raise line.error(name, value, "0: Fresnel surfaces, pivots of tilts, decentred openings are not read")
+        case _ if name in SOLVES:
+            if not getattr(block, SOLVES[name]):
+                raise line.error(name, " ".join(words), f"a {SOLVES[name]} beside it: solves are not carried out")
         case _ if name in TURNS:
             block.turns[name] = command.first(words)
         case "DAR" | "REV":
@@ -410,7 +425,8 @@ def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
         across, up = file.fields.get(x, []), file.fields.get(y, [])
         longest = max(len(across), len(up))
         across, up = across + [0.0] * (longest - len(across)), up + [0.0] * (longest - len(up))
-        far = max([far, *(math.hypot(a, b) for a, b in zip(across, up, strict=True))])
+        distance = from_axis_deg if y == "YAN" else math.hypot
+        far = max([far, *map(distance, across, up)])
     return far or None
 
 
@@ -419,8 +435,7 @@ def medium(
 ) -> MediumFields:
     """Return the fields of a surface for the medium behind it.
 
-    It is a name, "NAME_MAKER", a code, n:V, n V, or nothing for air. A code is the fraction of the index and the Abbe
-    number without its point: 517.642, 517642 or 516800.641700.
+    It is a name, "NAME_MAKER", a code, n:V, n V, or nothing for air.
     """
     if not words or words[0].upper() in ("AIR", ""):
         return {}
@@ -433,10 +448,8 @@ def medium(
     if len(pair) == 2:
         n_d, V_d = command.numbers(pair, 2)
         return {"n_d": n_d, "V_d": V_d}
-    code = re.fullmatch(r"([0-9]{3,6})\.([0-9]{3,6})|([0-9]{3})([0-9]{3})", word)
-    if code:
-        index, abbe = (code[1], code[2]) if code[1] else (code[3], code[4])
-        return {"n_d": 1 + int(index) / 10 ** len(index), "V_d": int(abbe) / 10 ** (len(abbe) - 2)}
+    if code := by_code(word):
+        return code
     if re.fullmatch(r"[0-9.]+(e[+-]?[0-9]+)?", word, re.IGNORECASE):
         numbers = command.numbers(words[:2])
         return {"n_d": numbers[0], "V_d": numbers[1] if len(numbers) > 1 else None}

@@ -101,6 +101,13 @@ class Block:
         return Row(surface, self.aperture, self.name)
 
 
+def from_axis_deg(x: float, y: float) -> float:
+    """Return the angle from the axis of a field point whose angles in the x-z and the y-z plane are given."""
+    if not (x and y) or max(abs(x), abs(y)) >= 90:
+        return math.hypot(x, y)
+    return math.degrees(math.atan(math.hypot(math.tan(math.radians(x)), math.tan(math.radians(y)))))
+
+
 @dataclass(frozen=True)
 class Row:
     """One surface in the file's unit.

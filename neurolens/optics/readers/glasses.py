@@ -50,6 +50,18 @@ _OFF = 1e-3  # a larger difference between n_d of the formula and of the NM line
 _DARKEST = 1e-6  # a transmittance of 0 says no more than that it is below this
 
 
+def by_code(word: str) -> MediumFields | None:
+    """Return the fields of a glass code, else None: the fraction of the index, and the Abbe number without its point.
+
+    It is written as 517642, 517.642 or 516800.641700.
+    """
+    code = re.fullmatch(r"([0-9]{3,6})\.([0-9]{3,6})|([0-9]{3})([0-9]{3})", word)
+    if not code:
+        return None
+    index, abbe = (code[1], code[2]) if code[1] else (code[3], code[4])
+    return {"n_d": 1 + int(index) / 10 ** len(index), "V_d": int(abbe) / 10 ** (len(abbe) - 2)}
+
+
 def named_glass(
     name: str,
     file: str,
@@ -73,6 +85,11 @@ def named_glass(
         InputError: the name is unknown and there are no figures; the message suggests the nearest name.
     """
     same = catalogue.same_name(name)
+    stem, _, maker = name.rpartition("_")
+    if not same and (code := by_code(name)):
+        return code
+    if not same and stem and maker.upper() in _NAMES:  # as CODE V writes it
+        return named_glass(stem, file, field, [maker.upper()], text=name, figures=figures)
     if not same and not figures and (left := _DISCONTINUED.get(name.upper())):
         warn(file, f"{field}: glass {name} is discontinued: taken by n_d {left[0]:g} and V_d {left[1] or 'unknown'}")
         return {"n_d": left[0], "V_d": left[1], "material": name}

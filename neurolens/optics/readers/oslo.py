@@ -15,21 +15,22 @@ from pathlib import Path
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.placement import Placement
-from neurolens.optics.lens.prescription import Lens, MediumFields
+from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
 from neurolens.optics.readers.draft import INFINITE, UNKNOWN, Draft, Row, placed, primary_first
-from neurolens.optics.readers.glasses import by_indices, named_glass
-from neurolens.optics.readers.source import UNITS_MM, Line, ReadOptions, by_word, read_lines
+from neurolens.optics.readers.glasses import by_code, by_indices, named_glass
+from neurolens.optics.readers.source import MAX_INDEX, UNITS_MM, Line, ReadOptions, by_word, read_lines, warn
 
 TURNS = ("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC")
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
+FIXED = {"RDF": "RD", "CVF": "CV", "THF": "TH", "APF": "AP", "GLF": "GLA", "AIF": "AIR"}  # with no solve or pickup
 # Designer, weights, settings of the program, drawings.
 HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
 # What changes rays and is not read, if a number other than 0 or a word follows; with what is expected in its place.
 REFUSED = by_word(
-    ("NA", "EBR, FNO or NAO to size the stop"),
+    ("NA NAP PUK", "EBR, FNO or NAO to size the stop"),
     ("GC RCO", "no return of the axes: without it, what follows a tilted surface is tilted with it"),
     ("BEN", "no bend of the axes: a bend belongs to a mirror"),
     ("RFL RFH REFL", "no mirror: the lens model has none"),
@@ -37,7 +38,10 @@ REFUSED = by_word(
     ("GRD GDT NZ1 NR1 NR2 NR4", "no gradient index: the lens model has none"),
     ("PFL PFM", "no ideal lens: it is not read from OSLO's files"),
     ("CVX RDX AAD ASP ASR ASI ASX TOR CCX", "a sphere, a conic, or AD to AG: other shapes are not read"),
-    ("PK PU PI PUC PIC PYC EAC", "a figure: solves and pickups are not carried out"),
+    (" ".join(f"AS{k}" for k in range(31)), "a sphere, a conic, or AD to AG: other shapes are not read"),
+    ("TOX TOY TOZ", "0: pivots of tilts are not read"),
+    ("GTO ATD CXD APD GCD RCD BED PFD TDD CSD TSD", "surfaces as they are: commands that edit are not carried out"),
+    ("PK PU PI PUC PIC PYC EAC EC", "a figure: solves and pickups are not carried out"),
     ("AN AX1 AY1 APN AAC", "a round opening"),
 )
 
@@ -48,6 +52,7 @@ class Block(draft.Block):
 
     values: dict[str, float] = field(default_factory=dict)
     glass: Line | None = None
+    indices: list[float] = field(default_factory=list)  # at the wavelengths of the file
 
 
 @dataclass
@@ -87,6 +92,7 @@ def _parts(text: str) -> list[str]:
 
 def _read(file: File, line: Line) -> None:
     word, rest = line.words[0].upper(), line.words[1:]
+    word = FIXED.get(word, word)
     if word == "LEN":
         quoted = re.search('"([^"]*)"', line.text)
         file.name = quoted[1] if quoted else ""
@@ -115,16 +121,22 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
         case "EBR":
             file.pupil = 2 * line.positive(word, rest)
         case "ANG":
-            angle = line.first(word, rest)
-            if angle < 0:
-                raise line.error(word, angle, "a number above 0")
+            angle = abs(line.first(word, rest))
             file.half_field_deg = angle if 1e-3 < angle < 90 else None
         case "NAO":
             file.object_na = line.positive(word, rest)
         case "FNO":
             file.f_number = line.positive(word, rest)
+        case "OBH":
+            warn(file.file, "the field is given as an object height: left out")
+        case "GIH":
+            file.image_radius = abs(line.first(word, rest)) or None
+        case "LMO" if "NSS" in line.text.upper():
+            raise line.error(word, " ".join(rest), "no non-sequential part: the lens model has none")
         case "WV":
             file.waves_um = line.numbers(word, rest)
+        case _ if re.fullmatch("WV[1-9][0-9]?", word):
+            file.waves_um[int(word[2:]) - 1 : int(word[2:])] = line.numbers(word, rest)[:1]
         case "UNI":
             mm = line.first(word, rest)
             file.unit = next((name for name, value in UNITS_MM.items() if value == mm), None)
@@ -137,9 +149,9 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
             if rest and line.first(word, rest) != len(file.blocks) - 1:
                 raise line.error(word, rest[0], f"{len(file.blocks) - 1}, the number of the image surface")
         case "AIR":
-            block.medium = {}
+            block.medium, block.indices = {}, []
         case "GLA":
-            block.medium, block.glass = _glass(line, rest), line
+            _glass(block, line, rest)
         case "AP":
             block.aperture = rest[:1] == ["CHK"]
             semi = line.first(word, rest[block.aperture :])
@@ -159,26 +171,36 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
             file.skipped[word] += 1
 
 
-def _glass(line: Line, rest: list[str]) -> MediumFields:
-    """Read GLA with a name of the catalogue, or with one index."""
+def _glass(block: Block, line: Line, rest: list[str]) -> None:
+    """Read GLA with a name of the catalogue, or with indices, of a model glass behind MOD and its name."""
+    model = rest[:1] == ["MOD"]
+    rest = rest[1 + (not re.match("[0-9.]", rest[1])) :] if model and rest[1:] else rest
+    block.medium, block.glass, block.indices = {}, line, []
     if not rest:
         raise line.error("GLA", "(nothing)", "the name of a glass, or an index")
-    if re.fullmatch(r"[0-9.]+", rest[0]):
-        return {"n_d": line.numbers("GLA", rest)[0]}
-    if rest[0].upper() in ("REFL", "RFL", "REFLECT"):
+    if re.fullmatch(r"[0-9.]+", rest[0]) and not by_code(rest[0]):
+        block.indices = line.numbers("GLA", rest)
+    elif rest[0].upper() in ("REFL", "RFL", "REFLECT"):
         raise line.error("GLA", rest[0], "a glass: the lens model has no mirrors")
-    return named_glass(rest[0], line.file, f"line {line.number}, GLA")
+    else:
+        block.medium = named_glass(rest[0], line.file, f"line {line.number}, GLA")
+    if model and len(block.indices) == 2 and block.indices[1] > MAX_INDEX:
+        block.medium, block.indices = {"n_d": block.indices[0], "V_d": block.indices[1]}, []
 
 
 def _complete(file: File) -> None:
     """Set what is known only when all surfaces are read."""
     waves_nm = [1000 * um for um in file.waves_um]
     for block in file.blocks:  # the indices stand at wavelengths that come after the surfaces
-        if block.glass and block.medium.keys() == {"n_d"}:
-            indices = block.glass.numbers("GLA", block.glass.words[1:])
-            block.medium = by_indices(block.glass, "GLA", indices, waves_nm)
-    first, *middle, _ = file.blocks
+        if block.glass and block.indices:
+            block.medium = by_indices(block.glass, "GLA", block.indices, waves_nm)
+    first, *middle, image = file.blocks
     last = middle[-1]
+    for block, name, plane in ((first, "object", "object"), (image, "image", "film")):
+        if block.values.get("RD") or block.values.get("CV"):
+            warn(file.file, f"the {name} surface is curved; the {plane} is taken as plane")
+    if "TH" in last.values:  # the thickness of the image says how far behind it the film lies
+        last.values["TH"] += image.values.get("TH", 0.0)
     for k, block in enumerate(middle, start=1):
         if block.solved and block is not last:
             raise block.start.error("PY", f"(on surface {k})", "the last surface")

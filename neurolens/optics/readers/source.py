@@ -259,10 +259,15 @@ def decode(raw: bytes, path: str | Path) -> str:
     raise InputError(path, "file", "(bytes that are not text)", "a text file in UTF-8, UTF-16 or Latin-1")
 
 
+def lines_of(text: str) -> list[str]:
+    """Split a text at ends of lines alone: `splitlines` does so at the ellipsis of Windows' Latin-1, too."""
+    return re.split("\r\n|[\n\r\f]", text)
+
+
 def read_lines(path: str | Path) -> list[Line]:
     """Return the lines of a text file that have content; refuses too many lines, or one that is too long."""
     file = str(path)
-    rows = read_text(path).splitlines()
+    rows = lines_of(read_text(path))
     if len(rows) > MAX_LINES:
         raise InputError(file, "file", f"({len(rows)} lines)", f"at most {MAX_LINES} lines")
     lines = [Line(file, k, row.rstrip()) for k, row in enumerate(rows, start=1) if row.strip()]

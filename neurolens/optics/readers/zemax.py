@@ -22,7 +22,16 @@ from neurolens.optics.lens.prescription import Lens, MediumFields
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
-from neurolens.optics.readers.draft import INFINITE, LEAST_RADIUS, Draft, Positions, ShapeFields, placed, primary_first
+from neurolens.optics.readers.draft import (
+    INFINITE,
+    LEAST_RADIUS,
+    Draft,
+    Positions,
+    ShapeFields,
+    from_axis_deg,
+    placed,
+    primary_first,
+)
 from neurolens.optics.readers.glasses import named_glass
 from neurolens.optics.readers.source import MAX_POWER, Line, ReadOptions, assume, by_word, read_lines, warn
 
@@ -408,7 +417,8 @@ def _solved(blocks: Sequence[Block], gaps: list[float]) -> bool:
 def _set_field(file: File) -> None:
     """Set half field or image radius by the farthest field point. FTYP 0 is an angle, 2 and 3 are image heights."""
     points = [(x, y) for x, y in zip(*(file.heights.get(k, [0.0] * 100) for k in ("XFLN", "YFLN")), strict=False)]
-    edge = max((math.hypot(x, y) for x, y in points[: file.fields or None]), default=0.0)
+    distance = math.hypot if file.field_type else from_axis_deg
+    edge = max((distance(x, y) for x, y in points[: file.fields or None]), default=0.0)
     if edge > 0 and file.field_type == 0:
         file.half_field_deg = edge
     elif edge > 0 and file.field_type in (2, 3):

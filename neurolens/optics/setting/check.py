@@ -37,6 +37,7 @@ BLUR_LIMIT = 0.003  # RMS radius over focal length; a good lens has 0.0001 to 0.
 SIMPLE = 2  # with at most so many refractions, blur is no sign of a mistake
 DARK = 0.02  # illumination of the corner relative to the axis, below which the corner counts as dark
 _TINY_MM = 1e-3
+_BACK_FOCUS = "back focus, mm"
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,12 @@ def check_lens(lens: Lens) -> list[Check]:
     corner.
     """
     data = first_order(lens)
-    found = [*_first_order(lens, data), _beam(lens, data), _edges(lens), *_field(lens)]
+    # Of an object near the lens, whose film and blur are not those at infinity; its state is checked below.
+    near = any(c.object_distance_mm is not None and not c.thickness_mm for c in lens.configurations)
+    table = [check for check in _first_order(lens, data) if not (near and check.quantity == _BACK_FOCUS)]
+    found = [*table, _beam(lens, data), _edges(lens), *_field(lens)]
     if data.efl_mm > 0:
-        found.append(_blur(lens, data))
+        found += [] if near else [_blur(lens, data)]
         found += _corner(lens)
     for c in lens.configurations:
         # The f-number that the source states for this state. A state without one has the table's stop, and any will do.
@@ -120,7 +124,7 @@ def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
     tabled, last = float(lens.surfaces[-1].thickness_mm), float(lens.vertices_mm[-2])
     film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
     wrong = efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl
-    return Check("back focus, mm", computed, tabled, f"{film}, its focus is at {last + computed:.2f} mm" * wrong)
+    return Check(_BACK_FOCUS, computed, tabled, f"{film}, its focus is at {last + computed:.2f} mm" * wrong)
 
 
 def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:

@@ -224,6 +224,7 @@ def _may_widen(passed: NDArray[np.bool_], u: Array, v: Array, du: Array, dv: Arr
 _NEAR, _FAR = 3.0, 4.0
 _CLOSE = 0.25  # a rim that is closer to the film than this share of its radius
 _COARSE = 8  # film radii of the illumination, of which the search for its end first takes every eighth
+_DISTORTED = 1.1  # a lens that images a field this much nearer to the axis than f tan(field) is no rectilinear one
 
 _AT_MANY_AZIMUTHS = 64  # at most so many points a grid where each is traced at many azimuths
 
@@ -346,14 +347,17 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
     """Return the radius (mm) of the lit film, and where it comes from.
 
     It is the file's own. Without one it follows from the half field: below 60 degrees it is f tan(half field), beyond
-    that the film radius whose passing rays leave, in the mean, at the half field. Without a half field it is where the
-    relative illumination falls to 10%.
+    that, and where no such light or that of much wider fields falls there, the film radius whose passing rays leave, in
+    the mean, at the half field. Without a half field it is where the relative illumination falls to 10%.
     """
     if lens.image_radius_mm is not None:
         return lens.image_radius_mm, "the lens file"
     f = first_order(lens).front_efl_mm  # of angles in the medium in front
     if lens.half_field_deg is not None and lens.half_field_deg < 60:
-        return abs(f) * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
+        tangent = math.tan(math.radians(lens.half_field_deg))
+        share, angle = _illumination(lens.with_stop_radius(math.inf), np.array([abs(f) * tangent]))
+        if share[0] > 0 and angle[0] < math.atan(_DISTORTED * tangent):
+            return abs(f) * tangent, "f tan(half field)"
     radii = np.linspace(0, 3 * abs(f), 481)
     points = 48
     if not _illumination(lens, radii[:1])[0] > 0:  # a nearly closed stop lies between the points of the grid

@@ -18,6 +18,7 @@ from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.readers.source import ReadOptions
+from neurolens.optics.setting.check import check_lens, doubts
 
 OTHERS = Path(__file__).parents[4] / "shared" / "data" / "cases" / "2026-11-28"
 CASES = Path(__file__).parents[4] / "shared" / "data" / "cases"
@@ -39,7 +40,7 @@ def heard(path: Path, options: ReadOptions | None = None) -> tuple[Lens, str]:
         ("00_reference_ok.zmx", 94.6861, 91.9145, ""),
         ("01_hypr.zmx", 94.6861, 91.9145, ""),
         ("02_dbdt.zmx", 94.6861, 91.9145, ""),
-        ("03_auth_iwdp_rcmf.zmx", 94.6861, 91.9145, "left out, since no ray depends on it: AUTH, IWDP, RCMF"),
+        ("03_auth_iwdp_rcmf.zmx", 94.6861, 91.9145, "left out, unknown or without effect on rays: AUTH, IWDP, RCMF"),
         ("06_object_in_water.zmx", 188.80, 187.18, ""),
         ("06_object_in_water.seq", 188.80, 187.18, ""),
         ("07_overlap_drawn_rims.zmx", 35.81, None, "surface 12 of the file (27.32 to 27.17 mm)"),
@@ -271,6 +272,17 @@ def test_the_numerical_aperture_of_a_near_object_sizes_the_stop(tmp_path: Path) 
     assert state.object_distance_mm == 500 and (state.stop_diameter_mm or 2 * lens.stop_radius_mm) == pytest.approx(
         2 * lens.stop_radius_mm, rel=1e-9
     )
+
+
+def test_the_film_of_a_near_object_is_judged_by_its_image(tmp_path: Path) -> None:
+    """By Newton's formula: of an object x in front of the front focus, the image lies f^2 / x behind the rear one."""
+    data = first_order(heard_text(HEAD + BODY + TAIL, tmp_path)[0])
+    behind = data.efl_mm**2 / (120 - (data.efl_mm - data.front_principal_z_mm))
+    for off, said in ((0.0, ""), (5.0, "as filed: the table's last thickness puts the film at")):
+        text = swapped("DISZ 45.0", f"DISZ {data.back_focus_mm + behind + off}", HEAD + BODY + TAIL)
+        lens, _ = heard_text(swapped("DISZ INFINITY", "DISZ 120", text), tmp_path)
+        told = "\n".join(doubts(check_lens(lens)))
+        assert told.startswith(said) and bool(told) == bool(said)
 
 
 def heard_text(text: str, tmp_path: Path) -> tuple[Lens, str]:

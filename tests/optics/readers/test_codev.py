@@ -57,7 +57,9 @@ def test_singlet_by_the_lensmakers_formula(text: str, tmp_path: Path) -> None:
     efl_mm, _ = singlet_mm(catalogue.find("N-BK7").n_d)
     assert first_order(lens).efl_mm == pytest.approx(efl_mm, rel=1e-12)
     assert lens.name.lower() == "a singlet; for a test!"
-    assert lens.half_field_deg == 5.0
+    # Angles in the x-z and the y-z plane: their tangents add as squares.
+    tangent = math.hypot(math.tan(math.radians(3)), math.tan(math.radians(4)))
+    assert lens.half_field_deg == pytest.approx(math.degrees(math.atan(tangent)), rel=1e-12)
     assert [s.diameter_mm for s in lens.surfaces] == pytest.approx([10.0, 18.0])
     assert lens.f_number == pytest.approx(efl_mm / 10)
 
@@ -111,6 +113,26 @@ def test_a_private_glass_that_no_surface_uses_is_not_read(tmp_path: Path) -> Non
     assert read(swapped("SO ", block), tmp_path).surfaces == read(TEXT, tmp_path).surfaces
     with pytest.raises(InputError, match="PRV NOA61: got 'LAU', expected an index at each wavelength"):
         read(swapped("SO ", block, swapped("NBK7_SCHOTT", "NOA61")), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("GO\n", "SCA 2\nGO\n", "line 19, SCA: got '2', expected surfaces as they are: commands that edit"),
+        ("GO\n", "FLY S1..2\nGO\n", "line 19, FLY: got 'S1..2', expected surfaces as they are"),
+        ("-50.0 45.0", "-50.0 0\n HMY 0", "line 17, HMY: got '0', expected a thickness beside it: solves are not"),
+        ("-50.0 45.0", "0 45.0\n UMY -0.1", "line 17, UMY: got '-0.1', expected a curvature beside it"),
+        ("  CIR 8", "  CIR 8; ADY 3", "line 13, ADY: got 3.0, expected 0: .* decentred openings are not read"),
+    ],
+)
+def test_what_a_file_asks_codev_to_do_is_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read(swapped(old, new), tmp_path)
+
+
+def test_solves_that_a_file_has_carried_out_and_clear_openings_read(tmp_path: Path) -> None:
+    text = swapped("-50.0 45.0", "-50.0 45.0\n UMY -0.1\n HMY 0", swapped("  CIR 8", "  CIR CLR 8; ADY 0"))
+    assert read(text, tmp_path) == read(TEXT, tmp_path)
 
 
 def test_radii_or_curvatures(tmp_path: Path) -> None:

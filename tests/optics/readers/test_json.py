@@ -215,7 +215,7 @@ def test_a_stop_without_a_medium_and_keys_of_the_program(tmp_path: Path) -> None
     """DeepLens writes apertures without mat2; a key that it does not know is left out and named."""
     bare = {key: value for key, value in STOP.items() if key != "mat2"}
     expected = read_any(written(tmp_path, DEEPLENS))
-    with pytest.warns(NeurolensWarning, match="left out, since no ray depends on it: squeeze"):
+    with pytest.warns(NeurolensWarning, match="left out, unknown or without effect on rays: squeeze"):
         lens = read_any(written(tmp_path, {**DEEPLENS, "surfaces": [{**bare, "squeeze": 1.5}, FRONT, REAR]}))
     assert lens.surfaces == expected.surfaces
     with pytest.raises(InputError, match="DOE: got .given., expected a lens without a diffractive element"):

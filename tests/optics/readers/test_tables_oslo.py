@@ -145,11 +145,46 @@ def test_oslo_by_the_lensmakers_formula(tmp_path: Path) -> None:
         ("END  3\n", "", r"END: got \(missing\)"),
         ("END  3\n", "END 3\nCFG NEW\n", r"line 26, CFG: got 'NEW', expected one configuration"),
         ("TH   5.0", "TH   x", r"line 14, TH: got 'x'"),
+        ("AST\n", "AST; AS2 1e-6\n", r"line 16, AS2: got '1e-6', expected a sphere, a conic, or AD to AG"),
+        ("AST\n", "AST; TLA 5; TOZ 2\n", r"line 16, TOZ: got '2', expected 0: pivots of tilts"),
+        ("AST\n", "AST; LMO NSS\n", r"line 16, LMO: got 'NSS', expected no non-sequential part"),
+        ("CALLBACK 1", "GTO 1; RD 30", r"line 23, GTO: got '1', expected surfaces as they are"),
+        ("EBR  5.0", "NAP 0.1", r"line 3, NAP: got '0.1', expected EBR, FNO or NAO"),
     ],
 )
 def test_oslo_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         read(swapped(old, new, OSLO), ".len", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "index"),
+    [
+        ({"RD   50.0": "RDF 50.0", "TH   5.0": "THF 5.0", "GLA  BK7": "GLF BK7", "AIR ; RD": "AIF ; CVF -0.02; RD"}, 0),
+        ({"GLA  BK7": "WV 0.58756 0.48613 0.65627\nGLA MOD MODEL1 1.6201 1.6272360458395 1.6169694895481"}, 1.6201),
+        ({"GLA  BK7": "GLA MOD 1.6201 60.4"}, 1.6201),
+        ({"GLA  BK7": "GLA 620604"}, 1.62),
+        ({"ANG  5.0": "ANG  -5.0", "WV 0.58756 0.48613 0.65627": "WV 0.58756; WV2 0.48613; WV3 0.65627"}, 0),
+    ],
+)
+def test_oslo_as_it_writes_fixed_figures_and_model_glasses(
+    changes: dict[str, str], index: float, tmp_path: Path
+) -> None:
+    """The model glass is one of a file that OSLO 6.6 wrote, with V_d = 60.4."""
+    text = OSLO
+    for old, new in changes.items():
+        text = swapped(old, new, text)
+    lens = read(text, ".len", tmp_path)
+    assert first_order(lens).efl_mm == pytest.approx(singlet_mm(index or catalogue.find("BK7").n_d)[0], rel=1e-12)
+    assert lens.surfaces[0].V_d == pytest.approx(60.4 if index else catalogue.find("BK7").V_d, rel=1e-6)
+    assert (lens.half_field_deg, lens.surfaces[0].thickness_mm) == (5.0, 5.0)
+    assert lens.wavelengths_nm[0] == 587.56 and len(lens.wavelengths_nm) == 3
+
+
+def test_the_image_of_oslo_is_where_its_thickness_says_and_plane(tmp_path: Path) -> None:
+    text = swapped("PY   0.0", "TH 46.0", swapped("CALLBACK 1", "TH 0.25; RD -300", OSLO))
+    with pytest.warns(NeurolensWarning, match="the image surface is curved; the film is taken as plane"):
+        assert read(text, ".len", tmp_path).surfaces[-1].thickness_mm == 46.25
 
 
 def test_a_glass_of_oslo_says_whose_it_is_taken_for(tmp_path: Path) -> None:

@@ -91,11 +91,36 @@ def test_singlet_by_the_lensmakers_formula(encoding: str, tmp_path: Path) -> Non
     assert data.back_focus_mm == pytest.approx(back_mm, rel=1e-12)
     assert (lens.name, lens.notes) == ("Einzellinse \u00d8 20 for a test", "made up")
     assert lens.surfaces[0].glass == "N-BK7"
-    assert lens.half_field_deg == 5.0  # the third field point, not the unused fourth
+    # The third field point, not the unused fourth, by the tangents of its angles in two planes.
+    tangent = math.hypot(math.tan(math.radians(3)), math.tan(math.radians(4)))
+    assert lens.half_field_deg == pytest.approx(math.degrees(math.atan(tangent)), rel=1e-12)
     assert lens.rims == "source"
     # The pupil of the file rules over the diameter that it prints for the stop, which is the first surface.
     assert lens.surfaces[0].diameter_mm == pytest.approx(10)
     assert lens.f_number == pytest.approx(efl_mm / 10)
+
+
+def test_the_corner_of_a_wide_field_by_its_tangents(tmp_path: Path) -> None:
+    """A field of 40 degrees in both planes is the corner of a square: arctan(sqrt(2) tan 40) from the axis."""
+    wide = swapped("XFLN 0 0 3 9\nYFLN 0 2.5 4 9", "XFLN 0 0 40 9\nYFLN 0 2.5 -40 9")
+    assert read(wide, tmp_path).half_field_deg == pytest.approx(49.88, abs=0.005)
+    fisheye = swapped("YFLN 0 2.5 4 9", "YFLN 0 2.5 110 9", swapped("XFLN 0 0 3 9", "XFLN 0 0 0 9"))
+    assert read(fisheye, tmp_path).half_field_deg == 110
+
+
+@pytest.mark.parametrize(
+    ("name", "n_d", "V_d"), [("517642", 1.517, 64.2), ("BK7_SCHOTT", 1.5168, 64.17), ("S-BSL7_OHARA", 1.51633, 64.14)]
+)
+def test_codes_of_glasses_and_makers_behind_names(name: str, n_d: float, V_d: float, tmp_path: Path) -> None:
+    front = read(swapped("GLAS N-BK7 0", f"GLAS {name} 0"), tmp_path).surfaces[0]
+    assert (front.n_d, front.V_d) == (pytest.approx(n_d, abs=1e-5), pytest.approx(V_d, abs=0.01))
+
+
+def test_an_ellipsis_ends_no_line(tmp_path: Path) -> None:
+    """Windows' Latin-1 has it where Unicode has a control that ends lines."""
+    path = tmp_path / "lens.zmx"
+    path.write_bytes(swapped("made up", "more\x85 SURF 9", HEAD + BODY + TAIL).encode("latin-1"))
+    assert read_zmx(path).surfaces == read(HEAD + BODY + TAIL, tmp_path).surfaces
 
 
 def test_a_glass_of_no_catalogue_is_taken_by_the_figures_beside_it(tmp_path: Path) -> None:

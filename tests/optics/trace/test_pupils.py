@@ -23,6 +23,7 @@ from experiments.accuracy.pupil_methods import (
 from neurolens.base.errors import InputError
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.setting.check import film_edge_mm
 from neurolens.optics.setting.pupils import camera_rays, image_radius_mm, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import trace
@@ -111,6 +112,12 @@ def test_image_radius_rules() -> None:
     assert image_radius_mm(stated) == (33.0, "the lens file")
     by_field = replace(tessar, image_radius_mm=None, half_field_deg=20.0)
     assert image_radius_mm(by_field)[0] == pytest.approx(f * math.tan(math.radians(20)))
+    fisheye = tabled("isshiki_fisheye_10")
+    narrow = replace(fisheye, image_radius_mm=None, half_field_deg=45.0)
+    # Where its chief ray lands, far within f tan(field).
+    assert (
+        0.8 * first_order(narrow).efl_mm > image_radius_mm(narrow)[0] == pytest.approx(film_edge_mm(narrow), rel=0.01)
+    )
     first, *others = by_field.surfaces
     diverging = replace(by_field, surfaces=(replace(first, radius_mm=-100.0), *others))
     assert first_order(diverging).efl_mm < 0 < image_radius_mm(diverging)[0]
