@@ -68,7 +68,7 @@ examples:
     called = "neurolens psf"
     intermixed = True
 
-    file: Path = cli.lens(also=", or a model with optical path (train --phase)", models=True, positional=True)
+    file: Path = cli.lens(also="; models need the optical path (train --phase)", models=True, positional=True)
     out: Path = cli.output_path("OUT.npz", "file to write: .npz or .exr")
     film: tuple[float, float] = cli.film()
     pixel_um: float = setting(

@@ -76,7 +76,7 @@ def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
         lens = read_lens(path, data)
         lens = replace(lens, name=options.name or lens.name, source=options.source or lens.source)
         if options != ReadOptions(name=options.name, source=options.source):
-            raise InputError(path, "options", "(others)", "--name and --source: a lens file has the rest")
+            raise InputError(path, "options", "(others)", "--name and --source only: the file has the rest")
         return lens
     found = format_of(path)
     for name, value in (("--gap-before", options.gap_before), ("--semi-diameters", options.semi_diameters)):

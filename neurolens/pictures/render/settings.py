@@ -122,7 +122,7 @@ _QUICK_BINS, _QUICK_CELL_PX, _QUICK_PHOTONS = 5, 24.0, 1 << 16
 
 
 # Titles of the options of flare in the help.
-OF_LIGHTS, OF_PICTURE, OF_LAYERS = "lights, at least one; all of them together", "picture", "layers"
+OF_LIGHTS, OF_PICTURE, OF_LAYERS = "lights, which add up", "picture", "layers"
 OF_PHOTONS = "photons, and what scatters them"
 
 
