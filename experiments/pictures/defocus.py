@@ -5,13 +5,15 @@ the thin lens framed as it (256), path-traced. FLIP (0 is equal) of the blurred 
 highlights as discs and without, and of the path-traced thin lens against it. Rendered pictures stay in the folder
 `--pictures` and are taken from there by the next run; all take half an hour of one core. The noise of both pictures
 is part of FLIP: that of two path-traced pictures of other seeds is its floor, measured on the scene with the largest
-FLIP. Also a 4K plate, made of the first scene's by repeating pixels, for its time. Writes defocus.md and defocus.json.
+FLIP. Also a 4K plate, made of the first scene's by repeating pixels, for its time; `--large` takes that time alone, and
+the rest from the results that are there. Writes defocus.md and defocus.json.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import math
 import tempfile
 import time
@@ -234,6 +236,7 @@ path-traced noise by 1 / samples; to equal error, what one eye cannot see (mirro
 OPTIONS = (
     lab.ONLY,
     lab.option("--pictures", type=Path, default=Path("runs/defocus"), metavar="FOLDER", help="where renders are kept"),
+    lab.option("--large", action="store_true", help="the time of a 4K plate alone"),
     lab.option("--checks", action="store_true", help="points of light and equal noise only: defocus_checks.md"),
     lab.out(),
 )
@@ -261,6 +264,11 @@ def run(args: argparse.Namespace) -> None:
     args.pictures.mkdir(parents=True, exist_ok=True)
     if args.checks:
         return run_checks(args)
+    if args.large:
+        known = json.loads((lab.RESULTS / "defocus.json").read_text(encoding="utf-8"))
+        rows, _ = known.pop("rows"), known.pop("machine")
+        large, count = large_s(known["first"], args.pictures)
+        return _write(args, {**known, "large": large, "count": count}, rows)
     rows = []
     for scene, report in lab.stages(lab.chosen(SCENES, str, args.only, "defocus"), str, args.quiet):
         rows.append(measure(scene, args.pictures))
@@ -273,6 +281,11 @@ def run(args: argparse.Namespace) -> None:
     known = {"lens": LENS, "f_number": F_NUMBER, "width": WIDTH, "first": first, "worst": worst, "better": better}
     known |= {"samples": SAMPLES["fused"], "plate": SAMPLES["pinhole"]}
     known |= {"floor": flip(*two), "wide": _LARGE[0], "high": _LARGE[1], "large": large, "count": count}
+    _write(args, known, rows)
+
+
+def _write(args: argparse.Namespace, known: lab.Row, rows: list[lab.Row]) -> None:
+    """Write the page and its figures."""
     head = "# Blur of a lens for sharp pictures, beside path-traced ones", "`python -m experiments defocus`"
     text = lab.page(*head, _NOTES.format(**known), lab.machine_line(), lab.table(_COLUMNS, rows))
     print(lab.write_results(args.out, "defocus", text, {**known, "machine": lab.machine(), "rows": rows}))
