@@ -422,5 +422,5 @@ def unpacked_lens(packed: dict[str, Any]) -> Lens:
             name, layers, *origin = values["coating"]
             values["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers), *origin)
         surfaces.append(Surface(**values))
-    most = {k: float(packed[k]) for k in _MOST if k in packed}
+    most: dict[str, Any] = {k: float(packed[k]) for k in _MOST if k in packed}
     return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS}, **most)
