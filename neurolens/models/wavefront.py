@@ -2,7 +2,12 @@
 
 The path of the model ends on the plane across s(P) through the front focal point F (`models.phase`). Light of an object
 point S that meets the film in one direction passes near one point R of the scene side. So its path from S is that of
-the plane wave of the direction d from R to S, which the model has, and (S - F) . d.
+the plane wave of the direction d from R to S, and (S - F) . d.
+
+By Fermat's principle the path hardly depends on which ray of that direction on the film is followed. That through the
+point P with s(P) = d has the path that the model knows; it leaves in a direction d + e, and the ray that leaves in the
+direction d passes R. So the path is too long by (R_P - R) . e / 2, which is small, and so are errors of the model's
+rays in it. The path along the very ray of S would have the error of R in full, times d - s.
 """
 
 from __future__ import annotations
@@ -40,6 +45,7 @@ _KNOWN: WeakKeyDictionary[Phased, tuple[Graph, CompiledGraph | None]] = WeakKeyD
 # Rays up to so many radii of stop and rims count: before they are led to the source (the second: may pass), and after.
 _NEAR, _ASIDE, _BEYOND = 1.2, 1.04, 1.1
 _RIM = 2.0  # a gate is (height / rim radius)^2 - 1; with this added it stands for a height and a rim of this radius
+_ASTRAY = 0.05  # pupil radii from a ray on the focal plane to the other whose path is taken for its own
 _NEWTON = 8  # steps from a direction to its point on the focal plane
 _SEARCH, _ROUNDS = 65, 3  # points among which the chief ray is sought, and how often
 
@@ -54,9 +60,11 @@ def checked_path(model: LensModel, lens: Lens, wavelengths_nm: Sequence[float]) 
     if not isinstance(model.core, Phased):
         expected = "a model with optical path (neurolens train --phase)"
         raise InputError(lens.path, "model", f"({model.method})", expected)
-    limits = [("film_z_mm", float(lens.film_z_mm or 0), domain.film_z_mm)]
-    limits.append(("stop_radius_mm", lens.stop_radius_mm, (0.0, domain.stop_radius_mm)))
-    limits += [("wavelength_nm", nm, domain.wavelength_nm) for nm in wavelengths_nm if model.encoding.dispersive]
+    limits = [
+        ("film_z_mm", float(lens.film_z_mm or 0), domain.film_z_mm),
+        ("stop_radius_mm", lens.stop_radius_mm, (0.0, domain.stop_radius_mm)),
+        *(("wavelength_nm", nm, domain.wavelength_nm) for nm in wavelengths_nm if model.encoding.dispersive),
+    ]
     for name, value, (low, high) in limits:
         if not low / DOMAIN_SLACK <= value <= high * DOMAIN_SLACK:
             raise InputError(lens.path, name, value, f"{low:.6g} to {high:.6g}, the domain of the model")
@@ -142,8 +150,7 @@ class _Known:
             """Repeat values of places for their rays."""
             return np.repeat(values, count, 1)
 
-        source = self._source(seen)
-        source = None if source is None else each(source) - self.front[:, None]
+        source = self._source(each(seen))
         cosines = each(middle) + each(half) * np.tile(_SQUARE, places)
         light = np.concatenate([cosines, _forwards(cosines)[None]])
         point, axis = each(place + chief * (focal_z - film_z)), each(seen[3:])
@@ -154,21 +161,22 @@ class _Known:
         # Far outside the stop a model may fold: rays from there come back into it.
         stop = out["stop"]  # of these rays, it is a rim, too: beyond it polynomials of the others may come back
         near = self._passes(out, point + slope * back, _NEAR * stop_mm, _NEAR**2 - 1)
-        # Rays of the source, by cosines: where those that leave so much aside come from.
-        point = point + self._point_of(way) - self._point_of(leaves)
-        aside = way - direction_at(self.core, point)
-        out = self.rays(np.tile(point, waves), np.tile(cosines, waves), focal_z, np.repeat(self.waves, places * count))
-        near &= (
-            self._passes(out, np.tile(point + slope * back, waves), _BEYOND * stop_mm, _BEYOND**2 - 1)
-            .reshape(waves, -1)
-            .all(0)
-        )  # the wavelengths have rays in the same directions, so that one design fits them all
-        ahead = np.concatenate([point - each(place), np.full((1, len(near)), focal_z - film_z)])
-        shift = -(light * ahead).sum(0)
-        if source is not None:
-            shift = shift + (source * way).sum(0)
-        foot, _, _ = foot_of(self.core, out["ray"])
-        wave = out["path_um"] / 1000 + np.tile(shift, waves) - (foot * np.tile(aside, waves)).sum(0)
+        # Rays of the source, by cosines: where those that leave so much aside come from. Then those with s(P) = d, or
+        # between both, where they come from far: rays outside its pupil are none that the model knows.
+        even, many = self._point_of(way), (np.tile(cosines, waves), focal_z, np.repeat(self.waves, places * count))
+        point = point + even - self._point_of(leaves)
+        apart = (even - point) / self.model.domain.pupil_radius_mm
+        even = point + (even - point) / np.maximum(1, np.hypot(*apart) / _ASTRAY)
+        out, plane = self.rays(np.tile(point, waves), *many), self.rays(np.tile(even, waves), *many)
+        ahead = np.concatenate([even - each(place), np.full((1, len(near)), focal_z - film_z)])
+        shift = -(light * ahead).sum(0) + (0 if source is None else (source * way).sum(0))
+        (foot, _, _), (beside, leaves, _) = (foot_of(self.core, some["ray"]) for some in (out, plane))
+        aside, along = np.tile(way - direction_at(self.core, even), waves), np.tile(way, waves)
+        longer = (beside * aside + (beside - foot) * (leaves - along) / 2).sum(0)
+        wave = plane["path_um"] / 1000 + np.tile(shift, waves) - longer
+        passed = self._passes(out, np.tile(point + slope * back, waves), _BEYOND * stop_mm, _BEYOND**2 - 1)
+        # The wavelengths have rays in the same directions, so that one design fits them all.
+        near &= (passed & np.isfinite(wave[0])).reshape(waves, -1).all(0)
         crossed, energy = self._across(foot, np.tile(axis, waves), None if source is None else np.tile(source, waves))
         gates = out.get("gates", np.zeros((0, foot.shape[1]))) + _RIM
         at = [*out["stop"], *np.tile(stop, waves), *np.stack([gates, 0 * gates], 1).reshape(-1, foot.shape[1])]
@@ -198,10 +206,10 @@ class _Known:
         return along * slope[every, best], out["ray"].reshape(6, *slope.shape)[:, every, best]
 
     def _source(self, seen: Array) -> Array | None:
-        """Return the object points [3, P] on chief rays [6, P]; None for distant ones."""
+        """Return the object points [3, P] on chief rays [6, P], from the front focal point; None for distant ones."""
         back = np.concatenate([seen[:3], -seen[3:]])  # light travels to the film
         found = self.scene.object_points(Rays(*torch.from_numpy(back)))
-        return None if found is None else np.stack([c.numpy() for c in found])
+        return None if found is None else np.stack([c.numpy() for c in found]) - self.front[:, None]
 
     def _box(self, place: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return middles and half sides [2, P] of boxes of cosines that hold the light, and which places have any."""
@@ -244,11 +252,9 @@ class _Known:
 
         `foot` and `source` [3, N] are counted from the front focal point; `axis` [3, N] are the chief rays.
         """
-        first = np.where(
-            np.abs(axis[1]) < 0.9, np.cross(axis, [0.0, 1.0, 0.0], 0).T, np.cross(axis, [1.0, 0.0, 0.0], 0).T
-        )
-        first = first / np.linalg.norm(first, axis=0)
-        across = np.stack([first, np.cross(axis, first, axis=0)])
+        beside = np.where(np.abs(axis[1]) < 0.9, np.array([[0.0], [1.0], [0.0]]), np.array([[1.0], [0.0], [0.0]]))
+        first = np.cross(axis, beside, axis=0)
+        across = np.stack([first, np.cross(axis, first, axis=0)]) / np.linalg.norm(first, axis=0)
         if source is None:
             return (across * foot).sum(1), 1.0
         way = source - foot
