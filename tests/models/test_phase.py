@@ -167,7 +167,7 @@ def test_a_network_takes_what_few_terms_leave(
     rays = passing_rays(plain.lens, plain.domain, 4000, seed=5, batch=8192).inputs
     monkeypatch.setattr(phase, "TERMS", 12)
     monkeypatch.setattr(phase, "_UNITS", 8)
-    monkeypatch.setattr(phase, "_STEPS", 40)
+    monkeypatch.setattr(phase, "_STEPS", 80)
     monkeypatch.setattr(phase, "_MOST_WAVES", math.inf)
     errors, models = [], list[LensModel]()
     for enough in (math.inf, phase.ENOUGH_WAVES):
@@ -257,6 +257,19 @@ def test_errors_of_rays_do_not_reach_the_waves(both: tuple[LensModel, LensModel]
     cosines = np.stack([u, v]).reshape(2, -1) * a.half[:, None]
     waves = [p.field((cosines + a.middle[:, None] - p.middle[:, None]) / p.half[:, None]) for p in (a, b)]
     assert np.unwrap(np.angle(waves[1] / waves[0])).std() / (2 * math.pi) < 0.0005
+
+
+def test_a_condenser_has_the_strehl_ratio_of_its_middle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its path errs by waves where there is no image; on its axis, stopped down, it is that of traced rays."""
+    monkeypatch.setattr(phase, "TERMS", 50)
+    plain = load_model(MODELS / "thorlabs_lb1471_biconvex_50.ols-64.onnx").fitted
+    model = with_phase(plain, passing_rays(plain.lens, plain.domain, 4000, seed=5, batch=8192).inputs)
+    scene = Scene(set_lens(plain.lens, Shot(film_mm=(60.0, 60.0), f_number=8.0)))
+    [[exact]], [[found]] = (
+        pupils_at(scene, (place := np.zeros((1, 2))), (546.0,)), model_pupils(model, scene, place, (546.0,))
+    )  # fmt: skip
+    assert exact is not None and found is not None and _strehl(exact) > 0.8
+    assert _strehl(found) == pytest.approx(_strehl(exact), abs=0.01)
 
 
 def test_a_model_gives_the_point_spread_of_its_lens(both: tuple[LensModel, LensModel]) -> None:
