@@ -56,6 +56,7 @@ _DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # names of depth, a
 _COMBINED = ("Combined.", "combined.")
 _SKY_M = 1e9  # depth from which on there is sky
 _LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
+_STATED = 0.2  # by which a stated shape of pixels may differ: that of 2, 1.8 or 1.33 holds for what is far
 _SAME = 1e-3  # by which the shapes of plate and film may differ, relatively
 
 
@@ -218,8 +219,8 @@ def read_plate(
         behind: files of the same size that show what is behind the things of the plate.
 
     Raises:
-        InputError: there is no depth, or depth is negative or only from 0 to 1; the shape is not the film's; the files
-            have different sizes.
+        InputError: there is no depth, or depth is negative or only from 0 to 1; the shape is not the film's, or that of
+            pixels not the lens's; the files have different sizes.
     """
     header = header_of(path)
     (left, top), (last, bottom) = header["displayWindow"]
@@ -238,6 +239,11 @@ def read_plate(
     film_px = max(1, round(film_mm[0] * per_mm[0])), max(1, round(film_mm[1] * per_mm[1]))
     for pixels in (size, film_px):
         check_size(path, "displayWindow", f"({pixels[0]} x {pixels[1]} pixels)", pixels, _LARGEST, _MOST_PIXELS)
+    shape, stated = reach[1] / reach[0] * per_mm[1] / per_mm[0], float(header.get("pixelAspectRatio", 1.0))
+    if not math.isclose(stated, shape, rel_tol=_STATED + 1 / min(size)):
+        if stated != 1:  # what many programs write whatever they render; another number was meant
+            raise InputError(path, "pixelAspectRatio", stated, f"{shape:.3g}, that of this lens's pixels on this film")
+        warn(f"{path}: pixels count as {shape:.3g} times as wide as high, as the lens squeezes; the file says square")
     start = [int(v) for v in header["dataWindow"][0]]
     centre = size[0] / 2 + int(left) - start[0], size[1] / 2 + int(top) - start[1]
     pinhole = PlatePinhole((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)

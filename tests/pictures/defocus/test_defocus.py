@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -614,6 +615,20 @@ def test_alpha_says_where_a_layer_has_nothing(tmp_path: Path) -> None:
     )
     assert alone[300] == 0 and both[300] == pytest.approx(0.97, abs=0.04)
     assert alone[192] == pytest.approx(alone[60] / 2, rel=0.2)  # the edge fades into nothing
+
+
+def test_pixels_that_a_plate_states_are_those_of_the_lens(tmp_path: Path) -> None:
+    """A 2:1 plate through a round lens, and a square one through a lens that squeezes 2:1; 1.8 is near to that."""
+    round_lens = frame_of(thin())
+    squeezes = round_lens._replace(reach_mm=(round_lens.reach_mm[0] / 2, round_lens.reach_mm[1]))
+    planes = {c: np.full(SIZE[::-1], 2.0, np.float32) for c in "RGBZ"}
+    for stated, frame, said in ((2.0, round_lens, "1,"), (1.8, squeezes, ""), (1.5, squeezes, "2,")):
+        write_channels(tmp_path / "a.exr", planes, attributes={"pixelAspectRatio": stated})
+        with pytest.raises(InputError, match=f"pixelAspectRatio.*expected {said}") if said else nullcontext():
+            read_plate(tmp_path / "a.exr", FILM, frame, DepthSettings())
+    write_channels(tmp_path / "a.exr", planes)
+    with pytest.warns(NeurolensWarning, match="2 times as wide"):
+        read_plate(tmp_path / "a.exr", FILM, squeezes, DepthSettings())
 
 
 @pytest.mark.parametrize("window", [(360000, 240000), (20000, 11250)])
