@@ -99,6 +99,7 @@ class Keeper:
         self.resumed = job.film.fraction
         self._kept = self.resumed if self._written else 0.0
         self._began = time.perf_counter()
+        self._first: tuple[float, float] | None = None  # seconds and share of the work when some was done
         self._preview_at = self._began + watch.preview_s
         self._checkpoint_at = self._began + watch.checkpoint_s
         self._failed: set[str] = set()
@@ -112,8 +113,10 @@ class Keeper:
         """Do what is due, and return whether the render is to stop."""
         watch, fraction, now = self._watch, self._job.film.fraction, time.perf_counter()
         if self._progress is not None and fraction > self.resumed:
-            pace = (now - self._began) / (fraction - self.resumed)
-            self._progress(fraction, pace * (1 - fraction))
+            self._first = first = self._first or (now, fraction)
+            since, done = first if fraction > first[1] else (self._began, self.resumed)
+            known = since != self._began or self.resumed  # the first rays of a run also wait for compilers
+            self._progress(fraction, (now - since) / (fraction - done) * (1 - fraction) if known else None)
         if (preview := watch.preview) is not None and now >= self._preview_at and fraction:
             self._preview_at = self._try("preview", lambda: preview(develop(self._job)[0]), watch.preview_s)
         if watch.checkpoint is not None and now >= self._checkpoint_at:

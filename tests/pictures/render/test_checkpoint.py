@@ -7,7 +7,8 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from shipped import whole
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
+from neurolens.pictures.render import renderer
 from neurolens.pictures.render.film import SPENT, digest
-from neurolens.pictures.render.renderer import RenderResult, Watch, render
+from neurolens.pictures.render.renderer import Keeper, RenderResult, Watch, render
 from neurolens.pictures.render.settings import FilmSettings
 
 PATHS_A_PASS = 16 * 64
@@ -245,3 +247,13 @@ def test_a_checkpoint_that_does_not_fit_the_disk_leaves_the_older_one_and_the_re
         found = kept_render(part, samples=32, watch=Watch(checkpoint=part, keep=True, note=told.append))
     assert found.stats.complete and told == [f"checkpoint not written: {part}: File too large"]
     assert part.read_bytes() == before and os.listdir(tmp_path) == [part.name]
+
+
+def test_time_left_does_not_count_what_only_the_first_rays_wait_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """12 s of compiling, then 1% of the work every half second: 98% take 49 s, not the 20 minutes of 1% in 12 s."""
+    film, seen, clock = SimpleNamespace(fraction=0.0, seconds=[0.0, 0.0]), list[float | None](), [0.0]
+    monkeypatch.setattr(renderer.time, "perf_counter", lambda: clock[0])
+    keeper = Keeper(cast(Any, SimpleNamespace(film=film)), Watch(), lambda _, left=None: seen.append(left))
+    for clock[0], film.fraction in ((12.0, 0.0), (12.0, 0.01), (12.5, 0.02)):
+        keeper()
+    assert seen == [None, pytest.approx(49)]
