@@ -325,6 +325,15 @@ def test_a_camera_says_that_a_stop_is_wider_than_the_lens_has(
         assert ("the stop gives f/1, wider than the f/5 of the source" in capsys.readouterr().err) == said
 
 
+@pytest.mark.parametrize("words", [["lens"], ["analyse", "seidel"]])
+def test_a_stop_wider_than_the_lens_has_is_told_once(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """f/4.8 is within the 5% by which sources round."""
+    for number, times in ((1, 1), (4.8, 0)):
+        assert main([words[0], str(TRIPLET), *words[1:], "--f-number", str(number)]) == 0
+        said = "".join(capsys.readouterr())
+        assert said.count("the stop gives f/1, wider than the f/5 of the source") == times
+
+
 def test_a_width_alone_is_enough(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of 36 x 24 mm, 16 pixels across and 11 down are 3% off, and none are nearer."""
     common = ("render", scene, "--camera", "thin", "--film", "36x24", "--samples", 1, "--quiet")

@@ -18,7 +18,7 @@ import tmm
 from command_line import described, failure, run_json
 
 import neurolens as nl
-from neurolens.base.errors import InputError, NeurolensError, Note
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, Note
 from neurolens.cameras.build import make_camera
 from neurolens.cli import _FIRST, build_parser, command, main
 from neurolens.cli.arguments import Reporting
@@ -220,6 +220,11 @@ def test_set_makes_another_lens_and_leaves_the_first() -> None:
     assert lens.f_number < 2 and "f/4, T" in repr(near) and "2 m" in repr(near)
     with pytest.raises(FrozenInstanceError):
         lens.settings = {}  # type: ignore[misc]
+
+
+def test_a_stop_wider_than_the_lens_has_is_told() -> None:
+    with pytest.warns(NeurolensWarning, match="the stop gives f/0.5, wider than the f/1.8 of the source"):
+        nl.lens("laikin_double_gauss_50", f_number=0.5)
 
 
 def test_a_lens_brings_its_settings_and_a_call_overrules_them() -> None:

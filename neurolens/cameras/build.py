@@ -181,13 +181,12 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera
     from neurolens.optics.readers.any_format import read_any
-    from neurolens.optics.setting.states import set_lens, wider_than_stated
+    from neurolens.optics.setting.states import set_lens
 
     tabled = read_any(path)
     camera = ExactCamera(tabled, shot, progress=progress)
     camera.settings["notes"] = [
         *_doubts(tabled),
-        *wider_than_stated(tabled, (not shot.clamp_f_number and shot.f_number) or math.inf),
         *_film_notes(set_lens(camera.lens, focus_m=math.inf), shot.film_mm),
     ]
     return camera

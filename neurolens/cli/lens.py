@@ -112,7 +112,7 @@ examples:
         began = time.perf_counter()
         with warned(file) as notes:
             tabled = read_any(file)
-        lens = set_lens(tabled, shot := self.state.shot())
+            lens = set_lens(tabled, shot := self.state.shot())
         focus, film_z = focus_of(lens, shot), float(lens.film_z_mm or 0.0)
         domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
         facts = lens_facts(lens, domain)
@@ -127,7 +127,7 @@ examples:
             breathing = draw_breathing(lens, self.breathing)
         found = Described(
             file=str(file),
-            facts=replace(facts, warnings=[*facts.warnings, *notes, *file_doubts(tabled)]),
+            facts=replace(facts, warnings=list(dict.fromkeys([*facts.warnings, *notes, *file_doubts(tabled)]))),
             zoom=self.state.given.zoom,
             focus_mode=focus_mode_of(lens, shot),
             derived=lens.derived,

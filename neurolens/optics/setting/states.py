@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, note
+from neurolens.base.errors import InputError, note, warn
 from neurolens.optics.lens import paraxial
 from neurolens.optics.lens.designs import coated, with_assumptions
 from neurolens.optics.lens.prescription import Configuration, Lens
@@ -57,6 +57,9 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
         InputError: the state is unknown, the focal length lies beyond the zoom's range, a setting is out of its bounds,
             the focus is nearer than the lens allows, the lens does not see the field, the cover glass has no room, or a
             size is asked of a lens that diverges.
+
+    Warns:
+        NeurolensWarning: an f-number opens the stop by over 5% beyond what the source states.
     """
     if shot is None:
         shot = Shot.part(focus_mode=focus_mode, **settings)
@@ -74,6 +77,8 @@ def set_lens(lens: Lens, shot: Shot | None = None, *, focus_mode: FocusMode = "p
         far = at_infinity(lens)
         widest = paraxial.first_order(far).f_number if shot.clamp_f_number else 0.0
         if (f_number := shot.f_number_for(widest)) is not None:
+            for said in wider_than_stated(lens, f_number):
+                warn(said)
             lens = lens.with_stop_radius(paraxial.stop_radius_mm(far, f_number))
     object_mm = _object_mm(lens, shot)
     if mode == "internal":
