@@ -158,6 +158,14 @@ def test_put_on_and_taken_back_leaves_no_trace(scene: Any) -> None:
     assert everything(scene) == before
 
 
+def test_blender_as_a_module_finds_what_reads_shaders(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    # pip's bpy leaves Blender's own packages out of Python's sight, which conftest.py mends for the other tests
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if not (Path(p) / "oslquery").is_dir()])
+    monkeypatch.setattr(f"{MODULE}.camera.find_spec", lambda _: None)
+    assert bpy.ops.neurolens.apply(lens="gauss", kind="polynomial") == {"FINISHED"}
+    assert any((Path(p) / "oslquery").is_dir() for p in sys.path)
+
+
 def test_a_custom_camera_of_the_users_own_comes_back(scene: Any, tmp_path: Path) -> None:
     camera = scene.camera.data
     scene.render.engine = "CYCLES"

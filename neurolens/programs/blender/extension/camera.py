@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -192,6 +195,8 @@ def _set(
     Raises:
         LensError: it does not compile.
     """
+    if find_spec("oslquery") is None:  # Blender as a module (pip's bpy) does not tell Python where its own packages are
+        sys.path += [str(f.parent) for f in Path(bpy.utils.resource_path("LOCAL"), "python").rglob("oslquery")]
     first, in_units = not applied(camera), "unit_m" in camera.cycles_custom
     opened = camera.dof.aperture_fstop if camera.dof.use_dof else None
     scene.render.engine = "CYCLES"
