@@ -56,7 +56,6 @@ _DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # names of depth, a
 _COMBINED = ("Combined.", "combined.")
 _SKY_M = 1e9  # depth from which on there is sky
 _LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
-_STATED = 0.2  # by which a stated shape of pixels may differ: that of 2, 1.8 or 1.33 holds for what is far
 _SAME = 1e-3  # by which the shapes of plate and film may differ, relatively
 
 
@@ -240,7 +239,7 @@ def read_plate(
     for pixels in (size, film_px):
         check_size(path, "displayWindow", f"({pixels[0]} x {pixels[1]} pixels)", pixels, _LARGEST, _MOST_PIXELS)
     shape, stated = reach[1] / reach[0] * per_mm[1] / per_mm[0], float(header.get("pixelAspectRatio", 1.0))
-    if not math.isclose(stated, shape, rel_tol=_STATED + 1 / min(size)):
+    if not math.isclose(stated, shape, rel_tol=0.2 + 1 / min(size)):  # 2, 1.8 or 1.33 are stated for what is far
         if stated != 1:  # what many programs write whatever they render; another number was meant
             raise InputError(path, "pixelAspectRatio", stated, f"{shape:.3g}, that of this lens's pixels on this film")
         warn(f"{path}: pixels count as {shape:.3g} times as wide as high, as the lens squeezes; the file says square")

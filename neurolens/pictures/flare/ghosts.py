@@ -152,8 +152,7 @@ class GhostTracer:
         numbers, film = self.stack.numbers(wavelength_nm)
         room = np.empty((surfaces + 5) * STATE * _BLOCK, np.float32)
         arrays = (start, self.stack.functions, numbers, film, np.array(rows, np.int32), room, out)
-        pointers = [a.ctypes.data for a in arrays]
-        self._call(start.shape[1], surfaces, len(rows), reach, *pointers)
+        self._call(start.shape[1], surfaces, len(rows), reach, *(a.ctypes.data for a in arrays))
         return GhostRays(out)
 
     def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
@@ -252,8 +251,7 @@ def entrances(
     """
     lens, rng = tracer.lens, np.random.default_rng(seed)
     p, u = _drawn(lens, rng)
-    wide = _WIDE * lens.surfaces[0].semi_diameter_mm
-    place = wide * u
+    place = _WIDE * lens.surfaces[0].semi_diameter_mm * u
     d = np.concatenate([sine * p, np.sqrt(1 - sine**2 * (p**2).sum(0, keepdims=True))])
     before = np.concatenate([place, np.zeros((1, _RAYS))]) - 1000.0 * d
     rays = tracer.trace(np.concatenate([before, d]), wavelength_nm)

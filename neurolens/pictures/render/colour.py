@@ -414,8 +414,7 @@ class ChannelWavelengths:
     """
 
     def __init__(self, low_nm: float, high_nm: float) -> None:
-        even = np.array([low_nm, high_nm]), np.ones(2)
-        self._range = SpectralRange(low_nm, high_nm, light=even)
+        self._range = SpectralRange(low_nm, high_nm, light=(np.array([low_nm, high_nm]), np.ones(2)))
         diagonal = np.maximum(self._range.response * self._range.basis, 0)
         weights = diagonal / diagonal.mean(axis=1, keepdims=True)
         self._weights = (weights if self._range.colours else np.ones_like(weights)).astype(np.float32)

@@ -112,8 +112,7 @@ def read_picture(
         return radiance
     with _opened(scene, field, path, most, pixels) as picture:
         if picture.mode.startswith("I;16"):
-            grey = srgb_to_linear(np.asarray(picture, np.float32) / np.float32(65535))
-            return np.stack([grey] * 3, axis=-1)
+            return np.stack([srgb_to_linear(np.asarray(picture, np.float32) / np.float32(65535))] * 3, axis=-1)
         if picture.mode in ("I", "F"):
             raise InputError(scene, field, str(path), "a picture of 8 or 16 bits a channel")
         # By a table: a picture takes 12 bytes a pixel, without temporary ones of 36 more.

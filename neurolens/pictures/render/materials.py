@@ -99,8 +99,7 @@ def _albedos(alpha: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     lambda_out, lambda_in = smith(cos_out, width**2), smith(np.maximum(cos_in, 1e-6), width**2)
     share = np.where(cos_in > 0, (1 + lambda_out) / (1 + lambda_out + lambda_in), 0)
     whole = share.reshape(_NODES, -1) @ weight
-    power = (share * fifth_power(cos_half)).reshape(_NODES, -1) @ weight
-    return [(cosine, whole), (cosine, power)]
+    return [(cosine, whole), (cosine, (share * fifth_power(cos_half)).reshape(_NODES, -1) @ weight)]
 
 
 def sine2(a: FloatArray, b: FloatArray) -> FloatArray:

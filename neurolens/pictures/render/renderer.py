@@ -47,7 +47,7 @@ from neurolens.pictures.render.pictures import (
 from neurolens.pictures.render.scene import Scene
 from neurolens.pictures.render.settings import FilmSettings
 
-Progress = Callable[[float, float], None]
+Progress = Callable[[float, float | None], None]
 _FORKS = sys.platform.startswith("linux")
 # Previews and checkpoints wait this many times as long as the last one took, and so cost a twentieth of one core at
 # most.
@@ -113,10 +113,10 @@ class Keeper:
         """Do what is due, and return whether the render is to stop."""
         watch, fraction, now = self._watch, self._job.film.fraction, time.perf_counter()
         if self._progress is not None and fraction > self.resumed:
-            self._first = first = self._first or (now, fraction)
-            since, done = first if fraction > first[1] else (self._began, self.resumed)
-            known = since != self._began or self.resumed  # the first rays of a run also wait for compilers
-            self._progress(fraction, (now - since) / (fraction - done) * (1 - fraction) if known else None)
+            self._first = self._first or (now, fraction)
+            since, done = self._first if fraction > self._first[1] else (self._began, self.resumed)
+            # The first rays of a run also wait for compilers, and foretell nothing.
+            self._progress(fraction, (now - since) / (fraction - done) * (1 - fraction) if done else None)
         if (preview := watch.preview) is not None and now >= self._preview_at and fraction:
             self._preview_at = self._try("preview", lambda: preview(develop(self._job)[0]), watch.preview_s)
         if watch.checkpoint is not None and now >= self._checkpoint_at:
@@ -243,7 +243,7 @@ def render(
         rows: the first row and the one after the last, to render only these. Their pixels are those of the whole
             picture, bit for bit, and statistics are theirs, too.
         threads: how many workers there are.
-        progress: called with the fraction done and the estimated seconds left.
+        progress: called with the fraction done and the estimated seconds left, None for the first rays.
         watch: previews, checkpoints and an early end.
 
     Raises:

@@ -51,15 +51,17 @@ def _is_near(vector: Vector) -> bool:
     return all(abs(x) <= FARTHEST_M for x in vector)
 
 
-def _is_direction(vector: Vector) -> bool:
-    return _is_near(vector) and math.hypot(*vector) >= SMALLEST_M
-
-
 _SIZE = bounded(SMALLEST_M, FARTHEST_M, "a length")
 Size = Annotated[float, Rule(_SIZE.good, f"{_SIZE.expected} m")]
 Angle = Annotated[float, bounded(-36000, 36000, "degrees")]
 Place = Annotated[Vector, Rule(_is_near, f"three numbers within {FARTHEST_M:g} m")]
-Direction = Annotated[Vector, Rule(_is_direction, f"a direction, between {SMALLEST_M:g} and {FARTHEST_M:g} long")]
+Direction = Annotated[
+    Vector,
+    Rule(
+        lambda v: _is_near(v) and math.hypot(*v) >= SMALLEST_M,
+        f"a direction, between {SMALLEST_M:g} and {FARTHEST_M:g} long",
+    ),
+]
 Light = Annotated[Vector, each_between(0, BRIGHTEST)]
 Share = Annotated[Vector, each_between(0, 1)]
 Reflectance = Annotated[  # linear sRGB, or the name of a measured spectrum
