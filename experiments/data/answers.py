@@ -242,8 +242,7 @@ def methods() -> Answer:
         "The tables of rays were meant for a GPU and are judged on a CPU here. Of two models of 2026 we know what "
         "their authors state, of other lenses: precomputed lens transport maps draw flare in 74.4 s, where tracing "
         "takes 1,180 s, at one zoom and stop; Ray2Ray leaves about 1 um and 0.01 degrees, by its abstract. "
-        "All are fitted to the coated lens: its light by each method's own terms, which the papers do not have. "
-        + MACHINE,
+        "The lens is coated: each method has terms for its transmittance, which the papers lack. " + MACHINE,
         [
             ("experiments/results/surrogates/ogawa_zoom_70_200.md", "the same through a bare 70-200 zoom, earlier"),
             ("experiments/results/surrogates/phone_lens_6.md", "the same through a bare phone lens, earlier"),
