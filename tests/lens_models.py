@@ -15,6 +15,7 @@ from typing import Any
 import onnx
 
 from experiments.accuracy.published import PublishedSettings, fit_any
+from experiments.data.refit import refitted
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
 from neurolens.models.card import CARD_KEY, MODEL_KEY, read_card
@@ -26,7 +27,7 @@ from neurolens.models.network import fit_network
 from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.source import at_wavelength
 from neurolens.models.targets import TRANSMITTANCE_TERMS
-from neurolens.models.transmittance import refitted, with_transmittance
+from neurolens.models.transmittance import with_transmittance
 from neurolens.optics.lens import designs, paraxial
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import Shot

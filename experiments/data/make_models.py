@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
+from experiments.data.refit import refit_transmittance
 from experiments.lab import Row
 from experiments.speed.promises import read_index
 from neurolens import __version__
@@ -47,7 +48,6 @@ from neurolens.studies.check import check_model, check_states
 from neurolens.studies.experiment import DomainChoice, Experiment, LensChoice, check_names
 from neurolens.studies.measure import Measured, fit_and_measure, shared_rays
 from neurolens.studies.rays import REFERENCE_RADIUS_MM
-from neurolens.studies.refit import refit_transmittance
 from neurolens.studies.speed import EXACT, exact_c_candidate, model_candidate, model_candidates, race
 from neurolens.studies.train import fit_and_measure_states, state_settings
 

@@ -36,11 +36,6 @@ def surface_of(status: int) -> int | None:
     return status // 4 - 1 if status >= 4 else None
 
 
-def reason_of(status: int) -> int | None:
-    """MISSED, RIM or TOTAL_REFLECTION, or None when no surface ended the ray."""
-    return status % 4 if status >= 4 else None
-
-
 def describe(status: int) -> str:
     """Return the text of a status, for messages and tables."""
     if status == PASSED:

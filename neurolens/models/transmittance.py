@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.models.cores import (
     Array,
@@ -29,7 +28,6 @@ from neurolens.models.cores import (
 )
 from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.pairs import passing_rays
 from neurolens.models.terms import (
     Exponents,
     Sweep,
@@ -42,7 +40,6 @@ from neurolens.models.terms import (
     solve,
     united,
 )
-from neurolens.optics.lens.prescription import Lens
 
 # RMS at which no term is added: so long as there are fewer than `_CHEAP`, and from then on.
 FINE, TRANSMITTANCE_ERROR, _CHEAP = 8e-5, 4e-4, 24
@@ -53,44 +50,9 @@ FINE, TRANSMITTANCE_ERROR, _CHEAP = 8e-5, 4e-4, 24
 _DEGREE, _BESIDE_W, MOST_W = {3: 5, 6: 4}, 2, 20
 _CHOICE_RAYS, _PASSES = 8000, 3
 _BEYOND_LIGHT = 0.3  # weight of rays outside `LIGHT_NM`, where films reflect most and pictures have hardly any light
-# Rays of a refit: in all, at least of each node, and traced at a time, for few more are needed than pass.
-_RAYS, _FEWEST_RAYS, BATCH = 8000, 2000, 5000
 
 Polynomial = InvariantPolynomial | MirrorPolynomial
 Sample = tuple[FilmRays, Tensor]  # rays that pass, and the transmittance [N] of the exact lens
-
-
-def refitted(models: Sequence[LensModel], lenses: Sequence[Lens], most: int) -> list[LensModel]:
-    """Return models with the transmittance of other lenses, which may differ in coatings and absorption alone.
-
-    Position, direction, stop crossing and gates keep their coefficients to the bit.
-
-    Args:
-        models: one model, or the nodes of one of many states; files keep the lens of the first only.
-        lenses: one for each model.
-        most: terms of the transmittance, at most.
-
-    Raises:
-        InputError: a lens whose rays go another way.
-    """
-    if not _same_ways(models[0].lens, lenses[0]):
-        expected = "the model's own but for coatings and absorption"
-        raise InputError(lenses[0].path, "surfaces", f"(another lens than {models[0].lens.path})", expected)
-    samples, found = [], []
-    for model, lens in zip(models, lenses, strict=True):
-        seed = int(model.settings.get("rays_seed") or 0)
-        passing = passing_rays(lens, model.domain, max(_RAYS // len(models), _FEWEST_RAYS), seed, batch=BATCH)
-        samples.append((passing.inputs, passing.transmittance))
-        found.append(replace(model, lens=lens, settings={**model.settings, "transmittance_terms": most}))
-    return with_transmittance(found, samples, most)
-
-
-def _same_ways(a: Lens, b: Lens) -> bool:
-    """Test whether rays go the same ways through two lenses."""
-    bare = (
-        replace(x, surfaces=tuple(replace(s, coating=None, absorption_per_mm=0.0) for s in x.surfaces)) for x in (a, b)
-    )
-    return len({one.sha256 for one in bare}) == 1
 
 
 def with_transmittance(models: Sequence[LensModel], samples: Sequence[Sample], most: int) -> list[LensModel]:

@@ -53,11 +53,6 @@ def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
     return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
 
 
-def family_colour(family: str | None) -> str:
-    """Return the colour of a family of models."""
-    return FAMILIES.get(str(family), _OTHER)[1]
-
-
 def trade_plot(
     title: str, records: Sequence[Record], exact: Sequence[Record], path: Path, kinds: Kinds = FAMILIES,
     kind: str = "family", use: str | None = None,

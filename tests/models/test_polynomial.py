@@ -13,6 +13,7 @@ from lens_models import anamorphic
 from torch import Tensor
 from vignetting_oracle import vignetting_errors
 
+from experiments.data.refit import refitted
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.models import polynomial
@@ -41,7 +42,7 @@ from neurolens.models.targets import (
     scales_of,
 )
 from neurolens.models.terms import monomials, solve, vector_columns
-from neurolens.models.transmittance import refitted, with_transmittance
+from neurolens.models.transmittance import with_transmittance
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.paraxial import stop_radius_mm
 from neurolens.optics.readers.lensfile import read_lens

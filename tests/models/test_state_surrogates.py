@@ -15,6 +15,7 @@ import torch
 from shipped import whole
 from vignetting_oracle import vignetting_errors
 
+from experiments.data.refit import refitted
 from experiments.hostile import outside
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
@@ -27,7 +28,6 @@ from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel, mix
 from neurolens.models.pairs import passing_rays, sample_domain
 from neurolens.models.targets import TRANSMITTANCE_TERMS
-from neurolens.models.transmittance import refitted
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens

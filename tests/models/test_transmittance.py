@@ -10,6 +10,7 @@ import pytest
 import tmm
 import torch
 
+from experiments.data.refit import refit_transmittance, refitted
 from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.exact import state_of
@@ -22,10 +23,8 @@ from neurolens.models.file import read_model
 from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import passing_rays, sample_domain
-from neurolens.models.transmittance import refitted
 from neurolens.optics.lens.glass import absorption_of, index_at, index_of
 from neurolens.optics.lens.shot import Shot
-from neurolens.studies.refit import refit_transmittance
 
 KINDS = {"coated": "invariants", "coated network": "residual"}
 

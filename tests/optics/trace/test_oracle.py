@@ -120,7 +120,7 @@ def check(case: Case, dtype: torch.dtype) -> Traced:
             assert st.surface_of(status) == ray["surface"], (i, st.describe(status), ray)
             # Beyond a sphere's edge a solver may call a ray that misses blocked by the rim, and the other way round.
             ends = {REASONS[ray["status"]]} if ray["status"] == "tir" else {st.MISSED, st.RIM}
-            assert st.reason_of(status) in ends
+            assert status % 4 in ends
             continue
         assert status == st.PASSED, (i, st.describe(status))
         point = [float(c[i]) for c in out.rays]

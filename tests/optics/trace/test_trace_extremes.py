@@ -193,7 +193,7 @@ def test_no_nan_gradient_where_most_rays_are_lost(towards: str) -> None:
     first.radius_mm.requires_grad_()
     table = replace(FISHEYE, surfaces=(first, *FISHEYE.surfaces[1:]))
     out = trace(table, start, 550.0, towards=towards, transmittance=True)  # type: ignore[arg-type]
-    assert {st.MISSED, st.RIM} <= {st.reason_of(int(s)) for s in out.status}
+    assert {st.MISSED, st.RIM} <= {int(s) % 4 for s in out.status if s >= 4}
     total = sum(c.sum() for c in out.rays) + out.transmittance.sum()
     assert isinstance(total, Tensor)
     for grad in torch.autograd.grad(total, [first.radius_mm, *start]):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from neurolens.base.errors import InputError
 from neurolens.models.axes import product
 from neurolens.models.export import export_onnx, export_states
 from neurolens.models.file import as_stored, read_model
@@ -15,12 +17,14 @@ from neurolens.models.fit import StateModel, StateSpace
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import passing_rays
 from neurolens.models.targets import TRANSMITTANCE_TERMS
-from neurolens.models.transmittance import BATCH, refitted
+from neurolens.models.transmittance import with_transmittance
 from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.check import random_states
 from neurolens.studies.measure import FRESH
 
 _RAYS, _STATES = 6000, 4  # fresh rays of a state on which errors are measured, and states
+# Rays of a fit: in all, at least of each node, and traced at a time, for few more are needed than pass.
+_FIT_RAYS, _FEWEST_RAYS, _BATCH = 8000, 2000, 5000
 
 
 def refit_transmittance(file: Path, lens: Lens | StateSpace, out: Path | None = None) -> dict[str, Any]:
@@ -59,10 +63,43 @@ def transmittance_errors(models: Sequence[LensModel]) -> dict[str, float]:
     rows = []
     for model in as_stored(models):
         seed = int(model.settings.get("rays_seed") or 0) + FRESH
-        fresh = passing_rays(model.lens, model.domain, _RAYS, seed, batch=BATCH)
+        fresh = passing_rays(model.lens, model.domain, _RAYS, seed, batch=_BATCH)
         with torch.no_grad():
             found = model.predict(fresh.inputs.to(torch.float32)).transmittance.double()
         off = (found - fresh.transmittance).abs()
         rows.append((float(off.square().mean().sqrt()), float(off.max())))
     rms, largest = (max(column) for column in zip(*rows, strict=True))
     return {"transmittance_rms": rms, "transmittance_max": largest}
+
+
+def refitted(models: Sequence[LensModel], lenses: Sequence[Lens], most: int) -> list[LensModel]:
+    """Return models with the transmittance of other lenses, which may differ in coatings and absorption alone.
+
+    Position, direction, stop crossing and gates keep their coefficients to the bit.
+
+    Args:
+        models: one model, or the nodes of one of many states; files keep the lens of the first only.
+        lenses: one for each model.
+        most: terms of the transmittance, at most.
+
+    Raises:
+        InputError: a lens whose rays go another way.
+    """
+    if not _same_ways(models[0].lens, lenses[0]):
+        expected = "the model's own but for coatings and absorption"
+        raise InputError(lenses[0].path, "surfaces", f"(another lens than {models[0].lens.path})", expected)
+    samples, found = [], []
+    for model, lens in zip(models, lenses, strict=True):
+        seed = int(model.settings.get("rays_seed") or 0)
+        passing = passing_rays(lens, model.domain, max(_FIT_RAYS // len(models), _FEWEST_RAYS), seed, batch=_BATCH)
+        samples.append((passing.inputs, passing.transmittance))
+        found.append(replace(model, lens=lens, settings={**model.settings, "transmittance_terms": most}))
+    return with_transmittance(found, samples, most)
+
+
+def _same_ways(a: Lens, b: Lens) -> bool:
+    """Test whether rays go the same ways through two lenses."""
+    bare = (
+        replace(x, surfaces=tuple(replace(s, coating=None, absorption_per_mm=0.0) for s in x.surfaces)) for x in (a, b)
+    )
+    return len({one.sha256 for one in bare}) == 1
