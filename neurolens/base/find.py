@@ -223,8 +223,7 @@ def _lines(name: str) -> list[dict[str, Any]]:
 def entries() -> Sequence[Entry]:
     """Return the lenses of the library, by name; they are read again where a file or the index has changed."""
     folder = library() / "lenses"
-    stamps = [path.stat().st_mtime_ns if path.exists() else 0 for path in (folder, folder / INDEX)]
-    return _entries(folder, *stamps)
+    return _entries(folder, *(path.stat().st_mtime_ns if path.exists() else 0 for path in (folder, folder / INDEX)))
 
 
 @lru_cache(maxsize=1)

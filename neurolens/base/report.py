@@ -39,8 +39,7 @@ class Report:
 
     def to_dict(self, full: bool = True) -> dict[str, Any]:
         """Return plain lists, numbers and strings by field name; NaN and infinities stay floats. See `plain`."""
-        found: dict[str, Any] = plain(self, strict=False, full=full)
-        return found
+        return plain(self, strict=False, full=full)
 
 
 # Metadata of fields. A field in bulk holds a number for each ray or pixel: JSON has it where it is asked for, tables

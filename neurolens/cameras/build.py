@@ -41,7 +41,7 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
         ModelError: a model that cannot be trusted.
     """
     camera, shot = as_c(_camera(str(spec), shot, progress)), shot.whole()
-    camera = with_dispersion(camera, shot)
+    camera = camera if shot.dispersion == "full" else ReducedDispersion(camera, shot.dispersion, shot.wavelength_nm)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
 
 
@@ -84,11 +84,6 @@ def as_c(camera: Camera) -> Camera:
     with suppress(InputError):
         return camera.compiled() if isinstance(camera, ThickLens) and has_compiler() else camera
     return camera
-
-
-def with_dispersion(camera: Camera, shot: Shot) -> Camera:
-    """Return the camera with the part of its dispersion that the shot keeps."""
-    return camera if shot.dispersion == "full" else ReducedDispersion(camera, shot.dispersion, shot.wavelength_nm)
 
 
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:

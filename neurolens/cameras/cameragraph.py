@@ -105,8 +105,7 @@ def status_graph(aperture: Aperture | None = None, stopped: int = 0, unit: bool 
     ray, status = g.input("scene_ray", 6), g.input("lens_status")
     if aperture is not None:
         opened = aperture.opening(g, g.input("stop_xy_mm", 2), g.input("stop_radius_mm", per_call=True))
-        shut = g.select(status <= float(st.PASSED), float(stopped), status)
-        status = g.select(opened, status, shut)
+        status = g.select(opened, status, g.select(status <= float(st.PASSED), float(stopped), status))
     if not unit:
         of_one = g.square(ray[3:]).between(1 - UNIT_SLACK, 1 + UNIT_SLACK)
         status = g.select(of_one, status, status.maximum(float(st.OUTSIDE_DOMAIN)))
@@ -164,8 +163,7 @@ def concentric_disk(square: NDArray[Any]) -> NDArray[Any]:
     """Map points [2, N] as `unit_disc` does, which keeps areas and neighbours."""
     g = Graph()
     g.outputs["disc"] = unit_disc(g.input("square", 2))
-    found: NDArray[Any] = evaluate(g, {"square": square})["disc"]
-    return found
+    return evaluate(g, {"square": square})["disc"]
 
 
 def _series(function: Callable[[Array], Array]) -> Array:

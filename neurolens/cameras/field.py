@@ -191,8 +191,7 @@ def _on_object(origin: Array, way: Array, frame: Frame, target: str, distance_m:
         start = origin + np.array([0.0, 0.0, pupil.mean()])[:, None, None]
         along = (start * way).sum(0)
         root = np.sqrt(along**2 + radius**2 - (start**2).sum(0))
-        found: Array = (start + (root - along) * way) * flip / radius
-        return found
+        return (start + (root - along) * way) * flip / radius
 
 
 def _undistorted(direction: Array, frame: Frame, target: str) -> Complex:
@@ -202,8 +201,7 @@ def _undistorted(direction: Array, frame: Frame, target: str) -> Complex:
     with np.errstate(all="ignore"):
         rho = np.tan(angle) if target == RECTILINEAR else PROJECTIONS[target].radius(angle)
     rho = rho / np.where(side > 0, side, 1.0)
-    found: Complex = frame.reach_mm[0] * rho * direction[0] + 1j * (frame.reach_mm[1] * rho * direction[1])
-    return found
+    return frame.reach_mm[0] * rho * direction[0] + 1j * (frame.reach_mm[1] * rho * direction[1])
 
 
 def _directions(place: Complex, frame: Frame, target: str) -> Array:
@@ -272,8 +270,7 @@ class Polar:
 
 def turns(azimuths: int) -> Complex:
     """Return the unit vectors [A] to equally spaced azimuths."""
-    found: Complex = np.exp(2j * math.pi * np.arange(azimuths) / azimuths)
-    return found
+    return np.exp(2j * math.pi * np.arange(azimuths) / azimuths)
 
 
 def on_rings(table: NDArray[Any], end: float, point: Complex) -> NDArray[Any]:
@@ -380,8 +377,7 @@ def field_of(
     end = corner if azimuths > 1 else end_of_light(lambda r: at(np.array([r + 0j]))[1].light[0] > 0, corner)
     points = (np.linspace(0, end, rings)[:, None] * turns(azimuths)).reshape(-1)
     place, found = at(points)
-    edge = film_edge(camera.film_mm)
-    edge_place, _ = at(edge / BEYOND)
+    edge_place, _ = at(film_edge(camera.film_mm) / BEYOND)
     widest = math.degrees(float(np.where(found.light > 0, found.angle, 0.0).max()))
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
@@ -400,8 +396,7 @@ def field_of(
 def shown_at(camera: Any, field: Field, point: Complex, distance_m: float) -> Complex:
     """Return where a field puts the things that picture points [N] show at this distance; NaN where it is dark."""
     seen = traced_light(camera, point, field.spectrum, field.frame, field.target, distance_m)
-    found: Complex = np.where(seen.light > 0, field.picture(seen.place), np.nan)
-    return found
+    return np.where(seen.light > 0, field.picture(seen.place), np.nan)
 
 
 def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:

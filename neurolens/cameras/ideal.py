@@ -39,7 +39,6 @@ from neurolens.cameras.cameragraph import camera_rays, concentric_disk, unit_dis
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
 from neurolens.cameras.sampling import (
     LEAST_COS2,
-    ahead,
     arrived,
     ideal_state,
     positive,
@@ -170,7 +169,8 @@ class ThickLens:
             weight = 1e6 * self._exposure / self._part / (1 + tangent2) ** 2 * scale**2
             weight *= np.sqrt(1 + (slope**2).sum(0))
         plane = np.full((1, depth.size), self.front_z_mm - self.film_z_mm)
-        status = self._stopped(entrance, ahead(depth))
+        behind = np.where(depth <= 0, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
+        status = self._stopped(entrance, np.where(depth > 0, st.PASSED, behind).astype(np.int32))
         return arrived(film, 1e-3 * np.concatenate([height, plane]), point_m, weight, status, wavelength_nm)
 
     def compiled(self) -> Self:

@@ -310,8 +310,7 @@ class LensCamera:
         session = open_session(path, write_onnx(g, {}, shapes=rows), inputs, shapes)
 
         def run(rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
-            done = run_batches(path, session, names, rays, {}, RAYS_A_CALL)
-            found = dict(zip(names, done, strict=True))
+            found = dict(zip(names, run_batches(path, session, names, rays, {}, RAYS_A_CALL), strict=True))
             derivatives = [found.pop(name) for name in D_FILM if name in found]
             return found | ({"d_film": np.stack(derivatives, 1)} if derivatives else {})
 

@@ -215,8 +215,7 @@ class LensFilm:
         """Return cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
         plane, pupil, _ = self.start(film_mm, square, wavelength_nm)
         slope = (pupil - plane) * np.float32(1 / self.distance_mm)
-        cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
-        return cos4
+        return np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
 
     def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
         """Return the integral of T cos over solid angle where the axis meets the film, as a mean over wavelengths."""
@@ -227,8 +226,7 @@ class LensFilm:
         given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
         given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
         given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
-        weight = evaluate(weight_graph(), given)["weight"]
-        exposure = float(weight.mean(dtype=np.float64))
+        exposure = float(evaluate(weight_graph(), given)["weight"].mean(dtype=np.float64))
         if not exposure > 0:
             raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
         return exposure

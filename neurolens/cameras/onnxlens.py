@@ -173,8 +173,7 @@ class LensRun:
         """Return `run(...).status` alone, which takes less time, since nothing else is computed."""
         call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
         names = ("status",)
-        found: NDArray[np.int32] = run_batches(self.path, self._session(names), names, {"rays": rays}, call, BATCH)[0]
-        return found
+        return run_batches(self.path, self._session(names), names, {"rays": rays}, call, BATCH)[0]
 
     def _session(self, outputs: tuple[str, ...]) -> Any:
         key = os.getpid(), *outputs  # a forked process opens its own

@@ -107,8 +107,7 @@ def film_shift(
     shift, lit = np.full((2, count), np.nan), rows.any(axis=1)
 
     def mean(values: Array) -> Array:
-        whole = np.where(passed, values, 0).reshape(3, count, pupils)[:, lit]
-        return whole.sum(axis=2) / rows[lit].sum(axis=1)
+        return np.where(passed, values, 0).reshape(3, count, pupils)[:, lit].sum(axis=2) / rows[lit].sum(axis=1)
 
     slopes = np.stack([mean(part) for part in moved], axis=-1).transpose(1, 0, 2)  # [F, 3, 2] per mm
     shift[:, lit] = -(np.linalg.pinv(slopes) @ mean(there - here).T[..., None])[..., 0].T

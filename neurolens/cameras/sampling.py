@@ -147,15 +147,6 @@ def arrived(
     )
 
 
-def ahead(depth: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return the status of scene points at depths [N] before a lens.
-
-    Points beside the lens or behind it miss the front surface; a depth that is NaN is outside the domain.
-    """
-    behind = np.where(depth <= 0, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
-    return np.where(depth > 0, st.PASSED, behind).astype(np.int32)
-
-
 def common_light(known_nm: tuple[float, float], light_nm: tuple[float, float]) -> tuple[float, float]:
     """Return the part of a range of light that a lens knows; where there is none, the nearest end of the lens's own."""
     low, high = known_nm

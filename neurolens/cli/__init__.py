@@ -119,8 +119,7 @@ def build_parser(first: str | None = None) -> Parser:
 
 def _class_at(place: str) -> type[Command]:
     module, _, name = place.partition(".")
-    found: type[Command] = getattr(import_module(f"{__name__}.{module}"), name)
-    return found
+    return getattr(import_module(f"{__name__}.{module}"), name)
 
 
 def command(name: str) -> type[Command]:

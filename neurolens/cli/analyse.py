@@ -298,8 +298,7 @@ def _colour_text(found: Colour) -> str:
 def _curvature_text(found: Curvature) -> str:
     head = f"Field curvature (focus from the film, mm; Petzval radius {cli.number(found.petzval_radius_mm)} mm)"
     curves = {"tangential": found.tangential_mm, "sagittal": found.sagittal_mm, "Petzval": found.petzval_mm}
-    columns = [(name, _each(_three, values)) for name, values in curves.items()]
-    return _over_field(head, found, columns)
+    return _over_field(head, found, [(name, _each(_three, values)) for name, values in curves.items()])
 
 
 def _distortion_text(found: Distortion) -> str:

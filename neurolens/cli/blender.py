@@ -164,8 +164,7 @@ class Add(cli.Reporting):
             expected = "a zip or a folder: no Blender of this machine has the extension installed"
             self.refuse("--extension", "(missing)", expected)
         check_takes(to)
-        form = form_of(self.file, zoom=self.zoom, quiet=self.quiet)
-        lens = packed_of([self.file], [form], zoom=self.zoom)
+        lens = packed_of([self.file], [form_of(self.file, zoom=self.zoom, quiet=self.quiet)], zoom=self.zoom)
         add_lens(to, lens)
         return self.answer(Added(lens.lens_id, to, [f.model or f.kind for f in lens.forms], lens.name))
 
@@ -217,8 +216,7 @@ def _kept(file: Path, *more: str | None, make: Callable[[], dict[str, Any]]) -> 
 
     The new one is kept if it can be.
     """
-    name = f"{fingerprint_of([_code(), file.name, sha256_of(file), *more])}.form"
-    return kept_in_cache(name, _KEPT, make)
+    return kept_in_cache(f"{fingerprint_of([_code(), file.name, sha256_of(file), *more])}.form", _KEPT, make)
 
 
 @cache

@@ -53,8 +53,7 @@ examples:
         lens, written = self._models(limits) if is_model(self.file) else self._lenses(limits)
         self.out.mkdir(parents=True, exist_ok=True)
         files = [str(path) for path in written]
-        spans = [[e[0], e[-1]] for e in elements_of(lens)]
-        return self.answer(Drawn(lens.name, self.seed, spans, limits, files))
+        return self.answer(Drawn(lens.name, self.seed, [[e[0], e[-1]] for e in elements_of(lens)], limits, files))
 
     def _path(self, stem: str, n: int, suffix: str) -> Path:
         return self.out / f"{stem}-{n:0{max(3, len(str(self.number)))}}{suffix}"

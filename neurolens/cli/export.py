@@ -286,8 +286,7 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
     with atomic_path(out) as measured:  # a file without its errors never has the final name
         export_onnx(model, measured, {})
         rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
-        errors = measure_on(rays, load_model(measured))
-        export_onnx(model, measured, errors, derivatives=derivatives)
+        export_onnx(model, measured, measure_on(rays, load_model(measured)), derivatives=derivatives)
 
 
 def _write_inverse(model: LensModel, out: Path) -> Mapping[str, Mapping[str, float | str]]:

@@ -211,8 +211,7 @@ class _Writer:
 
 def _coatings(settings: Mapping[str, Any]) -> str:
     """Return the coatings of a camera's lens, as `Lens.coatings`; "" where the camera states none."""
-    card = settings.get("card") or {}
-    return str(settings.get("coatings") or card.get("lens", {}).get("coatings", ""))
+    return str(settings.get("coatings") or (settings.get("card") or {}).get("lens", {}).get("coatings", ""))
 
 
 def _rate(text: str) -> Fraction:

@@ -146,8 +146,7 @@ examples:
         from neurolens.optics.readers.any_format import lens_files
 
         files = [file for path in paths for file in (lens_files(path) if path.is_dir() else [_file(path)])]
-        rows = self._rows(files, checked)
-        return self.answer(ListedLenses(rows, self.sort))
+        return self.answer(ListedLenses(self._rows(files, checked), self.sort))
 
     def _rows(self, files: list[Path], checked: bool) -> list[dict[str, Any]]:
         """`studies.describe.library_row` of each lens, in the order of --sort; the library's index has some of them."""

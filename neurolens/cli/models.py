@@ -172,8 +172,7 @@ def models_in(folder: Path) -> Iterator[Model]:
 def _times(file: Path) -> dict[str, dict[str, Any]]:
     """Return records of an index or of a run, by file name; none where there is no such file."""
     try:
-        rows = json.loads(file.read_text(encoding="utf-8"))["models"]
-        return {Path(row["file"]).name: row for row in rows}
+        return {Path(row["file"]).name: row for row in json.loads(file.read_text(encoding="utf-8"))["models"]}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
 

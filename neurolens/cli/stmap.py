@@ -222,8 +222,7 @@ examples:
         """Trace the fields of all frames, then write their maps, of one size."""
         progress = self.progress()
         frames, plates = self.traced(progress)
-        files = self.maps(frames, plates, progress, self.out)
-        return self.answer(self.found(frames, plates, files))
+        return self.answer(self.found(frames, plates, self.maps(frames, plates, progress, self.out)))
 
     def states(self) -> list[tuple[str, cli.LensState]]:
         """Return the numbers of frames as file names have them, with the state of the lens in each."""

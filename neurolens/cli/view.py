@@ -105,8 +105,7 @@ examples:
                 for entry in entries:
                     made.append(_view_lens(entry, Path(place), kinds, shaders, self.ghosts))
                     report(len(made) / len(entries))
-        page = write_page(self.out, made, kinds)
-        return self.answer(Viewed(self.out, page, [lens.key for lens in made]))
+        return self.answer(Viewed(self.out, write_page(self.out, made, kinds), [lens.key for lens in made]))
 
 
 @dataclass(frozen=True)

@@ -111,18 +111,13 @@ def _run(command: list[str], text: str = "", **environment: str) -> subprocess.C
             try:
                 out, err = child.communicate(text, timeout=_SECONDS)
             except BaseException:
-                _end(child)
+                with suppress(OSError):
+                    os.killpg(child.pid, signal.SIGKILL) if hasattr(os, "killpg") else child.kill()
                 raise
     except (OSError, subprocess.TimeoutExpired) as error:
         said = f"no end after {_SECONDS} s" if isinstance(error, subprocess.TimeoutExpired) else error
         raise InputError(command[0], "compile", f"({said})", "a C compiler that works") from error
     return subprocess.CompletedProcess(command, child.returncode, out, err)
-
-
-def _end(child: subprocess.Popen[str]) -> None:
-    """End a process and, where the system has process groups, all that it has started."""
-    with suppress(OSError):
-        os.killpg(child.pid, signal.SIGKILL) if hasattr(os, "killpg") else child.kill()
 
 
 def c_source(file: str, **constants: object) -> str:

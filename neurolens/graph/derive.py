@@ -145,10 +145,6 @@ def _is_zero(value: Value) -> bool:
     return node.kind == "affine" and not node.static[1] and not any(a[rows].any() for a in node.arrays)
 
 
-def _take(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    return None if d[0] is None else y.graph.take(d[0], node.static)
-
-
 def _concat(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
     g = y.graph
     return g.concat(*(g.constant(np.zeros(v.rows)) if m is None else m for v, m in zip(x, d, strict=True)))
@@ -237,8 +233,7 @@ def _with_gradient(g: Graph, node: Node, x: Value) -> tuple[Value, Callable[...,
 
 
 def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    coefficients = node.arrays[0][1:] * np.arange(1, len(node.arrays[0]))
-    return _times(d[0], y.graph.series(x[0], coefficients))
+    return _times(d[0], y.graph.series(x[0], node.arrays[0][1:] * np.arange(1, len(node.arrays[0]))))
 
 
 def _product(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
@@ -258,7 +253,7 @@ def _minus(d: Moved) -> Moved:
 
 Rule = Callable[[Node, Value, Sequence[Value], Sequence[Moved]], Moved]
 _RULES: dict[str, Rule] = {
-    "take": _take,
+    "take": lambda node, y, x, d: None if d[0] is None else y.graph.take(d[0], node.static),
     "concat": _concat,
     "affine": _affine,
     "quadratic": _quadratic,
@@ -364,8 +359,7 @@ def solve(columns: Sequence[Value], b: Value) -> Value:
 
 def determinant(columns: Sequence[Value]) -> Value:
     """Return the determinant of the matrix with these columns."""
-    pivots = [row[k] for k, row in enumerate(_eliminated(columns))]
-    return reduce(mul, pivots)
+    return reduce(mul, [row[k] for k, row in enumerate(_eliminated(columns))])
 
 
 def _eliminated(columns: Sequence[Value]) -> list[list[Value]]:

@@ -28,8 +28,7 @@ def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
     Raises:
         KeyError: an input that is missing.
     """
-    first = next(iter(inputs.values()), None)
-    space = _Space(first)
+    space = _Space(next(iter(inputs.values()), None))
     known: dict[int, Rows] = {}
     with np.errstate(all="ignore"):
         for number, done in _plan(graph):
@@ -139,10 +138,6 @@ def _quadratic(space: _Space, node: Node, given: list[Rows]) -> Rows:
     return space.concat(rows)
 
 
-def _polynomial(space: _Space, node: Node, given: list[Rows]) -> Rows:
-    return space.numbers(node.arrays[1]) @ monomials(given[0], node.arrays[0])
-
-
 def _series(space: _Space, node: Node, given: list[Rows]) -> Rows:
     coefficients = [float(c) for c in node.arrays[0]]
     total = space.ones_like(given[0]) * coefficients[-1]
@@ -199,7 +194,7 @@ _RULES: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
     "clip": lambda s, node, given: s.clip(given[0], *(float(v) for v in node.arrays[0])),
     "affine": _affine,
     "quadratic": _quadratic,
-    "polynomial": _polynomial,
+    "polynomial": lambda space, node, given: space.numbers(node.arrays[1]) @ monomials(given[0], node.arrays[0]),
     "series": _series,
     "lookup": _lookup,
     "between": _between,

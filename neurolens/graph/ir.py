@@ -422,8 +422,7 @@ def _kept_rows(new: Graph, node: Node, rows: list[int], inputs: list[Value]) -> 
     """Append a node that computes some of a node's rows."""
     cut = {"affine": 0, "quadratic": 0, "between": 0, "polynomial": 1}.get(node.kind, len(node.arrays))
     arrays = [a if k < cut else a[rows] for k, a in enumerate(node.arrays)]
-    by_row = node.kind in ("quadratic", "lookup")
-    static = tuple(node.static[r] for r in rows) if by_row else node.static
+    static = tuple(node.static[r] for r in rows) if node.kind in ("quadratic", "lookup") else node.static
     per_call = False if node.kind == "lookup" else None
     return new.add(node.kind, inputs, len(rows), arrays=arrays, static=static, per_call=per_call)
 

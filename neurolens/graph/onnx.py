@@ -196,8 +196,7 @@ class _Writer:
         assert self.mixing is not None
         rows = self.mixing.transform @ stack.reshape(len(stack), -1)
         key = (rows.tobytes(), stack.shape[1:])
-        name = f"state_c{len(self._moved)}"
-        return self._moved.setdefault(key, (name, rows, stack.shape[1:]))[0]
+        return self._moved.setdefault(key, (f"state_c{len(self._moved)}", rows, stack.shape[1:]))[0]
 
     def affine(self, weight: Array, value: str, bias: Array) -> str:
         """Write weight [T, R, K] @ value [K, N] + bias [T, R]."""

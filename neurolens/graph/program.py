@@ -448,8 +448,7 @@ class Program:
         Raises:
             ValueError: there are no lookups, or they read more than columns of one table at the same indices.
         """
-        live = self.live()
-        lookups = [self.steps[k] for k in live if self.steps[k].kind == "lookup"]
+        lookups = [self.steps[k] for k in self.live() if self.steps[k].kind == "lookup"]
         if len({(s.name, s.arguments) for s in lookups}) != 1:
             raise ValueError("lookups: expected columns of one table at the same indices")
         arguments, count = [Expr(self, a) for a in lookups[0].arguments], lookups[0].indices

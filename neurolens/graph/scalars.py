@@ -61,7 +61,9 @@ class _Lowering:
                 arrays = [np.stack([g.nodes[number].arrays[i] for g in graphs], -1) for i in range(len(node.arrays))]
                 self.rows.append(rule(self, node, given, arrays))
             else:
-                self.rows.append([self._each(node.kind, *(_row(v, r) for v in given)) for r in range(node.rows)])
+                # a single row stands for any
+                rows = [[v[r if len(v) > 1 else 0] for v in given] for r in range(node.rows)]
+                self.rows.append([self._each(node.kind, *row) for row in rows])
         for name, value in graphs[0].outputs.items():
             rows = [self._number(v) for v in self.rows[value.number]]
             self.program.outputs.update(zip(row_names(name, len(rows)), rows, strict=True))
@@ -96,11 +98,6 @@ class _Lowering:
 
     def _tests(self, truth: Expr | Tests) -> Tests:
         return [(self.program.literal(0.5), truth)] if isinstance(truth, Expr) else truth
-
-
-def _row(rows: Sequence[Any], r: int) -> Any:
-    """Return row r; a single row stands for any."""
-    return rows[r if len(rows) > 1 else 0]
 
 
 def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:

@@ -63,8 +63,7 @@ def fit_stop(data: Prepared, features: Features) -> Tensor:
     """Fit A and B [2 M] of the stop crossing (in stop radii) on M features, to rays on both sides of rims."""
     crossing, weight = stop_crossing(data)
     field = data.boundary_field
-    columns = vector_columns(features(field), field)
-    return solve(columns, crossing.reshape(1, -1), weight.repeat(2))[0]
+    return solve(vector_columns(features(field), field), crossing.reshape(1, -1), weight.repeat(2))[0]
 
 
 def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
@@ -116,8 +115,7 @@ def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] 
     train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
     if len(data.boundary) <= len(train):
         raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
-    values = gate_values(pairs.lens, data.gates, data.boundary)
-    fit = GateFit(near, values, data.boundary_weights[0], kept)
+    fit = GateFit(near, gate_values(pairs.lens, data.gates, data.boundary), data.boundary_weights[0], kept)
     fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
     return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
 

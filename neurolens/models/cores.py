@@ -76,8 +76,8 @@ def angle_vector(dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
     import torch
 
     sine = torch.hypot(dx, dy)
-    theta = torch.atan2(sine, -dz)
     # theta / sine tends to 1 on the axis; the guard also keeps the exact axis finite.
+    theta = torch.atan2(sine, -dz)
     ratio = torch.where(sine > 1e-12, theta / torch.where(sine > 1e-12, sine, 1.0), 1.0)
     return torch.stack([ratio * dx, ratio * dy])
 
@@ -203,8 +203,7 @@ class Core:
     @cached_property
     def _graph(self) -> Graph:
         g = Graph()
-        field = Field(g.concat(g.input("p", 2), g.input("u", 2)), w=g.input("w"))
-        values = self.build(g, field, Units())
+        values = self.build(g, Field(g.concat(g.input("p", 2), g.input("u", 2)), w=g.input("w")), Units())
         g.outputs = dict(zip(("position", "direction", "stop"), values.vectors, strict=True))
         if values.unit is not None:
             g.outputs["unit"] = values.unit

@@ -261,8 +261,7 @@ def onnx_of(
     if state is None:
         return write_onnx(graphs, metadata or {}, shapes=shapes)
     g, transform = state
-    film_z = g.input("film_z_mm", per_call=True)
-    g.outputs["film_z_mm"] = g.select(g.outputs.pop("inside"), film_z, _NOWHERE)
+    g.outputs["film_z_mm"] = g.select(g.outputs.pop("inside"), g.input("film_z_mm", per_call=True), _NOWHERE)
     return write_onnx(graphs, metadata or {}, Mixing(g, transform), shapes)
 
 
@@ -283,18 +282,12 @@ def coefficients_text(nodes: Sequence[LensModel]) -> str:
         "angle": first.angle,
         "nodes": [{"encoding": asdict(node.encoding), "core": pack(node.core)} for node in nodes],
     }
-    return deflated(data)
+    return base64.b64encode(zlib.compress(json.dumps(data, separators=(",", ":")).encode(), 9)).decode()
 
 
 def as_stored(nodes: Sequence[LensModel]) -> tuple[LensModel, ...]:
     """Return the models as their file will give them: with coefficients rounded to float32, and one angle for all."""
     return tuple(replace(node, core=unpack(pack(node.core))) for node in with_one_angle(nodes))
-
-
-def deflated(data: dict[str, Any]) -> str:
-    """Return JSON as a compressed text for an entry of metadata."""
-    text = json.dumps(data, separators=(",", ":")).encode()
-    return base64.b64encode(zlib.compress(text, 9)).decode()
 
 
 def inflated(text: str) -> bytes:

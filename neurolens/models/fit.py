@@ -86,7 +86,7 @@ def fit_model(
 
     Args:
         checkpoint: file in which the training of networks keeps its state, to go on from there after a kill (see
-            `fit_network`). It stays when the fit has ended; `clear_training` removes it.
+            `fit_network`). It stays when the fit has ended, for whoever asked for it to remove.
 
     Raises:
         InputError: an unknown method, or settings that the method refuses.
@@ -297,8 +297,7 @@ def axes_of(lens: Lens, *, zoom: bool, internal: bool, state: str | float | None
         return (first,)
     low, high = first.range
     zooms = [1 / (1 / high + (1 / low - 1 / high) * k / (_LIMITS - 1)) for k in range(_LIMITS)]
-    inner = [v for v in zooms if low < v < high]
-    focus = focus_axis(lens, [*(n for n, _ in first.stated), *inner])
+    focus = focus_axis(lens, [*(n for n, _ in first.stated), *(v for v in zooms if low < v < high)])
     return replace(first, degree=max(1, first.degree - _FEWER)), replace(focus, degree=focus.degree - _FEWER)
 
 
@@ -447,8 +446,7 @@ def _choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[
 
     Returns the exponents [M, 4] kept and the columns of `vector_columns` chosen among them (m p, then m u).
     """
-    dispersive = data[0].encoding.dispersive
-    exponents = invariant_exponents(settings.degree, dispersive=dispersive)
+    exponents = invariant_exponents(settings.degree, dispersive=data[0].encoding.dispersive)
     sweeps = []
     for d in data:
         train = d.train

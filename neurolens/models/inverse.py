@@ -285,8 +285,7 @@ def passing_rays(model: LensModel, count: int = _RAYS, seed: int = 0) -> tuple[A
     rng, found, total = np.random.default_rng(seed), list[Array](), 0
     for _ in range(_ROUNDS):
         rays = _drawn(model.domain, count, rng)
-        out = evaluate(model.graph, _inputs(model, rays[:5], rays[5]))
-        found.append(rays[:, out["status"][0] == st.PASSED])
+        found.append(rays[:, evaluate(model.graph, _inputs(model, rays[:5], rays[5]))["status"][0] == st.PASSED])
         total += found[-1].shape[1]
         if total >= count:
             break
@@ -380,8 +379,7 @@ def scene_system(model: LensModel) -> Graph:
     """
     g, e = Graph(), model.encoding
     unknown, wanted = g.input("unknown", 4), g.input("wanted", 4)
-    light = _light(e, [unknown[2:4], unknown[0:2]], g.input("wavelength_nm"))
-    values = model.core.build(g, light, Units())
+    values = model.core.build(g, _light(e, [unknown[2:4], unknown[0:2]], g.input("wavelength_nm")), Units())
     if values.unit is not None:
         raise InputError(model.method, "inverse", type(model.core).__name__, "a core of direction vectors")
     g.outputs["residual"] = g.concat(values.vectors[POSITION], values.vectors[DIRECTION]) - wanted
@@ -409,8 +407,7 @@ def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -
     inputs = {"film": film, "wanted": wanted, "wavelength_nm": wavelength}
     z = scaled_film_z(model, g.input("film_z_mm", per_call=True))
     (first,) = guess.build(g, _light(e, [film * (1 / e.film_scale_mm), wanted], wavelength), z)
-    system = stop_system(model)
-    u, size = _solve(system, inputs, first, steps, form)
+    u, size = _solve(stop_system(model), inputs, first, steps, form)
     rays = _pupil_rays(e, film, u, wavelength)
     judge = with_derivatives(model_graph(model, form), ["stop_xy_mm"], [("rays", 2), ("rays", 3)])
     out = g.inline(judge, {"rays": rays})
@@ -432,8 +429,7 @@ def scene_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) 
     position = position * (1 / model.scales.position_mm)
     wanted = g.concat(position, direction)
     first = g.concat(*guess.build(g, _light(e, [position, direction], wavelength), None))
-    inputs = {"wanted": wanted, "wavelength_nm": wavelength}
-    unknown, size = _solve(scene_system(model), inputs, first, steps, form)
+    unknown, size = _solve(scene_system(model), {"wanted": wanted, "wavelength_nm": wavelength}, first, steps, form)
     # Free space from the two planes to the film: F = U + (P - U) / along.
     u, p = g.split(unknown, [2, 2])
     p = p * e.film_scale_mm

@@ -325,8 +325,3 @@ def training_s(path: Path | None) -> float:
             with read_arrays(path) as (about, _):
                 return float(about["spent_s"])
     return 0.0
-
-
-def clear_training(path: Path) -> None:
-    """Remove the file of a model's training, once the model itself is written."""
-    path.unlink(missing_ok=True)

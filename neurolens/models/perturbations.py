@@ -352,8 +352,7 @@ def with_reach(model: LensModel, limits: Tolerances) -> tuple[LensModel, dict[st
     along = replace(limits, decentre_mm=0, tilt_deg=0)
 
     def errors(some: Tolerances, times: float) -> list[dict[str, float]]:
-        wider = Tolerances(*(v * times for v in vars(some).values()))
-        draws = draws_of(model.lens, wider, _COPIES, seed=5)
+        draws = draws_of(model.lens, Tolerances(*(v * times for v in vars(some).values())), _COPIES, seed=5)
         return [copy_errors(model, copy_of(model, off), lens) for off, lens in draws]
 
     def holds(some: Tolerances) -> float:

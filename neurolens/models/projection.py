@@ -224,7 +224,8 @@ def minimise(
         step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
         expected = -float(2 * (step @ gradient) + step @ matrix @ step) / len(problem)
         taken += 1
-        trial = _try(problem, _moved(best.hidden, step))
+        parts = torch.split(step, [w.numel() for w in best.hidden])
+        trial = _try(problem, [w + s.reshape(w.shape) for w, s in zip(best.hidden, parts, strict=True)])
         if trial is not None and trial.loss < best.loss:
             gain = (best.loss - trial.loss) / expected
             best, system = trial, None
@@ -240,11 +241,6 @@ def _try(problem: Problem, hidden: list[Tensor]) -> Projection | None:
         return project(problem, hidden)
     except torch.linalg.LinAlgError:
         return None  # A step so long that the features are no longer finite: rejected like one that helps nothing.
-
-
-def _moved(hidden: list[Tensor], step: Tensor) -> list[Tensor]:
-    parts = torch.split(step, [w.numel() for w in hidden])
-    return [w + s.reshape(w.shape) for w, s in zip(hidden, parts, strict=True)]
 
 
 def normal_equations(problem: Problem, at: Projection) -> tuple[Tensor, Tensor, Tensor]:

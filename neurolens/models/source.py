@@ -225,8 +225,7 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     fix.check(models[0].domain)
     fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
     constants = {name: value for name, value in fixed.items() if value is not None}
-    graphs = [model_graph(model, SCALARS, parts) for model in with_one_angle(models)]
-    return lower(graphs, constants)
+    return lower([model_graph(model, SCALARS, parts) for model in with_one_angle(models)], constants)
 
 
 def copies_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FREE) -> Program:

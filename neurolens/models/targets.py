@@ -172,8 +172,7 @@ def _greedy(stops: Tensor, enough: int) -> list[int]:
 
 def explained(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     """Return which rays [N] the stop or an exact gate would stop."""
-    stop = Gate(lens.stop_index, st.RIM)
-    return (gate_values(lens, (*gates, stop), pairs) > 0).any(0)
+    return (gate_values(lens, (*gates, Gate(lens.stop_index, st.RIM)), pairs) > 0).any(0)
 
 
 # ---- settings and targets ----
@@ -408,8 +407,7 @@ def prepare(pairs: RayPairs) -> Prepared:
         NeurolensWarning: more than one ray in 10,000 is lost in a way that no gate shows (beyond 90 degrees to a
             plane, or on the far half of a sphere).
     """
-    seed = pairs.settings.seed + 1_000_003
-    drawn, ended = draw_everywhere(pairs.domain, _GATE_RAYS, seed), []
+    drawn, ended = draw_everywhere(pairs.domain, _GATE_RAYS, pairs.settings.seed + 1_000_003), []
     with pinned_threads():
         for start in range(0, len(drawn), CHUNK):  # crossings with many surfaces are large: of blocked rays alone
             some = FilmRays(*(c[start : start + CHUNK] for c in drawn.columns()))

@@ -96,8 +96,7 @@ def vector_gram(
     pp, pu, uu = (_products(features, s) for s in (rho, sigma, tau))
     gram = torch.cat([torch.cat([pp, pu], 1), torch.cat([pu, uu], 1)])
     along_p, along_u = ((outputs * v).sum(1) for v in (field.p, field.u))
-    moments = torch.cat([features @ along_p.T, features @ along_u.T])
-    return gram.numpy(), moments.numpy()
+    return gram.numpy(), torch.cat([features @ along_p.T, features @ along_u.T]).numpy()
 
 
 def _products(features: Tensor, weights: Tensor) -> Tensor:
@@ -122,14 +121,12 @@ def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Te
         columns, outputs = columns * weights, outputs * weights
     norms = columns.norm(dim=1)
     norms = torch.where(norms > 0, norms, 1.0)
-    scaled = (columns / norms[:, None]).T
     # The Gram matrix would square the condition; QR first, then the small factor by singular values.
-    q, r = torch.linalg.qr(scaled)
+    q, r = torch.linalg.qr((columns / norms[:, None]).T)
     ridge = ROUNDING * torch.eye(len(columns), dtype=r.dtype)
     rows, wanted = torch.cat([r, ridge]), q.T @ outputs.T
     padded = torch.cat([wanted, wanted.new_zeros((len(columns), wanted.shape[1]))])
-    solution = torch.linalg.lstsq(rows, padded, rcond=1e-13, driver="gelsd").solution
-    return (solution / norms[:, None]).T
+    return (torch.linalg.lstsq(rows, padded, rcond=1e-13, driver="gelsd").solution / norms[:, None]).T
 
 
 @contextmanager

@@ -174,8 +174,7 @@ def exit_map(field: Field, plates: Plates, report: Report = lambda share: None) 
     planes = {name: np.zeros((SIDE, SIDE), np.float32) for name in "RGB"}
     across = np.asarray((np.arange(SIDE) + 0.5) * (2 / SIDE) - 1, np.float64)
     for row, down in enumerate(across):
-        place = place_of(field, plates, folded(across, np.full(SIDE, down)))
-        planes["R"][row], planes["G"][row] = place
+        planes["R"][row], planes["G"][row] = place_of(field, plates, folded(across, np.full(SIDE, down)))
         report((row + 1) / SIDE)
     return planes
 

@@ -25,7 +25,6 @@ from neurolens.models.export import export_onnx
 from neurolens.models.fit import NETWORKS, ModelSettings, Prepared, fit_model
 from neurolens.models.fitted import Domain, FilmRays
 from neurolens.models.model import Prediction
-from neurolens.models.network import clear_training
 from neurolens.models.pairs import PairSet, join_pairs, passing_rays, sample_domain, trace_pairs
 from neurolens.models.phase import path_errors
 from neurolens.optics.lens.prescription import Lens
@@ -243,8 +242,7 @@ def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
     """Draw the test rays of all models of a lens and domain; many, since one bad ray in 10,000 may dominate."""
     pairs = prepared.pairs
     seed = pairs.settings.seed + FRESH
-    rays = fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
-    return with_more(rays, seed)
+    return with_more(fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed), seed)
 
 
 def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
@@ -289,7 +287,7 @@ def fit_and_measure(
         lambda path, errors: export_onnx(model, path, errors),
         lambda m: measure_on(on, m) | path_errors(m.fitted, pairs.held_out.inputs),
     )
-    clear_training(training)
+    training.unlink(missing_ok=True)
     return Measured(settings, file, record)
 
 
@@ -325,5 +323,4 @@ def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     data = read_kept(file.with_suffix(".json")) or {}
     if data.get("fingerprint") != fingerprint or not file.is_file() or data["sha256"] != sha256_of(file):
         return None
-    record: dict[str, Any] = data["record"]
-    return record
+    return data["record"]

@@ -75,8 +75,7 @@ def to_use(
 
 def exact_of(records: Iterable[R]) -> R | None:
     """Return the fastest exact tracer that was timed."""
-    timed = [r for r in records if time_of(r)]
-    return min(timed, key=lambda r: time_of(r)["min"], default=None)
+    return min([r for r in records if time_of(r)], key=lambda r: time_of(r)["min"], default=None)
 
 
 def expected_exact(refractions: int) -> ExactRecord:
@@ -334,6 +333,9 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
     if not folder.is_dir():
         raise InputError(folder, "run folder", "(missing)", "a folder that exists")
     wall = None if results.wall_s is None else f"{results.wall_s:.0f} s in all"
+    parts = {"Lens": results.lens, "Domain": results.domain}
+    parts["Seed and versions"] = {"seed": results.seed, **results.versions}
+    parts["Image comparison"] = results.image_settings or {}
     page = html(
         "report.html",
         title=str(results.title or results.lens.get("name") or "neurolens run"),
@@ -343,7 +345,7 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
         exact=table([_exact_name(r) for r in results.exact], results.exact, _EXACT_COLUMNS),
         trade=figures_of(folder, results.figures),
         cameras=table(_names(results.cameras, "name"), results.cameras, _CAMERA_COLUMNS),
-        about=_about(results),
+        about=[(name, flat(values)) for name, values in parts.items()],
         settings=flat(results.settings or {}),
         **_models(results.models),
         **_pictures(folder, results.images),
@@ -360,13 +362,6 @@ def _names(records: Sequence[Record], last: str) -> list[str]:
 def _exact_name(record: Record) -> str:
     lacks = "" if record.get("available", True) else f": unavailable ({record.get('reason') or 'no reason given'})"
     return f"{record.get('name')}{lacks}"
-
-
-def _about(results: Results) -> list[tuple[str, list[tuple[str, str]]]]:
-    parts = {"Lens": results.lens, "Domain": results.domain}
-    parts["Seed and versions"] = {"seed": results.seed, **results.versions}
-    parts["Image comparison"] = results.image_settings or {}
-    return [(name, flat(values)) for name, values in parts.items()]
 
 
 def _models(models: Sequence[Record]) -> dict[str, Any]:

@@ -148,7 +148,8 @@ def race(
     unavailable: dict[str, str] = {}
     passes: dict[str, _Pass] = {}
     before = _load()
-    pool = _pool(domain)
+    rays = sample_domain(domain, POOL, seed=3)  # of the film plane nearest to the lens
+    pool = replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
     with pinned_threads(), torch.no_grad():
         for i, c in enumerate(candidates):
             try:
@@ -166,12 +167,6 @@ def race(
             report(_PREPARING + (1 - _PREPARING) * (i + 1) / rounds)
     load = max((v for v in (before, _load()) if v is not None), default=None)
     return Race(ns, {n: p.batch for n, p in passes.items()}, unavailable, load)
-
-
-def _pool(domain: Domain) -> FilmRays:
-    """Return the rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
-    rays = sample_domain(domain, POOL, seed=3)
-    return replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
 
 
 @dataclass(frozen=True)
@@ -230,8 +225,7 @@ def eager_arguments(rays: FilmRays) -> tuple[Any, ...]:
 
 def exact_c_candidate(lens: Lens, domain: Domain) -> Candidate:
     """Return the exact trace as C, by the writer and flags of the models, with which a model as C is compared."""
-    graph = exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)
-    return program_candidate(EXACT[1], lower(graph), domain)
+    return program_candidate(EXACT[1], lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)), domain)
 
 
 def exact_records(timed: Race) -> list[ExactRecord]:
@@ -287,8 +281,7 @@ def model_candidates(files: Mapping[str, Path], domain: Domain) -> list[Candidat
 def time_model(model: OnnxLens, name: str, *, rounds: int) -> Timing | None:
     """Time an exported model over its domain, in nanoseconds per ray."""
     domain = Domain.from_dict(model.card["domain"])
-    candidate = model_candidate(name, model, domain.stop_radius_mm)
-    return race([candidate], domain, rounds=rounds).timing(name)
+    return race([model_candidate(name, model, domain.stop_radius_mm)], domain, rounds=rounds).timing(name)
 
 
 class CompiledSource:

@@ -131,8 +131,7 @@ def run_task(task: Task) -> bytes:
                 stack.enter_context(more_glasses([_put(place / "glass", *glass) for glass in task.glasses]))
             _survey(task, _put(place / "lens", task.name, task.data), record)
         except Exception as error:
-            known = isinstance(error, NeurolensError)
-            record["verdict"] = record["verdict"] if known else "fault"
+            record["verdict"] = record["verdict"] if isinstance(error, NeurolensError) else "fault"
             record["reason"] = _reason(error).replace(f"{place}/lens/", "").replace(f"{place}/glass/", "")
     return json.dumps(plain(record), sort_keys=True, allow_nan=False).encode()
 

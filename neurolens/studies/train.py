@@ -142,8 +142,10 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress, rend
     if render is not None:
         with progress.stage("render") as report:
             drawn = render(shown, pictures, report)
+    keys = ("name", "source", "sha256", "refractions", "half_field_deg", "image_radius_mm", "dispersive")
+    data, facts = first_order(lens), {key: getattr(lens, key) for key in keys}
     return {
-        "lens": _describe_lens(lens),
+        "lens": {**facts, "file": Path(lens.path).name, "efl_mm": data.efl_mm, "f_number": data.f_number},
         "domain": _describe_domain(lens, pairs),
         "settings": settings,
         "models": records,
@@ -221,12 +223,6 @@ def _draw(
         {"file": f"{folder.name}/{stem}.png", "title": title, "caption": caption, "wide": stem == "trade"}
         for stem, title, caption in figures
     ]
-
-
-def _describe_lens(lens: Lens) -> dict[str, Any]:
-    keys = ("name", "source", "sha256", "refractions", "half_field_deg", "image_radius_mm", "dispersive")
-    data, facts = first_order(lens), {key: getattr(lens, key) for key in keys}
-    return {**facts, "file": Path(lens.path).name, "efl_mm": data.efl_mm, "f_number": data.f_number}
 
 
 def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:

@@ -246,8 +246,7 @@ def osl_graph(camera: OslCamera) -> Graph:
     pupil = g.inline(sampler, {"film_mm": central, "square": square, "wavelength_nm": nanometres, **per_call})
     turned = g.inline(to_plane(None, None), posed | pupil)
     film = turned["plane_mm"]
-    rays = g.concat(film, pupil["pupil_mm"], nanometres)
-    ray = g.inline(camera.graph, {"rays": rays, **per_call})
+    ray = g.inline(camera.graph, {"rays": g.concat(film, pupil["pupil_mm"], nanometres), **per_call})
     inputs = {"film_mm": film, **pupil, **ray, "lens_status": ray["status"], **per_call, **call.weighting()}
     weighted = g.inline(weight_graph(unit=camera.unit), inputs | {"area_mm2": turned["area_mm2"]})
     moves = g.inline(to_plane(None, None, D_FILM), posed | pupil | ray)
@@ -479,8 +478,7 @@ def _blade_margin(lens: ShaderLens, pupil: PupilCircles) -> float:
     image, true = (v[np.abs(true) > _EDGES] for v in (image, true))
     # Near a point, the edge faces the point's direction, to within half a blade's angle.
     facing = true / np.abs(true) * np.exp(1j * np.linspace(-1, 1, 5)[:, None] * np.pi / 5)
-    beyond = ((image - true) * facing.conj()).real.max(0)
-    return max(float(np.quantile(beyond, _NEARLY)), _LEAST)
+    return max(float(np.quantile(((image - true) * facing.conj()).real.max(0), _NEARLY)), _LEAST)
 
 
 def _entrance_mm(lens: ShaderLens) -> float:

@@ -72,12 +72,6 @@ class ShaderLens:
                 radii.append(end_of_light(self.table, pass_test(passes, self.wavelength_nm)) or 0.0)
         return min(max(radii), self.film_radius_mm)
 
-    def drawn_in_boxes(self, radius: Array, rng: np.random.Generator) -> Array:
-        """Draw random pupil points [2, N] in the boxes of film points at radii [N] along +x."""
-        radii = np.linspace(0, self.film_radius_mm, self.table.rows.shape[1])
-        low, high, half = (np.interp(radius, radii, row) for row in self.table.rows)
-        return np.stack([low + (high - low) * rng.random(radius.size), half * rng.uniform(-1, 1, radius.size)])
-
     def _passes(
         self, film: FloatArray, pupil: FloatArray, nanometres: float, film_z: float, azimuth: float
     ) -> NDArray[np.bool_]:
@@ -102,8 +96,7 @@ class ShaderLens:
         for start in range(0, rays.shape[1], _PART):
             part = np.s_[:, start : start + _PART]
             inputs = {"rays": rays[part]} | {name: v[part] if v.size > 1 else v for name, v in call.items()}
-            status = evaluate(self._status, inputs)["status"][0]
-            codes.append(np.broadcast_to(status, inputs["rays"].shape[1]))
+            codes.append(np.broadcast_to(evaluate(self._status, inputs)["status"][0], inputs["rays"].shape[1]))
         return np.concatenate(codes) if codes else np.zeros(0)
 
     @cached_property
@@ -274,7 +267,7 @@ def fit_stop_images(lenses: Sequence[ShaderLens], folded: bool = False) -> list[
 
     Where it is `folded`, return the best image that only moves and scales the stop.
     """
-    candidates = _candidates(lenses[0].anamorphic)
+    candidates = np.array(list(_of_anamorphic() if lenses[0].anamorphic else _of_round()), np.int64)
     if folded:
         candidates = candidates[candidates[:, 3:5].sum(1) <= lenses[0].anamorphic]
     images: list[StopImage] | None = None
@@ -365,12 +358,6 @@ def _with_terms(image: StopImage, numbers: Array, exponents: Exponents) -> StopI
     return replace(image, exponents=np.array(list(total)), numbers=np.array([*total.values()]))
 
 
-def _candidates(anamorphic: bool) -> Exponents:
-    """Return the exponents of all terms among which a fit chooses."""
-    terms = _of_anamorphic() if anamorphic else _of_round()
-    return np.array(list(terms), np.int64)
-
-
 def _of_round() -> Iterator[tuple[int, ...]]:
     degree, of_stop, moving = _DEGREE[0], _STOP_DEGREE[0], _MOVING[0]
     for part, x, square, pairs in product((0, 1), range(of_stop + 1), range(of_stop // 2 + 1), range(_FIELD // 2 + 1)):
@@ -406,7 +393,9 @@ def draw_rays(lens: ShaderLens, image: StopImage | None, seed: int) -> StopRays:
     angle = 2 * np.pi * rng.random(count) if lens.anamorphic else np.zeros(count)
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
     if image is None:
-        x, y = lens.drawn_in_boxes(radius, rng)
+        radii = np.linspace(0, lens.film_radius_mm, lens.table.rows.shape[1])
+        low, high, half = (np.interp(radius, radii, row) for row in lens.table.rows)
+        x, y = np.stack([low + (high - low) * rng.random(radius.size), half * rng.uniform(-1, 1, radius.size)])
         pupil = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
     else:
         turn = 2 * np.pi * rng.random(count)

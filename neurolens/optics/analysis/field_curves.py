@@ -170,8 +170,7 @@ def distortion(
     errors = {name: _error(height, ideal(theta)) for name, ideal in PROJECTIONS.items()}
     origin = scene.object_points(chief.start)
     if origin is not None and not scene.wide:
-        across = (origin[0] if scene.axis == "x" else origin[1]).numpy()
-        errors[RECTILINEAR] = _error(height, across)
+        errors[RECTILINEAR] = _error(height, (origin[0] if scene.axis == "x" else origin[1]).numpy())
     best = min(errors, key=lambda k: np.mean(errors[k] ** 2) if np.isfinite(errors[k]).all() else math.inf)
     reference = best if scene.wide else RECTILINEAR
     return Distortion(

@@ -252,8 +252,7 @@ class Scene:
     @property
     def to_stop(self) -> Lens:
         """The lens from the front to the stop, whose opening is the only rim."""
-        surfaces = self.open.traced.surfaces[: self.lens.stop_index + 1]
-        return replace(self.lens, surfaces=surfaces)
+        return replace(self.lens, surfaces=self.open.traced.surfaces[: self.lens.stop_index + 1])
 
     def require_power(self) -> None:
         """Raise InputError for a pinhole, which has no focus."""
@@ -273,5 +272,4 @@ def _edge(scene: Scene) -> FieldEdge:
     (field,), (reached,) = scene.nearest_fields([wanted], degrees=by_field)
     if not field > 0:
         raise InputError(lens.path, "half_field_deg", stated, "a lens with chief rays off the axis")
-    height = float(scene.chief_rays([field]).height_mm[0])
-    return FieldEdge(float(field), height, meant, bool(reached))
+    return FieldEdge(float(field), float(scene.chief_rays([field]).height_mm[0]), meant, bool(reached))

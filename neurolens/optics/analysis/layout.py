@@ -129,8 +129,7 @@ def _profile(s: Surface, vertex_mm: float, axis: str) -> Array | None:
         return None
     height = torch.linspace(-s.semi_diameter_mm, s.semi_diameter_mm, 65, dtype=torch.float64)
     place = (height, torch.zeros_like(height)) if axis == "x" else (torch.zeros_like(height), height)
-    found: Array = torch.stack([vertex_mm + sag_mm(s, *place, held=True), height], 1).numpy()
-    return found
+    return torch.stack([vertex_mm + sag_mm(s, *place, held=True), height], 1).numpy()
 
 
 def state_text(scene: Scene) -> str:

@@ -222,8 +222,7 @@ def coated(lens: Lens, names: str) -> Lens:
         if key not in single and name in ("bare", "stated"):
             coating = s.coating if stated and name == "stated" else None
         elif name is not None and (key in single or (not stated and before != n_d and 1.0 in (before, n_d))):
-            made = design(name, before, n_d, lens.path, f"surface {key[1:]}, coating")
-            coating = replace(made, origin="shot")
+            coating = replace(design(name, before, n_d, lens.path, f"surface {key[1:]}, coating"), origin="shot")
         rows.append(replace(s, coating=coating))
         before = n_d
     return replace(lens, surfaces=tuple(rows))

@@ -252,8 +252,7 @@ class RimLight:
         widest = np.full(len(ringed.surfaces), _WIDE_MM)
         widest[self.place] = _FACTORS[1] * self.rims
         widest[self.stop_place] = self.rims[self.stop]
-        half = min(profile.half_diagonal_mm, lens.image_radius_mm or math.inf)
-        height = half * np.linspace(_FIRST, 1, _HEIGHTS)
+        height = min(profile.half_diagonal_mm, lens.image_radius_mm or math.inf) * np.linspace(_FIRST, 1, _HEIGHTS)
         self.f_numbers = [row.f_number for row in lights]
         self.measured = np.stack([profile.stops(row, height) for row in lights])
         reach, plane = rear_opening_mm(with_rims(lens, widest[self.place]), float(lens.film_z_mm or 0.0))
@@ -312,8 +311,7 @@ class RimLight:
         light = np.stack([(np.minimum(both, stop) * self.opened.light).sum(axis=(1, 2)) for stop in self.stops])
         with np.errstate(divide="ignore", invalid="ignore"):
             stops = np.log2(light[:, 1:] / light[:, :1])
-        off = np.where(stops > _DARK, stops, _DARK) - self.measured
-        return np.asarray(np.sqrt(np.nanmean(off**2, axis=1)))
+        return np.asarray(np.sqrt(np.nanmean((np.where(stops > _DARK, stops, _DARK) - self.measured) ** 2, axis=1)))
 
     def fit(self, used: Sequence[int]) -> list[tuple[int, float]]:
         """Return the way and the value that fit best, of the front and of the rear.

@@ -352,8 +352,7 @@ def with_likely_rims(lens: Lens, draft: Draft) -> Lens:
     if not evidence:
         return lens
     assume(lens.path, f"rims are assumed to be half as wide as the format has them: {draft.in_file(evidence)}")
-    rows = (replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces)
-    return replace(lens, surfaces=tuple(rows))
+    return replace(lens, surfaces=tuple(replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces))
 
 
 def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:

@@ -309,8 +309,7 @@ def _new_surface(file: File, command: Command) -> None:
     if (name == "SO") != (not file.blocks) or file.closed:
         raise line.error(name, "(here)", "one object SO, then surfaces S, then one image SI")
     far = name == "SO" and command.words[1:2] and command.words[1].lower() in ("inf", "infinity")
-    numbers = command.numbers((command.words[0], str(INFINITE)) if far else command.words[:2], 2)
-    first, thickness = numbers[:2]
+    first, thickness = command.numbers((command.words[0], str(INFINITE)) if far else command.words[:2], 2)[:2]
     curvature, unsaid = 1 / first if file.radii and first else first, file.radii is None and first != 0
     block = Block(line, str(len(file.blocks)), curvature=curvature, thickness=thickness, unsaid=unsaid)
     if name == "SO" and block.thickness >= INFINITE:
@@ -505,8 +504,7 @@ def _biconic(block: Block) -> ShapeFields:
     for name, value in block.terms.items():
         if value and name != "KX" and not name.endswith("P"):
             raise block.start.error(f"{name} of AAS", value, "0: a biconic has no terms of higher order")
-    radius_x = 1 / block.curvature_x if block.curvature_x else math.inf
-    return block.crossed(block.rotational(), radius_x, conic_x)
+    return block.crossed(block.rotational(), 1 / block.curvature_x if block.curvature_x else math.inf, conic_x)
 
 
 def _special(block: Block) -> ShapeFields:

@@ -90,8 +90,7 @@ class Block:
         try:
             terms = qbfs_terms(values, radius, self.curvature, rim, self.conic)
         except ValueError as error:
-            found = f"(curvature {self.curvature:g}, rim {rim:g})"
-            raise self.start.error(name, found, str(error)) from None
+            raise self.start.error(name, f"(curvature {self.curvature:g}, rim {rim:g})", str(error)) from None
         return self.rotational(terms)
 
     def row(self, shape: ShapeFields) -> Row:

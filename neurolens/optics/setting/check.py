@@ -244,8 +244,7 @@ def axial_blur_mm(lens: Lens) -> float:
     r = Rays(*(c[out.status == st.PASSED] for c in out.rays))
     if not len(r.x):
         return math.inf
-    z = best_focus_z_mm(lens, math.inf, (lens.reference_nm, lens.reference_nm))
-    spot = on_plane(r, z)
+    spot = on_plane(r, best_focus_z_mm(lens, math.inf, (lens.reference_nm, lens.reference_nm)))
     return math.sqrt(float((spot.x**2 + spot.y**2).mean()))
 
 

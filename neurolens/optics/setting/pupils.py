@@ -215,8 +215,7 @@ def _may_widen(passed: NDArray[np.bool_], u: Array, v: Array, du: Array, dv: Arr
     count = passed.sum((1, 2))[:, None, None]
     # Where only few were found, all points within two steps are tried; where none were, the whole grid.
     near = (u > least - 2 * du) & (u < most + 2 * du) & (v < across + 2 * dv)
-    found: NDArray[np.bool_] = (within & beyond) | ((count < FEW) & near) | (count == 0)
-    return found
+    return (within & beyond) | ((count < FEW) & near) | (count == 0)
 
 
 # Where the rear rim's box is more than _FAR times as wide, rays are also looked for within this many paraxial exit
@@ -406,8 +405,7 @@ def rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
     """
     last, shift = len(lens.surfaces) - 1, 0.0
     while last > 1 and film_z - float(lens.vertices_mm[last]) < _CLOSE * lens.surfaces[last].semi_diameter_mm:
-        plates = lens.surfaces[last - 1 : last + 1]
-        if not all(math.isinf(s.radius_mm) and not s.figure.bends for s in plates):
+        if not all(math.isinf(s.radius_mm) and not s.figure.bends for s in lens.surfaces[last - 1 : last + 1]):
             break
         shift += float(lens.surfaces[last - 1].thickness_mm)
         last -= 2

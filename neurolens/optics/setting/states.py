@@ -276,15 +276,13 @@ def _states(lens: Lens) -> list[_State]:
             raise InputError(lens.path, f'focal length of "{c.name}"', f"({data.efl_mm:.6g} mm)", expected)
         thickness = gaps_mm(lens, c)
         inner = [thickness[k] for k in gaps]
-        places = data.back_focus_mm + np.append(np.cumsum(inner[::-1])[::-1], 0.0)
-        found.append(_State(c, data.efl_mm, places))
+        found.append(_State(c, data.efl_mm, data.back_focus_mm + np.append(np.cumsum(inner[::-1])[::-1], 0.0)))
     return sorted(found, key=lambda s: s.efl_mm)
 
 
 def _varying_gaps(lens: Lens) -> list[int]:
     """Return the surfaces behind which zoom states set the gap; not the last surface, whose gap ends at the film."""
-    last = len(lens.surfaces) - 1
-    return sorted({k for c in infinity_states(lens) for k, _ in c.thickness_mm} - {last})
+    return sorted({k for c in infinity_states(lens) for k, _ in c.thickness_mm} - {len(lens.surfaces) - 1})
 
 
 def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) -> Vector:
@@ -330,8 +328,7 @@ def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
         return np.asarray(unit[moving])
     # The first varying gap is kept: the two groups beside it move together, or stand still if one of them does.
     together = [unit[kept] + unit[kept + 1]] if moving[kept] and moving[kept + 1] else []
-    others = [unit[j] for j in np.flatnonzero(moving) if j not in (kept, kept + 1)]
-    return np.array(together + others)
+    return np.array(together + [unit[j] for j in np.flatnonzero(moving) if j not in (kept, kept + 1)])
 
 
 def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:

@@ -83,8 +83,7 @@ def aim_at_stop(
         ends = bracket(fine, *outwards(fine)[1:], target)
     off = _off(*outwards(ends)[1:], target)
     rays, field, _ = outwards(ends.gather(1, off.argmin(1, keepdim=True)))
-    reached = off.amin(1) < _MET
-    return Bundle(rays, reached.reshape(height_mm.shape), field.reshape(height_mm.shape))
+    return Bundle(rays, (off.amin(1) < _MET).reshape(height_mm.shape), field.reshape(height_mm.shape))
 
 
 def _axial(angle: Tensor, field: Tensor, exists: Tensor) -> Tensor:

@@ -130,8 +130,7 @@ def _solver(most_x: int, most_y: int) -> tuple[Array, Array]:
     x, y = _terms(most_x, most_y)
     basis = np.einsum("bk,ak->abk", one[:, x], one[:, y]).reshape(-1, len(x))
     q, glass = np.sqrt(1 - square), np.sqrt(1.65**2 - square)
-    weight = 1 / ((q + glass) ** 2 + (1.65 * q + glass / 1.65) ** 2)
-    rows = np.tile(weight, _NODES)[:, None]
+    rows = np.tile(1 / ((q + glass) ** 2 + (1.65 * q + glass / 1.65) ** 2), _NODES)[:, None]
     return basis, np.linalg.pinv(basis * rows) * rows.T
 
 

@@ -253,8 +253,7 @@ class Tracing:
     def _start(self, rays: Rays, lit: Tensor | None, entering: int) -> tuple[Survival, Rays]:
         """Return the rays with optical direction cosines, and the tests, which begin with that for unit directions."""
         o = self.o
-        length2 = o.dot(rays[3:], rays[3:])
-        sound = at_most((length2 - 1).abs(), UNIT_SLACK)
+        sound = at_most((o.dot(rays[3:], rays[3:]) - 1).abs(), UNIT_SLACK)
         if self.freeze:
             # A NaN in one ray must not reach the gradients of the others.
             sound = sound * torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)

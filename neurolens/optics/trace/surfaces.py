@@ -240,8 +240,7 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, curve: Curve, sense: int, 
     still = Rays(*(o.fixed(v) for v in r))
     nearest = (o.fixed(m[0]), o.fixed(m[1]), o.fixed(m[2]))
     with o.constant():
-        glass_before = Medium(*(o.fixed(v) for v in before))
-        missed, _, t = _meet_quadric(o, still, nearest, curve.start, sense, glass_before)
+        missed, _, t = _meet_quadric(o, still, nearest, curve.start, sense, Medium(*(o.fixed(v) for v in before)))
         for n in range(curve.steps + o.polish - 1):
             step = _toward(o, _along(o, nearest, t, still), still, curve, sense)
             if n == curve.steps - 1:

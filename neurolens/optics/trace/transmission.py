@@ -211,15 +211,11 @@ class Passage:
             gap = self.lens.vertices_mm[k] - self.lens.vertices_mm[last]
             near = nearest_approach(self._o, r, before.inverse_n2)
             curvatures = pair[0].curvature, pair[1].curvature
-            return turned_spheres(self._o, near, r[3:], before, curvatures, gap, self._skewness(r))
+            if self._skew is None:
+                self._skew = r.x * r.dy - r.y * r.dx
+            return turned_spheres(self._o, near, r[3:], before, curvatures, gap, self._skew)
         across = crossed(r[3:], other, normal)
         return turned([times(c, before.n2) for c in other], normal, q * met.q, times(across, before.n))
-
-    def _skewness(self, r: Rays) -> Any:
-        """Return x dy - y dx, with directions times the index, which surfaces round about the axis do not change."""
-        if self._skew is None:
-            self._skew = r.x * r.dy - r.y * r.dx
-        return self._skew
 
     def arrived(self, like: Any) -> Any:
         """Return the power of all rays, in the form that a value has."""

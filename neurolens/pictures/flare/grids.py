@@ -254,8 +254,7 @@ def _kept(rows: Floats, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
     A cell whose corners are all stopped by a rim is kept where `worst`, extrapolated by its change in the cell, reaches
     1.
     """
-    shape = (len(rows), 4, _SCOUTS + 1, _SCOUTS + 1)
-    xy, worst = np.split(rows.reshape(shape)[:, [0, 1, 3]], [2], 1)
+    xy, worst = np.split(rows.reshape((len(rows), 4, _SCOUTS + 1, _SCOUTS + 1))[:, [0, 1, 3]], [2], 1)
     lost = ~(worst < LOST)
     inf = np.float32(np.inf)
     low, high = _corners(np.where(lost, inf, xy), np.minimum), _corners(np.where(lost, -inf, xy), np.maximum)

@@ -425,8 +425,7 @@ def _scene_job(sources: SceneLights, filmed: Filmed, raster: Raster, threads: in
     settings = scene.settings.flare
     assert settings is not None and lens.film_z_mm is not None
     lights = keep(sources.seen(scene, lens.film_z_mm), settings.most, fade).lights
-    light_nm = scene.settings.camera.wavelength_nm
-    return FlareJob(lens, lights, raster, settings, light_nm, threads, pose=pose)
+    return FlareJob(lens, lights, raster, settings, scene.settings.camera.wavelength_nm, threads, pose=pose)
 
 
 def scene_flare(

@@ -103,9 +103,8 @@ def step_graph(kind: Kind) -> Graph:
     curve = Curve(curvature, plain=True) if shape is None else _curve(shape, call)
     # Indices are relative to the medium before the surface, so that directions there are unit vectors.
     met = meet(o, rays, curve, -1, _UNIT)
-    normal = normal_at(o, met, curvature)
     # Glass ends at the near half of a sphere.
-    tests = [*met.tests, (TINY, normal[2])]
+    tests = [*met.tests, (TINY, normal_at(o, met, curvature)[2])]
     ratio2 = radius2(o, met) * per_rim2
     point, d = g.concat(met.x, met.y, met.z), state[3:6]
     if kind.absorbs:

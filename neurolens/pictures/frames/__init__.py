@@ -360,8 +360,7 @@ def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) 
             found = _flaring(make_camera(str(frame.camera), replace(shot, runtime="onnxruntime")))
             assert found is not None  # as the first
             flaring[_state(frame)] = found
-        seen = seen_from(scene, frame.scene, frame.position_m, frame.look_at_m)
-        scenes.append((seen, *flaring[_state(frame)]))
+        scenes.append((seen_from(scene, frame.scene, frame.position_m, frame.look_at_m), *flaring[_state(frame)]))
     with _errors_of_table(prepared.frame.scene):
         return scene_choice(scenes, _raster(prepared), threads, fade=prepared.frame.number is not None)
 

@@ -68,8 +68,7 @@ def _solve(matrix: Matrix, right: Matrix) -> Matrix:
 def adaptation(xyz_from: ArrayLike, xyz_to: ArrayLike) -> Matrix:
     """Return the matrix on XYZ that turns one white into another (XYZ [3] each) at equal luminance (Bradford)."""
     source, target = (np.asarray(white, np.float64) / np.asarray(white)[1] for white in (xyz_from, xyz_to))
-    scale = np.diag(BRADFORD @ target / (BRADFORD @ source))
-    return _solve(BRADFORD, scale @ BRADFORD)
+    return _solve(BRADFORD, np.diag(BRADFORD @ target / (BRADFORD @ source)) @ BRADFORD)
 
 
 @dataclass(frozen=True)
@@ -110,8 +109,7 @@ COLOUR_SPACES = {space.name: space for space in (SRGB, ACESCG)}
 
 def conversion(source: ColourSpace, target: ColourSpace) -> Matrix:
     """Return the matrix [3, 3] from one linear RGB to another; white stays white."""
-    adapt = adaptation(xyz_of(source.white), xyz_of(target.white))
-    return _solve(target.to_xyz, adapt @ source.to_xyz)
+    return _solve(target.to_xyz, adaptation(xyz_of(source.white), xyz_of(target.white)) @ source.to_xyz)
 
 
 def converted(colours: NDArray[np.floating], matrix: ArrayLike) -> NDArray[np.floating]:
@@ -421,8 +419,7 @@ class ChannelWavelengths:
 
     def draw(self, sample: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Draw wavelengths [N] in nm, with weights [3, N], by uniform samples [N] in [0, 1)."""
-        weights = self._weights.take(self._range.bin_of(sample), axis=1)
-        return self._range.wavelengths_nm(sample)[0], weights
+        return self._range.wavelengths_nm(sample)[0], self._weights.take(self._range.bin_of(sample), axis=1)
 
 
 class Palette:

@@ -194,8 +194,7 @@ class Lights:
     def strongest(self, target_m: Vector, most: int) -> list[int]:
         """The numbers of the `most` lights that bring a point most light if nothing is between, in rising order."""
         importance = [group.importance(target_m) for _, group in self._groups]
-        order = np.argsort(-np.concatenate([np.zeros(0), *importance]), kind="stable")
-        return sorted(order[:most].tolist())
+        return sorted(np.argsort(-np.concatenate([np.zeros(0), *importance]), kind="stable")[:most].tolist())
 
     def _by_group(self, light: Numbers) -> Iterator[tuple[LightGroup, Numbers, Numbers]]:
         """Yield the groups of lights [N], the places at which each group's lights stand, and their numbers in it."""

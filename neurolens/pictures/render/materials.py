@@ -102,12 +102,6 @@ def _albedos(alpha: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     return [(cosine, whole), (cosine, (share * fifth_power(cos_half)).reshape(_NODES, -1) @ weight)]
 
 
-def sine2(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Squared sine [N] of the angle between unit vectors [3, N], exact for small ones, too."""
-    x, y, z = (a[j] * b[k] - a[k] * b[j] for j, k in ((1, 2), (2, 0), (0, 1)))
-    return x * x + y * y + z * z
-
-
 class GlossyLobes:
     """A GGX coat over a Lambert base, seen from one direction: how much it scatters, and directions to sample.
 
@@ -158,7 +152,8 @@ class GlossyLobes:
         cos_half = dot(self._normal, half)
         alpha2 = self._alpha * self._alpha
         # The squared sine comes from the cross product: 1 - cos^2 is lost in float32 where the lobe is narrow.
-        spread = cos_half * cos_half * alpha2 + sine2(self._normal, half)
+        x, y, z = (self._normal[j] * half[k] - self._normal[k] * half[j] for j, k in ((1, 2), (2, 0), (0, 1)))
+        spread = cos_half * cos_half * alpha2 + (x * x + y * y + z * z)
         peak = alpha2 / (_PI * spread * spread)
         lambda_out, lambda_in = smith(cos_out, alpha2), smith(np.maximum(cos_in, np.float32(1e-6)), alpha2)
         common = peak / (4 * cos_out)
@@ -184,8 +179,7 @@ class GlossyLobes:
         local = np.stack([dot(tangent, out), dot(bitangent, out), np.maximum(dot(normal, out), np.float32(1e-6))])
         local = visible_normal(local, self._alpha, square)
         half = tangent * local[0] + bitangent * local[1] + normal * local[2]
-        coated = half * (2 * dot(out, half)) - out
-        return np.where(lobe < self._choice, coated, diffuse)
+        return np.where(lobe < self._choice, half * (2 * dot(out, half)) - out, diffuse)
 
 
 def fresnel_dielectric(cos_in: FloatArray, relative_index: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -197,8 +191,7 @@ def fresnel_dielectric(cos_in: FloatArray, relative_index: FloatArray) -> tuple[
     cos_out = np.sqrt(np.maximum(1 - sin2, 0))
     s = (cos_in - relative_index * cos_out) / (cos_in + relative_index * cos_out)
     p = (relative_index * cos_in - cos_out) / (relative_index * cos_in + cos_out)
-    reflectance = np.float32(0.5) * (s * s + p * p)
-    return np.where(sin2 >= 1, np.float32(1), reflectance), cos_out
+    return np.where(sin2 >= 1, np.float32(1), np.float32(0.5) * (s * s + p * p)), cos_out
 
 
 def glass_direction(

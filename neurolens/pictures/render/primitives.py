@@ -8,7 +8,6 @@ of the batch, which live in the cache; tests are ordered so that the cheap rejec
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Any, Protocol
 
 import numpy as np
@@ -326,11 +325,6 @@ def _clusters(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.
     axis = int(np.argmax(np.ptp(centres[rows], axis=0)))
     halves = np.array_split(rows[np.argsort(centres[rows, axis], kind="stable")], 2)
     return [group for half in halves for group in _clusters(half, centres)]
-
-
-def has_embree() -> bool:
-    """Return whether Embree is installed; some machines have no wheel of it."""
-    return find_spec("embreex") is not None
 
 
 class Mesh:

@@ -266,8 +266,7 @@ def render(
     job = Job(scene, camera, grid, samples, seed, max_depth, film, (first, stop))
     keeper = Keeper(job, watch or Watch(), progress)
     try:
-        idle = watch is None and progress is None
-        run(job, min(threads, job.tiling.tiles), None if idle else keeper)
+        run(job, min(threads, job.tiling.tiles), None if watch is None and progress is None else keeper)
     except NeurolensError as error:
         raise keeper.rescue(error) from None
     except KeyboardInterrupt:
@@ -366,8 +365,7 @@ class Tile:
     @property
     def frame(self) -> int | None:
         """The number of its picture in a sequence."""
-        frame: int | None = self.metadata["tile"]["frame"]
-        return frame
+        return self.metadata["tile"]["frame"]
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that all tiles of one picture share."""

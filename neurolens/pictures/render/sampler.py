@@ -125,8 +125,7 @@ class Sampler:
     def keys(self, pixel: NDArray[np.intp], sample: NDArray[np.intp]) -> PathKeys:
         """Make the keys of the paths of pixel numbers [N] and sample indices [N]."""
         pixel_key = hash32(hash32(pixel.astype(np.uint32)) ^ self._seed)
-        path = hash32(pixel_key + sample.astype(np.uint32) * np.uint32(0x9E3779B9))
-        return PathKeys(pixel_key, sample, path)
+        return PathKeys(pixel_key, sample, hash32(pixel_key + sample.astype(np.uint32) * np.uint32(0x9E3779B9)))
 
     def draw(self, keys: PathKeys, dimension: int) -> FloatArray:
         """Return numbers [N] in [0, 1), one dimension of each path."""
@@ -170,8 +169,7 @@ def cosine_direction(normal: FloatArray, square: FloatArray) -> tuple[FloatArray
     direction[2] = height
     direction += normal
     # The point opposite to the normal would give the zero vector.
-    length2 = np.maximum(dot(direction, direction), np.float32(1e-12))
-    direction /= np.sqrt(length2)
+    direction /= np.sqrt(np.maximum(dot(direction, direction), np.float32(1e-12)))
     return direction, np.maximum(dot(direction, normal), np.float32(1e-6))
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,7 +42,6 @@ from neurolens.pictures.render.primitives import (
     SphereClusters,
     Spheres,
     dot,
-    has_embree,
     triangle_planes,
 )
 from neurolens.pictures.render.scene import Scene
@@ -205,7 +205,7 @@ class Assembly:
     def _add_flat(self) -> None:
         settings = self._scene.settings
         quads = np.array([(q.corner_m, q.edge_u_m, q.edge_v_m) for q in settings.quads], np.float64).reshape(-1, 3, 3)
-        many = len(quads) > _MANY_QUADS and has_embree()
+        many = len(quads) > _MANY_QUADS and find_spec("embreex") is not None  # some machines have no wheel
         if many:
             self.primitives.append(Mesh.of_rectangles(self._count, quads + quads[:, :1] * [[[0], [1], [1]]]))
         for quad, (corner, u, v) in zip(settings.quads, quads, strict=True):
@@ -467,8 +467,7 @@ class World:
                 triangle = surface[rows] - first
                 at = np.vstack([point.take(rows, axis=1), np.ones(len(rows), np.float32)])
                 u, v = np.einsum("tij,jt->it", planes[triangle, 1:], at)
-                weights = np.stack([1 - u - v, u, v])
-                blended = np.einsum("it,tij->jt", weights, normals[triangle])
+                blended = np.einsum("it,tij->jt", np.stack([1 - u - v, u, v]), normals[triangle])
                 shading[:, rows] = blended / np.sqrt(np.maximum(np.sum(blended**2, axis=0), 1e-12))
         return normal, shading
 

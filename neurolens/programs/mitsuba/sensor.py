@@ -123,8 +123,7 @@ def _compile(variant: str) -> None:
 
 def rows(*values: Any) -> FloatArray:
     """Evaluate values of the current variant, each one number or N, as rows [len(values), N] of float32."""
-    arrays = [np.atleast_1d(np.asarray(value, np.float32)) for value in values]
-    return np.stack(np.broadcast_arrays(*arrays))
+    return np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(value, np.float32)) for value in values)))
 
 
 def number(values: FloatArray) -> Any:
@@ -196,8 +195,7 @@ class FilmRays:
     def _film_points(self, position: FloatArray) -> FloatArray:
         size = np.array([self.grid.width, self.grid.height], np.float32)[:, None]
         offset, part = (np.array(x, np.float32)[:, None] for x in (self.crop_offset, self.crop_size))
-        place = (position * part + offset) * size
-        return self.grid.film_points(np.zeros(position.shape[1], np.intp), place)
+        return self.grid.film_points(np.zeros(position.shape[1], np.intp), (position * part + offset) * size)
 
 
 def wavelength_samples(position: FloatArray, aperture: FloatArray) -> FloatArray:
@@ -248,7 +246,10 @@ def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
     units = _number_of(props, "units_per_m", 1.0)
     if not 0 < units < math.inf:
         raise InputError(PLUGIN, "units_per_m", units, "a finite number above 0")
-    _check_rigid(self.world_transform())
+    turn = matrix(self.world_transform())[:3, :3]
+    if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-4):
+        expected = "a rotation and a translation; set units_per_m for scenes in other units"
+        raise InputError(PLUGIN, "to_world", turn.round(4).tolist(), expected)
     self.rays = FilmRays(
         camera,
         PixelGrid(width, height, camera.film_mm),
@@ -294,13 +295,6 @@ def _number_of(props: Any, name: str, default: float) -> float:
 def _found(name: str) -> str:
     """Find the file of that name, relative to the working folder or to the XML scene."""
     return str(libraries()[0].file_resolver().resolve(name))
-
-
-def _check_rigid(transform: Any) -> None:
-    turn = matrix(transform)[:3, :3]
-    if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-4):
-        expected = "a rotation and a translation; set units_per_m for scenes in other units"
-        raise InputError(PLUGIN, "to_world", turn.round(4).tolist(), expected)
 
 
 def _to_string(self: Any) -> str:
@@ -356,8 +350,7 @@ def _lanes(
 def _channels(self: Any, position: FloatArray, aperture: FloatArray) -> tuple[LocalRays, FloatArray]:
     """Return rays of one wavelength each, and weights [3, N] of R, G and B."""
     if self.channels is None:
-        middle = np.full(position.shape[1], _MIDDLE_NM, np.float32)
-        local = self.rays.sample(position, aperture, middle)
+        local = self.rays.sample(position, aperture, np.full(position.shape[1], _MIDDLE_NM, np.float32))
         return local, np.tile(local.weight, (3, 1))
     wavelength_nm, worth = self.channels.draw(wavelength_samples(position, aperture))
     local = self.rays.sample(position, aperture, wavelength_nm)

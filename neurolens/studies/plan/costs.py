@@ -91,8 +91,7 @@ def work_of(probed: Probe) -> Work:
     thin = as_c(ideal_as("thin:", probed.exact.lens, probed.shot))
     shot = scene.settings.camera
     samples = min(shot.samples, _SAMPLES)
-    paths = min(shot.width * shot.height * shot.samples // _PART, _STRIP_PATHS)
-    strips = strips_of(scene, paths, samples)
+    strips = strips_of(scene, min(shot.width * shot.height * shot.samples // _PART, _STRIP_PATHS), samples)
     rest, variance = [], []
     for camera, seen in ((thin, probed.thin_seen), (probed.exact, probed.seen)):
         with shared_worlds():

@@ -92,8 +92,7 @@ def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Arra
     with np.errstate(all="ignore"):  # a fisheye's ray across the axis meets no depth, and shows something distant
         distance = (depth_m + origin[2]) / np.maximum(-direction[2], 0.0)
     distance = np.where(np.isfinite(distance) & (distance > 0), distance, np.inf)
-    helper = np.where(np.abs(direction[0]) < 0.9, *np.eye(3)[:2, :, None])
-    first = np.cross(direction, helper, axis=0)
+    first = np.cross(direction, np.where(np.abs(direction[0]) < 0.9, *np.eye(3)[:2, :, None]), axis=0)
     first /= np.linalg.norm(first, axis=0)
     across = np.stack([first, np.cross(direction, first, axis=0)])
     empty = np.zeros((2, 2, film_mm.shape[1]))
@@ -113,8 +112,7 @@ def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
     rays, shape = _sampled(camera, places, np.stack(np.meshgrid(steps, steps)).reshape(2, -1))
     points = shape[0]
     origin, direction = (a.astype(np.float64).reshape(3, points, -1) for a in (rays.origin_m, rays.direction))
-    slope = _meet(places, origin, direction)
-    place = np.einsum("ijn,jnk->ink", places.to_film, slope).reshape(2, *shape)
+    place = np.einsum("ijn,jnk->ink", places.to_film, _meet(places, origin, direction)).reshape(2, *shape)
     from_chief, chief = origin - places.origin_m[:, :, None], places.direction[:, :, None]
     at_pupil = from_chief - (from_chief * chief).sum(0) / (direction * chief).sum(0) * direction
     across = 1e3 * np.einsum("icn,cnk->ink", places.across, at_pupil).reshape(2, *shape)
@@ -127,8 +125,7 @@ def light_beside(camera: Camera, places: Places) -> Array:
     angle = 2 * np.pi * (np.arange(_BESIDE_POINTS) + 0.5) / _BESIDE_POINTS
     edge = np.stack([np.cos(angle), np.sin(angle)])
     # the outline is continued beyond the edge of the square
-    square = 0.5 + 0.5 * (1 + _BESIDE) * edge / np.abs(edge).max(0)
-    rays, shape = _sampled(camera, places, square)
+    rays, shape = _sampled(camera, places, 0.5 + 0.5 * (1 + _BESIDE) * edge / np.abs(edge).max(0))
     return np.asarray(2 * _BESIDE * rays.weight.astype(np.float64).reshape(shape).mean((1, 2)))
 
 
@@ -214,8 +211,7 @@ def _meet(places: Places, origin: Array, direction: Array) -> Array:
 
 def centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
     """Return the centroid of all light [2, N], and that of each wavelength [2, N, W]."""
-    light = np.maximum(prints.weight.sum(2), 1e-300)
-    by_wave = (prints.place_mm * prints.weight).sum(3) / light
+    by_wave = (prints.place_mm * prints.weight).sum(3) / np.maximum(prints.weight.sum(2), 1e-300)
     return (by_wave * share).sum(2), by_wave
 
 
@@ -246,8 +242,7 @@ def _expanded(prints: Footprints, centre: Array) -> tuple[Array, Array]:
     """Return linear parts [2, 2, N, W], mm per mm of pupil, and mean squares [3, N, W] of degrees 2, 3 and the rest."""
     size = np.maximum(_pupil_size(prints), 1e-12)[:, None, None]
     x, y = prints.pupil_mm / size
-    total = np.maximum(prints.weight.sum(2, keepdims=True), 1e-300)
-    root = np.sqrt(prints.weight / total)
+    root = np.sqrt(prints.weight / np.maximum(prints.weight.sum(2, keepdims=True), 1e-300))
     monomials = (1 + 0 * x, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3)
     basis = np.stack([root * m for m in monomials], axis=-1)  # [N, W, P, 10]
     q, r = np.linalg.qr(basis)

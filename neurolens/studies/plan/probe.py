@@ -312,8 +312,7 @@ def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Eff
     maps, effects = effect_maps(probed), list[Effect]()
     if stray:
         with suppress(InputError):
-            added = stray_light(probed.scene, probed.exact, probed.small)
-            maps |= {k: ("relative", v) for k, v in added.items()}
+            maps |= {k: ("relative", v) for k, v in stray_light(probed.scene, probed.exact, probed.small).items()}
     for name, (unit, value) in maps.items():
         budget = budget_px if unit == "px" else LIGHT
         known = np.abs(value[np.isfinite(value)])

@@ -112,8 +112,7 @@ def focus_m(found: Any) -> float:
     if dof.focus_object is None:
         return float(dof.focus_distance)
     frame = found.matrix_world.normalized()
-    away = dof.focus_object.matrix_world.translation - frame.translation
-    return abs(float(away.dot(frame.col[2].xyz)))
+    return abs(float((dof.focus_object.matrix_world.translation - frame.translation).dot(frame.col[2].xyz)))
 
 
 def depths_in_view(context: Any, found: Any, setting: Setting, efl_mm: float) -> list[float]:
@@ -165,8 +164,7 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
     width = None
     if fit_sensor:
         width = fitting_width_mm(variant, setting)
-        share = width / setting.sensor_mm[0]
-        setting = replace(setting, sensor_mm=(width, setting.sensor_mm[1] * share))
+        setting = replace(setting, sensor_mm=(width, setting.sensor_mm[1] * (width / setting.sensor_mm[0])))
     if wrong := refusals(variant, setting):
         raise LensError("; ".join(wrong))
     try:
@@ -265,8 +263,7 @@ def _is_animated(camera: Any, path: str) -> bool:
     data = camera.animation_data
     if data is None:
         return False
-    driven = any(driver.data_path == path for driver in data.drivers)
-    return driven or (data.action is not None)
+    return any(driver.data_path == path for driver in data.drivers) or (data.action is not None)
 
 
 def _zoom_driver(camera: Any) -> Any:
